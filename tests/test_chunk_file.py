@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import h5py
@@ -9,35 +10,38 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from amiwarp.io.chunk_file import ChunkedColumn, ChunkFile
+from amiwarp.events.events import Events
+from amiwarp.io import RecordingWriter
+from amiwarp.io.chunk_file import ChunkFile, EncodedChunk
 from amiwarp.io.chunks import CHUNK, encode, encode_parts
 from amiwarp.io.native_layout import make_dataset
 
 assert hdf5plugin.FILTERS  # its import registers the filter
 
 
-def stored_in_any_order(path, columns):
-    """Write columns by four threads, the last chunks first."""
+def stored(path, columns):
+    """Write columns by four threads, of which the later ones are faster."""
     file = ChunkFile(path)
     datasets = {name: make_dataset(file.hdf5, name, c.dtype, c.shape[1:]) for name, c in columns.items()}
-    writers = {name: ChunkedColumn(file, dataset) for name, dataset in datasets.items()}
 
-    def write(job):
+    def write(turn, job):
         name, start = job
         part = columns[name][start : start + CHUNK]
-        writers[name].write(start, encode_parts(part), len(part))
+        parts = encode_parts(part)
+        time.sleep(0.01 * (3 - turn % 4))
+        file.write(turn, [EncodedChunk(name, start, part, parts)], lambda chunk: datasets[chunk.name])
 
     jobs = [(name, start) for start in reversed(range(0, 3 * CHUNK, CHUNK)) for name in columns]
     with ThreadPoolExecutor(4) as pool:
-        list(pool.map(write, jobs))
+        list(pool.map(write, range(len(jobs)), jobs))
     file.hdf5["after"] = np.arange(9)
     file.close()
 
 
 def in_two_pieces(output, data):
     """Write data as :class:`amiwarp.io.chunk_file._Output` does, but not at once."""
-    output.write_at(data[:7], output.tell())
-    output.write_at(data[7:], output.tell() + 7)
+    output.write_at([data[:7]], output.tell())
+    output.write_at([data[7:]], output.tell() + 7)
     output.seek(output.tell() + len(data))
     return len(data)
 
@@ -55,11 +59,53 @@ def test_threads_write_chunks_in_any_order(tmp_path, monkeypatch, in_one_piece):
     if not in_one_piece:
         monkeypatch.setattr("amiwarp.io.chunk_file._Output.write", in_two_pieces)
     columns = make()
-    stored_in_any_order(tmp_path / "a.h5", columns)
+    stored(tmp_path / "a.h5", columns)
     with h5py.File(tmp_path / "a.h5") as file:
         for name, column in columns.items():
             np.testing.assert_array_equal(file[name][()], column, strict=True)
         np.testing.assert_array_equal(file["after"][()], np.arange(9))
+
+
+def test_the_speed_of_threads_does_not_change_a_file(tmp_path, monkeypatch):
+    """Neither if pieces are filled in, nor if events are appended, and also with an index of several chunks."""
+    rng, n = np.random.default_rng(5), 4 * CHUNK
+    t = np.sort(rng.integers(0, 10**9, n))
+    events = Events(
+        *(rng.integers(0, 99, n).astype(np.uint16) for _ in "xy"), t, rng.integers(0, 2, n).astype(np.uint8)
+    )
+    flags = np.ones(n, np.uint8)
+
+    def write(path, delays):
+        monkeypatch.setattr(
+            "amiwarp.io.native_writer.encode_parts", lambda *a: (time.sleep(next(delays)), encode_parts(*a))[1]
+        )
+        monkeypatch.setattr("amiwarp.io.chunks.cpu_threads", lambda: 4)
+        with RecordingWriter(path.with_suffix(".filled.h5"), width=99, height=99) as writer:
+            pieces = [lambda s=slice(k, k + CHUNK): (events[s], flags[s], {}) for k in range(0, n, CHUNK)]
+            writer.fill(pieces, count=CHUNK, t_first=int(t[0]), done=lambda *_: None)
+        with RecordingWriter(path, width=99, height=99) as writer:
+            writer.append(events)
+        return path.read_bytes(), path.with_suffix(".filled.h5").read_bytes()
+
+    slow = iter(np.linspace(0.05, 0.0, 60).tolist())
+    assert write(tmp_path / "a.h5", slow) == write(tmp_path / "b.h5", iter(np.zeros(60).tolist()))
+    with h5py.File(tmp_path / "a.filled.h5") as file:
+        np.testing.assert_array_equal(file["events/t"][()], t - t[0])
+        assert len(file["ms_to_idx"]) > 2 * CHUNK
+
+
+def test_a_thread_that_fails_stops_the_others(tmp_path):
+    def fail():
+        time.sleep(0.2)
+        raise ValueError("no events")
+
+    flags = np.ones(CHUNK, np.uint8)
+    zeros = np.zeros(CHUNK, np.uint16)
+    events = Events(zeros, zeros, zeros.astype(np.int64), flags)
+    pieces = [fail, *[lambda: (events, flags, {})] * 8]
+    with pytest.raises(ValueError, match="no events"), RecordingWriter(tmp_path / "a.h5", width=9, height=9) as writer:
+        writer.fill(pieces, count=CHUNK, t_first=0, done=lambda *_: None)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_parts_of_a_chunk_are_its_bytes():

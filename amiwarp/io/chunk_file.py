@@ -6,24 +6,45 @@ chunk in the file; the thread that encoded the chunk writes it there.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+
+
+class EncodedChunk(NamedTuple):
+    """Chunk of a column."""
+
+    name: str
+    """Name of the column."""
+    start: int
+    """Index of its first element."""
+    values: NDArray[Any]
+    """Its values."""
+    parts: Sequence[bytes]
+    """Its encoded bytes, in one or several parts."""
 
 
 class ChunkFile:
-    """HDF5 file that is being written. Any thread may write chunks of its datasets."""
+    """HDF5 file that is being written. Threads write chunks of its datasets at places that they get in turn."""
 
     def __init__(self, path: Path) -> None:
         """Create the file. Raises OSError if it exists."""
         import h5py
 
         self.output = _Output(path)
-        self.lock = threading.Lock()
+        self._columns: dict[str, ChunkedColumn] = {}
+        self._turns = threading.Condition()
+        self._turn = 0
+        self._stopped = False
         try:
             # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
             self.hdf5 = h5py.File(self.output, "w", libver=("v110", "v110"))
@@ -31,6 +52,52 @@ class ChunkFile:
         except BaseException:
             self.output.close()
             raise
+
+    @contextlib.contextmanager
+    def turn(self, number: int) -> Iterator[None]:
+        """Wait until all lower numbers, from 0 on, had their turn, and keep out other turns.
+
+        Chunks get their places in turn, so the bytes of a file do not depend on the speed of the threads. Raises
+        :class:`AmiwarpError` if another thread failed.
+        """
+        with self._turns:
+            self._turns.wait_for(lambda: self._turn == number or self._stopped)
+            if self._stopped:
+                raise AmiwarpError("another thread could not write its part")
+            yield
+            self._turn += 1
+            self._turns.notify_all()
+
+    @contextlib.contextmanager
+    def stopping(self) -> Iterator[None]:
+        """If the work of a thread in the ``with`` block fails, end the waiting of the others."""
+        try:
+            yield
+        except BaseException:
+            with self._turns:
+                self._stopped = True
+                self._turns.notify_all()
+            raise
+
+    def write(
+        self, turn: int, chunks: Iterable[EncodedChunk], dataset_of: Callable[[EncodedChunk], Any],
+        before: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
+        """Write encoded chunks at places that they get in turn.
+
+        ``dataset_of`` makes the dataset of a column's first chunk. ``before`` is called first in turn.
+        """
+        placed = []
+        with self.turn(turn):
+            before()
+            for chunk in chunks:
+                if chunk.name not in self._columns:
+                    self._columns[chunk.name] = ChunkedColumn(self, dataset_of(chunk))
+                column = self._columns[chunk.name]
+                placed.append((column.place(chunk.start, chunk.parts, len(chunk.values)), chunk.parts))
+        for at, parts in placed:
+            if at is not None:
+                self.output.write_at(parts, at)
 
     def close(self) -> None:
         """Close the file, after all threads have written their chunks."""
@@ -41,30 +108,26 @@ class ChunkFile:
 
 
 class ChunkedColumn:
-    """Dataset of a :class:`ChunkFile`. Any thread may write its chunks, in any order."""
+    """Dataset of a :class:`ChunkFile`, whose chunks are written in any order."""
 
     def __init__(self, file: ChunkFile, dataset: Any) -> None:
-        self._file, self._id = file, dataset.id
+        self._output, self._id = file.output, dataset.id
         self._rows, *self._row = dataset.shape
 
-    def write(self, start: int, stored: Sequence[bytes], rows: int) -> None:
-        """Write an encoded chunk of ``rows`` elements, which starts at element ``start``.
+    def place(self, start: int, stored: Sequence[bytes], rows: int) -> int | None:
+        """Return the place in the file [bytes] of an encoded chunk of ``rows`` elements from element ``start`` on.
 
-        ``stored`` are the bytes of the chunk, in one or several parts. The dataset grows if it is too short.
+        ``stored`` are the bytes of the chunk, in one or several parts. The dataset grows if it is too short. If the
+        place cannot be found, the chunk is written at once and None is returned. Call this method in turn.
         """
-        size = sum(map(len, stored))
-        place = (start, *(0 for _ in self._row))
-        with self._file.lock:
-            if self._rows < start + rows:
-                self._rows = start + rows
-                self._id.set_extent((self._rows, *self._row))
-            at = self._file.output.place_of(size, partial(self._id.write_direct_chunk, place))
-            if at is None:
-                self._id.write_direct_chunk(place, b"".join(stored))
-                return
-        for part in stored:
-            self._file.output.write_at(part, at)
-            at += len(part)
+        size, offset = sum(map(len, stored)), (start, *(0 for _ in self._row))
+        if self._rows < start + rows:
+            self._rows = start + rows
+            self._id.set_extent((self._rows, *self._row))
+        at = self._output.place_of(size, partial(self._id.write_direct_chunk, offset))
+        if at is None:
+            self._id.write_direct_chunk(offset, b"".join(stored))
+        return at
 
 
 class _Output(io.RawIOBase):
@@ -93,19 +156,20 @@ class _Output(io.RawIOBase):
             self._sought = None
         return self._found
 
-    def write_at(self, data: Any, place: int) -> None:
-        """Write data at a place [bytes]. Any thread may call it."""
-        rest = memoryview(data)
-        while rest:
-            done = os.pwrite(self._handle, rest, place)
-            rest, place = rest[done:], place + done
+    def write_at(self, parts: Iterable[Any], place: int) -> None:
+        """Write data in several parts, one after the other, at a place [bytes]. Any thread may call it."""
+        for part in parts:
+            rest = memoryview(part)
+            while rest:
+                done = os.pwrite(self._handle, rest, place)
+                rest, place = rest[done:], place + done
 
     def write(self, data: Any) -> int:
         size = len(data)
         if size == self._sought and memoryview(data)[: len(self._token)] == self._token[:size]:
             self._found = self._position
         else:
-            self.write_at(data, self._position)
+            self.write_at([data], self._position)
         self._position += size
         return size
 

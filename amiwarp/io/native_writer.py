@@ -6,8 +6,8 @@ The format is described in ``docs/reference/recording-format.md``.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -25,7 +25,7 @@ from amiwarp.events.events import Events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.events.truth import EventTruth, WorldLabels
 from amiwarp.io.atomic_output import NewFile, spare_space
-from amiwarp.io.chunk_file import ChunkedColumn, ChunkFile
+from amiwarp.io.chunk_file import ChunkFile, EncodedChunk
 from amiwarp.io.chunks import CHUNK, Codec, encode_parts, in_order
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import (
@@ -119,8 +119,7 @@ class RecordingWriter(RecordAppender):
         self._file: Any = None
         self._chunks: Any = None
         self._datasets: dict[str, Any] = {}
-        self._chunked: dict[str, ChunkedColumn] = {}
-        self._making = threading.Lock()
+        self._turns = itertools.count()
         self._new: NewFile | None = None
         self._spare = contextlib.ExitStack()
         self._pending: list[Columns] = []
@@ -200,7 +199,7 @@ class RecordingWriter(RecordAppender):
         with errors_name(self.path, lambda: f"after {len(self)} events"):
             known = truth or EventTruth(points=None if truth_points is None else np.asarray(truth_points, np.float32))
             columns = self._as_columns(events, known, {"inside": inside, "extrapolated": extrapolated})
-            self._index(events.t)
+            self._index(events.t, len(self))
             columns["events/t"] = events.t - self._t_offset
             self._pending.append(columns)
             self._pending_count += len(events)
@@ -238,34 +237,44 @@ class RecordingWriter(RecordAppender):
             given = "fill() was called outside the writer's 'with' block, after append(), or for parts of chunks"
             raise AmiwarpError(f"{self.path}: {given}; call it inside the block, before other events")
         self._t_offset = t_first
-        jobs = (partial(self._write_piece, piece, k * count) for k, piece in enumerate(pieces))
+        jobs = (partial(self._write_piece, piece, k * count, next(self._turns)) for k, piece in enumerate(pieces))
         with contextlib.closing(in_order(jobs)) as written:
             for events, inside in written:
                 with errors_name(self.path, lambda: f"after {len(self)} events"):
                     if self._written % count:
                         raise AmiwarpError(f"a piece before the last ends within a chunk; give {count} events each")
-                    self._check(events[:1], len(self), allow_nan=True, after_t=self._t_last)
-                    self._index(events.t)
                     self._written += len(events)
                 done(events, inside)
 
-    def _write_piece(self, piece: Callable[[], FlaggedEvents], start: int) -> tuple[Events, NDArray[np.uint8]]:
+    def _write_piece(
+        self, piece: Callable[[], FlaggedEvents], start: int, turn: int
+    ) -> tuple[Events, NDArray[np.uint8]]:
         """Compute, encode and write a piece whose first event is event ``start``. Runs in a thread."""
-        events, inside, known = piece()
-        known = known if self._codec is Codec.BLOSC else {}
-        with errors_name(self.path, lambda: f"after {start} events"):
-            # The reader has checked encoded times and polarities.
-            check = check_events if known.keys() < {"events/t", "events/p"} else check_coordinates
-            check(events, *self._size, where=str(self.path), first_index=start, allow_nan=True)
-            t = events.t if "events/t" in known else events.t - self._t_offset  # only the size of an encoded one counts
-            columns = {"events/x": events.x, "events/y": events.y, "events/t": t}
-            columns |= {"events/p": events.p, "events/inside": inside}
-            for name, column in columns.items():
-                stored = iter(known.get(name, ()))
-                for at in range(0, len(column), CHUNK):
-                    part = next(stored, None)
-                    self._write_chunk(name, start + at, column[at : at + CHUNK], part)
+        with self._chunks.stopping():
+            events, inside, known = piece()
+            known = known if self._codec is Codec.BLOSC else {}
+            with errors_name(self.path, lambda: f"after {start} events"):
+                # The reader has checked encoded times and polarities.
+                check = check_events if known.keys() < {"events/t", "events/p"} else check_coordinates
+                check(events, *self._size, where=str(self.path), first_index=start, allow_nan=True)
+                # only the size of an encoded column counts
+                t = events.t if "events/t" in known else events.t - self._t_offset
+                columns = {"events/x": events.x, "events/y": events.y, "events/t": t}
+                columns |= {"events/p": events.p, "events/inside": inside}
+                chunks = []
+                for name, column in columns.items():
+                    stored = iter(known.get(name, ()))
+                    for at in range(0, len(column), CHUNK):
+                        values, part = column[at : at + CHUNK], next(stored, None)
+                        parts: Sequence[bytes] = encode_parts(values, self._codec) if part is None else (part,)
+                        chunks.append(EncodedChunk(name, start + at, values, parts))
+                self._chunks.write(turn, chunks, self._dataset_of, lambda: self._follow(events, start))
         return events, inside
+
+    def _follow(self, events: Events, start: int) -> None:
+        """Check that a piece is not earlier than the one before, and extend the index. Called in turn."""
+        self._check(events[:1], start, allow_nan=True, after_t=self._t_last)
+        self._index(events.t, start)
 
     def _check(self, events: Events, first_index: int, **how: Any) -> None:
         check_events(events, *self._size, where=str(self.path), first_index=first_index, **how)
@@ -296,9 +305,12 @@ class RecordingWriter(RecordAppender):
             raise AmiwarpError(f"{given}, those before with {describe_columns(self._columns)}; give the same arrays")
         return columns
 
-    def _index(self, t: NDArray[np.int64]) -> None:
-        """Extend the index ms_to_idx, whose entry m is the index of the first event at or after m milliseconds."""
-        for entries in ms_entries(t, self._t_offset, self._next_ms, len(self)):
+    def _index(self, t: NDArray[np.int64], start: int) -> None:
+        """Extend the index ms_to_idx by the events from event ``start`` on.
+
+        Its entry m is the index of the first event at or after m milliseconds.
+        """
+        for entries in ms_entries(t, self._t_offset, self._next_ms, start):
             self._ms.append(entries)
             self._ms_count += entries.size
             self._next_ms += entries.size
@@ -316,7 +328,7 @@ class RecordingWriter(RecordAppender):
             return
         joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
         jobs = (
-            partial(self._write_chunk, name, self._written + at, column[at : min(at + CHUNK, whole)])
+            partial(self._write_chunk, name, self._written + at, column[at : min(at + CHUNK, whole)], next(self._turns))
             for name, column in joined.items()
             for at in range(0, whole, CHUNK)
         )
@@ -326,14 +338,14 @@ class RecordingWriter(RecordAppender):
         self._pending_count -= whole
         self._pending = [{name: column[whole:] for name, column in joined.items()}] if self._pending_count else []
 
-    def _write_chunk(self, name: str, start: int, values: NDArray[Any], stored: bytes | None = None) -> None:
-        """Encode and write the values of a chunk that begins at element ``start``. ``stored`` is the encoded chunk."""
-        parts = encode_parts(values, self._codec) if stored is None else (stored,)
-        with self._making:
-            if name not in self._chunked:
-                dataset = self._dataset(name, values.dtype, values.shape[1:])
-                self._chunked[name] = ChunkedColumn(self._chunks, dataset)
-        self._chunked[name].write(start, parts, len(values))
+    def _write_chunk(self, name: str, start: int, values: NDArray[Any], turn: int) -> None:
+        """Encode and write the values of a chunk that begins at element ``start``. Runs in a thread."""
+        with self._chunks.stopping():
+            chunk = EncodedChunk(name, start, values, encode_parts(values, self._codec))
+            self._chunks.write(turn, [chunk], self._dataset_of)
+
+    def _dataset_of(self, chunk: EncodedChunk) -> Any:
+        return self._dataset(chunk.name, chunk.values.dtype, chunk.values.shape[1:])
 
     def _extend(self, name: str, values: NDArray[Any]) -> None:
         """Append values to a small dataset through HDF5."""
