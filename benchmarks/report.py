@@ -139,7 +139,8 @@ def aim_cells(aim: Aim, results: Results) -> list[str]:
         return []
     sides = {scene: [rows[scene, name] for name in names] for scene in aim.bars}
     most = aim.unit in ("s", "x time", "MiB")
-    target = " / ".join(f"{bar:g}" for bar in dict.fromkeys(aim.bars.values()))
+    bars = list(aim.bars.values())
+    target = " / ".join(f"{bar:g}" for bar in (bars if len(set(bars)) > 1 else bars[:1]))
     unit = aim.unit.replace("x ", "× ") if aim.unit != "x time" else "×"
     start = [aim.what, f"{'≤' if most else '≥'} {target} {unit}"]
     skipped = [row["skipped"] for pair in sides.values() for row in pair if "skipped" in row]
