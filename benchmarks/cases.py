@@ -193,5 +193,6 @@ AIMS = (
     Aim("bilinear image by the circle, compared with Numba and its table", "cpu", CIRCLE, _everywhere(1.3), "x faster",
         "Numba, angle table"),
     Aim("the same by the exact model", "cpu", EXACT, _everywhere(1.0), "x faster", "Numba, angle table"),
+    Aim("exact model over circle, time", "cpu", EXACT, _everywhere(1.5), "x time", CIRCLE),
     *_whole("cpu", (0.3, 1.5, 0.8), 90.0),
 )  # fmt: skip

@@ -18,6 +18,7 @@ from amiwarp.kernels.pixel_votes import (
     vote_point_blocks,
     vote_rotating_camera_blocks,
 )
+from amiwarp.kernels.recorded_launches import Program
 
 if TYPE_CHECKING:
     from amiwarp.imaging.device_events import UploadedEvents
@@ -39,6 +40,8 @@ class PixelVotes:
         self._slices = [self._sums[k] for k in range(self._sums.shape[0])]
         self._totals = wp.empty(0, dtype=wp.int64, device="cpu")
         self._room = CAPACITY  # number of events that the sums can still take
+        self._reader: tuple[Image, Program] | None = None
+        """Image that was read last, and the recorded launch that reads it."""
 
     def clear(self) -> None:
         """Discard all votes."""
@@ -93,4 +96,11 @@ class PixelVotes:
     def read(self, image: Image) -> None:
         """Write the current image [events] to ``image``; the votes are kept."""
         inputs = [self._sums, self._totals, self._canvas, image.frame]
-        launch(read_sums, image.blocks, inputs, [image.pixels], device="cpu", smallest=SMALLEST)
+        if len(self._totals):
+            launch(read_sums, image.blocks, inputs, [image.pixels], device="cpu", smallest=SMALLEST)
+            return
+        if self._reader is None or self._reader[0] is not image:
+            program = Program("cpu")
+            program.add(read_sums, image.blocks, inputs, [image.pixels], smallest=SMALLEST)
+            self._reader = image, program
+        self._reader[1].launch()

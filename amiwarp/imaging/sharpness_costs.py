@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,9 +17,12 @@ from amiwarp.imaging.warped_image import CanvasShape
 from amiwarp.kernels import iwe as kernels
 from amiwarp.kernels.iwe import STRIP
 from amiwarp.kernels.launch import launch
+from amiwarp.kernels.recorded_launches import Program
 from amiwarp.validation import array, choice, on_gpu, real
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
 PAPER_ETA = 1.0
@@ -46,23 +50,39 @@ class SharpnessMeter:
         self._n = layers // canvas.parts * rows * columns
         strips = -(-rows // int(STRIP)) * self.image.frame.blocks
         self._sums = wp.empty((layers, strips), dtype=wp.vec2d, device=device)
-        few = (layers, min(strips, FEW_SUMS))
-        self._few = wp.empty(few, dtype=wp.vec2d, device=device)
-        self._host = wp.empty(few, dtype=wp.vec2d, device="cpu", pinned=self.device.is_cuda)
+        self._host = self._sums
+        if self.device.is_cuda:
+            few = (layers, min(strips, FEW_SUMS))
+            self._few = wp.empty(few, dtype=wp.vec2d, device=device)
+            self._host = wp.empty(few, dtype=wp.vec2d, device="cpu", pinned=True)
 
     def launch(self) -> None:
         """Measure :attr:`image` on the device without waiting for the result."""
+        if self.device.is_cpu:
+            self._program.launch()
+            return
+        for kernel, n, inputs, out, _ in self._steps():
+            launch(kernel, n, inputs, [out], device=self.device)
+        wp.launch(kernels.gather_sums, self._few.shape, [self._sums], [self._few], device=self.device)
+        wp.copy(self._host, self._few)
+
+    def _steps(self) -> Iterator[tuple[Any, int, list[Any], Any, int]]:
+        """Yield each kernel with its number of threads, inputs, output, and the fewest threads of a CPU slice."""
         smoothed, frame, width = self.image.pixels, self.image.frame, self.image.width
         if len(self._weights) > 1:
             for step, out in ((1, self._half), (frame.stride, self._smooth)):
-                inputs = [smoothed, self._weights, step, frame]
-                launch(kernels.smooth(width), self.image.blocks, inputs, [out], device=self.device, smallest=512)
+                yield kernels.smooth(width), self.image.blocks, [smoothed, self._weights, step, frame], out, 512
                 smoothed = out
         kernel = kernels.sum_terms(width, list(Sharpness).index(self.kind))
-        inputs = [smoothed, frame, PAPER_ETA]
-        launch(kernel, self._sums.size, inputs, [self._sums.flatten()], device=self.device, smallest=64)
-        wp.launch(kernels.gather_sums, self._few.shape, [self._sums], [self._few], device=self.device)
-        wp.copy(self._host, self._few)
+        yield kernel, self._sums.size, [smoothed, frame, PAPER_ETA], self._sums.flatten(), 64
+
+    @cached_property
+    def _program(self) -> Program:
+        """Recorded launches for a CPU, where a new launch takes about as long as the kernel."""
+        program = Program(self.device)
+        for kernel, n, inputs, out, smallest in self._steps():
+            program.add(kernel, n, inputs, [out], smallest=smallest)
+        return program
 
     def results(self) -> list[float]:
         """Wait, and return the sharpness of each part of the last measured image."""
