@@ -181,15 +181,20 @@ def with_numba_table(events: PeerEvents, device: str) -> Peer:
     return Peer(lambda: kernel(events.x, events.y, turn, dx, dy, images, total), lambda: total, events)
 
 
-def with_torch(events: PeerEvents, device: str, *, block: int | None = None) -> Peer:
-    """Prepare PyTorch: four calls of ``index_add_`` over whole arrays or blocks."""
+def _in_torch(events: PeerEvents, device: str) -> tuple[Any, list[Any]]:
+    """Return PyTorch, and x, y and angle of the events as its tensors on the device."""
     torch = library("torch")
     if device != "cpu" and not torch.cuda.is_available():
         raise Missing("this PyTorch has no CUDA")
     arrays = (events.x, events.y, events.angle)
-    x, y, angle = events.keep(
+    return torch, events.keep(
         ("torch", device), lambda: [torch.from_numpy(a.astype(np.float32)).to(device) for a in arrays]
     )
+
+
+def with_torch(events: PeerEvents, device: str, *, block: int | None = None) -> Peer:
+    """Prepare PyTorch: four calls of ``index_add_`` over whole arrays or blocks."""
+    torch, (x, y, angle) = _in_torch(events, device)
     radius, margin, (rows, columns) = events.radius, events.margin, events.shape
     image = torch.zeros(rows * columns, device=device)
 
@@ -212,13 +217,7 @@ def with_torch(events: PeerEvents, device: str, *, block: int | None = None) -> 
 
 def with_torch_index_put(events: PeerEvents, device: str) -> Peer:
     """Prepare PyTorch as event_utils' ``events_to_image_torch`` votes: four ``index_put_`` with a row and a column."""
-    torch = library("torch")
-    if device != "cpu" and not torch.cuda.is_available():
-        raise Missing("this PyTorch has no CUDA")
-    arrays = (events.x, events.y, events.angle)
-    x, y, angle = events.keep(
-        ("torch", device), lambda: [torch.from_numpy(a.astype(np.float32)).to(device) for a in arrays]
-    )
+    torch, (x, y, angle) = _in_torch(events, device)
     radius, margin = events.radius, events.margin
     image = torch.zeros(events.shape, device=device)
 

@@ -42,8 +42,11 @@ def turned(w0: float, w1: float, c: float, s: float) -> wp.vec2:
 
 
 @wp.func
-def drifted(pairs: Pairs, drift: float, k: int, i: int, w0: float, w1: float) -> wp.vec2:
-    """Return the azimuth (w0, w1) of the first (k = 0) or second event of a pair, at the given drift."""
+def drifted_azimuth(model: Any, pairs: Pairs, drift: float, k: int, i: int) -> wp.vec2:
+    """Return (cos, sin) of the tilt azimuth at the first (k = 0) or second event of a pair, at the given drift."""
+    w0, w1 = event_azimuth(model, pairs, k, i)
+    if pairs.slope.shape[0] == 0:
+        return wp.vec2(w0, w1)
     angle = pairs.slope[k * pairs.stride + i] * drift
     return turned(w0, w1, wp.cos(angle), wp.sin(angle))
 
@@ -53,15 +56,11 @@ def compensated_position(
     model: Any, camera: CameraParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
 ) -> wp.vec2:
     """Return the compensated position [px] of the first (k = 0) or second event of a pair, at the given drift."""
-    w0, w1 = event_azimuth(model, pairs, k, i)
-    if pairs.slope.shape[0] > 0:
-        azimuth = drifted(pairs, drift, k, i, w0, w1)
-        w0 = azimuth[0]
-        w1 = azimuth[1]
+    w = drifted_azimuth(model, pairs, drift, k, i)
     pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
     if pairs.lag.shape[0] > 0:
-        return contracted_position(model, camera, pixel, w0, w1, lag_of(pairs, k, i))
-    xy = compensate(model, camera, pixel, wp.vec2(w0, w1))
+        return contracted_position(model, camera, pixel, w[0], w[1], lag_of(pairs, k, i))
+    xy = compensate(model, camera, pixel, w)
     return undo_camera_rotation(camera, xy, camera_rotation, pairs.time[k * pairs.stride + i])
 
 
@@ -70,12 +69,8 @@ def compensated_position(
     model: Any, camera: PinholeParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
 ) -> wp.vec2:
     """Return the compensated position for a camera without distortion, and pixels that are not slow."""
-    w0, w1 = event_azimuth(model, pairs, k, i)
-    if pairs.slope.shape[0] > 0:
-        azimuth = drifted(pairs, drift, k, i, w0, w1)
-        w0 = azimuth[0]
-        w1 = azimuth[1]
-    u, v = displace(model, camera, float(pairs.x[i]), float(pairs.y[i]), w0, w1)
+    w = drifted_azimuth(model, pairs, drift, k, i)
+    u, v = displace(model, camera, float(pairs.x[i]), float(pairs.y[i]), w[0], w[1])
     return undo_camera_rotation(camera, wp.vec2(u, v), camera_rotation, pairs.time[k * pairs.stride + i])
 
 
@@ -192,8 +187,7 @@ def drift_block(
 ):
     """Compute the azimuths (cos, sin) of the first (k = 0) or second events of a block of pairs, at the given drift."""
     for j in range(BLOCK):
-        w0, w1 = event_azimuth(model, pairs, k, first + j)
-        w = drifted(pairs, drift, k, first + j, w0, w1)
+        w = drifted_azimuth(model, pairs, drift, k, first + j)
         x[j] = w[0]
         y[j] = w[1]
 

@@ -103,10 +103,3 @@ def magnitudes(values: wp.array(dtype=float), start: int, out: wp.array(dtype=fl
     out[i] = wp.where(known, wp.abs(values[i]), wp.inf)
     if known:
         wp.atomic_add(number, 0, 1)
-
-
-@wp.kernel
-def clear_missing(values: wp.array(dtype=float), start: int, out: wp.array(dtype=float)):
-    """Replace each NaN by 0."""
-    i = start + wp.tid()
-    out[i] = replace_nan(values[i], 0.0)
