@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import assume, event, given, settings
+from hypothesis import assume, event, example, given, settings
 from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
@@ -64,7 +64,12 @@ def rotations(draw):
     )
 
 
+THREE_SAMPLES = (np.array([1000, 2000, 3000]), np.array([0.0, 0.28860215, -0.07995398]), 360, 1, "swinging")
+"""With 8 bits from 182 on, the counts are 182, 0 and 162: a steady rotation with 360 counts per turn as well."""
+
+
 @settings(deadline=None, max_examples=500)
+@example(THREE_SAMPLES, 8, False, 182, False)
 @given(rotations(), st.integers(8, 32), st.booleans(), st.integers(0, 2**32), st.booleans())
 def test_counts_are_right_or_refused(rotation, bits, signed, start, given_bits):
     """Steps are under half of the counter's period. With its width counts are right; without it right or refused."""

@@ -225,7 +225,7 @@ def _find(samples: _Samples, periods: Iterable[float]) -> _Steps:
     best = min([plain, *wrapped], key=lambda found: found.cost)
     if best is not plain:
         at = best.wraps != 0.0
-        few = best.period % samples.turn and samples.value.size < FEWEST_SAMPLES
+        few = samples.noun == "count" and samples.value.size < FEWEST_SAMPLES
         cost, best_cost = np.abs(plain.residual[at]).sum(), np.abs(best.residual[at]).sum()
         if few or not cost > DECISIVE_RATIO * best_cost + samples.rounding:
             raise UnwrapError.at(int(np.argmax(at)) + 1, _ambiguous(samples, best))
