@@ -36,6 +36,19 @@ def test_local_algorithms_climb_it(algorithm: str) -> None:
     assert np.linalg.norm(stage.x - PEAK) < 0.01
 
 
+@pytest.mark.parametrize("algorithm", LOCAL_ALGORITHMS)
+def test_a_search_ends_near_a_known_optimum(algorithm: str) -> None:
+    """It ends at its first point within 1 px of the optimum, and an optimum elsewhere does not end it."""
+    ways = {"low": LOW, "high": HIGH, "start": PEAK + 4.0, "evaluations": 400, "tolerance": 1e-4, "step": 0.3}
+    whole = maximise(hill, algorithm, **ways)
+    near = np.linalg.norm(whole.points - PEAK, axis=1) < 1.0
+    ended = maximise(hill, algorithm, **ways, known=[np.array([-9.0, 9.0]), PEAK])
+    if near.any():
+        assert ended.ended == "known optimum"
+        assert ended.evaluations == np.argmax(near) + 1 < whole.evaluations
+    np.testing.assert_array_equal(ended.points, whole.points[: ended.evaluations])
+
+
 @pytest.mark.parametrize("algorithm", [*GLOBAL_ALGORITHMS, *LOCAL_ALGORITHMS])
 def test_the_budget_holds_and_runs_repeat(algorithm: str) -> None:
     runs = [

@@ -14,7 +14,7 @@ from amiwarp.kernels.launch import launch
 from amiwarp.kernels.photometric import HELD
 from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
 from amiwarp.kernels.residual_slopes import add_clusters, magnitudes, sum_costs, sum_products
-from amiwarp.kernels.square_sums import MOST_ROWS, find_squares, sum_square_products, sum_squares
+from amiwarp.kernels.square_sums import MOST_ROWS, find_squares, find_starts, sum_square_products, sum_squares
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 CHUNKS = 8
 """Smallest number of chunks of a vector for which a second CPU thread is used."""
+SUM_COPIES = 64
+"""Number of copies of each tile's sum on a GPU."""
 
 
 class Residuals:
@@ -63,11 +65,13 @@ class Residuals:
         size = self.tiles if self.tiles > 1 else 1 << 20
         rows = []
         for slope in slopes:
-            sums = wp.zeros((2, size), dtype=wp.int64, device=self.device)
-            inputs = [self.pairs.arrays, self.tiles, slope, self.weight, self.values, 0, sums]
+            # on a GPU, many threads would wait for each other to add to the few sums of the tiles
+            copies = SUM_COPIES if self.device.is_cuda and self.tiles > 1 else 1
+            sums = wp.zeros((2, size * copies), dtype=wp.int64, device=self.device)
+            inputs = [self.pairs.arrays, self.tiles, copies, slope, self.weight, self.values, 0, sums]
             # one CPU thread only: several would add to the same sums
             wp.launch(add_clusters, self.count, inputs=inputs, device=self.device)
-            total, number = sums.numpy()
+            total, number = sums.numpy().reshape(2, size, copies).sum(axis=2)
             rows.append(total[number > 0] / 2.0**32)
         return np.array(rows)
 
@@ -89,16 +93,18 @@ class Residuals:
             find_squares, n, [self.pairs.arrays, values, side, columns, squares], [square, order], device=self.device
         )
         wp.utils.radix_sort_pairs(square, order, n)
+        starts = wp.empty(squares + 1, dtype=int, device=self.device)
+        launch(find_starts, squares + 1, [square, n], [starts], device=self.device)
         upper = np.triu_indices(len(factors))
         sums = self._doubles(squares, len(upper[0]))
-        number = wp.zeros(squares, dtype=int, device=self.device)
-        inputs = [values, self.weight, square, order, n]
+        inputs = [values, self.weight, order, starts]
         if self.device.is_cpu and len(factors) <= MOST_ROWS:
-            launch(sum_squares, squares, inputs, [sums, number], device="cpu", smallest=CHUNKS)
+            launch(sum_squares, squares, inputs, [sums], device="cpu", smallest=CHUNKS)
         else:
-            inputs += [wp.array(k, dtype=int, device=self.device) for k in upper]
-            launch(sum_square_products, sums.size, inputs, [sums, number], device=self.device, smallest=CHUNKS)
-        used = np.flatnonzero(number.numpy())
+            lanes = 1 if self.device.is_cpu else 32
+            inputs += [*(wp.array(k, dtype=int, device=self.device) for k in upper), lanes]
+            launch(sum_square_products, lanes * sums.size, inputs, [sums], device=self.device, smallest=CHUNKS)
+        used = np.flatnonzero(np.diff(starts.numpy()))
         found = np.empty((len(used), len(factors), len(factors)))
         found[:, upper[0], upper[1]] = found[:, upper[1], upper[0]] = sums.numpy()[used]
         return found, used

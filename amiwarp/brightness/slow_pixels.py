@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 THRESHOLD = 0.25
 """Assumed ON threshold [log intensity], which turns the map's brightness into light. Data sheets state 0.1 to 0.4."""
-MEDIAN_EVERY = 4
+MEDIAN_EVERY = 16
 """Every how many pairs one counts for the median brightness, which need not be exact."""
 MOST_THRESHOLDS = 8.0
 """Largest difference from the median brightness that is used [ON thresholds]."""
@@ -55,8 +55,9 @@ def darkness(brightness: BrightnessMap, model: Model, *, ahead: float = 0.0) -> 
     launch(kernels.find_levels, len(pairs), [*brightness.path_arguments(model), ahead], [out], device=brightness.device)
     levels = out.numpy().reshape(2, -1)[:, : len(pairs)]
     middle = float(np.nanmedian(levels[:, ::MEDIAN_EVERY]))
-    away = np.nan_to_num(np.clip(levels - middle, -MOST_THRESHOLDS, MOST_THRESHOLDS))
-    return np.exp(-THRESHOLD * away), middle
+    away = np.clip(levels - np.float32(middle), -MOST_THRESHOLDS, MOST_THRESHOLDS)
+    np.nan_to_num(away, copy=False)
+    return np.exp(np.float32(-THRESHOLD) * away), middle
 
 
 def set_lags(brightness: BrightnessMap, model: Model, turn: float, *, with_offsets: bool) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -45,6 +45,8 @@ LOCAL_ALGORITHMS = (
 """NLopt's derivative-free local algorithms."""
 _NEEDS_TWO = ("LN_BOBYQA", "LN_NEWUOA", "LN_NEWUOA_BOUND")
 """Powell's algorithms with quadratic models, which need at least two dimensions."""
+SAME_OPTIMUM_PX = 1.0
+"""Distance from a known optimum below which a search would end there [px]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +99,7 @@ def maximise(
     step: float = 1.0,
     inner: str = "LN_SBPLX",
     seed: int = 0,
+    known: Sequence[NDArray[np.float64]] = (),
 ) -> SearchStage:
     """Maximise a score in a box by one algorithm.
 
@@ -122,6 +125,8 @@ def maximise(
         Local algorithm of the MLSL algorithms.
     seed : int
         Seed of random algorithms.
+    known : sequence of ndarray
+        Optima that earlier searches found. The search ends if it comes near one of them.
 
     Returns
     -------
@@ -143,7 +148,7 @@ def maximise(
     optimiser = _optimiser(
         algorithm, low=low, high=high, evaluations=evaluations, tolerance=tolerance, step=step, inner=inner
     )
-    samples = _EvaluationLog(score, evaluations, optimiser.force_stop)
+    samples = _EvaluationLog(score, evaluations, optimiser.force_stop, known)
     optimiser.set_min_objective(samples.cost)
     try:
         optimiser.optimize(np.clip(start, low, high))
@@ -151,7 +156,7 @@ def maximise(
     except nlopt.RoundoffLimited:
         ended = "round-off"
     except nlopt.ForcedStop:
-        ended = "budget"
+        ended = "known optimum" if samples.near_known else "budget"
     except (RuntimeError, ValueError) as error:
         raise AmiwarpError(f"{algorithm} failed in {len(low)} dimensions: {error}; choose another algorithm") from error
     finally:
@@ -162,15 +167,29 @@ def maximise(
 
 
 class _EvaluationLog:
-    """Objective function for NLopt. It records every evaluation, and stops NLopt at the budget or at an exception."""
+    """Objective function for NLopt. It records every evaluation.
 
-    def __init__(self, score: Callable[[NDArray[np.float64]], float], most: int, stop: Callable[[], None]) -> None:
+    It stops NLopt at the budget, at an exception, and near a ``known`` optimum.
+    """
+
+    def __init__(
+        self,
+        score: Callable[[NDArray[np.float64]], float],
+        most: int,
+        stop: Callable[[], None],
+        known: Sequence[NDArray[np.float64]],
+    ) -> None:
         self.points: list[NDArray[np.float64]] = []
         self.scores: list[float] = []
         self.failure: BaseException | None = None
         self._score: Callable[[NDArray[np.float64]], float] | None = score
         self._stop: Callable[[], None] | None = stop
-        self._most = most
+        self._most, self._known = most, known
+
+    @property
+    def near_known(self) -> bool:
+        """Whether the last point is near a known optimum."""
+        return bool(self.points) and any(np.linalg.norm(self.points[-1] - k) < SAME_OPTIMUM_PX for k in self._known)
 
     def release(self) -> None:
         """Drop the reference to the score function, because NLopt never frees its callbacks."""
@@ -193,6 +212,8 @@ class _EvaluationLog:
             return 0.0
         self.points.append(x.copy())
         self.scores.append(value)
+        if self.near_known:
+            self._stop()
         return -value
 
 

@@ -17,7 +17,7 @@ from amiwarp.imaging.warped_image import CanvasShape
 from amiwarp.kernels import iwe as kernels
 from amiwarp.kernels.iwe import STRIP
 from amiwarp.kernels.launch import launch
-from amiwarp.kernels.recorded_launches import Program
+from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
 from amiwarp.validation import array, choice, on_gpu, real
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ PAPER_ETA = 1.0
 """Parameter η of the paper's sharpness cost J [events]; He et al. do not state the value that they used."""
 LARGEST_SMOOTHING = 1000.0
 """Largest accepted standard deviation of the smoothing Gaussian [px]."""
-FEW_SUMS = 256
+FEW_SUMS = 8
 """Number of partial sums per image layer that the device computes and the host adds up."""
 
 
@@ -55,6 +55,7 @@ class SharpnessMeter:
             few = (layers, min(strips, FEW_SUMS))
             self._few = wp.empty(few, dtype=wp.vec2d, device=device)
             self._host = wp.empty(few, dtype=wp.vec2d, device="cpu", pinned=True)
+        self._sums_on_host = self._host.numpy()
 
     def launch(self) -> None:
         """Measure :attr:`image` on the device without waiting for the result."""
@@ -63,15 +64,19 @@ class SharpnessMeter:
             return
         for kernel, n, inputs, out, _ in self._steps():
             launch(kernel, n, inputs, [out], device=self.device)
-        wp.launch(kernels.gather_sums, self._few.shape, [self._sums], [self._few], device=self.device)
+        threads = self._few.size * BLOCK_DIM
+        wp.launch(kernels.gather_sums, threads, [self._sums], [self._few], device=self.device, block_dim=BLOCK_DIM)
         wp.copy(self._host, self._few)
 
     def _steps(self) -> Iterator[tuple[Any, int, list[Any], Any, int]]:
         """Yield each kernel with its number of threads, inputs, output, and the fewest threads of a CPU slice."""
         smoothed, frame, width = self.image.pixels, self.image.frame, self.image.width
-        if len(self._weights) > 1:
+        taps = len(self._weights)
+        if taps > 1:
+            unrolled = self.device.is_cuda and taps <= kernels.MOST_UNROLLED
+            smooth = kernels.smooth_few(taps) if unrolled else kernels.smooth(width)
             for step, out in ((1, self._half), (frame.stride, self._smooth)):
-                yield kernels.smooth(width), self.image.blocks, [smoothed, self._weights, step, frame], out, 512
+                yield smooth, self.image.blocks, [smoothed, self._weights, step, frame], out, 512
                 smoothed = out
         kernel = kernels.sum_terms(width, list(Sharpness).index(self.kind))
         yield kernel, self._sums.size, [smoothed, frame, PAPER_ETA], self._sums.flatten(), 64
@@ -88,13 +93,13 @@ class SharpnessMeter:
         """Wait, and return the sharpness of each part of the last measured image."""
         if self.device.is_cuda:
             wp.synchronize_stream(self.device)
-        sums = self._host.numpy().reshape(self._parts, -1, 2).sum(axis=1)
+        sums = self._sums_on_host.reshape(self._parts, -1, 2).sum(axis=1)
         return [self._score(float(total), float(terms)) for total, terms in sums]
 
     @property
     def finite(self) -> bool:
         """Whether all values of the last measured image were finite."""
-        return bool(np.isfinite(self._host.numpy()[..., 0]).all())
+        return bool(np.isfinite(self._sums_on_host[..., 0]).all())
 
     def measure(self) -> float:
         """Return the sharpness of :attr:`image`, which has one part."""

@@ -51,15 +51,13 @@ class TileVotes:
         self._layout.stride, self._layout.layer, self._layout.first = frame.stride, frame.layer, frame.first
         self._layout.shift = (canvas.pad + 0.5) * canvas.scale - 0.5
         kind = {CircleModel: CircleParams, RadialCircleModel: RadialCircleParams, ExactModel: ExactParams}[type(like)]
-        self._host = [
-            wp.zeros(candidates, dtype=dtype, device="cpu", pinned=True)
-            for dtype in (kind, float, CameraRotationParams)
-        ]
-        self._drifts = self._host[1].numpy()
+        dtypes = (kind,) if still else (kind, float, CameraRotationParams)
+        self._host = [wp.zeros(candidates, dtype=dtype, device="cpu", pinned=True) for dtype in dtypes]
         self._on_device = [wp.zeros(candidates, dtype=array.dtype, device=device) for array in self._host]
-        motion = kernels.Motion()
-        motion.drift, motion.camera_rotation = self._on_device[1:]
-        self._motion = kernels.Still() if still else motion
+        self._motion: Any = kernels.Still()
+        if not still:
+            self._motion = kernels.Motion()
+            self._motion.drift, self._motion.camera_rotation = self._on_device[1:]
 
     def _sort(self, events: UploadedEvents) -> Any:
         """Sort the events by tile and pack each event into one word."""
@@ -101,12 +99,15 @@ class TileVotes:
         return chunks
 
     def set(self, k: int, model: Model, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None) -> None:
-        """Set the parameters of candidate ``k`` for the next :meth:`launch`. A previous launch must have finished."""
-        self._drifts[k] = drift
-        for array, struct in (
-            (self._host[0], model.params(self.device)),
-            (self._host[2], (camera_rotation or CameraRotation()).params()),
-        ):
+        """Set the parameters of candidate ``k`` for the next :meth:`launch`. A previous launch must have finished.
+
+        ``drift`` and ``camera_rotation`` move only events that have slopes or times.
+        """
+        structs = [(self._host[0], model.params(self.device))]
+        if len(self._host) > 1:
+            self._host[1].numpy()[k] = drift
+            structs.append((self._host[2], (camera_rotation or CameraRotation()).params()))
+        for array, struct in structs:
             size = wp.types.type_size_in_bytes(array.dtype)
             ctypes.memmove(array.ptr + k * size, ctypes.byref(struct.__ctype__()), size)
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import warp as wp
 
+from amiwarp.kernels.conjugate_gradients import block_sum
 from amiwarp.kernels.vector_code import load_float, load_int, load_word, store_float, store_int
 from amiwarp.kernels.votes import Canvas
 from amiwarp.kernels.word_votes import Cells
@@ -23,6 +24,7 @@ PAPER_J = wp.constant(3)
 ENTROPY = wp.constant(4)
 STRIP = wp.constant(16)  # number of rows that one thread sums
 CPU_WIDTH = wp.constant(64)  # number of pixels per CPU thread
+MOST_UNROLLED = 16  # largest number of weights for :func:`smooth_few`
 
 
 @wp.struct
@@ -193,6 +195,28 @@ def smooth(width: int) -> Any:
     return smooth
 
 
+@cache
+def smooth_few(taps: int) -> Any:
+    """Return :func:`smooth` for one pixel per thread and ``taps`` weights, whose loads overlap: the loop is unrolled."""
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def smooth_few(
+        image: wp.array(dtype=float),
+        weights: wp.array(dtype=float),
+        step: int,
+        frame: Frame,
+        start: int,
+        out: wp.array(dtype=float),
+    ):
+        at = block_start(frame, start + wp.tid(), 1, 1)
+        total = weights[0] * image[at]
+        for tap in range(1, wp.static(taps)):
+            total = total + weights[tap] * (image[at - tap * step] + image[at + tap * step])
+        out[at] = total
+
+    return smooth_few
+
+
 @wp.func
 def gradient2(image: wp.array(dtype=float), i: int, stride: int) -> float:
     """Return the squared central-difference gradient at pixel ``i``."""
@@ -253,11 +277,16 @@ def sum_terms(width: int, kind: int) -> Any:
     return sum_terms
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)  # for CUDA only
 def gather_sums(sums: wp.array2d(dtype=wp.vec2d), out: wp.array2d(dtype=wp.vec2d)):
-    """Add up the partial sums in each row, giving one sum per column of ``out``."""
-    row, i = wp.tid()
+    """Add up the partial sums in each row, one block of threads for each element of ``out``."""
+    thread = wp.tid()
+    block = thread / wp.block_dim()
+    row = block / out.shape[1]
     total = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
-    for k in range(i, sums.shape[1], out.shape[1]):
+    first = (block % out.shape[1]) * wp.block_dim() + thread % wp.block_dim()
+    for k in range(first, sums.shape[1], out.shape[1] * wp.block_dim()):
         total += sums[row, k]
-    out[row, i] = total
+    both = wp.vec2d(block_sum(total[0]), block_sum(total[1]))
+    if thread % wp.block_dim() == 0:
+        out[row, block % out.shape[1]] = both

@@ -9,6 +9,7 @@ from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.kernels.launch import SMALLEST_SLICE, run_together, slices
 
 BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks
+RUNS_PER_GRAPH = 4  # runs that one CUDA graph holds: launching a graph takes longer than a few small kernels
 
 
 class Program:
@@ -20,7 +21,7 @@ class Program:
     def __init__(self, device: Any) -> None:
         self.device = wp.get_device(device)
         self._stages: list[list[Any]] = []
-        self._graph: Any = None
+        self._graphs: dict[int, Any] = {}
 
     def add(
         self,
@@ -71,14 +72,21 @@ class Program:
             run_together(stage)
 
     def run(self, times: int = 1) -> None:
-        """Run all stages ``times`` times; on CUDA as a graph, which the first call captures."""
+        """Run all stages ``times`` times; on CUDA as graphs, which the first call captures."""
         if self.device.is_cpu:
             for _ in range(times):
                 self.launch()
             return
-        if self._graph is None:
+        many, rest = divmod(times, RUNS_PER_GRAPH)
+        for runs, count in ((RUNS_PER_GRAPH, many), (1, rest)):
+            for _ in range(count):
+                wp.capture_launch(self._graph(runs))
+
+    def _graph(self, runs: int) -> Any:
+        """Return the CUDA graph of a number of runs. The first call captures it."""
+        if runs not in self._graphs:
             with wp.ScopedCapture(self.device) as capture:
-                self.launch()
-            self._graph = capture.graph
-        for _ in range(times):
-            wp.capture_launch(self._graph)
+                for _ in range(runs):
+                    self.launch()
+            self._graphs[runs] = capture.graph
+        return self._graphs[runs]

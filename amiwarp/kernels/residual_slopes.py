@@ -85,12 +85,15 @@ def cluster_of(pairs: Pairs, tiles: int, i: int) -> int:
 
 @wp.kernel
 def add_clusters(
-    pairs: Pairs, tiles: int, slope: wp.array(dtype=float), weight: wp.array(dtype=float),
+    pairs: Pairs, tiles: int, copies: int, slope: wp.array(dtype=float), weight: wp.array(dtype=float),
     residual: wp.array(dtype=float), start: int, sums: wp.array2d(dtype=wp.int64),
 ):  # fmt: skip
-    """Add slope · weight · residual in fixed point, and the number of pairs, to the cluster of each pair."""
+    """Add slope · weight · residual in fixed point, and the number of pairs, to the cluster of each pair.
+
+    Each sum has ``copies`` that are added up later.
+    """
     i = start + wp.tid()
-    cluster = cluster_of(pairs, tiles, i)
+    cluster = cluster_of(pairs, tiles, i) * copies + i % copies
     add_fixed(sums[0], cluster, replace_nan(slope[i] * weight[i] * residual[i], 0.0))
     wp.atomic_add(sums[1], cluster, wp.int64(1))
 

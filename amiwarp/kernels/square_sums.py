@@ -39,27 +39,44 @@ def find_squares(
 
 
 @wp.kernel
+def find_starts(square: wp.array(dtype=int), count: int, start: int, starts: wp.array(dtype=int)):
+    """Find the first pair of each square in the sorted ``square``. The last thread finds the number of pairs."""
+    here = start + wp.tid()
+    starts[here] = wp.lower_bound(square, 0, count, here)
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int step = 16; step > 0; step /= 2) value += __shfl_xor_sync(0xffffffffu, value, step);
+#endif
+    return value;
+""")
+def sum_of_lanes(value: wp.float64) -> wp.float64:
+    """Return the sum of a value over the 32 threads of a warp, added in fixed order; on a CPU the value itself."""
+
+
+@wp.kernel
 def sum_square_products(
-    rows: wp.array2d(dtype=float), weight: wp.array(dtype=float), square: wp.array(dtype=int),
-    order: wp.array(dtype=int), count: int, first: wp.array(dtype=int), second: wp.array(dtype=int), start: int,
-    sums: wp.array2d(dtype=wp.float64), number: wp.array(dtype=int),
+    rows: wp.array2d(dtype=float), weight: wp.array(dtype=float), order: wp.array(dtype=int),
+    starts: wp.array(dtype=int), first: wp.array(dtype=int), second: wp.array(dtype=int), lanes: int, start: int,
+    sums: wp.array2d(dtype=wp.float64),
 ):  # fmt: skip
     """Compute the sum of rows[a] · rows[b] · weight over the pairs of a square, for each (a, b) of first and second.
 
-    Each thread computes one sum. ``square`` is sorted; ``order`` has the numbers of its pairs. ``number`` receives the
-    number of pairs of each square.
+    ``lanes`` threads compute one sum: 32, a warp of CUDA, or 1 on a CPU. The pairs of square k are those numbered
+    ``order[starts[k]:starts[k + 1]]``.
     """
     thread = start + wp.tid()
-    here = thread / first.shape[0]
-    k = thread % first.shape[0]
-    begin = wp.lower_bound(square, 0, count, here)
-    end = wp.lower_bound(square, begin, count, here + 1)
+    lane = thread % lanes
+    k = (thread / lanes) % first.shape[0]
+    here = thread / lanes / first.shape[0]
     total = wp.float64(0.0)
-    for at in range(begin, end):
+    for at in range(starts[here] + lane, starts[here + 1], lanes):
         i = order[at]
         total += wp.float64(rows[first[k], i]) * wp.float64(rows[second[k], i]) * wp.float64(weight[i])
-    sums[here, k] = total
-    number[here] = end - begin
+    total = sum_of_lanes(total)
+    if lane == 0:
+        sums[here, k] = total
 
 
 MOST_ROWS = 32  # largest number of rows for :func:`sum_squares`
@@ -78,7 +95,7 @@ MOST_ROWS = 32  # largest number of rows for :func:`sum_squares`
         for (int k = 0; k < m; ++k) value[k] = row[k * stride + i];
         for (int k = 0; k < m; ++k) {
             const double factor = weight * value[k];
-            for (int j = 0; j < wide; ++j) total[32 * k + j] += factor * value[j];
+            for (int j = k & ~7; j < wide; ++j) total[32 * k + j] += factor * value[j];
         }
     }
     double* out = (double*)((char*)sums.data + (size_t)sums.strides[0] * square);
@@ -95,13 +112,9 @@ def add_square(
 
 @wp.kernel
 def sum_squares(
-    rows: wp.array2d(dtype=float), weight: wp.array(dtype=float), square: wp.array(dtype=int),
-    order: wp.array(dtype=int), count: int, start: int, sums: wp.array2d(dtype=wp.float64),
-    number: wp.array(dtype=int),
+    rows: wp.array2d(dtype=float), weight: wp.array(dtype=float), order: wp.array(dtype=int),
+    starts: wp.array(dtype=int), start: int, sums: wp.array2d(dtype=wp.float64),
 ):  # fmt: skip
     """Compute the sums of :func:`sum_square_products`, one square per thread. For CPUs, and few rows."""
     here = start + wp.tid()
-    begin = wp.lower_bound(square, 0, count, here)
-    end = wp.lower_bound(square, begin, count, here + 1)
-    add_square(rows, weight, order, begin, end, here, sums)
-    number[here] = end - begin
+    add_square(rows, weight, order, starts[here], starts[here + 1], here, sums)

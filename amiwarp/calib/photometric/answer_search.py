@@ -149,10 +149,11 @@ def _evaluate(
     leak, excess = (float(x) for x in cost.brightness.extra)
     around = cost_around_optimum(cost, best, final)
     # the map is better converged now than at the start of the search, so the cost at the start is measured again
-    cost.residuals(v, rounds=2)
+    cost.predict(v)
+    cost.residuals(v)
     at_start = cost.mean()
     cost.replace_map(solved)
-    cost.residuals(best)
+    cost.residuals(best, rounds=0)
     rise = around[0][1] if around else math.inf
     next_step = float(np.linalg.norm(slopes.step()[of_prism]))
     moved = float(np.linalg.norm((best - v)[of_prism]))

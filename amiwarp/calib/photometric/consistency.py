@@ -59,6 +59,8 @@ COARSE_STD_PX = 0.01
 one or two pixels [px]."""
 DOUBT = 2.0
 """Factor of the standard deviation that a doubtful lens adds: a linearised fit finds too small changes."""
+MEDIAN_EVERY = 8
+"""Every how many pairs one counts for the median gap, which need not be exact."""
 REGIONS = (3, 2)
 """Number of columns and rows of the parts of the image whose answers are compared."""
 FEWEST_SQUARES = 4
@@ -184,7 +186,7 @@ def _columns(cost: Cost, best: Vector) -> dict[str, Any]:
     time = pairs.time
     middle, gap = time.mean(axis=0), time[1] - time[0]
     late = pairs.to_device((middle - middle.mean()) / max(float(middle.std()), 1e-9))
-    long = pairs.to_device(gap > np.median(gap))
+    long = pairs.to_device(gap > np.median(gap[::MEDIAN_EVERY]))
     for name in _orbit(space):
         columns[f"long {name}"] = masked(columns[name], long)
         if not (set(DRIFTS) & set(space.names) or space.moving):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,10 +36,21 @@ class Estimate:
 
     change: Vector
     """Change of the parameters, shape (n,)."""
-    covariance: Vector
-    """Its covariance by the sandwich estimate, shape (n, n)."""
     gain: float
     """Share of the sum of squared weighted residuals that the change removes."""
+    inverse: Vector
+    """Inverse of the sum of the Hessians, shape (n, n)."""
+    hessian: Vector
+    """Hessian of each square, shape (squares, n, n)."""
+    gradient: Vector
+    """Gradient of each square, shape (squares, n)."""
+
+    @cached_property
+    def covariance(self) -> Vector:
+        """Covariance of the change by the sandwich estimate, shape (n, n)."""
+        parts = self.gradient + self.hessian @ self.change
+        spare = len(parts) / max(1, len(parts) - len(self.change))
+        return np.asarray(self.inverse @ (parts.T @ parts) @ self.inverse * spare)
 
     def significance(self, first: int) -> float:
         """Return how many standard deviations the parameters from number ``first`` on are away from 0."""
@@ -73,10 +85,8 @@ class LinearFit:
         scale = np.sqrt(np.maximum(np.diag(total), 1e-30))
         inverse = np.linalg.pinv(total / np.outer(scale, scale), rcond=1e-6, hermitian=True) / np.outer(scale, scale)
         change = -inverse @ gradient.sum(axis=0)
-        parts = gradient + hessian @ change
-        spare = len(parts) / max(1, len(parts) - len(k))
         gain = float(change @ total @ change) / max(self.squares_sum, 1e-30)
-        return Estimate(change, inverse @ (parts.T @ parts) @ inverse * spare, gain)
+        return Estimate(change, gain, inverse, hessian, gradient)
 
     def adding(self, names: tuple[str, ...], more: tuple[str, ...]) -> tuple[Estimate, float, float]:
         """Return the fit of the columns ``names`` and ``more``, and what ``more`` contributes.

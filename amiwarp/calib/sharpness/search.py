@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ from amiwarp.calib.sharpness.objective import Objective
 from amiwarp.calib.summaries import StageSummary
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
+from amiwarp.kernels.launch import pool
 from amiwarp.optics.models import MODELS
 from amiwarp.progress import Progress
 from amiwarp.validation import choice, one_of, real, shown, whole
@@ -176,7 +177,9 @@ class Search:
             starts = self._run_global(self.settings.global_algorithm)
         if self.space.moving:
             starts = [self._track_rotation(start) for start in starts]
-        runs = [self._run_local(start) for start in starts]
+        runs: list[SearchStage] = []
+        for start in starts:
+            runs.append(self._run_local(start, [run.x for run in runs]))
         best = max(runs, key=lambda run: run.score)
         self.stages.extend(StageSummary.of("local", run, self.space) for run in runs)
         self.best, self.score = self.space.to_values(best.x), best.score
@@ -214,13 +217,20 @@ class Search:
             self.stages.append(StageSummary.of("local", stage, self.space))
         return start
 
-    def _run_local(self, start: NDArray[np.float64]) -> SearchStage:
+    def _run_local(self, start: NDArray[np.float64], known: Sequence[NDArray[np.float64]]) -> SearchStage:
+        """Run a local search on the fine image from ``start``. It ends early near an optimum in ``known``."""
         return self._maximise(
-            self.fine, self.settings.local_algorithm, start, self.settings.local_evaluations, step=0.7
+            self.fine, self.settings.local_algorithm, start, self.settings.local_evaluations, step=0.7, known=known
         )
 
     def _maximise(
-        self, objective: Objective, algorithm: str, start: NDArray[np.float64], budget: int, step: float
+        self,
+        objective: Objective,
+        algorithm: str,
+        start: NDArray[np.float64],
+        budget: int,
+        step: float,
+        known: Sequence[NDArray[np.float64]] = (),
     ) -> SearchStage:
         low, high = objective.space.bounds()
         name = "global" if algorithm.startswith("G") else "local"
@@ -233,17 +243,20 @@ class Search:
         s = self.settings
         return maximise(
             score, algorithm, low=low, high=high, start=start, evaluations=budget, tolerance=s.tolerance_px, step=step,
-            inner=s.local_algorithm, seed=s.seed,
+            inner=s.local_algorithm, seed=s.seed, known=known,
         )  # fmt: skip
 
     def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
         """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the sharpness."""
         best = self.best
+        directions = pool().submit(checks.check_directions, self.image(), name) if self.space.sized else None
         parts = self._objective_by_parts(self.settings.sharpness)
         if self.space.sized:
             self._check_sharper_than_chance(best, parts, name)
         v = self.space.to_vector(best)
         covariance, warnings = estimate_covariance(parts, v)
+        if directions is not None:
+            directions.result()
         return self._bound_warnings(best) + warnings, self.space.deviations(v, covariance)
 
     def _check_sharper_than_chance(self, best: dict[str, float], parts: Objective, name: str) -> None:
@@ -254,7 +267,6 @@ class Search:
         points = (best, {**best, "phase": best["phase"] + math.pi}, {**best, self.space.size_name: 0.0})
         sharp, opposite, still = (variance.each(values) for values in points)
         checks.check_texture(sharp, opposite, still, name)
-        checks.check_directions(self.image(), name)
 
     def image(self) -> NDArray[np.float32]:
         """Return the IWE at the calibrated parameters, cut to the sensor's size, summed over polarities."""
