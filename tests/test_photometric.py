@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 from conftest import COARSE, TRUE_PHASE, TRUE_PRISM
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
@@ -257,6 +258,18 @@ def test_a_memory_source_without_truth(recording: Recording, calibration: Calibr
     assert calibrate(bare, events=100_000, photometric=COARSE).parameters == calibration.parameters
 
 
+def test_pairs_are_split_by_time(recording: Recording, device: str) -> None:
+    width, height = recording.events.size
+    assert recording.encoder is not None
+    table = EventTable([recording.events.slice(0, 60_000)], np.zeros((height, width), np.int32), device)
+    pairs = table.pairs(recording.encoder, longest_gap_us=20_000)
+    late, long = (array.numpy()[: len(pairs)] for array in pairs.split_by_time())
+    first, second = pairs.time.astype(np.float64)
+    middle = 0.5 * (first + second)
+    np.testing.assert_allclose(late, (middle - middle.mean()) / middle.std(), rtol=0, atol=1e-3)
+    np.testing.assert_array_equal(long, second - first > np.median(second - first))
+
+
 def test_sums_of_products_by_square(recording: Recording, device: str) -> None:
     """Sums over the pairs of each square of 16 px agree with NumPy; pairs with a NaN count nowhere."""
     width, height = recording.events.size
@@ -268,9 +281,10 @@ def test_sums_of_products_by_square(recording: Recording, device: str) -> None:
     factors[1, ::7] = np.nan
     weight = rng.uniform(0.1, 1.0, len(pairs)).astype(np.float32)
     residuals = Residuals(pairs, 1)
-    residuals.weight = pairs.to_device(weight)
+    residuals.weight = wp.array(weight, dtype=float, device=device)
     columns, rows = -(-width // 16), -(-height // 16)
-    found, squares = residuals.products_by_square([pairs.to_device(f) for f in factors], 16, columns, rows)
+    on_device = [wp.array(f, dtype=float, device=device) for f in factors]
+    found, squares = residuals.products_by_square(on_device, 16, columns, rows)
     number = pairs.column("y").astype(int) // 16 * columns + pairs.column("x").astype(int) // 16
     known = np.isfinite(factors).all(axis=0)
     assert np.array_equal(squares, np.unique(number[known]))

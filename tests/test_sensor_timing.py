@@ -77,7 +77,8 @@ def test_lags_on_a_slope_of_brightness(device: str, turn: float) -> None:
     set_lags(brightness, model, turn, with_offsets=True)
     n = len(pairs)
     lag = pairs.arrays.lag.numpy().reshape(4, -1)[:, :n]
-    relative, middle = darkness(brightness, model, ahead=math.atan(turn))
+    on_device, middle = darkness(brightness, model, ahead=math.atan(turn))
+    relative = on_device.numpy()[:, :n]
     assert abs(middle - slope * (margin + width / 2)) < 0.5
     np.testing.assert_allclose(np.hypot(lag[0], lag[1]), np.cos(np.arctan(turn * relative[0])), atol=1e-5)
     np.testing.assert_allclose(relative, 1.0, atol=THRESHOLD * slope * width)

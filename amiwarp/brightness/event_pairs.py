@@ -19,6 +19,7 @@ from amiwarp.kernels.launch import launch
 from amiwarp.kernels.map_positions import find_places
 from amiwarp.kernels.pair_chains import BLOCK
 from amiwarp.kernels.photometric import HELD, Pairs
+from amiwarp.kernels.square_sums import split_by_time
 from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
 
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 
 COLUMNS = {"x": 1, "y": 1, "tile": 1, "on": 1, "azimuth": 4, "time": 2, "slope": 2}
 """Number of values per pair in each array of the kernels' struct ``Pairs``."""
+SAMPLED = 1 << 15
+"""Number of pairs whose times give the statistics of all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +79,26 @@ class PairSet:
         values: NDArray[np.float32] = self.arrays.time.numpy()
         return values.reshape(2, -1)[:, : len(self)]
 
-    def to_device(self, values: NDArray[Any]) -> Any:
-        """Return a value for each pair, shape (n,), as an array of the length of the pairs' columns on the device."""
-        padded = np.zeros(self.arrays.stride, np.float32)
-        padded[: len(self)] = values
-        return wp.array(padded, dtype=float, device=self.device)
+    @property
+    def some_times(self) -> NDArray[np.float64]:
+        """Times of evenly chosen pairs, at least :data:`SAMPLED` of them if there are so many, shape (2, m)."""
+        every = max(1, len(self) // SAMPLED)
+        values: NDArray[np.float32] = self.arrays.time.reshape((2, -1))[:, : len(self) : every].numpy()
+        return values.astype(np.float64)
+
+    def split_by_time(self) -> tuple[Any, Any]:
+        """Return each pair's mean time, in standard deviations from that of all, and 1 if its gap is long, else 0.
+
+        Both are on the device. A gap is long if it is longer than the median. The statistics are those of
+        :attr:`some_times`.
+        """
+        first, second = self.some_times
+        middle = 0.5 * (first + second)
+        late, long = (wp.zeros(self.arrays.stride, dtype=float, device=self.device) for _ in "ll")
+        spread = max(float(middle.std()), 1e-9)
+        inputs = [self.arrays, float(middle.mean()), spread, float(np.median(second - first))]
+        launch(split_by_time, len(self), inputs, [late, long], device=self.device)
+        return late, long
 
     def with_slope(self, slope_of: Callable[[NDArray[np.int64]], NDArray[np.float64]], middle_us: int) -> PairSet:
         """Attach to each pair the change of its prism angles per unit of a drifting parameter, and return the set.

@@ -9,7 +9,7 @@ differs from that elsewhere is computed along the prism's path and moved to the 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -18,8 +18,6 @@ from amiwarp.kernels import slow_pixels as kernels
 from amiwarp.kernels.launch import launch
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from amiwarp.brightness.solver import BrightnessMap
     from amiwarp.optics.models import Model
 
@@ -27,11 +25,9 @@ THRESHOLD = 0.25
 """Assumed ON threshold [log intensity], which turns the map's brightness into light. Data sheets state 0.1 to 0.4."""
 MEDIAN_EVERY = 16
 """Every how many pairs one counts for the median brightness, which need not be exact."""
-MOST_THRESHOLDS = 8.0
-"""Largest difference from the median brightness that is used [ON thresholds]."""
 
 
-def darkness(brightness: BrightnessMap, model: Model, *, ahead: float = 0.0) -> tuple[NDArray[np.float32], float]:
+def darkness(brightness: BrightnessMap, model: Model, *, ahead: float = 0.0) -> tuple[Any, float]:
     """Return the time constant at each event, relative to that at the median brightness of all, and that brightness.
 
     Parameters
@@ -45,19 +41,24 @@ def darkness(brightness: BrightnessMap, model: Model, *, ahead: float = 0.0) -> 
 
     Returns
     -------
-    relative : numpy.ndarray
-        Relative time constants at the first and the second event of each pair, shape (2, n).
+    relative : warp.array
+        Relative time constants at the first and the second event of each pair, shape (2, n) padded to (2, m).
     middle : float
         Median brightness [ON thresholds].
     """
-    pairs = brightness.pairs
-    out = wp.zeros(2 * pairs.arrays.stride, dtype=float, device=brightness.device)
-    launch(kernels.find_levels, len(pairs), [*brightness.path_arguments(model), ahead], [out], device=brightness.device)
-    levels = out.numpy().reshape(2, -1)[:, : len(pairs)]
-    middle = float(np.nanmedian(levels[:, ::MEDIAN_EVERY]))
-    away = np.clip(levels - np.float32(middle), -MOST_THRESHOLDS, MOST_THRESHOLDS)
-    np.nan_to_num(away, copy=False)
-    return np.exp(np.float32(-THRESHOLD) * away), middle
+    pairs, device = brightness.pairs, brightness.device
+    pixels = kernels.Photoreceptor()
+    pixels.ahead = ahead
+
+    def compute(every: int, columns: int) -> Any:
+        out = wp.zeros((2, columns), dtype=float, device=device)
+        inputs = [*brightness.path_arguments(model), pixels, every]
+        launch(kernels.find_time_constants, -(-len(pairs) // every), inputs, [out], device=device)
+        return out
+
+    pixels.middle = float(np.nanmedian(compute(MEDIAN_EVERY, -(-len(pairs) // MEDIAN_EVERY)).numpy()))
+    pixels.threshold = THRESHOLD
+    return compute(1, pairs.arrays.stride), pixels.middle
 
 
 def set_lags(brightness: BrightnessMap, model: Model, turn: float, *, with_offsets: bool) -> None:
@@ -77,7 +78,7 @@ def set_lags(brightness: BrightnessMap, model: Model, turn: float, *, with_offse
     """
     pairs, ahead = brightness.pairs, math.atan(turn)
     relative, middle = darkness(brightness, model, ahead=ahead if with_offsets else 0.0)
-    lag = np.arctan(turn * relative)
+    lag = np.arctan(turn * relative.numpy()[:, : len(pairs)])
     factor = np.cos(lag) * np.exp(1j * (ahead - lag))
     values = np.zeros((4, pairs.arrays.stride), np.float32)
     values[0] = values[2] = 1.0

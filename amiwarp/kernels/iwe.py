@@ -197,7 +197,7 @@ def smooth(width: int) -> Any:
 
 @cache
 def smooth_few(taps: int) -> Any:
-    """Return :func:`smooth` for one pixel per thread and ``taps`` weights, whose loads overlap: the loop is unrolled."""
+    """Return :func:`smooth` for one pixel per thread. The loop over ``taps`` weights is unrolled, so loads overlap."""
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def smooth_few(

@@ -18,6 +18,7 @@ wp.set_module_options({"enable_backward": False})
 
 STEPS = wp.constant(16)  # number of steps in which the filter's equation is solved
 MEMORY = wp.constant(6.0)  # time before an event from which the filter is followed [time constants at median light]
+MOST_THRESHOLDS = wp.constant(8.0)  # largest difference from the median brightness that is used [ON thresholds]
 
 
 @wp.struct
@@ -52,14 +53,21 @@ def brightness_before(
 
 
 @wp.kernel
-def find_levels(
-    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), ahead: float,
-    start: int, levels: wp.array(dtype=float),
+def find_time_constants(
+    model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), filter: Photoreceptor,
+    every: int, start: int, out: wp.array2d(dtype=float),
 ):  # fmt: skip
-    """Compute the brightness at each event, NaN off the map. The prism is ``ahead`` [rad] of the effective phase."""
-    i = start + wp.tid()
+    """Compute the time constant at both events of every ``every``-th pair, relative to that at the median brightness.
+
+    It is 1 off the map. For the threshold 0, the brightness is computed instead, NaN off the map.
+    """
+    number = start + wp.tid()
     for k in range(2):
-        levels[k * pairs.stride + i] = brightness_before(model, camera, pairs, atlas, image, k, i, -ahead)
+        level = brightness_before(model, camera, pairs, atlas, image, k, number * every, -filter.ahead)
+        if filter.threshold > 0.0:
+            away = wp.clamp(level - filter.middle, -MOST_THRESHOLDS, MOST_THRESHOLDS)
+            level = wp.where(wp.isnan(level), 1.0, wp.exp(-filter.threshold * away))
+        out[k, number] = level
 
 
 @wp.func

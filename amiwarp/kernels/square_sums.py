@@ -1,4 +1,4 @@
-"""Sums of products of derivatives and residuals over the pairs of each square of pixels."""
+"""Sums of products of derivatives and residuals over the pairs of each square of pixels, and factors of them."""
 
 import warp as wp
 
@@ -12,6 +12,22 @@ def multiply(a: wp.array(dtype=float), b: wp.array(dtype=float), start: int, out
     """Multiply two arrays element by element."""
     i = start + wp.tid()
     out[i] = a[i] * b[i]
+
+
+@wp.kernel
+def split_by_time(
+    pairs: Pairs, middle: float, spread: float, gap: float, start: int, late: wp.array(dtype=float),
+    is_long: wp.array(dtype=float),
+):  # fmt: skip
+    """Compute how far the mean time of each pair is from ``middle``, in units of ``spread``.
+
+    ``is_long`` is 1 for pairs with a longer gap than ``gap``, else 0. Times are in seconds.
+    """
+    i = start + wp.tid()
+    first = pairs.time[i]
+    second = pairs.time[pairs.stride + i]
+    late[i] = (0.5 * (first + second) - middle) / spread
+    is_long[i] = wp.where(second - first > gap, 1.0, 0.0)
 
 
 @wp.kernel

@@ -23,7 +23,7 @@ from amiwarp.kernels.refraction import (
     fit_harmonics,
 )
 from amiwarp.kernels.residual_slopes import sum_costs
-from amiwarp.kernels.slow_pixels import find_levels
+from amiwarp.kernels.slow_pixels import find_time_constants
 from amiwarp.kernels.square_sums import find_squares
 from amiwarp.kernels.votes import turn_events
 
@@ -38,7 +38,7 @@ EXACT_KERNELS = (
     (apply_normal_blocks,),
     (descend,),
     (sum_costs,),
-    (find_levels, ExactParams),
+    (find_time_constants, ExactParams),
     (find_squares,),
     (compensate_blocks, ExactParams, PinholeParams),
     (link,),

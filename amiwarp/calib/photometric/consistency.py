@@ -59,8 +59,6 @@ COARSE_STD_PX = 0.01
 one or two pixels [px]."""
 DOUBT = 2.0
 """Factor of the standard deviation that a doubtful lens adds: a linearised fit finds too small changes."""
-MEDIAN_EVERY = 8
-"""Every how many pairs one counts for the median gap, which need not be exact."""
 REGIONS = (3, 2)
 """Number of columns and rows of the parts of the image whose answers are compared."""
 FEWEST_SQUARES = 4
@@ -183,10 +181,7 @@ def _columns(cost: Cost, best: Vector) -> dict[str, Any]:
     """
     space, pairs = cost.space, cost.brightness.pairs
     columns = free_columns(cost, best)
-    time = pairs.time
-    middle, gap = time.mean(axis=0), time[1] - time[0]
-    late = pairs.to_device((middle - middle.mean()) / max(float(middle.std()), 1e-9))
-    long = pairs.to_device(gap > np.median(gap[::MEDIAN_EVERY]))
+    late, long = pairs.split_by_time()
     for name in _orbit(space):
         columns[f"long {name}"] = masked(columns[name], long)
         if not (set(DRIFTS) & set(space.names) or space.moving):
@@ -278,7 +273,7 @@ def free_columns(cost: Cost, v: Vector) -> dict[str, Any]:
 def _rotation_columns(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by a slow rotation of the camera about each axis, if it is not free."""
     space, at, columns = cost.space, cost.at(best), {}
-    half_s = max(0.5 * float(np.ptp(cost.brightness.pairs.time)), 1e-6)
+    half_s = max(0.5 * float(np.ptp(cost.brightness.pairs.some_times)), 1e-6)
     for k, name in enumerate(RATES if not space.moving else ()):
         rate = np.zeros(3)
         rate[k] = SLOPE_PX / space.camera.fx / half_s

@@ -39,8 +39,6 @@ FACTOR, MOST_TRIALS = 1.7, 7
 """Ratio between angles that are tried, and their largest number."""
 PARABOLAS = 2
 """Number of parabolas that are laid through the lowest costs."""
-REFERENCE = np.array([[1.0], [0.0]])
-"""Effect of the refractory period: the first event of a pair sets its reference later."""
 
 
 def timing_can_be_found(answer: Answer, cost: Cost) -> bool:
@@ -57,29 +55,29 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
     """
     cost.converge(v)
     relative, _ = darkness(cost.brightness, cost.space.build(cost.space.to_values(v)))
+    # the refractory period sets the reference of a pair, its first event, later
+    reference = wp.zeros_like(relative)
+    reference[0].fill_(1.0)
     columns = free_columns(cost, v)
-    columns["refractory"] = _shifted(cost, v, direction * REFERENCE)
-    columns["slow"] = _shifted(cost, v, -direction * relative)
+    columns["refractory"], columns["slow"] = (_shifted(cost, v, shift) for shift in (reference, relative))
     fit = linear_fit(cost, columns)
 
-    def angle(name: str) -> float:
+    def angle(name: str, sign: float) -> float:
         estimate, significance, gain = fit.adding(cost.space.names, (name,))
-        change = float(estimate.change[-1])
+        change = sign * float(estimate.change[-1])
         return change if change > 0.0 and significance >= SIGNIFICANT and gain >= LEAST_GAIN else 0.0
 
-    return angle("refractory"), angle("slow")
+    return angle("refractory", direction), angle("slow", -direction)
 
 
-def _shifted(cost: Cost, v: Vector, shift: NDArray[np.floating[Any]]) -> Any:
+def _shifted(cost: Cost, v: Vector, shift: Any) -> Any:
     """Return the derivative of the residuals by a factor of ``shift``, changes of the angles at the ends of pairs.
 
-    ``shift`` has shape (2, 1) or (2, pairs).
+    ``shift`` is a Warp array of shape (2, pairs), padded.
     """
     pairs, at = cost.brightness.pairs, cost.at(v)
     none = pairs.arrays.slope
-    values = np.zeros((2, pairs.arrays.stride), np.float32)
-    values[:, : len(pairs)] = shift
-    pairs.arrays.slope = wp.array(values.ravel(), dtype=float, device=pairs.device)
+    pairs.arrays.slope = shift.flatten()
     ends = {**at, "drift": STEP_RAD}, {**at, "drift": -STEP_RAD}
     column = cost.brightness.find_slope(*ends, 2.0 * STEP_RAD)
     pairs.arrays.slope = none

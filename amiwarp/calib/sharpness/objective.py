@@ -42,6 +42,7 @@ class Objective:
         *,
         kind: Sharpness,
         smoothing: float,
+        pad: int,
         scale: float = 1.0,
         per_polarity: bool = False,
         parts: int = 1,
@@ -59,6 +60,8 @@ class Objective:
             Measure of sharpness.
         smoothing : float
             Standard deviation of the Gaussian that smooths the image [sensor px].
+        pad : int
+            Border of the image [px], see :func:`padding`.
         scale : float
             Canvas pixels per sensor pixel.
         per_polarity : bool
@@ -73,7 +76,6 @@ class Objective:
         camera = space.camera
         # the paper's J is computed as published, without dithering
         dither = kind is not Sharpness.PAPER_J
-        pad = padding(space)
         canvas = CanvasShape(camera.width, camera.height, pad, scale, per_polarity, parts=parts, dither=dither)
         if parts > 1:
             events = events.in_parts(parts, per_polarity=per_polarity)

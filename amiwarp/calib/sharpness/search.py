@@ -15,7 +15,7 @@ from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, MOTION, UNITS, check_
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.calib.progress_share import stage_share
 from amiwarp.calib.sharpness.curvature import finite_differences
-from amiwarp.calib.sharpness.objective import Objective
+from amiwarp.calib.sharpness.objective import Objective, padding
 from amiwarp.calib.summaries import StageSummary
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
@@ -143,6 +143,7 @@ class Search:
         self.calibration_events, self.settings, self.device = calibration_events, settings, device
         self.progress = progress
         self.stages: list[StageSummary] = []
+        self._pad = padding(self.space)
         self.fine = self._objective(calibration_events, scale=1.0, smoothing=settings.smoothing_px)
 
     def _objective_by_parts(self, kind: Sharpness) -> Objective:
@@ -162,11 +163,12 @@ class Search:
     ) -> Objective:
         s = self.settings
         kind, space = kind or s.sharpness, space or self.space
+        pad = self._pad if space is self.space else padding(space)
         if kind is Sharpness.PAPER_J:
             smoothing = 0.0  # J counts pixels with h > 0, and a Gaussian's tails would make almost all of them positive
         return Objective(
             space, events.on(self.device, space.middle_us if space.moving else None),
-            kind=kind, smoothing=smoothing, scale=scale,
+            kind=kind, smoothing=smoothing, pad=pad, scale=scale,
             per_polarity=s.per_polarity, parts=parts, device=self.device,
         )  # fmt: skip
 
@@ -193,7 +195,7 @@ class Search:
 
         The camera's rotation stays at its start values.
         """
-        space = self.space.without(MOTION)
+        space = self.space.without(MOTION) if self.space.moving else self.space
         if not space.names:
             return [self.space.to_vector(self.space.start)]
         start = space.to_vector(space.start)
