@@ -15,16 +15,25 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def node_at(atlas: Atlas, tile: int, x: float, y: float):
-    """Return the map node up and left of a position, and the fractions to the next; -1 off the tile, and for NaN."""
-    u = (x - load_float(atlas.origin, 2 * tile)) * atlas.density
-    v = (y - load_float(atlas.origin, 2 * tile + 1)) * atlas.density
+def node_from(atlas: Atlas, tile: int, left: float, top: float, x: float, y: float):
+    """Return :func:`node_at` for the tile's origin (``left``, ``top``)."""
+    u = (x - left) * atlas.density
+    v = (y - top) * atlas.density
     inside = wp.where(u >= 0.0, wp.where(u < float(atlas.columns - 1), 1, 0), 0)
     inside = wp.where(v >= 0.0, wp.where(v < float(atlas.rows - 1), inside, 0), 0)
     u = wp.where(inside == 1, u, 0.0)
     v = wp.where(inside == 1, v, 0.0)
     cell = (tile * atlas.rows + int(v)) * atlas.columns + int(u)
     return wp.where(inside == 1, cell, -1), u - float(int(u)), v - float(int(v))
+
+
+@wp.func
+def node_at(atlas: Atlas, tile: int, x: float, y: float):
+    """Return the map node up and left of a position, and the fractions to the next; -1 off the tile, and for NaN."""
+    left = load_float(atlas.origin, 2 * tile)
+    top = load_float(atlas.origin, 2 * tile + 1)
+    cell, u, v = node_from(atlas, tile, left, top, x, y)
+    return cell, u, v
 
 
 @wp.func
@@ -208,12 +217,19 @@ def undo_rotations(
 
 @wp.func
 def find_nodes(
-    atlas: Atlas, pairs: Pairs, first: int, x: wp.array(dtype=float), y: wp.array(dtype=float),
-    cells: wp.array(dtype=int),
+    atlas: Atlas, pairs: Pairs, first: int, left: wp.array(dtype=float), top: wp.array(dtype=float),
+    x: wp.array(dtype=float), y: wp.array(dtype=float), cells: wp.array(dtype=int),
 ):  # fmt: skip
-    """Replace the positions of a block by the fractions between map nodes, and compute the nodes."""
+    """Replace the positions of a block by the fractions between map nodes, and compute the nodes.
+
+    ``left`` and ``top`` are the origins of the tiles. They are loaded beforehand, because a compiler does not vectorise
+    a loop that loads from other places than it stores to.
+    """
     for j in range(BLOCK):
-        cell, u, v = node_at(atlas, load_int(pairs.tile, first + j), load_float(x, j), load_float(y, j))
+        cell, u, v = node_from(
+            atlas, load_int(pairs.tile, first + j), load_float(left, j), load_float(top, j), load_float(x, j),
+            load_float(y, j),
+        )  # fmt: skip
         store_int(cells, j, cell)
         store_float(x, j, u)
         store_float(y, j, v)
@@ -254,7 +270,14 @@ def place_blocks(
     if wp.length_sq(camera_rotation.velocity) + wp.length_sq(camera_rotation.acceleration) > 0.0:
         undo_rotations(camera, camera_rotation, pairs, 0, first, ax, ay)
         undo_rotations(camera, camera_rotation, pairs, 1, first, bx, by)
-    find_nodes(atlas, pairs, first, ax, ay, a)
-    find_nodes(atlas, pairs, first, bx, by, b)
+    left = wp.zeros(shape=(64,), dtype=float)
+    top = wp.zeros(shape=(64,), dtype=float)
     for j in range(BLOCK):
-        store_geometry(geometry, first + j, a[j], ax[j], ay[j], b[j], bx[j], by[j])
+        tile = load_int(pairs.tile, first + j)
+        store_float(left, j, load_float(atlas.origin, 2 * tile))
+        store_float(top, j, load_float(atlas.origin, 2 * tile + 1))
+    find_nodes(atlas, pairs, first, left, top, ax, ay, a)
+    find_nodes(atlas, pairs, first, left, top, bx, by, b)
+    for j in range(BLOCK):
+        u, v = load_float(ax, j), load_float(ay, j)
+        store_geometry(geometry, first + j, load_int(a, j), u, v, load_int(b, j), load_float(bx, j), load_float(by, j))
