@@ -15,9 +15,10 @@ from amiwarp.kernels.launch import SMALLEST_SLICE
 
 COARSEST = 6
 """Smallest number of rows or columns of a grid; coarser grids are not made."""
-STRIDES = (3, 3, 7)
-"""Every how many pairs one is used to estimate the diagonal of the first grid, the second, and the further ones. They
-have no common divisor with the usual numbers of pairs per silent pixel. With fewer pairs, more steps are needed."""
+STRIDES = (3, 5, 11, 23)
+"""Every how many pairs one is used to estimate the diagonal of the first grid, the second, the third, and the further
+ones. They have no common divisor with the usual numbers of pairs per silent pixel. With fewer pairs, more steps are
+needed."""
 
 
 class GridHierarchy:
