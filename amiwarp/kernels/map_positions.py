@@ -216,14 +216,25 @@ def undo_rotations(
 
 
 @wp.func
+def load_origins(atlas: Atlas, pairs: Pairs, first: int, left: wp.array(dtype=float), top: wp.array(dtype=float)):
+    """Load the origins of the tiles of a block of pairs.
+
+    A compiler does not vectorise a loop that loads from places which it finds in the loop, and stores results.
+    """
+    for j in range(BLOCK):
+        tile = load_int(pairs.tile, first + j)
+        store_float(left, j, load_float(atlas.origin, 2 * tile))
+        store_float(top, j, load_float(atlas.origin, 2 * tile + 1))
+
+
+@wp.func
 def find_nodes(
     atlas: Atlas, pairs: Pairs, first: int, left: wp.array(dtype=float), top: wp.array(dtype=float),
     x: wp.array(dtype=float), y: wp.array(dtype=float), cells: wp.array(dtype=int),
 ):  # fmt: skip
     """Replace the positions of a block by the fractions between map nodes, and compute the nodes.
 
-    ``left`` and ``top`` are the origins of the tiles. They are loaded beforehand, because a compiler does not vectorise
-    a loop that loads from other places than it stores to.
+    ``left`` and ``top`` are the origins of the tiles, see :func:`load_origins`.
     """
     for j in range(BLOCK):
         cell, u, v = node_from(
@@ -272,10 +283,7 @@ def place_blocks(
         undo_rotations(camera, camera_rotation, pairs, 1, first, bx, by)
     left = wp.zeros(shape=(64,), dtype=float)
     top = wp.zeros(shape=(64,), dtype=float)
-    for j in range(BLOCK):
-        tile = load_int(pairs.tile, first + j)
-        store_float(left, j, load_float(atlas.origin, 2 * tile))
-        store_float(top, j, load_float(atlas.origin, 2 * tile + 1))
+    load_origins(atlas, pairs, first, left, top)
     find_nodes(atlas, pairs, first, left, top, ax, ay, a)
     find_nodes(atlas, pairs, first, left, top, bx, by, b)
     for j in range(BLOCK):
