@@ -246,6 +246,24 @@ def find_nodes(
         store_float(y, j, v)
 
 
+@wp.func
+def store_block(
+    geometry: Geometry, atlas: Atlas, pairs: Pairs, first: int, ax: wp.array(dtype=float), ay: wp.array(dtype=float),
+    bx: wp.array(dtype=float), by: wp.array(dtype=float),
+):  # fmt: skip
+    """Store the map nodes and fractions of a block of pairs, given their positions, which are replaced."""
+    a = wp.zeros(shape=(64,), dtype=int)
+    b = wp.zeros(shape=(64,), dtype=int)
+    left = wp.zeros(shape=(64,), dtype=float)
+    top = wp.zeros(shape=(64,), dtype=float)
+    load_origins(atlas, pairs, first, left, top)
+    find_nodes(atlas, pairs, first, left, top, ax, ay, a)
+    find_nodes(atlas, pairs, first, left, top, bx, by, b)
+    for j in range(BLOCK):
+        u, v = load_float(ax, j), load_float(ay, j)
+        store_geometry(geometry, first + j, load_int(a, j), u, v, load_int(b, j), load_float(bx, j), load_float(by, j))
+
+
 @wp.kernel
 def place_blocks(
     model: Any,
@@ -266,8 +284,6 @@ def place_blocks(
     ay = wp.zeros(shape=(64,), dtype=float)
     bx = wp.zeros(shape=(64,), dtype=float)
     by = wp.zeros(shape=(64,), dtype=float)
-    a = wp.zeros(shape=(64,), dtype=int)
-    b = wp.zeros(shape=(64,), dtype=int)
     drifts = wp.min(pairs.slope.shape[0], 1)
     if drifts == 1:
         drift_block(model, pairs, drift, 0, first, ax, ay)
@@ -281,11 +297,4 @@ def place_blocks(
     if wp.length_sq(camera_rotation.velocity) + wp.length_sq(camera_rotation.acceleration) > 0.0:
         undo_rotations(camera, camera_rotation, pairs, 0, first, ax, ay)
         undo_rotations(camera, camera_rotation, pairs, 1, first, bx, by)
-    left = wp.zeros(shape=(64,), dtype=float)
-    top = wp.zeros(shape=(64,), dtype=float)
-    load_origins(atlas, pairs, first, left, top)
-    find_nodes(atlas, pairs, first, left, top, ax, ay, a)
-    find_nodes(atlas, pairs, first, left, top, bx, by, b)
-    for j in range(BLOCK):
-        u, v = load_float(ax, j), load_float(ay, j)
-        store_geometry(geometry, first + j, load_int(a, j), u, v, load_int(b, j), load_float(bx, j), load_float(by, j))
+    store_block(geometry, atlas, pairs, first, ax, ay, bx, by)
