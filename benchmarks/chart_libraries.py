@@ -25,7 +25,8 @@ def library_tasks(sample: ErrorSample, uploads: Uploads, device: str) -> tuple[l
     camera, radius, turned = known.camera, *circle(sample)
 
     def peer_events(events: Any, theta: NDArray[np.float64]) -> libraries.PeerEvents:
-        angle = np.remainder(theta + turned, 2.0 * math.pi).astype(np.float32)
+        turns = theta + turned
+        angle = np.remainder(turns, 2.0 * math.pi, out=turns).astype(np.float32)
         margin = math.ceil(radius) + 2
         return libraries.PeerEvents(events.x, events.y, angle, radius, camera.width, camera.height, margin)
 

@@ -36,6 +36,18 @@ def test_angles_are_the_encoder_s(device: str) -> None:
     assert np.abs(error).max() < 0.5 + 1e-3
 
 
+def test_other_angles_leave_the_other_columns_alone(device: str) -> None:
+    events, rng = still_scene(1000), np.random.default_rng(2)
+    angles, others = rng.uniform(-20.0, 20.0, (2, 1000))
+    first = upload_events(events, angles, device)
+    found, expected = first.at_angles(others), upload_events(events, others, device)
+    assert found.arrays.x.ptr == first.arrays.x.ptr
+    for name in ("x", "y", "layer", "turn"):
+        np.testing.assert_array_equal(getattr(found.arrays, name).numpy(), getattr(expected.arrays, name).numpy())
+    turns = angles * (TURNS / (2.0 * math.pi))
+    np.testing.assert_array_equal(first.arrays.turn.numpy()[:1000], np.rint(turns).astype(np.int64) % TURNS)
+
+
 def test_uncovered_events_are_refused(device: str) -> None:
     encoder = Encoder.constant_speed(720.0, 0, 100_000)
     with pytest.raises(AmiwarpError, match="outside the encoder"):

@@ -19,13 +19,17 @@ RUN = 8
 
 
 def thin(recording: Recording, most: int) -> Events:
-    """Return about ``most`` events, evenly thinned: every k-th run of :data:`RUN` events. Files are read in blocks."""
+    """Return about ``most`` events, evenly thinned: every k-th run of :data:`RUN` events. Files are read in blocks.
+
+    All events of a recording in memory are not copied.
+    """
     source = recording.events
     step = max(1, -(-len(source) // most))
+    if isinstance(source, MemoryEvents):
+        events = source.slice(0, len(source))
+        return events if step == 1 else _every_run(events, step)
     if step == 1:
         return Events.concatenate(list(source.blocks()))
-    if isinstance(source, MemoryEvents):
-        return _every_run(source.slice(0, len(source)), step)
     # a block holds a whole number of steps, so that only the last run of the recording can be cut
     blocks = source.blocks(count=step * RUN * max(1, (1 << 20) // (step * RUN)))
     return Events.concatenate([_every_run(block, step) for block in blocks])

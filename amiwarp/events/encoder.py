@@ -389,7 +389,8 @@ class Encoder:
         start = min(max(start, 0), self.t.size - 2)
         stop = max(int(np.searchsorted(self.t, math.ceil(high + self.clock_offset_us))) + 1, start + 2)
         # Subtract as integers: float64 cannot represent fractions of microseconds in times since 1970.
-        elapsed = (times - self.t[start]).astype(np.float64) + self.clock_offset_us
+        elapsed = np.subtract(times, self.t[start], out=np.empty(times.shape), dtype=np.int64)
+        elapsed += self.clock_offset_us
         sampled = (self.t[start:stop] - self.t[start]).astype(np.float64)
         return elapsed, sampled, self.angle[start:stop]
 

@@ -35,6 +35,8 @@ TURNS = 1 << 16
 
 On an orbit with a radius of 10 px, the rounding moves an event by at most 0.0005 px.
 """
+PIECE = 1 << 20
+"""Number of angles that are converted at a time."""
 LARGEST_FOLD = 1 << 16
 """Largest number of angle bins per turn into which a pixel's events can be merged."""
 LARGEST_WEIGHT = 63
@@ -67,11 +69,20 @@ class UploadedEvents:
 
     def in_parts(self, parts: int, *, per_polarity: bool) -> UploadedEvents:
         """Return the same events split over ``parts`` images, or over ``parts`` pairs (OFF, ON) of images."""
-        a, e = self.arrays, EventArrays()
-        e.x, e.y, e.turn, e.azimuths, e.time, e.weight = a.x, a.y, a.turn, a.azimuths, a.time, a.weight
-        e.layer = wp.empty_like(a.layer)
-        inputs = [a.layer, parts, int(per_polarity)]
-        launch(layer_events, len(e.layer), inputs, [e.layer], device=e.layer.device)
+        old = self.arrays.layer
+        layer = wp.empty_like(old)
+        launch(layer_events, len(old), [old, parts, int(per_polarity)], [layer], device=old.device)
+        return self._with(layer=layer)
+
+    def at_angles(self, angles: NDArray[np.float64]) -> UploadedEvents:
+        """Return the same events at other prism angles [rad], shape ``(n,)``. The other columns are not copied."""
+        return self._with(turn=_put(_turns(angles), wp.uint16, self.arrays.turn.device))
+
+    def _with(self, **columns: wp.array) -> UploadedEvents:
+        """Return the same events with other columns."""
+        e = EventArrays()
+        for name in ("x", "y", "turn", "azimuths", "time", "weight", "layer"):
+            setattr(e, name, columns.get(name, getattr(self.arrays, name)))
         return replace(self, arrays=e)
 
 
@@ -126,9 +137,9 @@ def upload_events(
     e.azimuths, e.time = azimuths(str(device)), wp.empty(0, dtype=float, device=device)
     e.weight = wp.empty(0, dtype=wp.uint8, device=device)
     if not isinstance(angles, np.ndarray) or middle_us is not None:
-        t = events.t if isinstance(events, DeviceEvents) else wp.array(events.t, dtype=wp.int64, device=device)
+        t = _times(events, device)
     if isinstance(angles, np.ndarray):
-        e.turn = put(np.rint(angles * (TURNS / (2.0 * np.pi))).astype(np.int64).astype(np.uint16), wp.uint16)
+        e.turn = put(_turns(angles), wp.uint16)
     else:
         e.turn = wp.zeros(padded, dtype=wp.uint16, device=device)
         if n:
@@ -138,7 +149,11 @@ def upload_events(
         e.time = wp.empty(n, dtype=float, device=device)
         launch(time_events, n, [t, middle_us], [e.time], device=device)
     if fold:
-        return _folded(e, n, fold)
+        keys = _fold_keys(e, n, fold)
+        del e  # free arrays after their last use: with ten million events, each has tens of megabytes
+        points = _split(*_runs(keys))
+        del keys
+        return _folded(*points, n, fold, device)
     if slope is None:
         return UploadedEvents(e, n, n, None, None)
     return UploadedEvents(e, n, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
@@ -159,26 +174,47 @@ def _put(values: NDArray[Any] | wp.array, dtype: Any, device: Any) -> Any:
     return array
 
 
-def _folded(e: Any, n: int, bins: int) -> UploadedEvents:
-    """Merge events of equal pixel, polarity and angle bin into weighted points, sorted and counted on the device.
+def _times(events: Events | DeviceEvents, device: Any) -> wp.array:
+    """Return the times of events on the device. On a CPU they are not copied."""
+    if isinstance(events, DeviceEvents):
+        return events.t
+    return wp.array(events.t, dtype=wp.int64, device=device, copy=False)
 
-    Keys are sorted by bin first, so that neighbouring points share an angle.
-    """
+
+def _turns(angles: NDArray[np.float64]) -> NDArray[np.uint16]:
+    """Return prism angles [rad] in units of 1/65536 turn. They are converted in pieces, to need little memory."""
+    turns = np.empty(len(angles), np.uint16)
+    for start in range(0, len(angles), PIECE):
+        piece = slice(start, start + PIECE)
+        turns[piece] = np.rint(angles[piece] * (TURNS / (2.0 * np.pi))).astype(np.int64)
+    return turns
+
+
+def _fold_keys(e: Any, n: int, bins: int) -> NDArray[np.int64]:
+    """Return the sorted keys of events: bin, pixel and polarity. Neighbours share an angle, as the bin comes first."""
     device = e.x.device
     if not 1 <= bins <= LARGEST_FOLD:
         raise AmiwarpError(f"fold = {bins} angles a turn; give 1 .. {LARGEST_FOLD}, or 0 to disable folding")
-    keys, unused = wp.empty(2 * n, dtype=wp.int64, device=device), wp.zeros(2 * n, dtype=int, device=device)
+    room = n if device.is_cpu else 2 * n  # sorting on CUDA needs scratch memory behind the keys
+    keys = wp.empty(room, dtype=wp.int64, device=device)
     launch(fold_keys, n, [e.x, e.y, e.layer, e.turn, bins], [keys], device=device)
-    wp.utils.radix_sort_pairs(keys, unused, n)
-    del unused
-    key, weight = _split(*_runs(keys[:n].numpy()))
-    del keys  # with ten million events, these arrays are hundreds of megabytes
+    if device.is_cpu:
+        values = keys.numpy()  # shares the memory of keys
+        values.sort()
+        return values
+    wp.utils.radix_sort_pairs(keys, wp.zeros(room, dtype=int, device=device), n)
+    return np.asarray(keys[:n].numpy())
+
+
+def _folded(key: NDArray[np.int64], weight: NDArray[np.uint8], n: int, bins: int, device: Any) -> UploadedEvents:
+    """Return weighted points on the device by their keys. They stand for ``n`` events."""
     m = len(key)
     out = EventArrays()
     out.x, out.y, out.turn = (wp.zeros(_padded(m, device), dtype=wp.uint16, device=device) for _ in range(3))
     out.layer = wp.zeros(_padded(m, device), dtype=wp.uint8, device=device)
-    out.weight, out.azimuths, out.time = _put(weight, wp.uint8, device), e.azimuths, e.time
-    launch(unfold_keys, m, [wp.array(key, dtype=wp.int64, device=device), bins], [out], device=device)
+    out.weight, out.azimuths = _put(weight, wp.uint8, device), azimuths(str(device))
+    out.time = wp.empty(0, dtype=float, device=device)
+    launch(unfold_keys, m, [wp.array(key, dtype=wp.int64, device=device, copy=False), bins], [out], device=device)
     return UploadedEvents(out, m, n, None, None)
 
 

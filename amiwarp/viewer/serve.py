@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import ctypes
-import gc
 import logging
 import os
 import secrets
-import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from functools import partial
@@ -17,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from weakref import WeakSet
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.memory import release_memory
 from amiwarp.viewer.host_names import ALL_INTERFACES, HostNames, address, cannot_serve, normalised
 from amiwarp.viewer.message_filter import MOST_BYTES, Check, MessageFilter
 from amiwarp.viewer.page_files import FOLDER, ROUTE, first_page
@@ -139,25 +137,13 @@ class Tabs:
     def _clean_up(self, waited_s: float) -> None:
         """Release the memory of closed tabs. Retry at growing intervals while their threads still run."""
         self._cleanup = None
-        _release_memory()
+        release_memory()
         if len(self._servers) > len(self._sockets):
             self._clean_up_later(min(2.0 * waited_s, LONGEST_CLEANUP_S))
 
 
 def _refuse_tab(_: Any) -> Closing:
     raise AmiwarpError(TOO_MANY_TABS)
-
-
-def _release_memory() -> None:
-    """Return the memory of closed tabs to the operating system.
-
-    The objects of a page refer to each other in cycles, so only the garbage collector frees them. glibc then keeps the
-    freed memory in the arena of each thread until ``malloc_trim`` is called.
-    """
-    gc.collect()
-    if sys.platform.startswith("linux"):
-        with suppress(AttributeError):  # musl has no malloc_trim
-            ctypes.CDLL(None).malloc_trim(0)
 
 
 def _application(tabs: Tabs, token: str, names: HostNames) -> web.Application:

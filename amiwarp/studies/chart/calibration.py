@@ -179,7 +179,7 @@ def rows(
         found: Calibration | AmiwarpError = t.result
         return None if isinstance(found, AmiwarpError) else t.row(model_error(found.model, known.model).rms)
 
-    timed = measure(tasks, repeats, progress, "calibrating", warm_up=False,
+    timed = measure(tasks, repeats, progress, "calibrating", warm_up=False, release=True,
                     again=lambda once: near_front([row(t) for t in once]))  # fmt: skip
     notes = []
     for t, way in zip(timed, ways, strict=True):

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     from amiwarp.calib import Calibration
     from amiwarp.events.events import Events
+    from amiwarp.imaging.device_events import UploadedEvents
 
 IMAGE, FILE = "image of events", "file to file"
 """Names of the two measured jobs, an image and a file. Rows of one job can be compared and share a Pareto front."""
@@ -90,39 +91,49 @@ class ErrorSample:
 def coarse(theta: NDArray[np.float64], angles: int) -> NDArray[np.float64]:
     """Round prism angles [rad] to ``angles`` steps per turn."""
     step = 2.0 * math.pi / angles
-    return np.asarray(np.rint(theta / step) * step)
+    rounded = theta / step
+    np.rint(rounded, out=rounded)
+    rounded *= step
+    return rounded
 
 
 class Uploads:
     """Events of the recording on the device, for each number of angles and each share.
 
-    Each version is uploaded once.
+    Each version is uploaded once. Versions of one share have the same pixels in memory, only other angles.
     """
 
     def __init__(self, known: KnownRecording, device: str) -> None:
         self.known, self.device = known, device
         copies = 1 if wp.get_device(device).is_cpu else max(1, MANY // len(known.events))
         self.events = _repeated(known.events, copies)
-        self.theta = np.tile(known.encoder.angle_at(known.events.t), copies)
+        self.theta = _tiled(known.encoder.angle_at(known.events.t), copies)
         self.copies = copies
-        self._made: dict[tuple[int, int], Any] = {}
+        self._made: dict[tuple[int, int], UploadedEvents] = {}
 
-    def get(self, angles: int, share: int) -> Any:
+    def get(self, angles: int, share: int) -> UploadedEvents:
         """Return the uploaded events with ``angles`` distinct angles per turn, every ``share``-th event."""
         if (angles, share) not in self._made:
             # a share of the repeated events could contain all of them
             n = len(self.known.events)
-            theta = np.tile(coarse(self.theta[:n:share], angles), self.copies)
-            events = _repeated(self.known.events[::share], self.copies)
-            self._made[angles, share] = upload_events(events, theta, self.device)
+            theta = _tiled(coarse(self.theta[:n:share], angles), self.copies)
+            same = next((made for (_, other), made in self._made.items() if other == share), None)
+            self._made[angles, share] = self._upload(theta, share) if same is None else same.at_angles(theta)
         return self._made[angles, share]
+
+    def _upload(self, theta: NDArray[np.float64], share: int) -> UploadedEvents:
+        """Upload every ``share``-th event with prism angles [rad]."""
+        return upload_events(_repeated(self.known.events[::share], self.copies), theta, self.device)
 
 
 def _repeated(e: Events, copies: int) -> Events:
     """Return the events ``e`` repeated ``copies`` times."""
-    if copies == 1:
-        return e
-    return replace(e, **{n: np.tile(getattr(e, n), copies) for n in ("x", "y", "t", "p")})
+    return replace(e, **{n: _tiled(getattr(e, n), copies) for n in ("x", "y", "t", "p")})
+
+
+def _tiled(values: NDArray[Any], copies: int) -> NDArray[Any]:
+    """Return ``values`` repeated ``copies`` times; without a copy if that is once."""
+    return values if copies == 1 else np.tile(values, copies)
 
 
 @dataclass(frozen=True)
@@ -201,7 +212,20 @@ def rows(
     image.
     """
     progress("measuring images of events: the truth", 0.0)
-    sample, truth = ErrorSample.of(known), exact_image(known)
+    sample = ErrorSample.of(known)
+    images, notes = _image_rows(sample, device, repeats, quick, progress, libraries)
+    files, missing = _file_rows(sample, device, repeats, quick, progress, folder)
+    return images + files, notes + missing
+
+
+def _image_rows(
+    sample: ErrorSample, device: str, repeats: int, quick: bool, progress: Progress, libraries: Libraries | None
+) -> tuple[list[Row], list[str]]:
+    """Measure the images of events.
+
+    The uploaded events are freed when this function returns, before files are measured.
+    """
+    known, truth = sample.known, exact_image(sample.known)
     models = {name: simplified(known.calibration(), name).model for name in MODELS}
     uploads, ways = Uploads(known, device), settings(quick=quick)
     others, notes = libraries(sample, uploads, device) if libraries is not None else ([], [])
@@ -217,8 +241,7 @@ def rows(
         image = _image_error(t.result, truth, t.task.events / len(known.events))
         out.append(t.row(sample.error(places, Vote.BILINEAR), image_error=image))
     _check(out)
-    files, missing = _file_rows(sample, device, repeats, quick, progress, folder)
-    return out + files, notes + missing
+    return out, notes
 
 
 def _image_tasks(ways: list[ImageSetting], models: dict[str, Model], uploads: Uploads, device: str) -> Iterator[Task]:

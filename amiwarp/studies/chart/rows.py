@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from amiwarp.memory import release_memory
 from amiwarp.progress import Progress
 
 EQUAL_TIME_SHARE = 0.05
@@ -110,14 +111,17 @@ def measure(
     warm_up: bool = True,
     limit_s: float = 180.0,
     rest_s: float = 0.0,
+    release: bool = False,
     again: Callable[[Sequence[Timed]], Sequence[bool]] | None = None,
 ) -> list[Timed]:
     """Measure all tasks in rounds, so that a temporary slowdown of the machine affects all of them.
 
     ``warm_up`` adds an untimed first round, in which kernels are compiled. No new round begins after ``limit_s`` [s].
     ``rest_s`` [s] is a pause before each run, in which threads of the previous run may still be busy. ``again`` decides
-    from tasks that were timed once which of them to repeat.
+    from tasks that were timed once which of them to repeat. Memory that earlier work freed is released first; with
+    ``release`` before each run, for runs that need much memory. All runs then start with an equally empty heap.
     """
+    release_memory()
     times: list[list[float]] = [[] for _ in tasks]
     results: list[Any] = [None] * len(tasks)
     repeated: Sequence[bool] = [True] * len(tasks)
@@ -130,6 +134,8 @@ def measure(
         for k, task in enumerate(tasks):
             if not repeated[k]:
                 continue
+            if release:
+                release_memory()
             time.sleep(rest_s)
             start = time.perf_counter()
             result = task.run()

@@ -1,0 +1,20 @@
+"""Return of freed memory to the operating system."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import sys
+from contextlib import suppress
+
+
+def release_memory() -> None:
+    """Collect garbage, and return freed memory to the operating system.
+
+    Objects that refer to each other in cycles are freed by the garbage collector only. glibc keeps freed memory in the
+    arena of each thread until ``malloc_trim`` is called.
+    """
+    gc.collect()
+    if sys.platform.startswith("linux"):
+        with suppress(AttributeError):  # musl has no malloc_trim
+            ctypes.CDLL(None).malloc_trim(0)
