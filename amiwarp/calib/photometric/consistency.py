@@ -275,10 +275,9 @@ def _rotation_columns(cost: Cost, best: Vector) -> dict[str, Any]:
     space, at, columns = cost.space, cost.at(best), {}
     half_s = max(0.5 * float(np.ptp(cost.brightness.pairs.some_times)), 1e-6)
     for k, name in enumerate(RATES if not space.moving else ()):
-        rate = np.zeros(3)
-        rate[k] = SLOPE_PX / space.camera.fx / half_s
+        x, y, z = np.eye(3)[k] * (SLOPE_PX / space.camera.fx / half_s)
         # one-sided differences: a camera at rest is faster to compute, and only the gain counts
-        columns[name] = cost.brightness.find_slope({**at, "camera_rotation": CameraRotation(tuple(rate))}, at, SLOPE_PX)
+        columns[name] = cost.brightness.find_slope({**at, "camera_rotation": CameraRotation((x, y, z))}, at, SLOPE_PX)
     return columns
 
 
