@@ -14,7 +14,7 @@ from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.selection import model_choice as auto
 from amiwarp.calib.selection.model_choice import calibrate_auto
 from amiwarp.calib.selection.smaller_models import Places, candidate_space, encoder_noise, fit
-from amiwarp.calib.selection.trial import CONVERSION_FACTOR, make_trial
+from amiwarp.calib.selection.trial import CONVERSION_FACTOR, TILT, make_trial
 from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
 from amiwarp.calib.sharpness.held_out import split_turns
 from amiwarp.calib.thinning import thin
@@ -135,11 +135,19 @@ def test_the_answer_is_the_best_fit_to_the_exact_one(as_circle: Calibration, wid
     assert found.ladder.rungs[0].predicted_px == pytest.approx(best, abs=1e-4)
 
 
-def test_held_out_turns_see_the_circle_s_error_in_pixels(found: Calibration) -> None:
-    assert found.ladder is not None
-    circle = found.ladder.rungs[0]
+def test_held_out_turns_see_the_circle_s_error_in_pixels(as_circle: Calibration) -> None:
+    assert as_circle.ladder is not None
+    circle, exact = as_circle.ladder.rungs[:2]
+    assert circle.seen_px is not None
+    assert exact.seen_px == (0.0, 0.0)
     assert circle.seen_px[0] > circle.predicted_px / CONVERSION_FACTOR
     assert circle.seen_px[1] < circle.predicted_px * CONVERSION_FACTOR
+    assert as_circle.ladder.agreed
+
+
+def test_held_out_turns_are_not_measured_if_they_cannot_change_the_choice(found: Calibration) -> None:
+    assert found.ladder is not None
+    assert [r.seen_px for r in found.ladder.rungs] == [None] * len(MODELS)
     assert found.ladder.agreed
     assert found.warnings == ()
 
@@ -150,6 +158,7 @@ def test_a_judge_s_objection_is_heard(found: Calibration, wide: Recording, monke
     trial = make_trial(wide, found.exact, SHARPNESS, (), device="cpu", budget_px=None)
     circle, exact = (f.candidate for f in auto.fit_models(trial)[:2])
     assert not circle.chosen
+    assert circle.seen_px is not None
     assert circle.seen_px[0] > trial.rejection_px
     assert circle.verdict.startswith("predicted under the budget, but held-out turns show an error")
     assert exact.chosen
@@ -201,6 +210,18 @@ def test_at_one_speed_the_clock_offset_is_not_determined(found: Calibration) -> 
     assert not told["clock_offset"].determined
     assert "two speeds" in told["clock_offset"].verdict
     assert not any(p.freed for p in told.values())
+
+
+def test_a_tilt_that_the_photometric_stage_rules_out_is_not_measured(found: Calibration, wide: Recording) -> None:
+    assert found.ladder is not None
+    assert found.photometric is not None
+    tilt = next(p for p in found.ladder.parameters if p.name == "tilt")
+    assert tilt.gain_px is None
+    assert tilt.verdict.startswith("held: the photometric stage finds that it moves events by at most 0.0")
+    for center_px, names in (((0.0, 0.001), ()), ((0.1, 0.001), TILT), ((0.0, 0.1), TILT), (None, TILT)):
+        exact = replace(found.exact, photometric=replace(found.photometric, center_px=center_px))
+        trial = make_trial(wide, exact, BOTH, TILT, device="cpu", budget_px=None)
+        assert trial.space.names == ("apex", "phase", *names)
 
 
 def test_a_clock_offset_is_freed_where_the_speed_changes(texture: np.ndarray) -> None:

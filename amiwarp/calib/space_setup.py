@@ -217,7 +217,7 @@ def _pixels_per_unit(
     steps = {size: 0.25 * nominal[size], "phase": 0.05, **dict.fromkeys(_EXACT_ONLY, 0.02), **lens}
     shifts = {name: rms(name, step) for name, step in steps.items() if name in names}
     if set(DRIFTS) & set(names):
-        phase = rms("phase", 0.05)
+        phase = shifts["phase"] if "phase" in names else rms("phase", 0.05)
         shifts["clock_offset"] = phase * abs(rad_per_us)
         shifts["rpm"] = phase * 2.0 * math.pi / 60e6 * duration_us / math.sqrt(12.0)
     seconds = duration_us * 1e-6

@@ -97,6 +97,11 @@ class PhotometricSummary:
     rotation_gain: float = 0.0
     """Share of the squared residuals that a slow rotation of the camera would remove, by a linearised fit; 0 if it is
     not significant or was not examined."""
+    center_px: tuple[float, float] | None = None
+    """Correction of the principal point that the events ask for, by a linearised fit, and its standard deviation, as
+    displacements of events [px rms]; None if it was not examined.
+
+    A tilt of the prism's axis asks for nearly the same correction."""
     held: tuple[str, ...] = ()
     """Free parameters that the events do not determine. They keep the values of the sharpness stage."""
     warnings: tuple[str, ...] = ()
@@ -113,18 +118,19 @@ class ModelCandidate:
     """Number of the model's free parameters, and the parameters that must be known."""
     predicted_px: float
     """Predicted error: rms distance [px] at the events between the exact model and this model fitted to it."""
-    sharpness: float
-    """Mean sharpness of the model on held-out turns."""
-    loss: float
-    """Sharpness of the exact model on held-out turns, minus this model's."""
-    loss_std: float
-    """Standard deviation of the loss, from its scatter over disjoint parts of the events."""
-    seen_px: tuple[float, float]
+    sharpness: float | None
+    """Mean sharpness of the model on held-out turns; None if it was not measured, as it could not change the choice."""
+    loss: float | None
+    """Sharpness of the exact model on held-out turns, minus this model's; None if it was not measured."""
+    loss_std: float | None
+    """Standard deviation of the loss, from its scatter over disjoint parts of the events; None if it was not measured.
+    """
+    seen_px: tuple[float, float] | None
     """Displacements that would cost as much sharpness as the loss minus and plus two standard deviations [px rms].
 
-    Negative values are gains."""
-    cost_ns: float
-    """Measured time for one event's angle, displacement and vote [ns]."""
+    Negative values are gains. None if the loss was not measured."""
+    cost_ns: float | None
+    """Measured time for one event's angle, displacement and vote [ns]; None if the sharpness was not measured."""
     chosen: bool
     """Whether the automatic choice selected this model."""
     verdict: str
@@ -160,7 +166,7 @@ class ModelChoice:
     timing_px: float
     """Estimated blur from encoder noise, clock resolution and latency jitter [px rms]."""
     agreed: bool
-    """Whether the predicted errors and the held-out turns agree on the chosen model and on all smaller models."""
+    """Whether the predicted errors and the held-out turns agree on every model whose sharpness was measured."""
     exact: Mapping[str, float]
     """Parameters of the exact model, to which the smaller models were fitted: values by name, in their units."""
     exact_uncertainty: Mapping[str, float]

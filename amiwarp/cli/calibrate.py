@@ -22,7 +22,7 @@ from amiwarp.io.atomic_output import check_output
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
     from amiwarp.calib.photometric.stage import PhotometricSettings
-    from amiwarp.calib.summaries import ModelChoice
+    from amiwarp.calib.summaries import ModelCandidate, ModelChoice
     from amiwarp.events.recording import Recording
 
 EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.png"
@@ -325,26 +325,19 @@ def _ladder(ladder: ModelChoice | None) -> list[Any]:
     """Return a table that compares the models, and the check of additional parameters, as lines of text."""
     if ladder is None:
         return []
+    measured = any(r.seen_px is not None for r in ladder.rungs)
     models = [
-        (r.model, r.numbers, f"{r.predicted_px:.4f} px", f"{r.sharpness:.5g}", f"{r.loss:.2g} ± {r.loss_std:.1g}",
-         _range(r.seen_px), f"{r.cost_ns:.3g} ns", ("chosen: " if r.chosen else "") + r.verdict)
+        (r.model, r.numbers, f"{r.predicted_px:.4f} px", *(_held_out(r) if measured else ()),
+         ("chosen: " if r.chosen else "") + r.verdict)
         for r in ladder.rungs
     ]  # fmt: skip
+    held_out = ("held-out sharpness", "loss", "loss as motion", "time per event") if measured else ()
+    agreement = f"predicted errors and held-out sharpness {'agree' if ladder.agreed else 'do not agree'}"
     freed = [(p.name, "" if p.std_px is None else f"{p.std_px:.2g} px", p.verdict) for p in ladder.parameters]
     return [
-        table(
-            models,
-            "model",
-            "parameters",
-            "predicted error",
-            "held-out sharpness",
-            "loss",
-            "loss as motion",
-            "time per event",
-            "verdict",
-        ),
-        f"budget {ladder.budget_px:.3g} px; blur from timing {ladder.timing_px:.2g} px; predicted errors and held-out "
-        f"sharpness {'agree' if ladder.agreed else 'do not agree'}",
+        table(models, "model", "parameters", "predicted error", *held_out, "verdict"),
+        f"budget {ladder.budget_px:.3g} px; blur from timing {ladder.timing_px:.2g} px"
+        + (f"; {agreement}" if measured else ""),
         *([table(freed, "additional parameter", "± std", "verdict")] if freed else []),
         *(_exact(ladder) if not any(r.chosen and r.model == "exact" for r in ladder.rungs) else []),
         "",
@@ -357,11 +350,15 @@ def _exact(ladder: ModelChoice) -> list[str]:
     return [f"the exact model's apex: {math.degrees(ladder.exact['apex']):.6g} ± {math.degrees(std):.2g} deg"]
 
 
-def _range(px: tuple[float, float]) -> str:
+def _held_out(r: ModelCandidate) -> tuple[str, ...]:
+    """Return a model's results on held-out turns as text; empty if it was not measured."""
     from amiwarp.calib.selection.trial import in_pixels
 
-    low, high = (max(x, 0.0) for x in px)
-    return f"{low:.3f} to {in_pixels(high)}"
+    if r.seen_px is None:
+        return ("",) * 4
+    low, high = (max(x, 0.0) for x in r.seen_px)
+    lost = f"{r.loss:.2g} ± {r.loss_std:.1g}"
+    return f"{r.sharpness:.5g}", lost, f"{low:.3f} to {in_pixels(high)}", f"{r.cost_ns:.3g} ns"
 
 
 def _photometric(c: Calibration) -> list[str]:

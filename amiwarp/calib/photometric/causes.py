@@ -38,9 +38,10 @@ class Cause:
         return CAUSES.index(self)
 
 
+CENTER = Cause("the principal point", ("center_x", "center_y"))
 CAUSES = (
     Cause("the focal length", ("focal_length",)),
-    Cause("the principal point", ("center_x", "center_y")),
+    CENTER,
     Cause("the flat side of the prism", (FLAT_SIDE,)),
     Cause("the lens distortion k1", ("k1",)),
     Cause("the direction of the prism's axis", ("tilt_x", "tilt_y")),

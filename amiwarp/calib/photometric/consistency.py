@@ -16,6 +16,7 @@ import numpy as np
 from amiwarp.calib.parameters import DRIFTS, LENS, RATES
 from amiwarp.calib.photometric.causes import (
     CAUSES,
+    CENTER,
     FLAT_SIDE,
     SCREENED,
     Cause,
@@ -100,6 +101,9 @@ class Consistency:
     """Share of the squared residuals that a slow rotation of the camera would remove; 0 if it is not significant."""
     untold_px: float
     """Error if the other side of the prism is the flat one [px rms], if the events do not tell which it is; else 0."""
+    center_px: tuple[float, float] | None = None
+    """Correction of the principal point, and its standard deviation, as displacements of events [px rms]; None if it is
+    free or cannot be tested."""
 
     def inconsistent_px(self) -> float:
         """Return the largest error that the check found [px].
@@ -171,6 +175,7 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         step=fit.fit(space.names).change, systematic=systematic, findings=tuple(findings),
         drift=_drift(space, best, fit), spread=_spread(space, best, fit),
         rotation_gain=_rotation_gain(space, fit), untold_px=_untold(space, best, fit),
+        center_px=_center(space, best, fit),
     )  # fmt: skip
 
 
@@ -287,6 +292,18 @@ def _rotation_gain(space: ParameterSpace, fit: LinearFit) -> float:
         return 0.0
     _, significance, gain = fit.adding(space.names, RATES)
     return gain if significance >= SIGNIFICANT else 0.0
+
+
+def _center(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, float] | None:
+    """Return the correction of the principal point and its standard deviation, as displacements of events [px rms]."""
+    if not set(CENTER.names) <= set(fit.names) - set(space.names):
+        return None
+    n = len(space.names)
+    estimate = fit.fit((*space.names, *CENTER.names))
+    # the unit of the search vector holds for the nominal prism
+    size = space.to_values(best)["apex"] / space.prism.apex
+    std = math.sqrt(float(np.trace(estimate.covariance[n:, n:])))
+    return size * float(np.linalg.norm(estimate.change[n:])), size * std
 
 
 def testable(space: ParameterSpace) -> list[Cause]:

@@ -140,6 +140,7 @@ def _final(search: AnswerSearch, answer: Answer, check: Consistency) -> Answer:
     result = replace(
         result, parameters=space.to_values(v),
         uncertainty=space.deviations(v, answer.covariance + systematic), rotation_gain=check.rotation_gain,
+        center_px=check.center_px,
     )  # fmt: skip
     accepted, reason = judge_consistency(check.inconsistent_px(), check.likeliest())
     if result.accepted and not accepted:

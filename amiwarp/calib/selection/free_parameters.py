@@ -11,14 +11,14 @@ import numpy as np
 from amiwarp.calib.parameters import MOTION
 from amiwarp.calib.photometric.gauss_newton import LEAST_CURVATURE, UNDETERMINED_PX
 from amiwarp.calib.result import Calibration
-from amiwarp.calib.selection.trial import LARGEST_MOTION_PX, SIGNIFICANT_STD, Trial, in_pixels
+from amiwarp.calib.selection.trial import LARGEST_MOTION_PX, SIGNIFICANT_STD, TILT, Trial, in_pixels, largest_tilt
 from amiwarp.calib.summaries import FreedParameter
 
 if TYPE_CHECKING:
     from amiwarp.calib.sharpness.search import Settings
     from amiwarp.events.recording import Recording
 
-GROUPS = {"clock_offset": ("clock_offset",), "tilt": ("tilt_x", "tilt_y"), "index": ("index",)}
+GROUPS = {"clock_offset": ("clock_offset",), "tilt": TILT, "index": ("index",)}
 """Parameters that the automatic calibration may free, in groups that are freed together."""
 REMEDY = {
     "clock_offset": "record at two speeds, or while the prism speeds up: at one speed it is part of the phase",
@@ -42,9 +42,9 @@ def candidate_names(recording: Recording, exact: Calibration) -> tuple[str, ...]
     return tuple(n for n in names if n != "clock_offset" or recording.encoder is not None)
 
 
-def judge_parameters(trial: Trial) -> tuple[FreedParameter, ...]:
-    """Decide for each group of the trial's parameters whether to free it, and whether a free rpm is determined."""
-    found = [_judge(trial, group) for group, members in GROUPS.items() if set(members) <= set(trial.space.names)]
+def judge_parameters(trial: Trial, names: tuple[str, ...]) -> tuple[FreedParameter, ...]:
+    """Decide for each group of the parameters ``names`` whether to free it, and whether a free rpm is determined."""
+    found = [_judge(trial, group) for group, members in GROUPS.items() if set(members) <= set(names)]
     if "rpm" in trial.exact.uncertainty:
         angle = trial.exact.uncertainty["rpm"] * (math.tau / 60e6) * trial.duration_us / math.sqrt(12.0)
         std = angle * trial.sample.motion_per_angle(trial.exact.model)
@@ -61,6 +61,8 @@ def judge_parameters(trial: Trial) -> tuple[FreedParameter, ...]:
 def _judge(trial: Trial, group: str) -> FreedParameter:
     """Decide whether to free a group: it must be determined, and held-out turns must become sharper with it."""
     space, members = trial.space, GROUPS[group]
+    if not set(members) <= set(space.names):
+        return _no_tilt(trial.exact)
     if not set(members) <= set(trial.tested):
         most = min(trial.motion_range(n) for n in members)
         return _undetermined(group, None, f"independently of apex and phase it moves events by at most {most:.2g} px")
@@ -83,6 +85,15 @@ def _judge(trial: Trial, group: str) -> FreedParameter:
         name=group, freed=wins, determined=True, std_px=std, gain_px=gain,
         verdict=f"{'freed' if wins else 'held'}: {evidence}",
     )  # fmt: skip
+
+
+def _no_tilt(exact: Calibration) -> FreedParameter:
+    """Return the decision on a tilt that the photometric stage has ruled out."""
+    assert exact.photometric is not None
+    assert exact.photometric.center_px is not None
+    verdict = f"held: the photometric stage finds that it moves events by at most {largest_tilt(exact):.3f} px"
+    std = exact.photometric.center_px[1]
+    return FreedParameter(name="tilt", freed=False, determined=True, std_px=std, gain_px=None, verdict=verdict)
 
 
 def _undetermined(group: str, std_px: float | None, why: str) -> FreedParameter:

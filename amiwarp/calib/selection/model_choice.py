@@ -1,8 +1,8 @@
 """Choice of the smallest model that a scene needs, and of the parameters that a recording determines.
 
 The exact model is calibrated. Each smaller model is fitted to its answer where the scene has events, which predicts the
-model's error. Held-out turns give independent evidence: each model is moved to its sharpest on half of the turns and
-measured on the other half.
+model's error. Held-out turns give independent evidence on a model that the prediction favours: it is moved to its
+sharpest on half of the turns and measured on the other half.
 """
 
 from __future__ import annotations
@@ -14,8 +14,16 @@ from typing import TYPE_CHECKING, Any
 
 from amiwarp.calib.result import Calibration
 from amiwarp.calib.selection import free_parameters
-from amiwarp.calib.selection.smaller_models import fit
-from amiwarp.calib.selection.trial import CONVERSION_FACTOR, Trial, in_pixels, make_trial, sharpness_answer
+from amiwarp.calib.selection.smaller_models import ellipse_error, fit
+from amiwarp.calib.selection.trial import (
+    CONVERSION_FACTOR,
+    TILT,
+    Trial,
+    accepted_photometric,
+    in_pixels,
+    make_trial,
+    sharpness_answer,
+)
 from amiwarp.calib.sharpness.held_out import gradient
 from amiwarp.calib.sharpness.objective import padding
 from amiwarp.calib.sharpness.search import Settings
@@ -67,7 +75,7 @@ def calibrate_auto(
     pick = next(k for k, f in enumerate(fitted) if f.candidate.chosen)
     chosen = express(trial, fitted[pick], settings, device)
     whole = time.perf_counter() - began
-    disagreements = [f.candidate for f in fitted[: pick + 1] if not _agree(trial, f.candidate)]
+    disagreements = [f.candidate for f in fitted if not _agree(trial, f.candidate)]
     choice = ModelChoice(
         budget_px=trial.budget_px,
         timing_px=trial.timing_px,
@@ -106,7 +114,7 @@ def _free_parameters(
     """
     names = free_parameters.candidate_names(recording, first) if settings.free is None else ()
     trial = make_trial(recording, first, settings, names, device=device, budget_px=budget_px)
-    parameters = free_parameters.judge_parameters(trial)
+    parameters = free_parameters.judge_parameters(trial, names)
     while more := free_parameters.freed_names(parameters):
         again = free_parameters.freed_settings(first, settings, more)
         try:
@@ -123,6 +131,8 @@ def _free_parameters(
 
 def _whole_image_warning(trial: Trial, chosen: Calibration) -> tuple[str, ...]:
     """Return a warning if the chosen model keeps the error budget at this recording's events only."""
+    if chosen.model_name == "exact":
+        return ()
     away = predicted_error(chosen.model, trial.exact.model).rms
     if away <= CONVERSION_FACTOR * trial.budget_px:
         return ()
@@ -143,68 +153,69 @@ class FittedCandidate:
 
 
 def fit_models(trial: Trial) -> tuple[FittedCandidate, ...]:
-    """Fit every model and measure it on held-out turns. The smallest model without an objection is the chosen one."""
-    target, sharp = (trial.sample.compensated(c.model) for c in (trial.exact, sharpness_answer(trial.exact)))
-    sharpest = trial.sharpest([0, 1])
-    reference = trial.test.each(trial.space, sharpest)
+    """Fit every model. The smallest one that keeps the budget is chosen, unless held-out turns object.
+
+    Models are measured on held-out turns only if that may change the choice, or if no photometric stage has confirmed
+    the exact model, and measuring shows whether the recording contradicts it.
+    """
+    target = trial.sample.compensated(trial.exact.model)
+    confirmed = accepted_photometric(trial.exact) is not None
     fitted: list[FittedCandidate] = []
     for name in MODELS:
+        values, predicted, held_out = dict(trial.exact.parameters), 0.0, None
+        found = any(f.candidate.chosen for f in fitted)
         if name in ("circle", "radial"):
             values, predicted = fit(trial.space_of(name, trial.exact), target, trial.sample)
-            held_out = _refined(trial, trial.space_of(name, sharpness_answer(trial.exact)), sharp)
+            if not found and (predicted <= trial.budget_px or not confirmed):
+                held_out = _refined(trial, name)
         elif name == "ellipse":
-            values, predicted, held_out = _as_ellipse(trial, sharpest)
-        else:
-            values, predicted, held_out = dict(trial.exact.parameters), 0.0, reference
-        found = any(f.candidate.chosen for f in fitted)
-        fitted.append(FittedCandidate(_candidate(trial, name, predicted, reference, held_out, found=found), values))
+            predicted = ellipse_error(trial.exact.model, trial.sample)
+        elif any(f.candidate.sharpness is not None for f in fitted):
+            held_out = trial.reference
+        fitted.append(FittedCandidate(_candidate(trial, name, predicted, held_out, found=found), values))
     return tuple(fitted)
 
 
-def _refined(trial: Trial, space: ParameterSpace, sharp: Vector) -> Vector:
+def _refined(trial: Trial, name: str) -> Vector:
     """Return the held-out sharpness of a smaller model, with the parameters that are sharpest on the training turns."""
-    values, _ = fit(space, sharp, trial.sample)
+    answer = sharpness_answer(trial.exact)
+    space = trial.space_of(name, answer)
+    values, _ = fit(space, trial.sample.compensated(answer.model), trial.sample)
     v = space.to_vector(values)
     step = trial.quadratic.restricted_to([0, 1]).step_to_maximum(gradient(trial.train, space, v))
     return trial.test.each(space, space.to_values(v + step))
 
 
-def _as_ellipse(trial: Trial, sharpest: Mapping[str, float]) -> tuple[dict[str, float], float, Vector]:
-    """Return the ellipse model's parameters, predicted error [px rms] and held-out sharpness.
+def _candidate(trial: Trial, name: str, predicted: float, held_out: Vector | None, *, found: bool) -> ModelCandidate:
+    """Return the summary of a candidate model; ``found``: whether a smaller model was chosen already.
 
-    Its parameters are those of the exact model.
+    ``held_out`` is the model's sharpness on the held-out turns, None if it was not measured.
     """
-    space = replace(trial.space, model="ellipse")
-    model = space.build(sharpest)
-    predicted = trial.sample.distance(model, trial.space.build(sharpest))
-    trial.train.each(space, sharpest, model)  # a second measurement of its time per event
-    return dict(trial.exact.parameters), predicted, trial.test.each(space, sharpest, model)
-
-
-def _candidate(
-    trial: Trial, name: str, predicted: float, reference: Vector, held_out: Vector, *, found: bool
-) -> ModelCandidate:
-    """Return the summary of a candidate model; ``found``: whether a smaller model was chosen already."""
-    mean, std, seen = trial.as_motion(reference - held_out)
-    chosen = predicted <= trial.budget_px and seen[0] <= trial.rejection_px and not found
+    sharpness = mean = std = seen = cost = None
+    if held_out is not None:
+        sharpness = float(held_out.mean())
+        mean, std, seen = trial.as_motion(trial.reference - held_out)
+        cost = 1e9 * min(half.fastest[name] for half in (trial.train, trial.test))
+    chosen = predicted <= trial.budget_px and not found and (seen is None or seen[0] <= trial.rejection_px)
     verdict = _verdict(trial, name, predicted, seen)
     if chosen or found:
         verdict = f"{'the smallest that keeps the budget' if chosen else 'larger than needed'}; {verdict}"
     numbers = NUMBERS[name]
-    if name == "exact" and any(trial.exact.parameters.get(n) for n in ("tilt_x", "tilt_y")):
+    if name == "exact" and any(trial.exact.parameters.get(n) for n in TILT):
         numbers = numbers.replace("2", "4")
-    cost = 1e9 * min(half.fastest[name] for half in (trial.train, trial.test))
     return ModelCandidate(
-        model=name, numbers=numbers, predicted_px=predicted, sharpness=float(held_out.mean()), loss=mean, loss_std=std,
+        model=name, numbers=numbers, predicted_px=predicted, sharpness=sharpness, loss=mean, loss_std=std,
         seen_px=seen, cost_ns=cost, chosen=chosen, verdict=verdict,
     )  # fmt: skip
 
 
-def _verdict(trial: Trial, name: str, predicted: float, seen: tuple[float, float]) -> str:
+def _verdict(trial: Trial, name: str, predicted: float, seen: tuple[float, float] | None) -> str:
     """Return a sentence that compares a model's predicted error with its error on held-out turns."""
     budget = trial.budget_px
     if name == "exact":
         return "the reference for the others"
+    if seen is None:
+        return f"{'under' if predicted <= budget else 'over'} the budget"
     if seen[1] < -trial.rejection_px:
         by = in_pixels(-seen[1])
         return f"sharper on held-out turns than the exact model, by {by}: check index, flat side and lens"
@@ -218,7 +229,9 @@ def _verdict(trial: Trial, name: str, predicted: float, seen: tuple[float, float
 
 
 def _agree(trial: Trial, candidate: ModelCandidate) -> bool:
-    """Return whether the held-out turns are consistent with the candidate's predicted error."""
+    """Return whether the held-out turns are consistent with the candidate's predicted error, if they were measured."""
+    if candidate.seen_px is None:
+        return True
     low, high = candidate.seen_px
     if candidate.predicted_px <= trial.budget_px:
         return -trial.rejection_px <= high and low <= trial.rejection_px

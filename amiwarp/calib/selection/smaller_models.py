@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.calib.parameters import EXACT_PARAMETERS, ParameterSpace, size_name
 from amiwarp.calib.space_setup import make_space
+from amiwarp.optics.displacement import wrap_angle
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,8 +31,10 @@ SAMPLED = 5_000
 SLOPE_PX = 0.25
 """Step of the finite differences in the search vector [px]."""
 STEPS = 2
-"""Number of Gauss-Newton steps that fit a model. The displacement is nearly linear: one step is accurate to 0.00001 px.
-"""
+"""Number of Gauss-Newton steps that fit a model, with the derivatives at the start. The displacement is nearly linear:
+one step is accurate to 0.00001 px."""
+TURN_ANGLES = 8
+"""Number of prism angles that give the mean and the first harmonic of a motion. Higher harmonics fall off quickly."""
 QUANTISATION_PX = 1.0 / math.sqrt(12.0)
 """Standard deviation of the error from rounding coordinates to whole pixels [px]."""
 CLOCK_US = 1.0 / math.sqrt(12.0)
@@ -64,7 +69,16 @@ class Places:
 
     def compensated(self, model: Model, ahead: float | NDArray[np.float64] = 0.0) -> NDArray[np.float64]:
         """Return the events' compensated coordinates [px], shape (n, 2), with ``ahead`` [rad] added to the angles."""
-        return model.compensate_points(self.xy, self.theta + ahead)
+        theta = _on_cpu(self.theta + ahead) if np.any(ahead) else self._given_theta
+        return np.asarray(model.compensate_points(self._given_xy, theta).numpy(), np.float64)
+
+    @cached_property
+    def _given_xy(self) -> Any:
+        return wp.array(self.xy, dtype=wp.vec2, device="cpu")
+
+    @cached_property
+    def _given_theta(self) -> Any:
+        return _on_cpu(self.theta)
 
     def distance(self, model: Model, other: Model, *, remove_lag: bool = False) -> float:
         """Return the rms distance of two models at the events [px].
@@ -82,6 +96,11 @@ class Places:
         """Return how far compensated events move per change of the prism angle [px rms per rad]."""
         h = 0.01
         return _rms(self.compensated(model, h) - self.compensated(model, -h)) / (2.0 * h)
+
+
+def _on_cpu(theta: NDArray[np.float64]) -> Any:
+    """Return angles [rad] as a Warp array, for CPU launches: a few thousand events are faster there than on a GPU."""
+    return wp.array(wrap_angle(theta), dtype=float, device="cpu")
 
 
 def _rms(shift: NDArray[np.float64]) -> float:
@@ -139,14 +158,24 @@ def fit(space: ParameterSpace, target: NDArray[np.float64], sample: Places) -> t
         return sample.compensated(space.build(space.to_values(v))) - target
 
     v = space.to_vector(space.start)
+    left = away(v)
+    slopes = [(away(v + h) - left) / SLOPE_PX for h in SLOPE_PX * np.eye(len(v))]
+    valid = np.isfinite(sum(slopes, left)).all(axis=1)
+    design = np.stack([slope[valid].ravel() for slope in slopes])
     for _ in range(STEPS):
+        v = v - np.linalg.solve(design @ design.T, design @ np.nan_to_num(left[valid]).ravel())
         left = away(v)
-        steps = SLOPE_PX * np.eye(len(v))
-        slopes = [(away(v + h) - away(v - h)) / (2.0 * SLOPE_PX) for h in steps]
-        valid = np.isfinite(sum(slopes, left)).all(axis=1)
-        design = np.stack([slope[valid].ravel() for slope in slopes], axis=1)
-        v = v - np.linalg.lstsq(design, left[valid].ravel(), rcond=None)[0]
-    return space.to_values(v), _rms(away(v))
+    return space.to_values(v), _rms(left)
+
+
+def ellipse_error(model: Model, sample: Places) -> float:
+    """Return the error of the ellipse model at the events [px rms]: the second and higher harmonics of the motion."""
+    turn = math.tau * np.arange(TURN_ANGLES) / TURN_ANGLES
+    xy, angles = np.repeat(sample.xy, len(turn), axis=0), (sample.theta[:, None] + turn).ravel()
+    path = model.compensate_points(xy, angles).reshape(-1, len(turn), 2)
+    # mean and first harmonic of the motion at each event's own angle, the first of the turn
+    ellipse = np.mean(path * (1.0 + 2.0 * np.cos(turn))[:, None], axis=1)
+    return _rms(path[:, 0] - ellipse)
 
 
 def independent_directions(space: ParameterSpace, v: NDArray[np.float64], sample: Places) -> NDArray[np.float64]:
@@ -165,8 +194,9 @@ def independent_directions(space: ParameterSpace, v: NDArray[np.float64], sample
     fields = np.array([at(h) - at(-h) for h in SLOPE_PX * np.eye(n)]) / (2.0 * SLOPE_PX)
     fields = fields[:, np.isfinite(fields).all(axis=(0, 2))].reshape(n, -1)
     directions = np.eye(n)
+    products = fields @ fields[:2].T
     for k in range(2, n):
-        reproduced = np.linalg.lstsq(fields[:2].T, fields[k], rcond=None)[0]
+        reproduced = np.linalg.lstsq(products[:2], products[k], rcond=None)[0]
         left = fields[k] - reproduced @ fields[:2]
         directions[k, :2] = -reproduced
         directions[k] /= max(float(np.sqrt(2.0 * np.mean(left**2))), 1e-9)

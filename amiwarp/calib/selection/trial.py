@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.result import Calibration
+    from amiwarp.calib.summaries import PhotometricSummary
     from amiwarp.events.recording import Recording
 
     Vector = NDArray[np.float64]
@@ -48,9 +50,19 @@ SEARCH_RANGE = {"clock_offset": 20_000.0, "tilt_x": math.radians(15.0), "tilt_y"
 """Half width of the tested range of each parameter that might be freed, in its unit (us, rad, 1)."""
 
 
+TILT = ("tilt_x", "tilt_y")
+"""Parameters of the direction of the prism's axis."""
+TILT_FACTOR = 2.0
+"""Factor by which a tilt may move events further than the correction of the principal point that it asks for: a tenth,
+for lenses of 20 to 90 deg. The rest is for the linearised fit, which may find too small changes."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Trial:
-    """Calibrated exact model, with the two halves of the events on which models are fitted and compared."""
+    """Calibrated exact model, with the two halves of the events on which models are fitted and compared.
+
+    The sharpness of the halves is measured when it is first used: most recordings do not need it.
+    """
 
     exact: Calibration
     """Calibration of the exact model, with which smaller models are compared."""
@@ -66,10 +78,8 @@ class Trial:
     """Largest tolerated error of a smaller model relative to the exact one [px rms]."""
     timing_px: float
     """Estimated blur from encoder noise, clock resolution and latency jitter [px rms]."""
-    train: HalfSharpness
-    """Sharpness of the training turns, on which models are fitted."""
-    test: HalfSharpness
-    """Sharpness of the held-out turns, on which models are compared."""
+    device: Any
+    """Device that measures sharpness."""
     space: ParameterSpace
     """Parameter space of the exact model in which all parameters that might be freed are free."""
     start: Vector
@@ -78,9 +88,32 @@ class Trial:
     """One search direction per parameter (see :func:`independent_directions`), shape ``(n, n)``."""
     tested: tuple[str, ...]
     """Parameters that move events measurably within their tested range: size, phase and possibly others."""
-    quadratic: Quadratic
-    """Quadratic approximation of the exact model's sharpness on the training turns, along the directions of ``tested``.
-    """
+
+    @cached_property
+    def _halves(self) -> tuple[HalfSharpness, ...]:
+        halves = split_turns(self.calibration_events)
+        return tuple(HalfSharpness(half, self.calibration_events, self.space, self.device) for half in halves)
+
+    @property
+    def train(self) -> HalfSharpness:
+        """Sharpness of the training turns, on which models are fitted."""
+        return self._halves[0]
+
+    @property
+    def test(self) -> HalfSharpness:
+        """Sharpness of the held-out turns, on which models are compared."""
+        return self._halves[1]
+
+    @cached_property
+    def quadratic(self) -> Quadratic:
+        """Quadratic approximation of the exact model's sharpness on the training turns, along all tested directions."""
+        rows = [self.space.names.index(n) for n in self.tested]
+        return Quadratic.about(self.train, self.space, self.start, self.directions[rows])
+
+    @cached_property
+    def reference(self) -> Vector:
+        """Sharpness of the exact model on the held-out turns, with the parameters sharpest on the training turns."""
+        return self.test.each(self.space, self.sharpest([0, 1]))
 
     @property
     def rejection_px(self) -> float:
@@ -137,10 +170,10 @@ def make_trial(
     device: Any,
     budget_px: float | None,
 ) -> Trial:
-    """Prepare the choice of a model: copy both halves of the events to the device, measure sharpness near ``exact``.
+    """Prepare the choice of a model: the places of events, and what the parameters that might be freed do there.
 
-    ``names`` are the parameters that might be freed. ``budget_px`` is the largest tolerated model error [px rms]; None:
-    :data:`SHARE` of the blur by quantisation and timing.
+    ``names`` are these parameters; the tilt is left out if it cannot exceed the budget. ``budget_px`` is the largest
+    tolerated model error [px rms]; None: :data:`SHARE` of the blur by quantisation and timing.
     """
     events = thin(rotation_window(recording, settings), settings.events)
     first, last = int(events.t[0]), int(events.t[-1])
@@ -153,26 +186,43 @@ def make_trial(
     duration = float(max(last - first, 1))
     speed = float(np.ptp(encoder.angle_at(events.t[[0, -1]]))) / duration
     sample = Places.of(events, encoder)
-    space = candidate_space("exact", sharpness_answer(exact), names, rad_per_us=speed, duration_us=duration)
-    space = _with_search_range(space)
-    train, test = (HalfSharpness(half, events_with_angles, space, device) for half in split_turns(events_with_angles))
-    start = space.to_vector(space.start)
-    rows = independent_directions(space, start, sample)
-    which = [k for k, n in enumerate(space.names) if _motion_range(space, rows, n) >= STEP_PX]
     timing = timing_blur(exact.model, sample, encoder, speed)
     budget = budget_px or SHARE * math.hypot(QUANTISATION_PX, timing)
+    if largest_tilt(exact) <= budget:
+        names = tuple(n for n in names if n not in TILT)
+    space = candidate_space("exact", sharpness_answer(exact), names, rad_per_us=speed, duration_us=duration)
+    space = _with_search_range(space)
+    start = space.to_vector(space.start)
+    rows = independent_directions(space, start, sample)
     return Trial(
         exact=exact, calibration_events=events_with_angles, sample=sample, rad_per_us=speed, duration_us=duration,
-        budget_px=budget, timing_px=timing, train=train, test=test, space=space, start=start, directions=rows,
-        tested=tuple(space.names[k] for k in which),
-        quadratic=Quadratic.about(train, space, start, rows[which]),
+        budget_px=budget, timing_px=timing, device=device, space=space, start=start, directions=rows,
+        tested=tuple(n for n in space.names if _motion_range(space, rows, n) >= STEP_PX),
     )  # fmt: skip
+
+
+def accepted_photometric(exact: Calibration) -> PhotometricSummary | None:
+    """Return the result of the photometric stage if it is the calibration's result, else None."""
+    p = exact.photometric
+    return p if p is not None and p.accepted else None
+
+
+def largest_tilt(exact: Calibration) -> float:
+    """Return how far a tilt of the prism's axis may move events [px rms]; infinite if only sharpness can show it.
+
+    A tilt would ask the photometric stage for another principal point.
+    """
+    p = accepted_photometric(exact)
+    if p is None or p.center_px is None:
+        return math.inf
+    moved, std = p.center_px
+    return TILT_FACTOR * (moved + SIGNIFICANT_STD * std)
 
 
 def sharpness_answer(exact: Calibration) -> Calibration:
     """Return the calibration with the sharpness stage's parameters, which are sharper than the photometric stage's."""
-    p = exact.photometric
-    if p is None or not p.accepted:
+    p = accepted_photometric(exact)
+    if p is None:
         return exact
     # parameters that only the photometric stage found stay; a camera rotation that was discarded stays discarded
     found = {n: x for n, x in p.sharpness_parameters.items() if n in exact.parameters and n not in DEGENERATE_WITH_APEX}
