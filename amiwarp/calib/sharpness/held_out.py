@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
     from amiwarp.events.events import Events
-    from amiwarp.optics.models import Model
 
     Vector = NDArray[np.float64]
 
@@ -74,11 +73,9 @@ class HalfSharpness:
         self.fastest: dict[str, float] = {}
         """Shortest measured time for one event's angle, displacement and vote [s], by name of the model."""
 
-    def each(self, space: ParameterSpace, values: Mapping[str, float], model: Model | None = None) -> Vector:
-        """Return the sharpness of each part, shape (PARTS,). ``model`` may give the already built model."""
-        model = model or space.build(values)
-        device = self._meter.device
-        model.params(device)  # build an ellipse's tables before the time is measured
+    def each(self, space: ParameterSpace, values: Mapping[str, float]) -> Vector:
+        """Return the sharpness of each part, shape (PARTS,)."""
+        model, device = space.build(values), self._meter.device
         self._votes.clear()
         wp.synchronize_device(device)
         began = time.perf_counter()
