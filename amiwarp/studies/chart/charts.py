@@ -37,7 +37,7 @@ USUAL, QUICK = (640, 480, 2.0), (320, 240, 0.2)
 CONTRAST = 0.54
 """Contrast threshold [log intensity] of the simulated sensor. With it the map of the earth gives ten million events in
 two seconds."""
-REPEATS = {"compensation": 5, "calibration": 3}
+REPEATS = {"compensation": 5, "calibration": 7}
 """Number of repeated measurements of each setting, by chart."""
 
 
