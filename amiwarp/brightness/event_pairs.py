@@ -81,7 +81,10 @@ class PairSet:
 
     @property
     def some_times(self) -> NDArray[np.float64]:
-        """Times of evenly chosen pairs, at least :data:`SAMPLED` of them if there are so many, shape (2, m)."""
+        """Times of some pairs, evenly chosen [s], shape (2, m).
+
+        At least :data:`SAMPLED` pairs are chosen; all, if there are fewer.
+        """
         every = max(1, len(self) // SAMPLED)
         values: NDArray[np.float32] = self.arrays.time.reshape((2, -1))[:, : len(self) : every].numpy()
         return values.astype(np.float64)

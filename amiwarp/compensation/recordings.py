@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 DEFAULT_BLOCK = 1 << 20
 """Number of events per block if the caller does not give one."""
 PIECE = 4 * CHUNK
-"""Number of events that a thread reads, compensates and writes at a time: so many that threads rarely wait for each
-other, so few that they need little memory."""
+"""Number of events that a thread reads, compensates and writes at a time. With fewer, threads wait more often for
+Python's lock; more events need more memory."""
 
 
 @dataclass(frozen=True, slots=True)
