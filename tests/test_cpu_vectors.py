@@ -13,9 +13,10 @@ from amiwarp.brightness.solver import BrightnessMap, Smoothness
 from amiwarp.brightness.tiles import Tiles
 from amiwarp.events.recording import Recording
 from amiwarp.kernels import conjugate_gradients as cg
-from amiwarp.kernels import multilevel, normal_equations
+from amiwarp.kernels import equation_blocks, multilevel, normal_equations
 from amiwarp.kernels.map_prior import Prior
 from amiwarp.kernels.pair_chains import weigh_chains
+from amiwarp.kernels.residual_slopes import slope_between
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import RadialTangential
@@ -53,8 +54,7 @@ def test_sums_over_blocks_of_pairs(placed: BrightnessMap, name: str) -> None:
     wp.launch(weigh_chains, at.chains.blocks, [weight, 0], [at.chains.arrays], device="cpu")
     vectors = {"add_diagonal": [], "apply_transpose": [placed.residuals.values], "apply_normal": [placed._image]}[name]
     one = summed(placed, getattr(normal_equations, name), placed.count, [at.geometry, weight, *vectors])
-    blocks = getattr(normal_equations, f"{name}_blocks")
-    other = summed(placed, blocks, at.chains.blocks, [at.chains.arrays, weight, *vectors])
+    other = summed(placed, getattr(equation_blocks, name), at.chains.blocks, [at.chains.arrays, weight, *vectors])
     assert np.count_nonzero(one) > 1000
     np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-4)
 
@@ -73,6 +73,24 @@ def test_residuals_over_blocks_of_pairs(placed: BrightnessMap) -> None:
     other = wp.zeros(stride, dtype=float, device="cpu")
     placed._subtract(placed._image, other)
     np.testing.assert_allclose(other.numpy()[:n], rest.numpy()[:n], rtol=1e-5, atol=1e-5)
+
+
+def test_slopes_over_blocks_of_pairs(placed: BrightnessMap, recording: Recording) -> None:
+    at, n = placed._at, placed.count
+    assert recording.camera is not None
+    sides = [
+        {"model": ExactModel(recording.camera, TRUE_PRISM, TRUE_PHASE + shift), "drift": 0.0, "camera_rotation": None}
+        for shift in (0.01, -0.01)
+    ]
+    slope = placed.find_slope(*sides, 0.02).numpy()[:n]
+    plus, minus = at._sides
+    inputs = [placed.pairs.arrays, placed._atlas, plus, minus, placed._image, 0.02, 0]
+    for side, values in zip((plus, minus), sides, strict=True):
+        at._place(**values, out=side)
+    other = wp.zeros(placed.pairs.arrays.stride, dtype=float, device="cpu")
+    wp.launch(slope_between, n, inputs, [other], device="cpu")
+    assert 1000 < np.count_nonzero(slope) < n  # some pairs are off the map
+    np.testing.assert_allclose(slope, other.numpy()[:n], rtol=1e-4, atol=2e-4)
 
 
 @pytest.mark.parametrize("linked", [False, True])

@@ -11,7 +11,7 @@ from amiwarp.imaging.sharpness_costs import PAPER_ETA, gaussian, sharpness
 
 @pytest.fixture
 def image() -> np.ndarray:
-    return np.random.default_rng(0).poisson(3.0, (40, 50)).astype(np.float32)
+    return np.random.default_rng(0).poisson(3.0, (40, 150)).astype(np.float32)
 
 
 def reference(image: np.ndarray, kind: Sharpness) -> float:

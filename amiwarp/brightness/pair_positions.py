@@ -13,7 +13,7 @@ from amiwarp.kernels import map_positions as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.pairs import keep_nodes
 from amiwarp.kernels.photometric import Geometry
-from amiwarp.kernels.residual_slopes import slope_between
+from amiwarp.kernels.residual_slopes import slope_between, slope_of_changes
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
@@ -35,6 +35,7 @@ class PairPositions:
         """Positions: the kernels' struct ``Geometry``."""
         self.chains = PairChains(pairs.arrays.stride, self.device)
         """The same in chains, on a CPU."""
+        self._nothing = wp.empty(0, dtype=float, device=self.device)
 
     def _new_geometry(self) -> Any:
         g = Geometry()
@@ -48,33 +49,61 @@ class PairPositions:
         self._place(model, drift, camera_rotation, self.geometry)
         self.chains.join(self.geometry)
 
-    def _place(self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any) -> None:
-        """Compute the positions into ``out``."""
-        arrays, pinhole = self.pairs.arrays, pinhole_params(model.camera)
-        turn = (camera_rotation or CameraRotation()).about(self._middle_us)
-        moves = arrays.slope.shape[0] > 0 or any((*turn.angular_velocity, *turn.angular_acceleration))
-        slow = arrays.lag.shape[0] > 0
-        if pinhole is None or slow or (moves and not self.device.is_cpu):
+    def _place(
+        self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any, image: Any = None
+    ) -> None:
+        """Compute the positions into ``out``.
+
+        With the map ``image``, on a CPU and if :meth:`_in_blocks`, ``out`` gets the changes of brightness instead.
+        """
+        arrays, turn = self.pairs.arrays, self._turn(camera_rotation)
+        if not self._in_blocks(model, turn):
             inputs = [model.params(self.device), model_camera(model, self.device), arrays, self._atlas]
             launch(kernels.place_pairs, arrays.stride, [*inputs, drift, turn.params()], [out], device=self.device)
             return
-        inputs = [model.params(self.device), pinhole, arrays, self._atlas]
-        if self.device.is_cpu:
-            inputs += [drift, turn.params()]
-            launch(kernels.place_blocks, self.chains.blocks, inputs, [out], device=self.device, smallest=FEW_BLOCKS)
-        else:
+        inputs = [model.params(self.device), pinhole_params(model.camera), arrays, self._atlas]
+        if not self.device.is_cpu:
             launch(kernels.place_still, arrays.stride, inputs, [out], device=self.device)
+            return
+        inputs += [drift, turn.params(), self._nothing if image is None else image]
+        outputs = [out, self._nothing] if image is None else [self.geometry, out]
+        launch(kernels.place_blocks, self.chains.blocks, inputs, outputs, device="cpu", smallest=FEW_BLOCKS)
+
+    def _turn(self, camera_rotation: CameraRotation | None) -> CameraRotation:
+        return (camera_rotation or CameraRotation()).about(self._middle_us)
+
+    def _in_blocks(self, model: Model, turn: CameraRotation) -> bool:
+        """Return whether the fast kernels apply: no distortion, no slow pixels, and on CUDA only the prism moves."""
+        arrays = self.pairs.arrays
+        moves = arrays.slope.shape[0] > 0 or any((*turn.angular_velocity, *turn.angular_acceleration))
+        return (
+            pinhole_params(model.camera) is not None
+            and not arrays.lag.shape[0]
+            and not (moves and not self.device.is_cpu)
+        )
 
     @cached_property
     def _sides(self) -> tuple[Any, Any]:
         """Buffers for the positions at two more parameter values, for finite differences."""
         return self._new_geometry(), self._new_geometry()
 
+    @cached_property
+    def _changes(self) -> tuple[Any, Any]:
+        """Buffers for the changes of brightness at two parameter values, for finite differences."""
+        plus, minus = (wp.empty(self.geometry.stride, dtype=float, device=self.device) for _ in "+-")
+        return plus, minus
+
     def find_slope(self, plus: dict[str, Any], minus: dict[str, Any], width: float, image: Any) -> Any:
         """Return the derivative of the residuals for the map ``image``; see :meth:`BrightnessMap.find_slope`."""
-        for side, at in zip(self._sides, (plus, minus), strict=True):
-            self._place(at["model"], at["drift"], at["camera_rotation"], side)
+        both = (plus, minus)
         out = wp.zeros(self.pairs.arrays.stride, dtype=float, device=self.device)
+        if self.device.is_cpu and all(self._in_blocks(at["model"], self._turn(at["camera_rotation"])) for at in both):
+            for change, at in zip(self._changes, both, strict=True):
+                self._place(**at, out=change, image=image)
+            launch(slope_of_changes, len(self.pairs), [*self._changes, width], [out], device="cpu")
+            return out
+        for side, at in zip(self._sides, both, strict=True):
+            self._place(**at, out=side)
         inputs = [self.pairs.arrays, self._atlas, *self._sides, image, width]
         launch(slope_between, len(self.pairs), inputs, [out], device=self.device)
         return out

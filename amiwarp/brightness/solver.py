@@ -17,10 +17,10 @@ import warp as wp
 from amiwarp.brightness.multigrid import GridHierarchy
 from amiwarp.brightness.pair_chains import FEW_BLOCKS
 from amiwarp.brightness.pair_positions import PairPositions
-from amiwarp.brightness.residuals import CHUNKS, Residuals
+from amiwarp.brightness.residuals import Residuals
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import conjugate_gradients as cg
-from amiwarp.kernels import normal_equations as kernels
+from amiwarp.kernels import equation_blocks, normal_equations
 from amiwarp.kernels.conjugate_gradients import add_multiple, dot, gather, gather_diagonal
 from amiwarp.kernels.launch import launch, slice_count
 from amiwarp.kernels.map_prior import EXTRA, Prior, link
@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from amiwarp.brightness.tiles import Tiles
     from amiwarp.optics.models import Model
 
+FEW_CHUNKS = 16
+"""Smallest number of chunks of the unknowns for which a second CPU thread is used. Fewer take less time than the
+hand-over to a thread."""
 DAMPING = 0.02
 """Weight of the squared map values relative to the equations. It determines unknowns that no equation does."""
 CONTRAST = 6.0
@@ -85,6 +88,7 @@ class BrightnessMap:
             raise AmiwarpError("no pixel fired twice in time, so no brightness can be found; give a longer recording")
         self.device, self.tiles, self.count = wp.get_device(pairs.device), tiles, len(pairs)
         self.pairs, self.middle_us, self.smoothness = pairs, middle_us, smoothness
+        self._kernels = equation_blocks if self.device.is_cpu else normal_equations
         self._atlas = Atlas()
         self._atlas.origin = wp.array(tiles.origin.ravel(), dtype=float, device=self.device)
         self._atlas.rows, self._atlas.columns, self._atlas.density = tiles.rows, tiles.columns, tiles.density
@@ -194,37 +198,35 @@ class BrightnessMap:
         """Prepare :meth:`unexplained` with the weights that the last :meth:`solve` set."""
         self._prepare.run()
 
-    def new_change(self) -> Any:
-        """Return a change of the map that is zero, on the device, as a start for :meth:`unexplained`."""
-        return self._zeros(len(self._image))
-
     def add(self, change: Any, factor: float) -> None:
         """Add a change of the map times a factor to the map."""
         launch(add_multiple, len(change), [change, factor], [self._image], device=self.device)
 
-    def unexplained(self, target: Any, change: Any, *, steps: int) -> Any:
-        """Return the part of ``target`` (pairs, on the device) that no change of the map explains.
+    def unexplained(self, target: Any, change: Any = None, *, steps: int) -> tuple[Any, Any]:
+        """Return the part of ``target`` (pairs, on the device) that no change of the map explains, and the change.
 
         This is the projection of variable projection (Golub and Pereyra 1973). It is solved by conjugate gradients that
-        start from ``change``, which is replaced by the better solution.
+        start from ``change``, or from none.
         """
-        wp.copy(self._projection.image, change)
         wp.copy(self._projection.residual, target)
-        self._subtract(self._projection.image, self._projection.residual)
+        if change is None:
+            self._projection.image.zero_()
+        else:
+            wp.copy(self._projection.image, change)
+            self._subtract(change, self._projection.residual)
         self._projection.run(steps)
-        wp.copy(change, self._projection.image)
-        rest = wp.clone(target)
+        change, rest = wp.clone(self._projection.image), wp.clone(target)
         self._subtract(change, rest)
-        return rest
+        return rest, change
 
     def _subtract(self, vector: Any, residual: Any) -> None:
         """Subtract the left sides of the equations, for a ``vector`` of unknowns, from ``residual``."""
         at, given = self._at, [self.pairs.arrays, self._atlas, self._at.geometry]
         if self.device.is_cpu:
             inputs = [*given, at.chains.arrays, vector]
-            launch(kernels.subtract_blocks, at.chains.blocks, inputs, [residual], device="cpu", smallest=FEW_BLOCKS)
+            launch(self._kernels.subtract, at.chains.blocks, inputs, [residual], device="cpu", smallest=FEW_BLOCKS)
         else:
-            launch(kernels.subtract, self.count, [*given, vector], [residual], device=self.device)
+            launch(self._kernels.subtract, self.count, [*given, vector], [residual], device=self.device)
 
     @cached_property
     def _weigh(self) -> Any:
@@ -234,19 +236,20 @@ class BrightnessMap:
         return program
 
     def _add_weigh(self, program: Any) -> None:
-        inputs, out = [self._image, self._scale], [self.residuals.weight, self.residuals.values]
+        out = [self.residuals.weight, self.residuals.values]
+        given, unknowns = [self.pairs.arrays, self._atlas, self._at.geometry], [self._image, self._scale]
         if self.device.is_cpu:
-            inputs = [self.pairs.arrays, self._atlas, self._at.geometry, self._at.chains.arrays, *inputs]
-            program.add(kernels.weigh_blocks, self._at.chains.blocks, inputs, out, smallest=FEW_BLOCKS)
+            inputs = [*given, self._at.chains.arrays, *unknowns]
+            program.add(self._kernels.weigh, self._at.chains.blocks, inputs, out, smallest=FEW_BLOCKS)
         else:
-            program.add(kernels.weigh, self.count, [self.pairs.arrays, self._atlas, self._at.geometry, *inputs], out)
+            program.add(self._kernels.weigh, self.count, [*given, *unknowns], out)
 
-    def _add_sums(self, program: Any, kernel: Any, on_blocks: Any, *vectors: Any) -> None:
-        """Add a step that sums up over the weighted equations: ``on_blocks`` on a CPU, else ``kernel``."""
+    def _add_sums(self, program: Any, kernel: Any, *vectors: Any) -> None:
+        """Add a step that sums up over the weighted equations."""
         where = self._at.chains.arrays if self.device.is_cpu else self._at.geometry
         inputs = [self.pairs.arrays, self._atlas, where, self.residuals.weight, *vectors]
         if self.device.is_cpu:
-            program.add_slices(on_blocks, self._at.chains.blocks, inputs, self._slices, smallest=FEW_BLOCKS)
+            program.add_slices(kernel, self._at.chains.blocks, inputs, self._slices, smallest=FEW_BLOCKS)
         else:
             program.add_slices(kernel, self.count, inputs, self._slices)
 
@@ -258,7 +261,7 @@ class BrightnessMap:
             inputs = [self._image, self.tiles.rows, self.smoothness.edge, self._prior]
             program.add(link, self.tiles.nodes, inputs, [self._prior.right, self._prior.down])
         self._at.chains.add_weights(program, self.residuals.weight)
-        self._add_sums(program, kernels.add_diagonal, kernels.add_diagonal_blocks)
+        self._add_sums(program, self._kernels.add_diagonal)
         program.add(gather_diagonal, len(self._image), [self._sums, self._prior], [self._u.diagonal])
         return program
 
@@ -306,7 +309,7 @@ class BrightnessMap:
         program = Program(self.device)
         self._add_weigh(program)
         self._at.chains.add_weights(program, self.residuals.weight)
-        self._add_sums(program, kernels.add_diagonal, kernels.add_diagonal_blocks)
+        self._add_sums(program, self._kernels.add_diagonal)
         out = self._zeros(len(self._image))
         program.add(gather, len(out), [self._sums], [out])
         program.launch()
@@ -340,7 +343,7 @@ class _ConjugateGradients:
 
     def _add_start(self, program: Any) -> None:
         of = self._map
-        of._add_sums(program, kernels.apply_transpose, kernels.apply_transpose_blocks, self.residual)
+        of._add_sums(program, of._kernels.apply_transpose, self.residual)
         self._add(program, cg.start_descent, [of._sums, of._prior, self.image], [of._u, of._dots])
         self._correct(program)
 
@@ -350,7 +353,7 @@ class _ConjugateGradients:
             self._add(program, cg.update_search_direction, [], [of._u, of._dots])
         else:
             self._add(program, cg.update_search_direction_with, [of._z], [of._u, of._dots])
-        of._add_sums(program, kernels.apply_normal, kernels.apply_normal_blocks, of._u.direction)
+        of._add_sums(program, of._kernels.apply_normal, of._u.direction)
         self._add(program, cg.finish_product, [of._sums, of._prior], [of._u, of._dots])
         self._add(program, cg.descend, [], [self.image, of._u, of._dots])
         self._correct(program)
@@ -363,4 +366,4 @@ class _ConjugateGradients:
             self._add(program, dot, [of._u.residual, of._z], [of._dots.rz])
 
     def _add(self, program: Any, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        program.add(kernel, self._map._threads, [*inputs, self._map._width], outputs, smallest=CHUNKS)
+        program.add(kernel, self._map._threads, [*inputs, self._map._width], outputs, smallest=FEW_CHUNKS)

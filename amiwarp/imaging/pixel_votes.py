@@ -40,17 +40,19 @@ class PixelVotes:
         self._slices = [self._sums[k] for k in range(self._sums.shape[0])]
         self._totals = wp.empty(0, dtype=wp.int64, device="cpu")
         self._room = CAPACITY  # number of events that the sums can still take
+        self._stale = False  # whether the sums are to be cleared before they are used
         self._reader: tuple[Image, Program] | None = None
         """Image that was read last, and the recorded launch that reads it."""
 
     def clear(self) -> None:
-        """Discard all votes."""
-        self._clear_sums()
+        """Discard all votes. The next vote clears the sums, each in the thread that adds to it."""
+        self._stale = True
         self._totals = wp.empty(0, dtype=wp.int64, device="cpu")
         self._room = CAPACITY
 
     def _clear_sums(self) -> None:
         run_together([one.zero_ for one in self._slices])
+        self._stale = False
 
     def add_events(self, inputs: list[Any], events: UploadedEvents, camera_rotation: Any | None) -> None:
         """Vote events. ``inputs``: model, camera, columns of the events and canvas, as the kernels take them."""
@@ -69,6 +71,8 @@ class PixelVotes:
 
         def vote_range(first: int, blocks: int) -> None:
             self._reserve(blocks * int(BLOCK))
+            if self._stale:
+                self._clear_sums()
             vote(first, blocks)
 
         return vote_range
@@ -81,7 +85,9 @@ class PixelVotes:
         for first in range(0, blocks, piece):
             n = min(piece, blocks - first)
             self._reserve(total if n == blocks else CAPACITY)
-            launch_slices(kernel, n, [*inputs, count], self._slices, first=first, smallest=SMALLEST)
+            columns = [*inputs, count]
+            launch_slices(kernel, n, columns, self._slices, first=first, smallest=SMALLEST, clear=self._stale)
+            self._stale = False
 
     def _reserve(self, events: int) -> None:
         """Make room for the votes of a number of events."""
@@ -89,12 +95,14 @@ class PixelVotes:
             if not len(self._totals):
                 self._totals = wp.zeros(self._cells, dtype=wp.int64, device="cpu")
             launch(add_sums, self._cells, [self._sums], [self._totals], device="cpu")
-            self._clear_sums()
+            self._stale = True
             self._room = CAPACITY
         self._room -= events
 
     def read(self, image: Image) -> None:
         """Write the current image [events] to ``image``; the votes are kept."""
+        if self._stale:
+            self._clear_sums()
         inputs = [self._sums, self._totals, self._canvas, image.frame]
         if len(self._totals):
             launch(read_sums, image.blocks, inputs, [image.pixels], device="cpu", smallest=SMALLEST)

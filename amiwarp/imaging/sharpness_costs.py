@@ -44,7 +44,6 @@ class SharpnessMeter:
         self.image = Image(canvas, len(weights), self.device)
         """Image whose sharpness is measured [events per pixel]; the caller writes its pixels."""
         self._weights = wp.array(weights, dtype=float, device=device)
-        self._half, self._smooth = (wp.zeros_like(self.image.pixels) for _ in range(2))
         layers, rows, columns = canvas.shape
         self._parts = canvas.parts
         self._n = layers // canvas.parts * rows * columns
@@ -72,14 +71,23 @@ class SharpnessMeter:
         """Yield each kernel with its number of threads, inputs, output, and the fewest threads of a CPU slice."""
         smoothed, frame, width = self.image.pixels, self.image.frame, self.image.width
         taps = len(self._weights)
+        if self.device.is_cpu and self.kind is Sharpness.VARIANCE and 1 < taps <= kernels.MOST_UNROLLED:
+            kernel, inputs = kernels.smooth_and_sum(taps), [smoothed, self._weights, frame]
+            yield kernel, self._sums.size, inputs, self._sums.flatten(), 64
+            return
         if taps > 1:
             unrolled = self.device.is_cuda and taps <= kernels.MOST_UNROLLED
             smooth = kernels.smooth_few(taps) if unrolled else kernels.smooth(width)
-            for step, out in ((1, self._half), (frame.stride, self._smooth)):
+            for step, out in zip((1, frame.stride), self._smoothed, strict=True):
                 yield smooth, self.image.blocks, [smoothed, self._weights, step, frame], out, 512
                 smoothed = out
         kernel = kernels.sum_terms(width, list(Sharpness).index(self.kind))
         yield kernel, self._sums.size, [smoothed, frame, PAPER_ETA], self._sums.flatten(), 64
+
+    @cached_property
+    def _smoothed(self) -> list[Any]:
+        """Buffers for the image, smoothed along rows and along both axes."""
+        return [wp.zeros_like(self.image.pixels) for _ in range(2)]
 
     @cached_property
     def _program(self) -> Program:

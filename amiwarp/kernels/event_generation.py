@@ -18,7 +18,8 @@ from amiwarp.kernels.prism_view import (
     texels_ahead,
 )
 
-wp.set_module_options({"enable_backward": False})
+OPTIONS = {"enable_backward": False}
+wp.set_module_options(OPTIONS)
 
 TICKS = wp.constant(16)  # ticks per microsecond
 HALF_TICKS = wp.constant(8)
@@ -305,7 +306,7 @@ def shift_times(p: Pixel, passed: wp.int64) -> Pixel:
     return p
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)  # so that each device compiles only what it runs
 def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), start: int, sink: Sink):
     """Advance one pixel per thread through all steps of a chunk."""
     i = start + wp.tid()
@@ -321,7 +322,7 @@ def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(
     pixels[i] = shift_times(p, t0)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def run_pixels_ahead(
     view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), start: int, sink: Sink
 ):

@@ -241,6 +241,21 @@ def other_term(kind: int, h: float, eta: float) -> float:
     return wp.where(h > 0.0, h * wp.log(wp.max(h, 1.0e-30)), 0.0)
 
 
+@wp.func
+def strip_row(frame: Frame, block: int) -> int:
+    """Return the first row of a block of a strip, in its layer."""
+    return ((block / frame.blocks) % ((frame.rows + STRIP - 1) / STRIP)) * STRIP
+
+
+@wp.func
+def sum_of(total: wp.array(dtype=float), terms: wp.array(dtype=float), columns: int) -> wp.vec2d:
+    """Return the sums of the first ``columns`` elements of both arrays."""
+    both = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
+    for k in range(columns):
+        both += wp.vec2d(wp.float64(total[k]), wp.float64(terms[k]))
+    return both
+
+
 @cache
 def sum_terms(width: int, kind: int) -> Any:
     """Return the kernel that sums the image and its sharpness terms over ``width`` columns of a strip of rows."""
@@ -260,21 +275,61 @@ def sum_terms(width: int, kind: int) -> Any:
     def sum_terms(image: wp.array(dtype=float), frame: Frame, eta: float, start: int, sums: wp.array(dtype=wp.vec2d)):
         block = start + wp.tid()
         at = block_start(frame, block, width, STRIP)
-        column = block_column(frame, block, width)
-        row = ((block / frame.blocks) % ((frame.rows + STRIP - 1) / STRIP)) * STRIP
         total = wp.zeros(shape=(width,), dtype=float)
         terms = wp.zeros(shape=(width,), dtype=float)
-        for line in range(wp.min(STRIP, frame.rows - row)):
+        for line in range(wp.min(STRIP, frame.rows - strip_row(frame, block))):
             for k in range(width):
                 i = at + line * frame.stride + k
                 store_float(total, k, load_float(total, k) + load_float(image, i))
                 store_float(terms, k, load_float(terms, k) + term(image, i, frame.stride, eta))
-        both = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
-        for k in range(wp.min(width, frame.columns - column)):
-            both += wp.vec2d(wp.float64(total[k]), wp.float64(terms[k]))
-        sums[block] = both
+        sums[block] = sum_of(total, terms, wp.min(width, frame.columns - block_column(frame, block, width)))
 
     return sum_terms
+
+
+@cache
+def smooth_and_sum(taps: int) -> Any:
+    """Return the kernel for CPUs that smooths an image by ``taps`` weights and sums it and its squares.
+
+    The sums are those of :func:`smooth` and :func:`sum_terms` for the variance, to the last bit. The smoothed image is
+    not stored.
+    """
+    width, halo = int(CPU_WIDTH), taps - 1
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def smooth_and_sum(
+        image: wp.array(dtype=float),
+        weights: wp.array(dtype=float),
+        frame: Frame,
+        start: int,
+        sums: wp.array(dtype=wp.vec2d),
+    ):
+        block = start + wp.tid()
+        rows = wp.min(STRIP, frame.rows - strip_row(frame, block))
+        first = block_start(frame, block, width, STRIP) - halo * frame.stride
+        half = wp.zeros(shape=(wp.static(width * (int(STRIP) + 2 * halo)),), dtype=float)
+        for line in range(rows + 2 * halo):
+            at = first + line * frame.stride
+            to = line * width
+            for k in range(width):
+                h = weights[0] * load_float(image, at + k)
+                for tap in range(1, taps):
+                    h += weights[tap] * (load_float(image, at + k - tap) + load_float(image, at + k + tap))
+                store_float(half, to + k, h)
+        total = wp.zeros(shape=(width,), dtype=float)
+        terms = wp.zeros(shape=(width,), dtype=float)
+        for line in range(rows):
+            at = (line + halo) * width
+            for k in range(width):
+                h = weights[0] * load_float(half, at + k)
+                for tap in range(1, taps):
+                    both = load_float(half, at + k - tap * width) + load_float(half, at + k + tap * width)
+                    h += weights[tap] * both
+                store_float(total, k, load_float(total, k) + h)
+                store_float(terms, k, load_float(terms, k) + h * h)
+        sums[block] = sum_of(total, terms, wp.min(width, frame.columns - block_column(frame, block, width)))
+
+    return smooth_and_sum
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)  # for CUDA only

@@ -194,21 +194,25 @@ def launch_slices(
     *,
     first: int = 0,
     smallest: int = SMALLEST_SLICE,
+    clear: bool = False,
 ) -> None:
     """Run a kernel on a CPU as :func:`launch` does, but let slice k write into ``outputs[k]`` only.
 
-    For kernels whose threads add to the same elements. The range is ``range(first, first + n)``.
+    For kernels whose threads add to the same elements. The range is ``range(first, first + n)``. With ``clear``, all
+    outputs are first set to zero, by the threads that write into them.
     """
     device, ranges = wp.get_device("cpu"), slices(n, len(outputs), smallest)
     kernel = specialised(kernel, inputs)
     load(kernel, device)
 
-    def run(job: tuple[tuple[int, int], Any]) -> None:
-        (start, stop), out = job
-        wp.launch(kernel, dim=stop - start, inputs=[*inputs, first + start], outputs=[out], device=device)
+    def run(out: Any, start: int, stop: int) -> None:
+        if clear:
+            out.zero_()
+        if stop > start:
+            wp.launch(kernel, dim=stop - start, inputs=[*inputs, first + start], outputs=[out], device=device)
 
-    jobs = list(zip(ranges, outputs, strict=False))
-    run_together([partial(run, job) for job in jobs])
+    ranges += [(0, 0)] * (len(outputs) - len(ranges) if clear else 0)
+    run_together([partial(run, out, *span) for span, out in zip(ranges, outputs, strict=False)])
 
 
 class RecordedLaunch:

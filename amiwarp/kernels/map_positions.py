@@ -4,8 +4,8 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
-from amiwarp.kernels.pair_chains import BLOCK
+from amiwarp.kernels.camera import NAN, CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
+from amiwarp.kernels.pair_chains import BLOCK, interpolate
 from amiwarp.kernels.photometric import Atlas, Geometry, Pairs
 from amiwarp.kernels.plain_models import is_plain, plain
 from amiwarp.kernels.refraction import compensate, displace
@@ -216,6 +216,23 @@ def undo_rotations(
 
 
 @wp.func
+def compensate_block(
+    model: Any, camera: PinholeParams, pairs: Pairs, drift: float, camera_rotation: CameraRotationParams, k: int,
+    first: int, x: wp.array(dtype=float), y: wp.array(dtype=float),
+):  # fmt: skip
+    """Compute the compensated positions [px] of the first (k = 0) or second events of a block of pairs."""
+    drifts = wp.min(pairs.slope.shape[0], 1)
+    if drifts == 1:
+        drift_block(model, pairs, drift, k, first, x, y)
+    if is_plain(model) == 1:
+        displace_block(plain(model), camera, pairs, k, first, drifts, x, y)
+    else:
+        displace_block(model, camera, pairs, k, first, drifts, x, y)
+    if wp.length_sq(camera_rotation.velocity) + wp.length_sq(camera_rotation.acceleration) > 0.0:
+        undo_rotations(camera, camera_rotation, pairs, k, first, x, y)
+
+
+@wp.func
 def load_origins(atlas: Atlas, pairs: Pairs, first: int, left: wp.array(dtype=float), top: wp.array(dtype=float)):
     """Load the origins of the tiles of a block of pairs.
 
@@ -247,21 +264,48 @@ def find_nodes(
 
 
 @wp.func
-def store_block(
-    geometry: Geometry, atlas: Atlas, pairs: Pairs, first: int, ax: wp.array(dtype=float), ay: wp.array(dtype=float),
-    bx: wp.array(dtype=float), by: wp.array(dtype=float),
+def find_block_nodes(
+    atlas: Atlas, pairs: Pairs, first: int, ax: wp.array(dtype=float), ay: wp.array(dtype=float),
+    bx: wp.array(dtype=float), by: wp.array(dtype=float), a: wp.array(dtype=int), b: wp.array(dtype=int),
 ):  # fmt: skip
-    """Store the map nodes and fractions of a block of pairs, given their positions, which are replaced."""
-    a = wp.zeros(shape=(64,), dtype=int)
-    b = wp.zeros(shape=(64,), dtype=int)
+    """Compute the map nodes of a block of pairs, given their positions, which the fractions replace."""
     left = wp.zeros(shape=(64,), dtype=float)
     top = wp.zeros(shape=(64,), dtype=float)
     load_origins(atlas, pairs, first, left, top)
     find_nodes(atlas, pairs, first, left, top, ax, ay, a)
     find_nodes(atlas, pairs, first, left, top, bx, by, b)
+
+
+@wp.func
+def store_block(
+    geometry: Geometry, first: int, ax: wp.array(dtype=float), ay: wp.array(dtype=float), bx: wp.array(dtype=float),
+    by: wp.array(dtype=float), a: wp.array(dtype=int), b: wp.array(dtype=int),
+):  # fmt: skip
+    """Store the map nodes and fractions of a block of pairs."""
     for j in range(BLOCK):
         u, v = load_float(ax, j), load_float(ay, j)
         store_geometry(geometry, first + j, load_int(a, j), u, v, load_int(b, j), load_float(bx, j), load_float(by, j))
+
+
+@wp.func
+def store_changes(
+    atlas: Atlas, image: wp.array(dtype=float), first: int, ax: wp.array(dtype=float), ay: wp.array(dtype=float),
+    bx: wp.array(dtype=float), by: wp.array(dtype=float), a: wp.array(dtype=int), b: wp.array(dtype=int),
+    change: wp.array(dtype=float),
+):  # fmt: skip
+    """Store how much the brightness changes from the first to the second event of each pair; NaN off the map."""
+    before = wp.zeros(shape=(80,), dtype=float)
+    after = wp.zeros(shape=(80,), dtype=float)
+    on_map = wp.zeros(shape=(64,), dtype=int)
+    for j in range(BLOCK):
+        store_int(on_map, j, wp.where(wp.min(load_int(a, j), load_int(b, j)) >= 0, 1, 0))
+        store_int(a, j, wp.max(load_int(a, j), 0))
+        store_int(b, j, wp.max(load_int(b, j), 0))
+    interpolate(before, image, atlas.columns, a, ax, ay, 0, BLOCK)
+    interpolate(after, image, atlas.columns, b, bx, by, 0, BLOCK)
+    for j in range(BLOCK):
+        value = load_float(after, 16 + j) - load_float(before, 16 + j)
+        store_float(change, first + j, wp.where(load_int(on_map, j) == 1, value, NAN))
 
 
 @wp.kernel
@@ -272,29 +316,27 @@ def place_blocks(
     atlas: Atlas,
     drift: float,
     camera_rotation: CameraRotationParams,
+    image: wp.array(dtype=float),
     start: int,
     geometry: Geometry,
+    change: wp.array(dtype=float),
 ):
     """Compute the positions as :func:`place_pairs` does, one block of pairs per thread. For CPUs.
 
-    This kernel is for a camera without distortion, and for pixels that are not slow.
+    This kernel is for a camera without distortion, and for pixels that are not slow. With an ``image``, it computes the
+    change of brightness from the first to the second events instead, for finite differences.
     """
     first = (start + wp.tid()) * BLOCK
     ax = wp.zeros(shape=(64,), dtype=float)
     ay = wp.zeros(shape=(64,), dtype=float)
     bx = wp.zeros(shape=(64,), dtype=float)
     by = wp.zeros(shape=(64,), dtype=float)
-    drifts = wp.min(pairs.slope.shape[0], 1)
-    if drifts == 1:
-        drift_block(model, pairs, drift, 0, first, ax, ay)
-        drift_block(model, pairs, drift, 1, first, bx, by)
-    if is_plain(model) == 1:
-        displace_block(plain(model), camera, pairs, 0, first, drifts, ax, ay)
-        displace_block(plain(model), camera, pairs, 1, first, drifts, bx, by)
+    a = wp.zeros(shape=(64,), dtype=int)
+    b = wp.zeros(shape=(64,), dtype=int)
+    compensate_block(model, camera, pairs, drift, camera_rotation, 0, first, ax, ay)
+    compensate_block(model, camera, pairs, drift, camera_rotation, 1, first, bx, by)
+    find_block_nodes(atlas, pairs, first, ax, ay, bx, by, a, b)
+    if image.shape[0] > 0:
+        store_changes(atlas, image, first, ax, ay, bx, by, a, b, change)
     else:
-        displace_block(model, camera, pairs, 0, first, drifts, ax, ay)
-        displace_block(model, camera, pairs, 1, first, drifts, bx, by)
-    if wp.length_sq(camera_rotation.velocity) + wp.length_sq(camera_rotation.acceleration) > 0.0:
-        undo_rotations(camera, camera_rotation, pairs, 0, first, ax, ay)
-        undo_rotations(camera, camera_rotation, pairs, 1, first, bx, by)
-    store_block(geometry, atlas, pairs, first, ax, ay, bx, by)
+        store_block(geometry, first, ax, ay, bx, by, a, b)

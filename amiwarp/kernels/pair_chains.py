@@ -60,26 +60,32 @@ def make_chains(
     join_pairs(cells, parts, stride, chains, start + wp.tid())
 
 
+@wp.func_native("""
+    const float* from = (const float*)weight.data + 64 * block;
+    const uint8_t* end = (const uint8_t*)chains.end.data + 64 * block;
+    float* to = (float*)chains.weight.data + 128 * block;
+    for (int j = 0; j < 128; ++j) to[j] = 0.0f;
+    for (int k = 0; k < 64; ++k) to[end[k]] = from[k];
+""")
+def move_weights(weight: wp.array(dtype=float), chains: Chains, block: int):
+    """Store the weights of a block of pairs at the positions at which the pairs end."""
+
+
 @wp.kernel
 def weigh_chains(weight: wp.array(dtype=float), start: int, chains: Chains):
     """Copy the weights of one block of pairs per thread to the positions at which the pairs end."""
-    block = start + wp.tid()
-    for j in range(128):
-        chains.weight[2 * BLOCK * block + j] = 0.0
-    for k in range(BLOCK):
-        i = BLOCK * block + k
-        chains.weight[2 * BLOCK * block + int(chains.end[i])] = weight[i]
+    move_weights(weight, chains, start + wp.tid())
 
 
 @wp.func_native("""
 #if defined(__clang__)
     typedef uint64_t Eight __attribute__((vector_size(64)));
     const float* map = (const float*)vector.data;
-    const int n = (((const int*)chains.count.data)[block] + 7) & ~7;
-    const int* cell = (const int*)chains.cell.data + 128 * block;
-    const float* x = (const float*)chains.x.data + 128 * block;
-    const float* y = (const float*)chains.y.data + 128 * block;
+    const int* cell = (const int*)cells.data + first;
+    const float* fx = (const float*)x.data + first;
+    const float* fy = (const float*)y.data + first;
     alignas(64) float upper[256], lower[256];
+#pragma clang loop unroll(disable)
     for (int j = 0; j < n; j += 8) {
         uint64_t a[8], b[8];
         for (int i = 0; i < 8; ++i) {
@@ -91,20 +97,32 @@ def weigh_chains(weight: wp.array(dtype=float), start: int, chains: Chains):
         memcpy(upper + 2 * j, &above, 64);
         memcpy(lower + 2 * j, &below, 64);
     }
-    float* at = (float*)levels.data;
-    at[15] = 0.0f;
+    float* at = (float*)levels.data + 16;
     for (int j = 0; j < n; ++j) {
-        const float u = upper[2 * j] + (upper[2 * j + 1] - upper[2 * j]) * x[j];
-        const float v = lower[2 * j] + (lower[2 * j + 1] - lower[2 * j]) * x[j];
-        at[16 + j] = u + (v - u) * y[j];
+        const float u = upper[2 * j] + (upper[2 * j + 1] - upper[2 * j]) * fx[j];
+        const float v = lower[2 * j] + (lower[2 * j + 1] - lower[2 * j]) * fx[j];
+        at[j] = u + (v - u) * fy[j];
     }
 #endif
 """)
+def interpolate(
+    levels: wp.array(dtype=float), vector: wp.array(dtype=float), columns: int, cells: wp.array(dtype=int),
+    x: wp.array(dtype=float), y: wp.array(dtype=float), first: int, n: int,
+):  # fmt: skip
+    """Compute the brightness at ``n`` positions, a multiple of 8 of at most 128, from element 16 of ``levels`` on.
+
+    The positions are the elements of ``cells``, ``x`` and ``y`` from ``first`` on, as in :class:`Chains`.
+    """
+
+
+@wp.func
 def find_levels(levels: wp.array(dtype=float), chains: Chains, vector: wp.array(dtype=float), columns: int, block: int):
     """Compute the brightness at the positions of a block, from element 16 of ``levels`` (144 elements) on.
 
-    Element 15 becomes 0. So the difference of a pair is the level at its second position minus the element before.
+    The difference of a pair is the level at its second position minus the element before. Element 15 is 0.
     """
+    n = (chains.count[block] + 7) / 8 * 8
+    interpolate(levels, vector, columns, chains.cell, chains.x, chains.y, 2 * BLOCK * block, n)
 
 
 @wp.func_native("""
@@ -119,6 +137,16 @@ def weighted_differences(values: wp.array(dtype=float), levels: wp.array(dtype=f
 
 
 @wp.func_native("""
+    const float* value = (const float*)values.data;
+    const uint8_t* end = (const uint8_t*)chains.end.data + 64 * block;
+    float* out = (float*)ends.data;
+    for (int k = 0; k < 64; ++k) out[end[k]] = value[k];
+""")
+def move_to_ends(ends: wp.array(dtype=float), values: wp.array(dtype=float), chains: Chains, block: int):
+    """Store the values of the 64 pairs in a block at the places of their second positions."""
+
+
+@wp.func_native("""
     const float* at = (const float*)levels.data + 16;
     const uint8_t* end = (const uint8_t*)chains.end.data + 64 * block;
     float* out = (float*)values.data;
@@ -128,25 +156,19 @@ def pair_differences(values: wp.array(dtype=float), levels: wp.array(dtype=float
     """Compute L(second) - L(first) of the 64 pairs in a block, in their order."""
 
 
-@wp.func_native("""
-#if defined(__clang__)
-    typedef long long Two __attribute__((vector_size(16), aligned(8)));
-    typedef long long Four __attribute__((vector_size(32)));
-    typedef double Real __attribute__((vector_size(32)));
-    typedef float Shares __attribute__((vector_size(16)));
+POSITIONS = """
     const int n = ((const int*)chains.count.data)[block], padded = (n + 7) & ~7;
     const int* cell = (const int*)chains.cell.data + 128 * block;
     const float* x = (const float*)chains.x.data + 128 * block;
     const float* y = (const float*)chains.y.data + 128 * block;
-    const float* value = (const float*)values.data;
     alignas(64) float share[512];
-    for (int j = 0; j < padded; ++j) {
-        const float s = value[j] - value[j + 1], below = s * y[j], above = s - below;
-        share[4 * j + 1] = above * x[j];
-        share[4 * j + 3] = below * x[j];
-        share[4 * j] = above - share[4 * j + 1];
-        share[4 * j + 2] = below - share[4 * j + 3];
-    }
+"""
+"""Declares the positions of a block, in C++, and an array for the share of each position in the four nodes around."""
+ADD_SHARES = """
+    typedef long long Two __attribute__((vector_size(16), aligned(8)));
+    typedef long long Four __attribute__((vector_size(32)));
+    typedef double Real __attribute__((vector_size(32)));
+    typedef float Shares __attribute__((vector_size(16)));
     const Real origin = {1572864.0, 1572864.0, 1572864.0, 1572864.0};
     for (int first = 0; first < 4; ++first)
         for (int j = first; j < n; j += 4) {
@@ -158,39 +180,54 @@ def pair_differences(values: wp.array(dtype=float), levels: wp.array(dtype=float
             *(Two*)to += Two{fixed[0], fixed[1]};
             *(Two*)(to + columns) += Two{fixed[2], fixed[3]};
         }
+"""
+"""Adds the shares to the sums, in C++, if no other thread writes to them.
+
+The bits of a double between 2**20 and 2**21 are a number in units of 2**-32, as
+:func:`amiwarp.kernels.conjugate_gradients.to_fixed` returns. So shares must be below 2**19. Neighbouring positions are
+not added one right after the other, because a vector load waits for a store that overlaps it in part.
+"""
+
+
+@wp.func_native(f"""
+#if defined(__clang__)
+    {POSITIONS}
+    const float* value = (const float*)values.data;
+    for (int j = 0; j < padded; ++j) {{
+        const float s = value[j] - value[j + 1], below = s * y[j], above = s - below;
+        share[4 * j + 1] = above * x[j];
+        share[4 * j + 3] = below * x[j];
+        share[4 * j] = above - share[4 * j + 1];
+        share[4 * j + 2] = below - share[4 * j + 3];
+    }}
+    {ADD_SHARES}
 #endif
 """)
 def add_differences(
     sums: wp.array(dtype=wp.int64), values: wp.array(dtype=float), chains: Chains, columns: int, block: int
 ):
-    """Add the transpose of the differences times their values to the sums, if no other thread writes to them.
+    """Add the transpose of the differences of a block times their values to the sums; see :data:`ADD_SHARES`.
 
-    The element of ``values`` after the last one must be 0. The bits of a double between 2**20 and 2**21 are a number in
-    units of 2**-32, as :func:`amiwarp.kernels.conjugate_gradients.to_fixed` returns. So shares must be below 2**19.
-    Neighbouring positions are not added one right after the other, because a vector load waits for a store that
-    overlaps it in part.
+    The element of ``values`` after the last one must be 0.
     """
 
 
-@wp.func_native("""
+@wp.func_native(f"""
 #if defined(__clang__)
-    const int n = ((const int*)chains.count.data)[block];
-    const int* cell = (const int*)chains.cell.data + 128 * block;
-    const float* x = (const float*)chains.x.data + 128 * block;
-    const float* y = (const float*)chains.y.data + 128 * block;
+    {POSITIONS}
     const float* weight = (const float*)chains.weight.data + 128 * block;
-    for (int j = 0; j < n; ++j) {
-        const float both = weight[j] + (j + 1 < n ? weight[j + 1] : 0.0f);
-        const float below = y[j], above = 1.0f - below, right = x[j], left = 1.0f - right;
-        const float share[4] = {above * left, above * right, below * left, below * right};
-        int64_t* to = (int64_t*)sums.data + cell[j];
-        to[0] += (int64_t)((double)(both * share[0] * share[0]) * 4294967296.0);
-        to[1] += (int64_t)((double)(both * share[1] * share[1]) * 4294967296.0);
-        to[columns] += (int64_t)((double)(both * share[2] * share[2]) * 4294967296.0);
-        to[columns + 1] += (int64_t)((double)(both * share[3] * share[3]) * 4294967296.0);
-    }
+    for (int j = 0; j < padded; ++j) {{
+        const float both = weight[j] + (j < 127 ? weight[j + 1] : 0.0f);
+        const float right = x[j] * x[j], left = (1.0f - x[j]) * (1.0f - x[j]);
+        const float below = both * (y[j] * y[j]), above = both * ((1.0f - y[j]) * (1.0f - y[j]));
+        share[4 * j] = above * left;
+        share[4 * j + 1] = above * right;
+        share[4 * j + 2] = below * left;
+        share[4 * j + 3] = below * right;
+    }}
+    {ADD_SHARES}
 #endif
 """)
 def add_weights(sums: wp.array(dtype=wp.int64), chains: Chains, columns: int, block: int):
     """Add the squares of the bilinear weights of a block's positions, times the weights of the pairs that they end or
-    begin, to the sums, if no other thread writes to them."""
+    begin, to the sums; see :data:`ADD_SHARES`."""

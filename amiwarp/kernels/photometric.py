@@ -116,9 +116,11 @@ def is_off(pairs: Pairs, i: int) -> float:
 def sensor_terms(image: wp.array(dtype=float), atlas: Atlas, pairs: Pairs, i: int) -> float:
     """Return the terms of a pair's equation that do not depend on the map: [OFF] s + leak (t2 - t1)."""
     extra = image.shape[0] - EXTRA
-    elapsed = load_float(pairs.time, pairs.stride + i) - load_float(pairs.time, i)
-    value = atlas.with_leak * load_float(image, extra) * elapsed
-    return value + is_off(pairs, i) * load_float(image, extra + 1)
+    value = is_off(pairs, i) * load_float(image, extra + 1)
+    if atlas.with_leak > 0.0:
+        elapsed = load_float(pairs.time, pairs.stride + i) - load_float(pairs.time, i)
+        value += load_float(image, extra) * elapsed
+    return value
 
 
 @wp.func

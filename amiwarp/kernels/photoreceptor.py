@@ -29,7 +29,8 @@ from amiwarp.kernels.prism_view import (
     texels_ahead,
 )
 
-wp.set_module_options({"enable_backward": False})
+OPTIONS = {"enable_backward": False}
+wp.set_module_options(OPTIONS)
 
 MOST_PIECES = wp.constant(16)  # largest number of pieces per step; divides the ticks of a step, a multiple of 16
 LARGEST_BEND = wp.constant(0.01)  # largest deviation of the level from a straight line within a piece [ON thresholds]
@@ -137,7 +138,7 @@ def advance_filtered(
     return p
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)  # so that each device compiles only what it runs
 def run_filtered_pixels(
     view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), seen: wp.array(dtype=float),
     start: int, sink: Sink,
@@ -159,7 +160,7 @@ def run_filtered_pixels(
     seen[i] = before.level
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def run_filtered_pixels_ahead(
     view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), seen: wp.array(dtype=float),
     start: int, sink: Sink,

@@ -4,6 +4,7 @@ import warp as wp
 
 from amiwarp.kernels.conjugate_gradients import add_fixed, store_partial_sum
 from amiwarp.kernels.photometric import Atlas, Geometry, Pairs, difference
+from amiwarp.kernels.vector_code import load_float, store_float
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,6 +27,16 @@ def slope_between(
     i = start + wp.tid()
     change = difference(image, atlas, pairs, minus, i) - difference(image, atlas, pairs, plus, i)
     slope[i] = wp.where(plus.cell[i] >= 0 and minus.cell[i] >= 0, change / width, 0.0)
+
+
+@wp.kernel
+def slope_of_changes(
+    plus: wp.array(dtype=float), minus: wp.array(dtype=float), width: float, start: int, slope: wp.array(dtype=float)
+):
+    """Compute the derivative of the residuals from two changes of brightness, over ``width``; 0 if either is NaN."""
+    i = start + wp.tid()
+    change = load_float(minus, i) - load_float(plus, i)
+    store_float(slope, i, wp.where(change == change, change / width, 0.0))
 
 
 @wp.func

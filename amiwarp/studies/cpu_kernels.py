@@ -6,11 +6,11 @@ Each is followed by the structs of its generic arguments. The other kernels of i
 from amiwarp.kernels.camera import PinholeParams
 from amiwarp.kernels.compensation import compensate_blocks
 from amiwarp.kernels.conjugate_gradients import descend
+from amiwarp.kernels.equation_blocks import apply_normal
 from amiwarp.kernels.iwe import read_sums
 from amiwarp.kernels.map_positions import find_places, place_blocks
 from amiwarp.kernels.map_prior import link
 from amiwarp.kernels.multilevel import prolong
-from amiwarp.kernels.normal_equations import apply_normal_blocks
 from amiwarp.kernels.pair_chains import make_chains
 from amiwarp.kernels.pairs import mark_spans
 from amiwarp.kernels.pixel_votes import vote_event_blocks, vote_point_blocks
@@ -35,7 +35,7 @@ EXACT_KERNELS = (
     (find_places, ExactParams, PinholeParams),
     (place_blocks, ExactParams),
     (make_chains,),
-    (apply_normal_blocks,),
+    (apply_normal,),
     (descend,),
     (sum_costs,),
     (find_time_constants, ExactParams),

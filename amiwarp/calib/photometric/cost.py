@@ -140,10 +140,11 @@ class Cost:
         b, n = self.brightness, len(v)
         if self._solved is None or not np.array_equal(self._solved, v):
             self.residuals(v)
-        if len(self._changes) != n:
-            self._changes = [b.new_change() for _ in v]
+        changes = self._changes or [None] * n
         b.prepare_projection()
         steps = np.eye(n) * SLOPE_PX
         slopes = [b.find_slope(self.at(v + step), self.at(v - step), 2.0 * SLOPE_PX) for step in steps]
-        both = zip(slopes, self._changes, strict=True)
-        return [b.unexplained(slope, change, steps=self.steps // 2) for slope, change in both]
+        both = zip(slopes, changes, strict=True)
+        found = [b.unexplained(slope, change, steps=self.steps // 2) for slope, change in both]
+        self._changes = [change for _, change in found]
+        return [left for left, _ in found]

@@ -106,7 +106,7 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     b.prepare_projection()
     for name, column in columns.items():
         if name not in cost.columns or cost.columns[name][0] is not column:
-            cost.columns[name] = column, b.unexplained(column, b.new_change(), steps=MAP_STEPS)
+            cost.columns[name] = column, b.unexplained(column, steps=MAP_STEPS)[0]
     left = [cost.columns[name][1] for name in columns]
     width, height = (-(-side // SQUARE_PX) for side in (camera.width, camera.height))
     sums, squares = b.residuals.products_by_square([*left, b.residuals.values], SQUARE_PX, width, height)
