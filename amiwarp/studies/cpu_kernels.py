@@ -3,11 +3,12 @@
 Each is followed by the structs of its generic arguments. The other kernels of its module are compiled with it.
 """
 
+from amiwarp.imaging.sharpness_costs import gaussian
 from amiwarp.kernels.camera import PinholeParams
 from amiwarp.kernels.compensation import compensate_blocks
 from amiwarp.kernels.conjugate_gradients import descend
 from amiwarp.kernels.equation_blocks import apply_normal
-from amiwarp.kernels.iwe import read_sums
+from amiwarp.kernels.iwe import read_sums, smooth_and_sum
 from amiwarp.kernels.map_positions import find_places, place_blocks
 from amiwarp.kernels.map_prior import link
 from amiwarp.kernels.multilevel import prolong
@@ -16,11 +17,9 @@ from amiwarp.kernels.pairs import mark_spans
 from amiwarp.kernels.pixel_votes import vote_event_blocks, vote_point_blocks
 from amiwarp.kernels.refraction import (
     CircleParams,
-    EllipseParams,
     ExactParams,
     RadialCircleParams,
     compensate_points,
-    fit_harmonics,
 )
 from amiwarp.kernels.residual_slopes import sum_costs
 from amiwarp.kernels.slow_pixels import find_time_constants
@@ -31,6 +30,7 @@ EXACT_KERNELS = (
     (turn_events,),
     (vote_event_blocks, ExactParams, PinholeParams),
     (read_sums,),
+    *((smooth_and_sum(len(gaussian(sigma))),) for sigma in (2.0, 1.0)),  # coarse and fine images of a calibration
     (mark_spans,),
     (find_places, ExactParams, PinholeParams),
     (place_blocks, ExactParams),
@@ -45,10 +45,8 @@ EXACT_KERNELS = (
     (prolong,),
 )
 """Kernels of calibration, compensation and reconstruction by the exact model, in the order of their use."""
-OTHER_MODELS = (
-    (fit_harmonics, ExactParams),
-    *((vote_event_blocks, struct, PinholeParams) for struct in (CircleParams, RadialCircleParams, EllipseParams)),
-    *((compensate_points, struct) for struct in (CircleParams, RadialCircleParams, EllipseParams)),
+FIGURE_KERNELS = (
+    *((compensate_points, struct) for struct in (CircleParams, RadialCircleParams)),
     (vote_point_blocks,),
 )
-"""Kernels of a comparison of the optical models."""
+"""Kernels of the demo's figure and of its comparison of simpler models."""

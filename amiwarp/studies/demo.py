@@ -35,7 +35,7 @@ from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.studies.cpu_kernels import EXACT_KERNELS, OTHER_MODELS
+from amiwarp.studies.cpu_kernels import EXACT_KERNELS, FIGURE_KERNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -125,7 +125,7 @@ def run_demo(demo: Demo, progress: Progress | None = None) -> DemoResult:
     for path in files.values():
         check_output(path)
     if demo.device == "cpu":
-        load_ahead((*EXACT_KERNELS, *OTHER_MODELS), demo.device)
+        load_ahead((*EXACT_KERNELS, *FIGURE_KERNELS), demo.device)
     # of the two threads, one often waits for the process that draws with VTK
     with ThreadPoolExecutor(2, thread_name_prefix="amiwarp-demo") as aside:
         return _run(demo, files, aside, progress or silent)
