@@ -213,6 +213,13 @@ class EventTable:
         self.arrays.count = 0
 
     @property
+    def _places(self) -> int:
+        """Number of pixels of whole squares, in whose order the events are sorted."""
+        side = int(kernels.SQUARE)
+        rows, columns = (-(-n // side) * side for n in self.tile_of.shape)
+        return int(rows * columns)
+
+    @property
     def covers(self) -> tuple[int, int]:
         """Times of the first and the last event [us]."""
         ends = [time_span(span) for span in self.spans]
@@ -226,10 +233,10 @@ class EventTable:
         place, s.count = _running_count(flag)
         s.key, s.order = (wp.empty(2 * s.count, dtype=int, device=self.device) for _ in "ko")
         first = np.cumsum([0, *(len(span) for span in self.spans[:-1])])
-        inputs = [s.x, s.y, self.tile_of, place, wp.array(first, dtype=int, device=self.device)]
+        inputs = [s.x, s.y, self.tile_of, place, wp.array(first, dtype=int, device=self.device), self._places]
         launch(kernels.fill_keys, n, inputs, [s.key, s.order], device=self.device)
         if s.count:
-            bits = (s.pixels * max(1, len(self.spans))).bit_length()
+            bits = (self._places * max(1, len(self.spans))).bit_length()
             wp.utils.radix_sort_pairs(s.key, s.order, s.count, end_bit=bits)
 
     def pairs(
@@ -266,7 +273,7 @@ class EventTable:
         m, device = self.arrays.count, self.device
         ends, base = (0, m) if window is None else (m, 3 * m)
         edges, at_least = (np.zeros(1, np.int64), 0) if quiet is None else quiet
-        spans = (len(edges) - 1) * self.arrays.pixels
+        spans = (len(edges) - 1) * self._places
         flag = wp.empty(base + spans, dtype=int, device=device)
         launch(kernels.mark_pairs, m, [self.arrays, times], [flag], device=device)
         launch(kernels.mark_ends, ends, [self.arrays], [flag], device=device)
@@ -288,8 +295,8 @@ class EventTable:
         """Mark the time spans in which pixels are silent."""
         fired = wp.zeros((len(edges) - 1) * self.arrays.pixels, dtype=wp.uint8, device=self.device)
         launch(kernels.mark_spans, len(self.arrays.x), [self.arrays, edges], [fired], device=self.device)
-        inputs = [fired, self.tile_of.flatten(), at_least, base]
-        launch(kernels.mark_quiet, self.arrays.pixels, inputs, [flag], device=self.device)
+        inputs = [fired, self.tile_of, at_least, base]
+        launch(kernels.mark_quiet, self._places, inputs, [flag], device=self.device)
 
     def exclude_hot_pixels(self) -> NDArray[np.int32]:
         """Exclude pixels that fire far more often than the busiest pixels around them, by setting ``tile_of`` to -1.
