@@ -6,6 +6,7 @@ pairs.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -208,16 +209,11 @@ class EventTable:
         self.arrays = kernels.Sorted()
         self.arrays.columns = tile_of.shape[1]
         self.arrays.pixels = tile_of.shape[0] * tile_of.shape[1]
+        side = int(kernels.SQUARE)
+        self.arrays.places = math.prod(-(-n // side) * side for n in tile_of.shape)
         for name, dtype in (("x", wp.uint16), ("y", wp.uint16), ("t", wp.int64), ("p", wp.uint8)):
             setattr(self.arrays, name, _upload([getattr(span, name) for span in self.spans], dtype, self.device))
         self.arrays.count = 0
-
-    @property
-    def _places(self) -> int:
-        """Number of pixels of whole squares, in whose order the events are sorted."""
-        side = int(kernels.SQUARE)
-        rows, columns = (-(-n // side) * side for n in self.tile_of.shape)
-        return int(rows * columns)
 
     @property
     def covers(self) -> tuple[int, int]:
@@ -233,10 +229,10 @@ class EventTable:
         place, s.count = _running_count(flag)
         s.key, s.order = (wp.empty(2 * s.count, dtype=int, device=self.device) for _ in "ko")
         first = np.cumsum([0, *(len(span) for span in self.spans[:-1])])
-        inputs = [s.x, s.y, self.tile_of, place, wp.array(first, dtype=int, device=self.device), self._places]
+        inputs = [s.x, s.y, self.tile_of, place, wp.array(first, dtype=int, device=self.device), s.places]
         launch(kernels.fill_keys, n, inputs, [s.key, s.order], device=self.device)
         if s.count:
-            bits = (self._places * max(1, len(self.spans))).bit_length()
+            bits = (s.places * max(1, len(self.spans))).bit_length()
             wp.utils.radix_sort_pairs(s.key, s.order, s.count, end_bit=bits)
 
     def pairs(
@@ -273,7 +269,7 @@ class EventTable:
         m, device = self.arrays.count, self.device
         ends, base = (0, m) if window is None else (m, 3 * m)
         edges, at_least = (np.zeros(1, np.int64), 0) if quiet is None else quiet
-        spans = (len(edges) - 1) * self._places
+        spans = (len(edges) - 1) * self.arrays.places
         flag = wp.empty(base + spans, dtype=int, device=device)
         launch(kernels.mark_pairs, m, [self.arrays, times], [flag], device=device)
         launch(kernels.mark_ends, ends, [self.arrays], [flag], device=device)
@@ -287,8 +283,11 @@ class EventTable:
         span = self.covers if window is None else (min(self.covers[0], window[0]), max(self.covers[1], window[1]))
         angles = encoder_params(encoder, *span, device)
         launch(kernels.write_pairs, base, [self.arrays, times, angles, self.tile_of, flag, place], [out], device=device)
-        inputs = [edges_d, times, angles, self.tile_of, base, flag, place]
-        launch(kernels.write_quiet, spans, inputs, [out], device=device)
+        if spans:
+            of_spans = _empty(len(edges) - 1, device)
+            launch(kernels.write_spans, len(edges) - 1, [edges_d, times, angles], [of_spans], device=device)
+            inputs = [of_spans, self.tile_of, base, flag, place]
+            launch(kernels.write_quiet, spans, inputs, [out], device=device)
         return PairSet(out, device)
 
     def _mark_quiet(self, edges: Any, at_least: int, base: int, flag: Any) -> None:
@@ -296,7 +295,7 @@ class EventTable:
         fired = wp.zeros((len(edges) - 1) * self.arrays.pixels, dtype=wp.uint8, device=self.device)
         launch(kernels.mark_spans, len(self.arrays.x), [self.arrays, edges], [fired], device=self.device)
         inputs = [fired, self.tile_of, at_least, base]
-        launch(kernels.mark_quiet, self._places, inputs, [flag], device=self.device)
+        launch(kernels.mark_quiet, self.arrays.places, inputs, [flag], device=self.device)
 
     def exclude_hot_pixels(self) -> NDArray[np.int32]:
         """Exclude pixels that fire far more often than the busiest pixels around them, by setting ``tile_of`` to -1.
@@ -359,7 +358,7 @@ def _int_array(values: NDArray[Any], device: Any) -> Any:
 
 def _running_count(flag: Any) -> tuple[Any, int]:
     """Return the running count of the marked entries, and their total."""
-    place = wp.empty_like(flag)
+    place = wp.empty(len(flag), dtype=int, device=flag.device)
     if not len(flag):
         return place, 0
     wp.utils.array_scan(flag, place, inclusive=True)

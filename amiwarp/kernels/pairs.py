@@ -24,6 +24,7 @@ class Sorted:
 
     count: int
     pixels: int
+    places: int  # number of places of :func:`place_of`
     columns: int
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)
@@ -217,9 +218,10 @@ def write_pairs(
     at = candidate % s.count
     event = s.order[at]
     i = place[candidate] - 1
-    pairs.x[i] = s.x[event]
-    pairs.y[i] = s.y[event]
-    pairs.tile[i] = tile_of[int(s.y[event]), int(s.x[event])]
+    row, column = pixel_at(s.key[at] % s.places, s.columns)
+    pairs.x[i] = wp.uint16(column)
+    pairs.y[i] = wp.uint16(row)
+    pairs.tile[i] = tile_of[row, column]
     if kind == 0:
         pairs.on[i] = s.p[s.order[at + 1]]
         store_pair(encoder, window, pairs, i, s.t[event], s.t[s.order[at + 1]])
@@ -232,23 +234,32 @@ def write_pairs(
 
 
 @wp.kernel
+def write_spans(edges: wp.array(dtype=wp.int64), window: Window, encoder: EncoderParams, start: int, pairs: Pairs):
+    """Write times and azimuths of a pair from the beginning to the end of each time span between ``edges`` [us]."""
+    span = start + wp.tid()
+    store_pair(encoder, window, pairs, span, edges[span], edges[span + 1])
+
+
+@wp.kernel
 def write_quiet(
-    edges: wp.array(dtype=wp.int64), window: Window, encoder: EncoderParams, tile_of: wp.array2d(dtype=int), base: int,
-    flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, pairs: Pairs,
+    spans: Pairs, tile_of: wp.array2d(dtype=int), base: int, flag: wp.array(dtype=int), place: wp.array(dtype=int),
+    start: int, pairs: Pairs,
 ):  # fmt: skip
-    """Write the marked pairs of spans without an event."""
+    """Write the marked pairs of spans without an event; ``spans`` are those of :func:`write_spans`."""
     candidate = start + wp.tid()
     if flag[base + candidate] == 0:
         return
-    spans = edges.shape[0] - 1
-    span = candidate % spans
-    row, column = pixel_at(candidate / spans, tile_of.shape[1])
+    span = candidate % spans.count
+    row, column = pixel_at(candidate / spans.count, tile_of.shape[1])
     i = place[base + candidate] - 1
     pairs.x[i] = wp.uint16(column)
     pairs.y[i] = wp.uint16(row)
     pairs.tile[i] = tile_of[row, column]
     pairs.on[i] = wp.uint8(2)
-    store_pair(encoder, window, pairs, i, edges[span], edges[span + 1])
+    for k in range(4):
+        pairs.azimuth[k * pairs.stride + i] = spans.azimuth[k * spans.stride + span]
+    for k in range(2):
+        pairs.time[k * pairs.stride + i] = spans.time[k * spans.stride + span]
 
 
 # -- selecting
