@@ -63,7 +63,8 @@ def test_clouds_are_drawn_or_said_not_to_be() -> None:
     rng = np.random.default_rng(0)
     cloud = clouds.Cloud(rng.uniform(-0.4, 0.4, (2000, 3)).astype(np.float32), rng.random(2000) < 0.5)
     # without OpenGL, the plain pictures must keep the same limit
-    pictures = clouds.render([cloud, cloud]) or [plain_picture(cloud)]
+    with clouds.Renderer() as renderer:
+        pictures = renderer.render([cloud, cloud]) or [plain_picture(cloud)]
     for picture in pictures:
         assert picture.ndim == 3
         assert (picture.reshape(-1, 3) < 200).any(axis=1).mean() > 0.02

@@ -6,6 +6,7 @@ same points.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -34,7 +35,7 @@ _CAMERA = ((2.75, -2.75, 1.55), (0.0, 0.0, -0.03), (0.0, 0.0, 1.0))
 """Position, focal point and upward direction of the camera."""
 
 
-__all__ = ["HALF", "MISSING", "Cloud", "draw_plain", "render"]
+__all__ = ["HALF", "MISSING", "Cloud", "Renderer", "draw_plain"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,24 +49,48 @@ class Cloud:
     """Whether each point is an ON event, shape ``(n,)``."""
 
 
-def render(clouds: Sequence[Cloud]) -> list[NDArray[np.uint8]] | None:
-    """Draw each cloud by VTK and return its picture, shape ``(height, width, 3)``; None if VTK cannot draw here."""
-    with tempfile.TemporaryDirectory() as folder:
-        for k, cloud in enumerate(clouds):
-            np.savez(Path(folder) / f"{k}.npz", xyz=cloud.xyz, on=cloud.on)
+class Renderer:
+    """Process that draws clouds with VTK. It loads VTK when it starts, while the caller does something else."""
+
+    def __init__(self) -> None:
+        """Start the process. One that fails is noticed by :meth:`render`."""
         environment = dict(os.environ)
         if sys.platform.startswith("linux"):
             # By default VTK tries X first, and crashes if libX11 is missing; EGL needs no display.
             environment["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"
-        command = [sys.executable, "-m", "amiwarp.plotting.clouds", folder]
-        try:
-            done = subprocess.run(command, env=environment, capture_output=True, timeout=SECONDS, check=False)
-        except (OSError, subprocess.TimeoutExpired):
+        quiet = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        command = [sys.executable, "-m", "amiwarp.plotting.clouds"]
+        self._process: subprocess.Popen[bytes] | None = None
+        with contextlib.suppress(OSError):
+            self._process = subprocess.Popen(command, env=environment, **quiet)  # type: ignore[call-overload]
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """End the process."""
+        if self._process is not None:
+            with self._process:  # closes its input, and waits
+                self._process.kill()
+
+    def render(self, clouds: Sequence[Cloud]) -> list[NDArray[np.uint8]] | None:
+        """Draw each cloud and return its picture, shape ``(height, width, 3)``; None if VTK cannot draw here.
+
+        The process then ends.
+        """
+        if self._process is None:
             return None
-        pictures = [Path(folder) / f"{k}.npy" for k in range(len(clouds))]
-        if done.returncode != 0 or not all(picture.is_file() for picture in pictures):
-            return None
-        return [np.asarray(np.load(picture), np.uint8) for picture in pictures]
+        with tempfile.TemporaryDirectory() as folder:
+            for k, cloud in enumerate(clouds):
+                np.savez(Path(folder) / f"{k}.npz", xyz=cloud.xyz, on=cloud.on)
+            try:
+                self._process.communicate(folder.encode(), timeout=SECONDS)
+            except (OSError, subprocess.TimeoutExpired):
+                return None
+            pictures = [Path(folder) / f"{k}.npy" for k in range(len(clouds))]
+            if self._process.returncode != 0 or not all(picture.is_file() for picture in pictures):
+                return None
+            return [np.asarray(np.load(picture), np.uint8) for picture in pictures]
 
 
 def draw_plain(axes: Any, cloud: Cloud) -> None:
@@ -107,6 +132,16 @@ def _cropped(picture: NDArray[np.uint8], border: int = 8) -> NDArray[np.uint8]:
     return picture[top : rows[-1] + border, left : columns[-1] + border]
 
 
-if __name__ == "__main__":
-    for file in sorted(Path(sys.argv[1]).glob("*.npz")):
+def _main() -> None:
+    """Load VTK, then draw all clouds in the folder whose name comes from the standard input."""
+    with tempfile.TemporaryDirectory() as folder:  # a first picture loads all that VTK needs
+        points = Path(folder) / "points.npz"
+        np.savez(points, xyz=np.zeros((2, 3), np.float32), on=np.array([False, True]))
+        _render_here(points, points.with_suffix(".npy"))
+    given = sys.stdin.read()
+    for file in sorted(Path(given).glob("*.npz")) if given else ():
         _render_here(file, file.with_suffix(".npy"))
+
+
+if __name__ == "__main__":
+    _main()

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from amiwarp.events.events import Events
     from amiwarp.events.recording import Recording
     from amiwarp.imaging.metrics import PictureQuality
+    from amiwarp.plotting.clouds import Renderer
     from amiwarp.reconstruction.result import Picture
 
 EVENTS = 2_000_000
@@ -161,12 +162,12 @@ class EventViews:
     """Pictures of the clouds by VTK; None if it cannot draw here."""
 
     @classmethod
-    def of(cls, recording: Recording, calibration: Calibration, device: Any) -> EventViews:
+    def of(cls, recording: Recording, calibration: Calibration, device: Any, renderer: Renderer) -> EventViews:
         """Compute the images and draw the clouds."""
         pair = images(thin(recording, EVENTS), recording, calibration, device=device)
         corner = busiest(pair.after)
         both = region_clouds(recording, calibration, corner, device)
-        return cls(pair, corner, both, clouds.render(both))
+        return cls(pair, corner, both, renderer.render(both))
 
 
 def draw_demo(

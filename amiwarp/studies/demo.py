@@ -26,6 +26,7 @@ from amiwarp.io.atomic_output import check_output, make_folder
 from amiwarp.kernels.launch import load_ahead
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+from amiwarp.plotting.clouds import Renderer
 from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.export import save_picture
@@ -139,41 +140,42 @@ def _run(demo: Demo, files: dict[str, Path], aside: ThreadPoolExecutor, report: 
     simulated.write(files["recording"], progress=report)
     simulated_s = time.perf_counter() - began
     recording = open_recording(files["recording"])
-    found = calibrate(
-        recording, seed=demo.seed, device=demo.device, photometric=PhotometricSettings(sensor=KNOWN_SENSOR),
-        progress=report,
-    )  # fmt: skip
-    found.save(files["calibration"])
-    compensated = compensate(
-        recording, found, files["compensated"], device=demo.device,
-        progress=report,
-    )  # fmt: skip
-    views = aside.submit(EventViews.of, recording, found, demo.device)
-    accuracy = aside.submit(_accuracy, recording, found, demo.device)
-    report("reconstructing", 0.0)
-    picture = middle_turn(recording, found, demo.device)
-    save_picture(picture, files["picture"], contrast=simulated.sensor.contrast_on)
-    report("measuring and drawing", 0.0)
-    original = simulated.log_view()
-    quality = metrics.picture_quality(picture.log, original)
-    values = {"events": compensated.events, **accuracy.result()}
-    report("measuring and drawing", 0.5)
-    assert recording.truth is not None
-    notes = draw_demo(
-        files["figure"], grid.result(), found, views.result(), Reconstructed(picture, original, quality),
-        headline=headline(values), truth=(recording.truth.parameters["apex"], recording.truth.parameters["phase"]),
-    )  # fmt: skip
-    return DemoResult(
-        **values,
-        picture_correlation=quality.correlation,
-        picture_psnr_db=quality.psnr_db,
-        simulate_s=simulated_s,
-        calibrate_s=found.seconds,
-        reconstruct_s=picture.seconds,
-        compensate_mev_per_s=compensated.mev_per_s,
-        files={name: str(path) for name, path in files.items()},
-        notes=found.warnings + notes,
-    )
+    with Renderer() as renderer:  # loads VTK meanwhile
+        found = calibrate(
+            recording, seed=demo.seed, device=demo.device, photometric=PhotometricSettings(sensor=KNOWN_SENSOR),
+            progress=report,
+        )  # fmt: skip
+        found.save(files["calibration"])
+        compensated = compensate(
+            recording, found, files["compensated"], device=demo.device,
+            progress=report,
+        )  # fmt: skip
+        views = aside.submit(EventViews.of, recording, found, demo.device, renderer)
+        accuracy = aside.submit(_accuracy, recording, found, demo.device)
+        report("reconstructing", 0.0)
+        picture = middle_turn(recording, found, demo.device)
+        save_picture(picture, files["picture"], contrast=simulated.sensor.contrast_on)
+        report("measuring and drawing", 0.0)
+        original = simulated.log_view()
+        quality = metrics.picture_quality(picture.log, original)
+        values = {"events": compensated.events, **accuracy.result()}
+        report("measuring and drawing", 0.5)
+        assert recording.truth is not None
+        notes = draw_demo(
+            files["figure"], grid.result(), found, views.result(), Reconstructed(picture, original, quality),
+            headline=headline(values), truth=(recording.truth.parameters["apex"], recording.truth.parameters["phase"]),
+        )  # fmt: skip
+        return DemoResult(
+            **values,
+            picture_correlation=quality.correlation,
+            picture_psnr_db=quality.psnr_db,
+            simulate_s=simulated_s,
+            calibrate_s=found.seconds,
+            reconstruct_s=picture.seconds,
+            compensate_mev_per_s=compensated.mev_per_s,
+            files={name: str(path) for name, path in files.items()},
+            notes=found.warnings + notes,
+        )
 
 
 def _accuracy(recording: Recording, found: Calibration, device: Any) -> dict[str, Any]:
