@@ -297,7 +297,7 @@ def about(device: str) -> dict[str, Any]:
 
     wp.init()
     found = {"python": platform.python_version()}
-    for name in ("warp-lang", "numpy", "h5py", "hdf5plugin", "numcodecs"):
+    for name in ("warp-lang", "numpy", "h5py", "hdf5plugin", "blosc"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
     machine = f"{processor()}, {cpu_threads()} cores"

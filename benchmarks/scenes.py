@@ -55,7 +55,7 @@ exponent of each correction.
 
 The number of events falls with a power of the threshold between -1 and -2.
 """
-FILTERS = ("hdf5plugin", "numcodecs")
+FILTERS = ("hdf5plugin", "blosc")
 """Libraries that HDF5 files need. Without them, the benchmark's files are plain binary columns."""
 threads = ThreadPoolExecutor(cpu_threads())
 

@@ -86,10 +86,14 @@ def in_order(jobs: Iterable[Callable[[], Result]]) -> Generator[Result, None, No
 
 
 @cache
-def _blosc(shuffle: int) -> Any:
-    from numcodecs.blosc import Blosc
+def _blosc() -> Any:
+    """Return the module of Blosc, set up for calls in several threads. Its own threads would only add to them."""
+    import blosc
 
-    return Blosc(cname="lz4", clevel=1, shuffle=shuffle, blocksize=BLOCK_BYTES)
+    blosc.set_nthreads(1)
+    blosc.set_releasegil(True)
+    blosc.set_blocksize(BLOCK_BYTES)
+    return blosc
 
 
 def blosc_shuffle(dtype: np.dtype[Any]) -> int:
@@ -111,8 +115,15 @@ def encode_parts(values: NDArray[Any], codec: Codec = Codec.BLOSC) -> tuple[byte
     if len(values) < CHUNK:
         whole = np.concatenate([values, np.zeros((CHUNK - len(values), *values.shape[1:]), values.dtype)])
     whole = np.ascontiguousarray(whole)
-    frame = _blosc(blosc_shuffle(whole.dtype)).encode(whole) if codec is Codec.BLOSC else _deflate(whole)
+    frame = _compress(whole) if codec is Codec.BLOSC else _deflate(whole)
     return frame, checksum(frame).to_bytes(4, "little")
+
+
+def _compress(values: NDArray[Any]) -> bytes:
+    """Compress the bytes of values as HDF5's Blosc filter does."""
+    shuffle, place = blosc_shuffle(values.dtype), values.ctypes.data
+    compressed: bytes = _blosc().compress_ptr(place, values.size, values.itemsize, 1, shuffle, "lz4")
+    return compressed
 
 
 def _deflate(values: NDArray[Any]) -> bytes:
@@ -131,10 +142,9 @@ def decode(stored: bytes, out: NDArray[Any]) -> bool:
     if sizes != [out.nbytes, len(frame)] or checksum(frame).to_bytes(4, "little") != stored[-4:]:
         return False
     try:
-        _blosc(2).decode(frame, out=out)  # the frame says how it was shuffled
-    except RuntimeError:  # raised by Blosc for a frame that it cannot decode
+        return int(_blosc().decompress_ptr(frame, out.ctypes.data)) == out.nbytes
+    except _blosc().blosc_extension.error:  # a frame that it cannot decode
         return False
-    return True
 
 
 def checksum(data: bytes | memoryview) -> int:
