@@ -95,6 +95,7 @@ def load_pairs(
 #ifndef __CUDACC__
     for (int k = 0; k < n; ++k) __builtin_prefetch(sum + place[k] + columns, 1);
 #endif
+#pragma clang loop unroll(disable)
     for (int k = 0; k < n; ++k) {
         uint64_t above, below;
         uint32_t* at = sum + place[k];
