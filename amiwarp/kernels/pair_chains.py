@@ -171,6 +171,7 @@ ADD_SHARES = """
     typedef float Shares __attribute__((vector_size(16)));
     const Real origin = {1572864.0, 1572864.0, 1572864.0, 1572864.0};
     for (int first = 0; first < 4; ++first)
+#pragma clang loop unroll(disable)
         for (int j = first; j < n; j += 4) {
             Shares four;
             memcpy(&four, share + 4 * j, 16);
@@ -185,7 +186,8 @@ ADD_SHARES = """
 
 The bits of a double between 2**20 and 2**21 are a number in units of 2**-32, as
 :func:`amiwarp.kernels.conjugate_gradients.to_fixed` returns. So shares must be below 2**19. Neighbouring positions are
-not added one right after the other, because a vector load waits for a store that overlaps it in part.
+not added one right after the other, because a vector load waits for a store that overlaps it in part. The loop is not
+unrolled, see :func:`amiwarp.kernels.vector_code.add_word_pairs`.
 """
 
 
