@@ -358,7 +358,7 @@ def _int_array(values: NDArray[Any], device: Any) -> Any:
 
 def _running_count(flag: Any) -> tuple[Any, int]:
     """Return the running count of the marked entries, and their total."""
-    place = wp.empty(len(flag), dtype=int, device=flag.device)
+    place = wp.empty_like(flag)
     if not len(flag):
         return place, 0
     wp.utils.array_scan(flag, place, inclusive=True)

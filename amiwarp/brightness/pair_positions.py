@@ -76,11 +76,7 @@ class PairPositions:
         """Return whether the fast kernels apply: no distortion, no slow pixels, and on CUDA only the prism moves."""
         arrays = self.pairs.arrays
         moves = arrays.slope.shape[0] > 0 or any((*turn.angular_velocity, *turn.angular_acceleration))
-        return (
-            pinhole_params(model.camera) is not None
-            and not arrays.lag.shape[0]
-            and not (moves and not self.device.is_cpu)
-        )
+        return model.camera.distortion is None and not arrays.lag.shape[0] and (self.device.is_cpu or not moves)
 
     @cached_property
     def _sides(self) -> tuple[Any, Any]:

@@ -88,7 +88,6 @@ class BrightnessMap:
             raise AmiwarpError("no pixel fired twice in time, so no brightness can be found; give a longer recording")
         self.device, self.tiles, self.count = wp.get_device(pairs.device), tiles, len(pairs)
         self.pairs, self.middle_us, self.smoothness = pairs, middle_us, smoothness
-        self._kernels = equation_blocks if self.device.is_cpu else normal_equations
         self._atlas = Atlas()
         self._atlas.origin = wp.array(tiles.origin.ravel(), dtype=float, device=self.device)
         self._atlas.rows, self._atlas.columns, self._atlas.density = tiles.rows, tiles.columns, tiles.density
@@ -105,6 +104,7 @@ class BrightnessMap:
         self.residuals = Residuals(pairs, len(tiles.origin))
         self._scale, self._solved = self._zeros(1), False
         self._at = PairPositions(pairs, self._atlas, middle_us)
+        self._choose_kernels()
 
     def _zeros(self, n: int) -> Any:
         return wp.zeros(n, dtype=float, device=self.device)
@@ -119,6 +119,16 @@ class BrightnessMap:
         parts = -(-self._threads // (1 if self.device.is_cpu else BLOCK_DIM))
         for name, n in (("scalars", 2), ("pq", parts), ("rz", parts)):
             setattr(self._dots, name, wp.zeros(n, dtype=wp.float64, device=self.device))
+
+    def _choose_kernels(self) -> None:
+        """Set the kernels over all equations, their number of threads, and their common inputs.
+
+        The last input has the positions as the kernels that sum up take them.
+        """
+        on_cpu, at = self.device.is_cpu, self._at
+        self._kernels = equation_blocks if on_cpu else normal_equations
+        self._equation_threads = at.chains.blocks if on_cpu else self.count
+        self._equations = [self.pairs.arrays, self._atlas, at.geometry, *([at.chains.arrays] if on_cpu else ())]
 
     def _make_prior(self, damping: float, unknowns: int) -> None:
         """Set up damping, smoothness, and the multigrid preconditioner of a single tile."""
@@ -221,12 +231,8 @@ class BrightnessMap:
 
     def _subtract(self, vector: Any, residual: Any) -> None:
         """Subtract the left sides of the equations, for a ``vector`` of unknowns, from ``residual``."""
-        at, given = self._at, [self.pairs.arrays, self._atlas, self._at.geometry]
-        if self.device.is_cpu:
-            inputs = [*given, at.chains.arrays, vector]
-            launch(self._kernels.subtract, at.chains.blocks, inputs, [residual], device="cpu", smallest=FEW_BLOCKS)
-        else:
-            launch(self._kernels.subtract, self.count, [*given, vector], [residual], device=self.device)
+        kernel, inputs = self._kernels.subtract, [*self._equations, vector]
+        launch(kernel, self._equation_threads, inputs, [residual], device=self.device, smallest=FEW_BLOCKS)
 
     @cached_property
     def _weigh(self) -> Any:
@@ -236,22 +242,13 @@ class BrightnessMap:
         return program
 
     def _add_weigh(self, program: Any) -> None:
-        out = [self.residuals.weight, self.residuals.values]
-        given, unknowns = [self.pairs.arrays, self._atlas, self._at.geometry], [self._image, self._scale]
-        if self.device.is_cpu:
-            inputs = [*given, self._at.chains.arrays, *unknowns]
-            program.add(self._kernels.weigh, self._at.chains.blocks, inputs, out, smallest=FEW_BLOCKS)
-        else:
-            program.add(self._kernels.weigh, self.count, [*given, *unknowns], out)
+        inputs, out = [*self._equations, self._image, self._scale], [self.residuals.weight, self.residuals.values]
+        program.add(self._kernels.weigh, self._equation_threads, inputs, out, smallest=FEW_BLOCKS)
 
     def _add_sums(self, program: Any, kernel: Any, *vectors: Any) -> None:
         """Add a step that sums up over the weighted equations."""
-        where = self._at.chains.arrays if self.device.is_cpu else self._at.geometry
-        inputs = [self.pairs.arrays, self._atlas, where, self.residuals.weight, *vectors]
-        if self.device.is_cpu:
-            program.add_slices(kernel, self._at.chains.blocks, inputs, self._slices, smallest=FEW_BLOCKS)
-        else:
-            program.add_slices(kernel, self.count, inputs, self._slices)
+        inputs = [self.pairs.arrays, self._atlas, self._equations[-1], self.residuals.weight, *vectors]
+        program.add_slices(kernel, self._equation_threads, inputs, self._slices, smallest=FEW_BLOCKS)
 
     @cached_property
     def _prepare(self) -> Any:

@@ -50,9 +50,11 @@ class PixelVotes:
         self._totals = wp.empty(0, dtype=wp.int64, device="cpu")
         self._room = CAPACITY
 
-    def _clear_sums(self) -> None:
-        run_together([one.zero_ for one in self._slices])
-        self._stale = False
+    def _clear_stale(self) -> None:
+        """Clear the sums if they are to be cleared, so that they can be used."""
+        if self._stale:
+            run_together([one.zero_ for one in self._slices])
+            self._stale = False
 
     def add_events(self, inputs: list[Any], events: UploadedEvents, camera_rotation: Any | None) -> None:
         """Vote events. ``inputs``: model, camera, columns of the events and canvas, as the kernels take them."""
@@ -71,8 +73,7 @@ class PixelVotes:
 
         def vote_range(first: int, blocks: int) -> None:
             self._reserve(blocks * int(BLOCK))
-            if self._stale:
-                self._clear_sums()
+            self._clear_stale()
             vote(first, blocks)
 
         return vote_range
@@ -101,8 +102,7 @@ class PixelVotes:
 
     def read(self, image: Image) -> None:
         """Write the current image [events] to ``image``; the votes are kept."""
-        if self._stale:
-            self._clear_sums()
+        self._clear_stale()
         inputs = [self._sums, self._totals, self._canvas, image.frame]
         if len(self._totals):
             launch(read_sums, image.blocks, inputs, [image.pixels], device="cpu", smallest=SMALLEST)

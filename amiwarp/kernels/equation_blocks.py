@@ -74,7 +74,7 @@ def apply_transpose(
         w = load_float(weight, BLOCK * block + k)
         product = w * load_float(residual, BLOCK * block + k)
         store_float(products, k, wp.where(w > 0.0, product, 0.0))  # the residual of a pair off the map is NaN
-    move_to_ends(values, products, chains, block)
+    move_to_ends(values, 0, products, 0, chains, block)
     if atlas.with_leak > 0.0 or atlas.with_off != 0:
         for k in range(BLOCK):
             add_extra(sums, atlas, pairs, BLOCK * block + k, products[k])

@@ -61,20 +61,26 @@ def make_chains(
 
 
 @wp.func_native("""
-    const float* from = (const float*)weight.data + 64 * block;
+    const float* from = (const float*)values.data + first;
     const uint8_t* end = (const uint8_t*)chains.end.data + 64 * block;
-    float* to = (float*)chains.weight.data + 128 * block;
+    float* to = (float*)ends.data + place;
     for (int j = 0; j < 128; ++j) to[j] = 0.0f;
     for (int k = 0; k < 64; ++k) to[end[k]] = from[k];
 """)
-def move_weights(weight: wp.array(dtype=float), chains: Chains, block: int):
-    """Store the weights of a block of pairs at the positions at which the pairs end."""
+def move_to_ends(
+    ends: wp.array(dtype=float), place: int, values: wp.array(dtype=float), first: int, chains: Chains, block: int
+):
+    """Store the values of a block of pairs at the places of their second positions; the other places become 0.
+
+    The values are the 64 elements from ``first`` on. The places are the 128 elements of ``ends`` from ``place`` on.
+    """
 
 
 @wp.kernel
 def weigh_chains(weight: wp.array(dtype=float), start: int, chains: Chains):
     """Copy the weights of one block of pairs per thread to the positions at which the pairs end."""
-    move_weights(weight, chains, start + wp.tid())
+    block = start + wp.tid()
+    move_to_ends(chains.weight, 2 * BLOCK * block, weight, BLOCK * block, chains, block)
 
 
 @wp.func_native("""
@@ -85,7 +91,6 @@ def weigh_chains(weight: wp.array(dtype=float), start: int, chains: Chains):
     const float* fx = (const float*)x.data + first;
     const float* fy = (const float*)y.data + first;
     alignas(64) float upper[256], lower[256];
-#pragma clang loop unroll(disable)
     for (int j = 0; j < n; j += 8) {
         uint64_t a[8], b[8];
         for (int i = 0; i < 8; ++i) {
@@ -134,16 +139,6 @@ def find_levels(levels: wp.array(dtype=float), chains: Chains, vector: wp.array(
 """)
 def weighted_differences(values: wp.array(dtype=float), levels: wp.array(dtype=float), chains: Chains, block: int):
     """Compute weight · (L(second) - L(first)) of each pair in a block, at the place of its second position."""
-
-
-@wp.func_native("""
-    const float* value = (const float*)values.data;
-    const uint8_t* end = (const uint8_t*)chains.end.data + 64 * block;
-    float* out = (float*)ends.data;
-    for (int k = 0; k < 64; ++k) out[end[k]] = value[k];
-""")
-def move_to_ends(ends: wp.array(dtype=float), values: wp.array(dtype=float), chains: Chains, block: int):
-    """Store the values of the 64 pairs in a block at the places of their second positions."""
 
 
 @wp.func_native("""

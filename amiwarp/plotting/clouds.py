@@ -53,7 +53,7 @@ class Renderer:
     """Process that draws clouds with VTK. It loads VTK when it starts, while the caller does something else."""
 
     def __init__(self) -> None:
-        """Start the process. One that fails is noticed by :meth:`render`."""
+        """Start the process. If it fails, :meth:`render` returns None."""
         environment = dict(os.environ)
         if sys.platform.startswith("linux"):
             # By default VTK tries X first, and crashes if libX11 is missing; EGL needs no display.
