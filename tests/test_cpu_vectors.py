@@ -1,7 +1,6 @@
 """Vectorised kernels for CPUs compute what the kernels with one pair, node or unknown per thread compute."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,13 +8,14 @@ import warp as wp
 from conftest import TRUE_PHASE, TRUE_PRISM
 
 from amiwarp.brightness.event_pairs import EventTable
+from amiwarp.brightness.pair_ends import PairEnds
 from amiwarp.brightness.solver import BrightnessMap, Smoothness
 from amiwarp.brightness.tiles import Tiles
 from amiwarp.events.recording import Recording
 from amiwarp.kernels import conjugate_gradients as cg
-from amiwarp.kernels import equation_blocks, multilevel, normal_equations
+from amiwarp.kernels import multilevel, normal_equations
 from amiwarp.kernels.map_prior import Prior
-from amiwarp.kernels.pair_chains import weigh_chains
+from amiwarp.kernels.recorded_launches import Program
 from amiwarp.kernels.residual_slopes import slope_between
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.exact_model import ExactModel
@@ -42,21 +42,20 @@ def placed(recording: Recording) -> BrightnessMap:
     return brightness
 
 
-def summed(of: BrightnessMap, kernel: Any, count: int, inputs: list[Any]) -> np.ndarray:
-    out = wp.zeros(len(of.unknowns), dtype=wp.int64, device="cpu")
-    wp.launch(kernel, count, [of.pairs.arrays, of._atlas, *inputs, 0], [out], device="cpu")
-    return np.asarray(out.numpy() * SCALE)
-
-
-@pytest.mark.parametrize("name", ["add_diagonal", "apply_transpose", "apply_normal"])
-def test_sums_over_blocks_of_pairs(placed: BrightnessMap, name: str) -> None:
-    at, weight = placed._at, placed.residuals.weight
-    wp.launch(weigh_chains, at.chains.blocks, [weight, 0], [at.chains.arrays], device="cpu")
-    vectors = {"add_diagonal": [], "apply_transpose": [placed.residuals.values], "apply_normal": [placed._image]}[name]
-    one = summed(placed, getattr(normal_equations, name), placed.count, [at.geometry, weight, *vectors])
-    other = summed(placed, getattr(equation_blocks, name), at.chains.blocks, [at.chains.arrays, weight, *vectors])
-    assert np.count_nonzero(one) > 1000
-    np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-4)
+@pytest.mark.parametrize("name", ["add_diagonal", "add_transpose", "add_product"])
+def test_sums_over_blocks_of_pairs(placed: BrightnessMap, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sums of blocks of pairs, and of ends in the order of the map as they are on CUDA."""
+    monkeypatch.setattr("amiwarp.kernels.recorded_launches.cpu_threads", lambda: 1)  # one thread writes to the sums
+    weight, found = placed.residuals.weight, []
+    vectors = {"add_diagonal": [], "add_transpose": [placed.residuals.values], "add_product": [placed._image]}[name]
+    for equations in (placed._equations, PairEnds(placed.pairs, placed._atlas, placed._at.geometry)):
+        out, program = wp.zeros(len(placed.unknowns), dtype=wp.int64, device="cpu"), Program("cpu")
+        equations.take_positions()
+        getattr(equations, name)(program, weight, *vectors, [out])
+        program.launch()
+        found.append(out.numpy() * SCALE)
+    assert np.count_nonzero(found[1]) > 1000
+    np.testing.assert_allclose(*found, rtol=1e-5, atol=1e-4)
 
 
 def test_residuals_over_blocks_of_pairs(placed: BrightnessMap) -> None:

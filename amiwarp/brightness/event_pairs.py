@@ -20,6 +20,7 @@ from amiwarp.kernels.launch import launch
 from amiwarp.kernels.map_positions import find_places
 from amiwarp.kernels.pair_chains import BLOCK
 from amiwarp.kernels.photometric import HELD, Pairs
+from amiwarp.kernels.recorded_launches import BLOCK_DIM
 from amiwarp.kernels.square_sums import split_by_time
 from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
@@ -368,7 +369,7 @@ def _running_count(flag: Any) -> tuple[Any, int]:
 def _empty(count: int, device: Any, *, weak: float = 0.0, drifts: bool = False) -> Any:
     """Return a set of ``count`` pairs to be filled, whose arrays are padded with zeros to whole blocks."""
     out = Pairs()
-    block = int(BLOCK)
+    block = int(BLOCK) if wp.get_device(device).is_cpu else BLOCK_DIM
     out.count, out.stride, out.weak = count, -(-count // block) * block, weak
     dtypes = {"x": wp.uint16, "y": wp.uint16, "tile": int, "on": wp.uint8}
     for name, columns in COLUMNS.items():

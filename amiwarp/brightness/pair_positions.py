@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp.brightness.pair_chains import FEW_BLOCKS, PairChains
+from amiwarp.brightness.pair_ends import PairEnds
 from amiwarp.kernels import map_positions as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.pairs import keep_nodes
@@ -33,8 +34,8 @@ class PairPositions:
         self.pairs, self.device, self._atlas, self._middle_us = pairs, wp.get_device(pairs.device), atlas, middle_us
         self.geometry = self._new_geometry()
         """Positions: the kernels' struct ``Geometry``."""
-        self.chains = PairChains(pairs.arrays.stride, self.device)
-        """The same in chains, on a CPU."""
+        self.equations = (PairChains if self.device.is_cpu else PairEnds)(pairs, atlas, self.geometry)
+        """Equations of the pairs at these positions."""
         self._nothing = wp.empty(0, dtype=float, device=self.device)
 
     def _new_geometry(self) -> Any:
@@ -47,7 +48,7 @@ class PairPositions:
     def place(self, model: Model, drift: float, camera_rotation: CameraRotation | None) -> None:
         """Compute the positions."""
         self._place(model, drift, camera_rotation, self.geometry)
-        self.chains.join(self.geometry)
+        self.equations.take_positions()
 
     def _place(
         self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any, image: Any = None
@@ -67,7 +68,7 @@ class PairPositions:
             return
         inputs += [drift, turn.params(), self._nothing if image is None else image]
         outputs = [out, self._nothing] if image is None else [self.geometry, out]
-        launch(kernels.place_blocks, self.chains.blocks, inputs, outputs, device="cpu", smallest=FEW_BLOCKS)
+        launch(kernels.place_blocks, self.equations.threads, inputs, outputs, device="cpu", smallest=FEW_BLOCKS)
 
     def _turn(self, camera_rotation: CameraRotation | None) -> CameraRotation:
         return (camera_rotation or CameraRotation()).about(self._middle_us)
@@ -109,4 +110,4 @@ class PairPositions:
         on = wp.array(nodes.ravel().view(np.uint8), dtype=wp.uint8, device=self.device)
         inputs = [on, self.pairs.arrays.on, self.geometry.stride]
         launch(keep_nodes, len(self.pairs), inputs, [self.geometry.cell], device=self.device)
-        self.chains.join(self.geometry)
+        self.equations.take_positions()

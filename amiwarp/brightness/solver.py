@@ -20,7 +20,6 @@ from amiwarp.brightness.pair_positions import PairPositions
 from amiwarp.brightness.residuals import Residuals
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import conjugate_gradients as cg
-from amiwarp.kernels import equation_blocks, normal_equations
 from amiwarp.kernels.conjugate_gradients import add_multiple, dot, gather, gather_diagonal
 from amiwarp.kernels.launch import launch, slice_count
 from amiwarp.kernels.map_prior import EXTRA, Prior, link
@@ -104,7 +103,7 @@ class BrightnessMap:
         self.residuals = Residuals(pairs, len(tiles.origin))
         self._scale, self._solved = self._zeros(1), False
         self._at = PairPositions(pairs, self._atlas, middle_us)
-        self._choose_kernels()
+        self._equations = self._at.equations
 
     def _zeros(self, n: int) -> Any:
         return wp.zeros(n, dtype=float, device=self.device)
@@ -119,16 +118,6 @@ class BrightnessMap:
         parts = -(-self._threads // (1 if self.device.is_cpu else BLOCK_DIM))
         for name, n in (("scalars", 2), ("pq", parts), ("rz", parts)):
             setattr(self._dots, name, wp.zeros(n, dtype=wp.float64, device=self.device))
-
-    def _choose_kernels(self) -> None:
-        """Set the kernels over all equations, their number of threads, and their common inputs.
-
-        The last input has the positions as the kernels that sum up take them.
-        """
-        on_cpu, at = self.device.is_cpu, self._at
-        self._kernels = equation_blocks if on_cpu else normal_equations
-        self._equation_threads = at.chains.blocks if on_cpu else self.count
-        self._equations = [self.pairs.arrays, self._atlas, at.geometry, *([at.chains.arrays] if on_cpu else ())]
 
     def _make_prior(self, damping: float, unknowns: int) -> None:
         """Set up damping, smoothness, and the multigrid preconditioner of a single tile."""
@@ -231,8 +220,10 @@ class BrightnessMap:
 
     def _subtract(self, vector: Any, residual: Any) -> None:
         """Subtract the left sides of the equations, for a ``vector`` of unknowns, from ``residual``."""
-        kernel, inputs = self._kernels.subtract, [*self._equations, vector]
-        launch(kernel, self._equation_threads, inputs, [residual], device=self.device, smallest=FEW_BLOCKS)
+        equations, inputs = self._equations, [*self._equations.inputs, vector]
+        launch(
+            equations.kernels.subtract, equations.threads, inputs, [residual], device=self.device, smallest=FEW_BLOCKS
+        )
 
     @cached_property
     def _weigh(self) -> Any:
@@ -242,13 +233,9 @@ class BrightnessMap:
         return program
 
     def _add_weigh(self, program: Any) -> None:
-        inputs, out = [*self._equations, self._image, self._scale], [self.residuals.weight, self.residuals.values]
-        program.add(self._kernels.weigh, self._equation_threads, inputs, out, smallest=FEW_BLOCKS)
-
-    def _add_sums(self, program: Any, kernel: Any, *vectors: Any) -> None:
-        """Add a step that sums up over the weighted equations."""
-        inputs = [self.pairs.arrays, self._atlas, self._equations[-1], self.residuals.weight, *vectors]
-        program.add_slices(kernel, self._equation_threads, inputs, self._slices, smallest=FEW_BLOCKS)
+        equations, out = self._equations, [self.residuals.weight, self.residuals.values]
+        inputs = [*equations.inputs, self._image, self._scale]
+        program.add(equations.kernels.weigh, equations.threads, inputs, out, smallest=FEW_BLOCKS)
 
     @cached_property
     def _prepare(self) -> Any:
@@ -257,8 +244,7 @@ class BrightnessMap:
         if self.smoothness is not None:
             inputs = [self._image, self.tiles.rows, self.smoothness.edge, self._prior]
             program.add(link, self.tiles.nodes, inputs, [self._prior.right, self._prior.down])
-        self._at.chains.add_weights(program, self.residuals.weight)
-        self._add_sums(program, self._kernels.add_diagonal)
+        self._equations.add_diagonal(program, self.residuals.weight, self._slices)
         program.add(gather_diagonal, len(self._image), [self._sums, self._prior], [self._u.diagonal])
         return program
 
@@ -305,8 +291,7 @@ class BrightnessMap:
         weak, self.pairs.arrays.weak = self.pairs.arrays.weak, 0.0
         program = Program(self.device)
         self._add_weigh(program)
-        self._at.chains.add_weights(program, self.residuals.weight)
-        self._add_sums(program, self._kernels.add_diagonal)
+        self._equations.add_diagonal(program, self.residuals.weight, self._slices)
         out = self._zeros(len(self._image))
         program.add(gather, len(out), [self._sums], [out])
         program.launch()
@@ -340,7 +325,7 @@ class _ConjugateGradients:
 
     def _add_start(self, program: Any) -> None:
         of = self._map
-        of._add_sums(program, of._kernels.apply_transpose, self.residual)
+        of._equations.add_transpose(program, of.residuals.weight, self.residual, of._slices)
         self._add(program, cg.start_descent, [of._sums, of._prior, self.image], [of._u, of._dots])
         self._correct(program)
 
@@ -350,7 +335,7 @@ class _ConjugateGradients:
             self._add(program, cg.update_search_direction, [], [of._u, of._dots])
         else:
             self._add(program, cg.update_search_direction_with, [of._z], [of._u, of._dots])
-        of._add_sums(program, of._kernels.apply_normal, of._u.direction)
+        of._equations.add_product(program, of.residuals.weight, of._u.direction, of._slices)
         self._add(program, cg.finish_product, [of._sums, of._prior], [of._u, of._dots])
         self._add(program, cg.descend, [], [self.image, of._u, of._dots])
         self._correct(program)

@@ -8,6 +8,7 @@ the next kernel adds them up itself. Nothing is copied to the host, and the resu
 import warp as wp
 
 from amiwarp.kernels.map_prior import Prior, prior_diagonal, prior_product
+from amiwarp.kernels.warp_runs import ends_run, sum_run
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,6 +48,14 @@ def to_fixed(value: float) -> wp.int64:
 def add_fixed(sums: wp.array(dtype=wp.int64), i: int, value: float):
     """Add a value to element ``i`` of fixed-point sums, atomically."""
     wp.atomic_add(sums, i, to_fixed(value))
+
+
+@wp.func
+def add_from_warp(sums: wp.array(dtype=wp.int64), i: int, value: float):
+    """Add a value of each thread to element ``i``. On CUDA all threads of a warp must call it; one of them adds."""
+    total = sum_run(value, 1)
+    if ends_run(0):
+        add_fixed(sums, i, total)
 
 
 @wp.func_native("""

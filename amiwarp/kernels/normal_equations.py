@@ -6,20 +6,14 @@ A thread processes one pair. These kernels are for CUDA; :mod:`amiwarp.kernels.e
 import warp as wp
 
 from amiwarp.kernels.camera import NAN
-from amiwarp.kernels.conjugate_gradients import add_two, to_fixed
 from amiwarp.kernels.photometric import (
     Atlas,
     Geometry,
     Pairs,
     add_extra,
     add_extra_diagonal,
-    add_to_nodes,
-    bilinear,
-    continues_previous,
     difference,
-    fractions_of,
     residual_of,
-    transpose_add,
     weight_of,
 )
 
@@ -27,41 +21,40 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def apply_normal(
+def find_flows(
     pairs: Pairs,
     atlas: Atlas,
     geometry: Geometry,
     weight: wp.array(dtype=float),
     vector: wp.array(dtype=float),
     start: int,
+    flow: wp.array(dtype=float),
     sums: wp.array(dtype=wp.int64),
 ):
-    """Compute sums += Aᵀ W A vector for equations A with weights W."""
+    """Compute flow = W A vector for equations A with weights W, and the part of sums += Aᵀ flow off the map."""
     i = start + wp.tid()
-    if geometry.cell[i] < 0:
-        return
     value = weight[i] * difference(vector, atlas, pairs, geometry, i)
+    flow[i] = value
     add_extra(sums, atlas, pairs, i, value)
-    if i == 0 or not continues_previous(geometry, i):
-        add_to_nodes(sums, geometry.cell[i], atlas.columns, fractions_of(geometry, 0, i), -value)
-    if i + 1 < pairs.count and continues_previous(geometry, i + 1):
-        value -= weight[i + 1] * difference(vector, atlas, pairs, geometry, i + 1)
-    add_to_nodes(sums, geometry.cell[geometry.stride + i], atlas.columns, fractions_of(geometry, 1, i), value)
 
 
 @wp.kernel
-def apply_transpose(
+def weigh_residuals(
     pairs: Pairs,
     atlas: Atlas,
-    geometry: Geometry,
     weight: wp.array(dtype=float),
     residual: wp.array(dtype=float),
     start: int,
+    flow: wp.array(dtype=float),
     sums: wp.array(dtype=wp.int64),
 ):
-    """Compute sums += Aᵀ W residual for equations A with weights W."""
+    """Compute flow = W residual for equations A with weights W, and the part of sums += Aᵀ flow off the map."""
     i = start + wp.tid()
-    transpose_add(sums, atlas, pairs, geometry, i, weight[i] * residual[i])
+    value = float(0.0)
+    if weight[i] > 0.0:  # the residual of a pair off the map is NaN
+        value = weight[i] * residual[i]
+    flow[i] = value
+    add_extra(sums, atlas, pairs, i, value)
 
 
 @wp.kernel
@@ -81,24 +74,11 @@ def subtract(
 
 
 @wp.kernel
-def add_diagonal(
-    pairs: Pairs,
-    atlas: Atlas,
-    geometry: Geometry,
-    weight: wp.array(dtype=float),
-    start: int,
-    sums: wp.array(dtype=wp.int64),
+def add_sensor_diagonal(
+    pairs: Pairs, atlas: Atlas, weight: wp.array(dtype=float), start: int, sums: wp.array(dtype=wp.int64)
 ):
-    """Compute sums += diag(Aᵀ W A), the preconditioner, as if the two positions of a pair shared no node."""
+    """Compute the part of sums += diag(Aᵀ W A) off the map."""
     i = start + wp.tid()
-    if geometry.cell[i] < 0:
-        return
-    for k in range(2):
-        w = bilinear(fractions_of(geometry, k, i))
-        w = wp.cw_mul(w, w) * weight[i]
-        cell = geometry.cell[k * geometry.stride + i]
-        add_two(sums, cell, to_fixed(w[0]), to_fixed(w[1]))
-        add_two(sums, cell + atlas.columns, to_fixed(w[2]), to_fixed(w[3]))
     add_extra_diagonal(sums, atlas, pairs, i, weight[i])
 
 

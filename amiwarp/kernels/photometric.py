@@ -7,7 +7,7 @@ not depend on the order of threads.
 
 import warp as wp
 
-from amiwarp.kernels.conjugate_gradients import add_fixed, add_two, to_fixed
+from amiwarp.kernels.conjugate_gradients import add_from_warp
 from amiwarp.kernels.map_prior import EXTRA
 from amiwarp.kernels.vector_code import load_float, load_int, load_uint8
 
@@ -138,32 +138,13 @@ def right_side(pairs: Pairs, i: int) -> float:
 
 
 @wp.func
-def add_to_nodes(sums: wp.array(dtype=wp.int64), cell: int, columns: int, f: wp.vec2, value: float):
-    """Add a value to the sums of four nodes; the transpose of :func:`brightness_at`."""
-    upper = value * (1.0 - f[1])
-    lower = value * f[1]
-    add_two(sums, cell, to_fixed(upper * (1.0 - f[0])), to_fixed(upper * f[0]))
-    add_two(sums, cell + columns, to_fixed(lower * (1.0 - f[0])), to_fixed(lower * f[0]))
-
-
-@wp.func
-def transpose_add(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, g: Geometry, i: int, value: float):
-    """Add the transpose of :func:`difference` times a value to the sums; nothing for a pair off the map."""
-    if g.cell[i] < 0:
-        return
-    add_to_nodes(sums, g.cell[g.stride + i], atlas.columns, fractions_of(g, 1, i), value)
-    add_to_nodes(sums, g.cell[i], atlas.columns, fractions_of(g, 0, i), -value)
-    add_extra(sums, atlas, pairs, i, value)
-
-
-@wp.func
 def add_extra(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, i: int, value: float):
-    """Add a value to the sums of the leak and the OFF threshold."""
+    """Add a value to the sums of the leak and the OFF threshold. On CUDA all threads of a warp must call it."""
     extra = sums.shape[0] - EXTRA
     if atlas.with_leak > 0.0:
-        add_fixed(sums, extra, value * (pairs.time[pairs.stride + i] - pairs.time[i]))
+        add_from_warp(sums, extra, value * (pairs.time[pairs.stride + i] - pairs.time[i]))
     if atlas.with_off != 0:
-        add_fixed(sums, extra + 1, is_off(pairs, i) * value)
+        add_from_warp(sums, extra + 1, is_off(pairs, i) * value)
 
 
 @wp.func
@@ -172,21 +153,9 @@ def add_extra_diagonal(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pair
     extra = sums.shape[0] - EXTRA
     if atlas.with_leak > 0.0:
         gap = pairs.time[pairs.stride + i] - pairs.time[i]
-        add_fixed(sums, extra, weight * gap * gap)
+        add_from_warp(sums, extra, weight * gap * gap)
     if atlas.with_off != 0:
-        add_fixed(sums, extra + 1, is_off(pairs, i) * weight)
-
-
-@wp.func
-def continues_previous(g: Geometry, i: int) -> bool:
-    """Return whether pair i begins at the position at which pair i - 1 ends, for i > 0.
-
-    A single addition then serves both pairs.
-    """
-    before = g.stride + i - 1
-    if g.cell[i] < 0 or g.cell[i] != g.cell[before]:
-        return False
-    return g.part[i] == g.part[g.stride + before] and g.part[g.stride + i] == g.part[2 * g.stride + before]
+        add_from_warp(sums, extra + 1, is_off(pairs, i) * weight)
 
 
 @wp.func

@@ -1,0 +1,109 @@
+"""Ends of event pairs in the order of the brightness map, for CUDA.
+
+A pair has two ends: the positions of its two events. In the order of the map, neighbouring threads add to the same
+nodes. A warp first adds up what its threads have for each cell, so that few of them add to the sums.
+"""
+
+import warp as wp
+
+from amiwarp.kernels.conjugate_gradients import add_two, to_fixed
+from amiwarp.kernels.map_prior import EXTRA
+from amiwarp.kernels.photometric import Geometry, bilinear
+from amiwarp.kernels.warp_runs import ends_run, run_starts, sum_run
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Ends:
+    """Ends in the order of the map. If a pair begins where the one before it ends, that is one end.
+
+    The number of an end is the index of its pair, plus the stride for a second event, plus twice the stride if the next
+    pair begins there.
+    """
+
+    order: wp.array(dtype=int)  # number of each end
+    cell: wp.array(dtype=int)  # index of the map node up and left of each end; the number of nodes for unused elements
+    part: wp.array(dtype=wp.vec2)  # fractions (x, y) to the next node
+
+
+@wp.func
+def continues_previous(geometry: Geometry, i: int) -> bool:
+    """Return whether pair i begins at the position on the map at which pair i - 1 ends."""
+    if i == 0 or i == geometry.stride:
+        return False
+    before = geometry.stride + i - 1
+    if geometry.cell[i] < 0 or geometry.cell[i] != geometry.cell[before]:
+        return False
+    same_x = geometry.part[i] == geometry.part[geometry.stride + before]
+    return same_x and geometry.part[geometry.stride + i] == geometry.part[2 * geometry.stride + before]
+
+
+@wp.kernel
+def list_ends(geometry: Geometry, nodes: int, start: int, cell: wp.array(dtype=int), order: wp.array(dtype=int)):
+    """List the cell and the number of the first and the second end of each pair."""
+    end = start + wp.tid()
+    second = end >= geometry.stride
+    i = end - wp.where(second, geometry.stride, 0)
+    if second and continues_previous(geometry, i + 1):
+        order[end] = end + geometry.stride
+    else:
+        order[end] = end
+    unused = geometry.cell[end] < 0 or (not second and continues_previous(geometry, i))
+    cell[end] = wp.where(unused, nodes, geometry.cell[end])
+
+
+@wp.kernel
+def take_fractions(geometry: Geometry, start: int, ends: Ends):
+    """Store the fractions of the ends in their order."""
+    end = start + wp.tid()
+    number = ends.order[end]
+    i = number % geometry.stride
+    x = i + wp.where(number >= geometry.stride, 2 * geometry.stride, 0)
+    ends.part[end] = wp.vec2(geometry.part[x], geometry.part[x + geometry.stride])
+
+
+@wp.func
+def value_at(values: wp.array(dtype=float), number: int, stride: int, squared: int) -> float:
+    """Return the value of the pair that ends here, minus that of the pair that begins here; or plus, if squared."""
+    i = number % stride
+    sign = wp.where(squared != 0, 1.0, -1.0)
+    if number < stride:
+        return sign * values[i]
+    if number < 2 * stride:
+        return values[i]
+    return values[i] + sign * values[i + 1]
+
+
+@wp.kernel
+def add_ends(
+    ends: Ends,
+    stride: int,
+    columns: int,
+    values: wp.array(dtype=float),
+    squared: int,
+    start: int,
+    sums: wp.array(dtype=wp.int64),
+):
+    """Add each pair's value times the bilinear weights of its second end, minus those of its first, to the sums.
+
+    With ``squared``, add its value times the squares of the bilinear weights of both ends.
+    """
+    end = start + wp.tid()
+    cell = ends.cell[end]
+    used = cell < sums.shape[0] - EXTRA
+    share = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    if used:
+        share = bilinear(ends.part[end])
+        if squared != 0:
+            share = wp.cw_mul(share, share)
+        share = share * value_at(values, ends.order[end], stride, squared)
+    starts = run_starts(cell)
+    last = ends_run(cell)
+    upper_left = sum_run(share[0], starts)
+    upper_right = sum_run(share[1], starts)
+    lower_left = sum_run(share[2], starts)
+    lower_right = sum_run(share[3], starts)
+    if last and used:
+        add_two(sums, cell, to_fixed(upper_left), to_fixed(upper_right))
+        add_two(sums, cell + columns, to_fixed(lower_left), to_fixed(lower_right))
