@@ -1,6 +1,8 @@
 """Vectorised kernels for CPUs compute what the kernels with one pair, node or unknown per thread compute."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import warp as wp
 from conftest import TRUE_PHASE, TRUE_PRISM
 
 from amiwarp.brightness.event_pairs import EventTable
+from amiwarp.brightness.multigrid import GridHierarchy
 from amiwarp.brightness.pair_ends import PairEnds
 from amiwarp.brightness.solver import BrightnessMap, Smoothness
 from amiwarp.brightness.tiles import Tiles
@@ -151,9 +154,35 @@ def test_rows_of_grids(shape: tuple[int, int]) -> None:
     for a, b in zip(one, other, strict=True):
         np.testing.assert_allclose(b.numpy(), a.numpy(), rtol=1e-5, atol=1e-5)
     a, b = wp.clone(fine), wp.clone(fine)
-    wp.launch(multilevel.prolong, rows * columns, [one[0], few_columns, rows, columns, 0], [a], device="cpu")
+    wp.launch(multilevel.prolong, rows * columns, [one[0], rows, columns, 0], [a], device="cpu")
     wp.launch(multilevel.prolong_rows, rows, [one[0], few_columns, columns, 0], [b], device="cpu")
     np.testing.assert_allclose(b.numpy(), a.numpy(), rtol=1e-5, atol=1e-5)
+
+
+class OneThread:
+    """Stand-in for a program on CUDA that runs its kernels on a CPU, where a block is one thread."""
+
+    device = SimpleNamespace(is_cpu=False)
+
+    def add(self, kernel: Any, n: int, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, 1 if kernel is multilevel.correct_small else n, [*inputs, 0], outputs, device="cpu")
+
+
+@pytest.mark.parametrize("shape", [(40, 50), (77, 83), (301, 402), (13, 700)])
+def test_corrections_of_small_grids_in_one_block(shape: tuple[int, int]) -> None:
+    rng, prior, found = np.random.default_rng(4), Prior(), []
+    prior.smooth, prior.damping = (wp.full(1, value, dtype=float, device="cpu") for value in (0.01, 1e-6))
+    residual, diagonal = (rng.uniform(0.5, 1.5, shape[0] * shape[1]).astype(np.float32) for _ in "rd")
+    for program in (Program("cpu"), OneThread()):
+        grids, out = GridHierarchy(*shape, wp.get_device("cpu")), wp.zeros(len(residual), dtype=float, device="cpu")
+        for k, part in enumerate(grids._diagonal):
+            part.fill_(0.5 + k)
+        grids.correct(program, wp.array(diagonal, device="cpu"), prior, wp.array(residual, device="cpu"), out)
+        if isinstance(program, Program):
+            program.launch()
+        found.append(out.numpy())
+    assert not np.allclose(found[0], residual / diagonal, rtol=0.1)
+    np.testing.assert_allclose(*found, rtol=1e-5)
 
 
 @pytest.mark.parametrize("drift", [0.0, 0.3])

@@ -5,6 +5,7 @@ Corrections are computed on coarser and coarser grids, which transport brightnes
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import warp as wp
@@ -12,6 +13,7 @@ import warp as wp
 from amiwarp.kernels import multilevel as k
 from amiwarp.kernels.conjugate_gradients import gather
 from amiwarp.kernels.launch import SMALLEST_SLICE
+from amiwarp.kernels.recorded_launches import BLOCK_DIM
 
 COARSEST = 6
 """Smallest number of rows or columns of a grid; coarser grids are not made."""
@@ -19,6 +21,8 @@ STRIDES = (3, 5, 11, 23)
 """Every how many pairs one is used to estimate the diagonal of the first grid, the second, the third, and the further
 ones. They have no common divisor with the usual numbers of pairs per silent pixel. With fewer pairs, more steps are
 needed."""
+SMALL = 2048
+"""Largest number of nodes of a grid that a single block of threads processes on CUDA, with all coarser grids."""
 
 
 class GridHierarchy:
@@ -29,9 +33,11 @@ class GridHierarchy:
         self.shapes = [(rows, columns)]
         while min(self.shapes[-1]) // 2 + 1 >= COARSEST:
             self.shapes.append((self.shapes[-1][0] // 2 + 1, self.shapes[-1][1] // 2 + 1))
-        sizes = [r * c for r, c in self.shapes]
+        sizes = [r * c for r, c in self.shapes[1:]]
+        self._first = [sum(sizes[:k]) for k in range(len(sizes) + 1)]
+        self._all = [wp.zeros(sum(sizes), dtype=float, device=device) for _ in range(3)]
         self._diagonal, self._residual, self._correction = (
-            [wp.zeros(n, dtype=float, device=device) for n in sizes[1:]] for _ in range(3)
+            [one[a:b] for a, b in pairwise(self._first)] for one in self._all
         )
 
     def prepare(self, program: Any, equations: list[Any], count: int, sums: Any, slices: list[Any]) -> None:
@@ -45,8 +51,11 @@ class GridHierarchy:
     def correct(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
         """Add to ``program`` the step ``out`` = sum of the grids' corrections for the finest grid's ``residual``."""
         program.add(k.divide, len(out), [diagonal, residual], [out])
-        fine, on_cpu = residual, program.device.is_cpu
-        for level, (rows, columns) in enumerate(self.shapes[1:], start=1):
+        on_cpu = program.device.is_cpu
+        small = sum(rows * columns <= SMALL for rows, columns in self.shapes[2:]) if not on_cpu else 0
+        large = len(self.shapes) - small
+        fine = residual
+        for level, (rows, columns) in enumerate(self.shapes[1:large], start=1):
             outputs = [self._residual[level - 1], self._correction[level - 1]]
             inputs = [fine, *self.shapes[level - 1], columns, self._diagonal[level - 1], prior, 4.0**level]
             if on_cpu:
@@ -54,12 +63,16 @@ class GridHierarchy:
             else:
                 program.add(k.restrict, rows * columns, inputs, outputs)
             fine = outputs[0]
-        for level in range(len(self.shapes) - 1, 0, -1):
+        if small:
+            above, (all_diagonals, *outputs) = large - 1, self._all
+            inputs = [*self.shapes[above], self._first[above - 1], small, all_diagonals, prior, 4.0**above]
+            program.add(k.correct_small, BLOCK_DIM, inputs, outputs)
+        for level in range(large if small else large - 1, 0, -1):
             rows, columns = self.shapes[level - 1]
             target = out if level == 1 else self._correction[level - 2]
-            inputs = [self._correction[level - 1], self.shapes[level][1]]
             if on_cpu:
                 smallest = SMALLEST_SLICE // columns + 1
-                program.add(k.prolong_rows, rows, [*inputs, columns], [target], smallest=smallest)
+                inputs = [self._correction[level - 1], self.shapes[level][1], columns]
+                program.add(k.prolong_rows, rows, inputs, [target], smallest=smallest)
             else:
-                program.add(k.prolong, rows * columns, [*inputs, rows, columns], [target])
+                program.add(k.prolong, rows * columns, [self._correction[level - 1], rows, columns], [target])

@@ -9,6 +9,7 @@ import warp as wp
 from amiwarp.kernels.conjugate_gradients import add_fixed
 from amiwarp.kernels.map_prior import Prior
 from amiwarp.kernels.photometric import Atlas, Geometry, bilinear, fraction, fractions_of
+from amiwarp.kernels.shared_memory import wait_for_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -75,6 +76,27 @@ def divide(diagonal: wp.array(dtype=float), residual: wp.array(dtype=float), sta
         out[i] = residual[i] / diagonal[i]
 
 
+@wp.func
+def restricted(fine: wp.array(dtype=float), at: int, rows: int, columns: int, i: int) -> float:
+    """Return the residual at node ``i`` of the next coarser grid, from a grid stored from element ``at`` on."""
+    row = 2 * (i / (columns / 2 + 1))
+    column = 2 * (i % (columns / 2 + 1))
+    total = float(0.0)
+    for dy in range(-1, 2):
+        for dx in range(-1, 2):
+            y = row + dy
+            x = column + dx
+            if y >= 0 and y < rows and x >= 0 and x < columns:
+                total += fine[at + y * columns + x] / float((1 + wp.abs(dy)) * (1 + wp.abs(dx)))
+    return total
+
+
+@wp.func
+def corrected(total: float, diagonal: float, prior: Prior, four: float) -> float:
+    """Return the correction of a node with the residual ``total``; ``four`` is 4 to the power of its grid's level."""
+    return total / (diagonal + prior.smooth[0] * HAT + prior.damping[0] * four)
+
+
 @wp.kernel
 def restrict(
     fine: wp.array(dtype=float),
@@ -92,17 +114,9 @@ def restrict(
     i = start + wp.tid()
     if i >= coarse.shape[0]:
         return
-    row = 2 * (i / columns)
-    column = 2 * (i % columns)
-    total = float(0.0)
-    for dy in range(-1, 2):
-        for dx in range(-1, 2):
-            y = row + dy
-            x = column + dx
-            if y >= 0 and y < fine_rows and x >= 0 and x < fine_columns:
-                total += fine[y * fine_columns + x] / float((1 + wp.abs(dy)) * (1 + wp.abs(dx)))
+    total = restricted(fine, 0, fine_rows, fine_columns, i)
     coarse[i] = total
-    correction[i] = total / (diagonal[i] + prior.smooth[0] * HAT + prior.damping[0] * four)
+    correction[i] = corrected(total, diagonal[i], prior, four)
 
 
 @wp.func_native("""
@@ -155,25 +169,75 @@ def restrict_rows(
     restrict_row(fine, fine_rows, fine_columns, columns, diagonal, least, row, coarse, correction)
 
 
-@wp.kernel
-def prolong(
-    coarse: wp.array(dtype=float),
-    columns: int,
-    fine_rows: int,
-    fine_columns: int,
-    start: int,
-    fine: wp.array(dtype=float),
-):
-    """Interpolate the coarser grid's correction and add it to the finer grid's."""
-    i = start + wp.tid()
+@wp.func
+def prolonged(coarse: wp.array(dtype=float), first: int, fine_columns: int, i: int) -> float:
+    """Return the correction at node ``i`` of the next finer grid, from a grid stored from element ``first`` on."""
+    columns = fine_columns / 2 + 1
     row = i / fine_columns
     column = i % fine_columns
-    if row >= fine_rows:
-        return
-    at = (row / 2) * columns + column / 2
+    at = first + (row / 2) * columns + column / 2
     right = column % 2
     down = (row % 2) * columns
-    fine[i] = fine[i] + 0.25 * (coarse[at] + coarse[at + right] + coarse[at + down] + coarse[at + right + down])
+    return 0.25 * (coarse[at] + coarse[at + right] + coarse[at + down] + coarse[at + right + down])
+
+
+@wp.kernel
+def prolong(
+    coarse: wp.array(dtype=float), fine_rows: int, fine_columns: int, start: int, fine: wp.array(dtype=float)
+):  # fmt: skip
+    """Interpolate the coarser grid's correction and add it to the finer grid's."""
+    i = start + wp.tid()
+    if i < fine_rows * fine_columns:
+        fine[i] = fine[i] + prolonged(coarse, 0, fine_columns, i)
+
+
+@wp.func
+def grid_below(rows: int, columns: int, at: int, levels: int):
+    """Return rows, columns and first element of the grid that is ``levels`` coarser than the one given by these."""
+    r = int(rows)
+    c = int(columns)
+    first = int(at)
+    for _ in range(levels):
+        first += r * c
+        r = r / 2 + 1
+        c = c / 2 + 1
+    return r, c, first
+
+
+@wp.kernel
+def correct_small(
+    rows: int,
+    columns: int,
+    at: int,
+    levels: int,
+    diagonal: wp.array(dtype=float),
+    prior: Prior,
+    four: float,
+    start: int,
+    residual: wp.array(dtype=float),
+    correction: wp.array(dtype=float),
+):
+    """Compute the sum of the corrections on the ``levels`` grids below one of ``rows`` x ``columns`` nodes, in a block.
+
+    The grids are stored one after the other, the given one from element ``at`` on. ``four`` is 4 to the power of its
+    level. The sum is stored on the first grid below.
+    """
+    thread = start + wp.tid()
+    power = float(four)
+    for level in range(levels):
+        r, c, fine = grid_below(rows, columns, at, level)
+        coarse = fine + r * c
+        power *= 4.0
+        for i in range(thread, (r / 2 + 1) * (c / 2 + 1), wp.block_dim()):
+            total = restricted(residual, fine, r, c, i)
+            residual[coarse + i] = total
+            correction[coarse + i] = corrected(total, diagonal[coarse + i], prior, power)
+        wait_for_block()
+    for above in range(1, levels):
+        r, c, fine = grid_below(rows, columns, at, levels - above)
+        for i in range(thread, r * c, wp.block_dim()):
+            correction[fine + i] += prolonged(correction, fine + r * c, c, i)
+        wait_for_block()
 
 
 @wp.func_native("""
