@@ -168,7 +168,7 @@ class OneThread:
         wp.launch(kernel, 1 if kernel is multilevel.correct_small else n, [*inputs, 0], outputs, device="cpu")
 
 
-@pytest.mark.parametrize("shape", [(40, 50), (77, 83), (301, 402), (13, 700)])
+@pytest.mark.parametrize("shape", [(9, 40), (12, 13), (40, 50), (77, 83), (301, 402), (13, 700)])
 def test_corrections_of_small_grids_in_one_block(shape: tuple[int, int]) -> None:
     rng, prior, found = np.random.default_rng(4), Prior(), []
     prior.smooth, prior.damping = (wp.full(1, value, dtype=float, device="cpu") for value in (0.01, 1e-6))
@@ -181,7 +181,7 @@ def test_corrections_of_small_grids_in_one_block(shape: tuple[int, int]) -> None
         if isinstance(program, Program):
             program.launch()
         found.append(out.numpy())
-    assert not np.allclose(found[0], residual / diagonal, rtol=0.1)
+    assert np.allclose(found[0], residual / diagonal, rtol=0.1) == (shape == (9, 40))  # it has one grid only
     np.testing.assert_allclose(*found, rtol=1e-5)
 
 

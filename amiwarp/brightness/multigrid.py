@@ -5,8 +5,8 @@ Corrections are computed on coarser and coarser grids, which transport brightnes
 
 from __future__ import annotations
 
-from itertools import pairwise
-from typing import Any
+from itertools import islice, pairwise
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
@@ -14,6 +14,9 @@ from amiwarp.kernels import multilevel as k
 from amiwarp.kernels.conjugate_gradients import gather
 from amiwarp.kernels.launch import SMALLEST_SLICE
 from amiwarp.kernels.recorded_launches import BLOCK_DIM
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 COARSEST = 6
 """Smallest number of rows or columns of a grid; coarser grids are not made."""
@@ -50,29 +53,48 @@ class GridHierarchy:
 
     def correct(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
         """Add to ``program`` the step ``out`` = sum of the grids' corrections for the finest grid's ``residual``."""
+        if program.device.is_cpu:
+            self._correct_by_rows(program, diagonal, prior, residual, out)
+        else:
+            self._correct_by_nodes(program, diagonal, prior, residual, out)
+
+    def _restrictions(self, residual: Any, prior: Any) -> Iterator[tuple[list[Any], list[Any]]]:
+        """Yield inputs and outputs of the restriction to each grid but the finest."""
+        fines = [residual, *self._residual]
+        for level, (fine, *outputs) in enumerate(zip(fines, self._residual, self._correction, strict=False)):
+            columns = self.shapes[level + 1][1]
+            yield [fine, *self.shapes[level], columns, self._diagonal[level], prior, 4.0 ** (level + 1)], outputs
+
+    def _correct_by_rows(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
+        """Correct with a row of nodes per thread."""
         program.add(k.divide, len(out), [diagonal, residual], [out])
-        on_cpu = program.device.is_cpu
-        small = sum(rows * columns <= SMALL for rows, columns in self.shapes[2:]) if not on_cpu else 0
-        large = len(self.shapes) - small
-        fine = residual
-        for level, (rows, columns) in enumerate(self.shapes[1:large], start=1):
-            outputs = [self._residual[level - 1], self._correction[level - 1]]
-            inputs = [fine, *self.shapes[level - 1], columns, self._diagonal[level - 1], prior, 4.0**level]
-            if on_cpu:
-                program.add(k.restrict_rows, rows, inputs, outputs, smallest=SMALLEST_SLICE // (4 * columns) + 1)
-            else:
-                program.add(k.restrict, rows * columns, inputs, outputs)
-            fine = outputs[0]
+        for (rows, columns), (inputs, outputs) in zip(
+            self.shapes[1:], self._restrictions(residual, prior), strict=True
+        ):
+            program.add(k.restrict_rows, rows, inputs, outputs, smallest=SMALLEST_SLICE // (4 * columns) + 1)
+        for level in range(len(self._correction) - 1, -1, -1):
+            rows, columns = self.shapes[level]
+            inputs = [self._correction[level], self.shapes[level + 1][1], columns]
+            target = self._correction[level - 1] if level else out
+            program.add(k.prolong_rows, rows, inputs, [target], smallest=SMALLEST_SLICE // columns + 1)
+
+    def _correct_by_nodes(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
+        """Correct with a node per thread, and the small grids in one block of threads."""
+        if not self._correction:
+            program.add(k.divide, len(out), [diagonal, residual], [out])
+            return
+        small = sum(rows * columns <= SMALL for rows, columns in self.shapes[2:])
+        large = len(self._correction) - small
+        for inputs, outputs in islice(self._restrictions(residual, prior), large):
+            program.add(k.restrict, len(outputs[0]), inputs, outputs)
         if small:
-            above, (all_diagonals, *outputs) = large - 1, self._all
-            inputs = [*self.shapes[above], self._first[above - 1], small, all_diagonals, prior, 4.0**above]
+            all_diagonals, *outputs = self._all
+            inputs = [*self.shapes[large], self._first[large - 1], small, all_diagonals, prior, 4.0**large]
             program.add(k.correct_small, BLOCK_DIM, inputs, outputs)
         for level in range(large if small else large - 1, 0, -1):
-            rows, columns = self.shapes[level - 1]
-            target = out if level == 1 else self._correction[level - 2]
-            if on_cpu:
-                smallest = SMALLEST_SLICE // columns + 1
-                inputs = [self._correction[level - 1], self.shapes[level][1], columns]
-                program.add(k.prolong_rows, rows, inputs, [target], smallest=smallest)
-            else:
-                program.add(k.prolong, rows * columns, [self._correction[level - 1], rows, columns], [target])
+            rows, columns = self.shapes[level]
+            program.add(
+                k.prolong, rows * columns, [self._correction[level], rows, columns], [self._correction[level - 1]]
+            )
+        inputs = [self._correction[0], *self.shapes[0], diagonal, residual]
+        program.add(k.prolong_to_finest, len(out), inputs, [out])

@@ -191,6 +191,25 @@ def prolong(
         fine[i] = fine[i] + prolonged(coarse, 0, fine_columns, i)
 
 
+@wp.kernel
+def prolong_to_finest(
+    coarse: wp.array(dtype=float),
+    fine_rows: int,
+    fine_columns: int,
+    diagonal: wp.array(dtype=float),
+    residual: wp.array(dtype=float),
+    start: int,
+    out: wp.array(dtype=float),
+):
+    """Compute the correction on the finest grid (:func:`divide`), and add that of the coarser, interpolated."""
+    i = start + wp.tid()
+    if i < out.shape[0]:
+        correction = residual[i] / diagonal[i]
+        if i < fine_rows * fine_columns:
+            correction += prolonged(coarse, 0, fine_columns, i)
+        out[i] = correction
+
+
 @wp.func
 def grid_below(rows: int, columns: int, at: int, levels: int):
     """Return rows, columns and first element of the grid that is ``levels`` coarser than the one given by these."""
