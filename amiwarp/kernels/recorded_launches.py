@@ -9,6 +9,7 @@ from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.kernels.launch import SMALLEST_SLICE, run_together, slices
 
 BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks
+FEW_LAUNCHES = 6  # launches that take less time than the capture of a graph
 RUNS_PER_GRAPH = 4  # runs that one CUDA graph holds: launching a graph takes longer than a few small kernels
 
 
@@ -72,8 +73,8 @@ class Program:
             run_together(stage)
 
     def run(self, times: int = 1) -> None:
-        """Run all stages ``times`` times; on CUDA as graphs, which the first call captures."""
-        if self.device.is_cpu:
+        """Run all stages ``times`` times; many launches on CUDA run as graphs, which the first call captures."""
+        if self.device.is_cpu or times * len(self._stages) <= FEW_LAUNCHES:
             for _ in range(times):
                 self.launch()
             return

@@ -193,9 +193,9 @@ class Reconstruction:
             where = f"{start_us} .. {start_us + length_us} us"
             raise AmiwarpError(f"{recording.name}: no pixel fires twice in {where}; give a longer window")
         off = off_excess_by_counts(recording.events, self.turn_us, start_us, length_us)
-        if self.smoothness is None:
-            self.smoothness = self._choose(count, pairs, start_us, length_us, off)
         left, top, tiles = self._tile(start_us, length_us)
+        if self.smoothness is None:
+            self.smoothness = self._choose(count, pairs, start_us + length_us // 2, (left, top), off)
         solver = self._solver(pairs, tiles, off, start_us + length_us // 2)
         residual, covered = solve_rounds(solver, pair_count, last)
         cut = np.s_[top : top + height, left : left + width]
@@ -285,15 +285,17 @@ class Reconstruction:
         solver.place(self.model, camera_rotation=self.camera_rotation)
         return solver
 
-    def _choose(self, count: NDArray[np.int32], pairs: PairSet, start_us: int, length_us: int, off: float) -> float:
+    def _choose(
+        self, count: NDArray[np.int32], pairs: PairSet, middle_us: int, margin: tuple[int, int], off: float
+    ) -> float:
         """Return the smoothness weight with the lowest cost of held-out pairs, in the busiest part of the image."""
         x0, y0, side = choice_square(count)
         part = pairs.of_square(x0, y0, side)
         if part.hold_out(HOLD_OUT_EVERY) < 50:
             return SMOOTHNESS[-1]
-        left, top, _ = self._tile(start_us, length_us)
+        left, top = margin
         tiles = Tiles(np.array([[x0 - left, y0 - top]], np.float32), side + 2 * top, side + 2 * left, 1.0)
-        solver = self._solver(part, tiles, off, start_us + length_us // 2)
+        solver = self._solver(part, tiles, off, middle_us)
 
         def cost(weight: float) -> float:
             solver.restart(weight)
