@@ -113,7 +113,7 @@ def collect_pairs(recording: Recording, search: Search, settings: PhotometricSet
     if len(recording.events.between(first, first + int(FEWEST_TURNS * turn) + 1)) <= settings.pairs:
         tile_of, tiles = one_tile(*recording.events.size, settings.density, margin)
     else:
-        tile_of, tiles = choose_tiles(search.image(), settings.density, margin)
+        tile_of, tiles = choose_tiles(search.image, settings.density, margin)
     collector = _PairCollector(recording, search, tile_of, settings.sensor)
     spans = [(first + int(k * turn), first + int(k * turn) + int(turn)) for k in van_der_corput(turns)]
     if search.full_space.moving:
