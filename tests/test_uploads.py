@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
@@ -46,6 +47,29 @@ def test_other_angles_leave_the_other_columns_alone(device: str) -> None:
         np.testing.assert_array_equal(getattr(found.arrays, name).numpy(), getattr(expected.arrays, name).numpy())
     turns = angles * (TURNS / (2.0 * math.pi))
     np.testing.assert_array_equal(first.arrays.turn.numpy()[:1000], np.rint(turns).astype(np.int64) % TURNS)
+
+
+@pytest.mark.parametrize("middle_us", [None, 100_000])
+@pytest.mark.parametrize("drifts", [False, True])
+def test_every_third_event_as_if_uploaded_alone(drifts: bool, middle_us: int | None, device: str) -> None:
+    t = np.cumsum(np.random.default_rng(1).integers(500, 1500, 300))
+    encoder = Encoder.from_angles(t, 0.04 * np.arange(300) ** 1.1, clock_offset_us=12.25)
+    events = still_scene(20_000)
+    events = events[np.searchsorted(events.t, 2000) :]
+    everything = CalibrationEvents(events, encoder, (lambda at: encoder.speed_at(at) * 1e-6) if drifts else None)
+    everything.on(device, middle_us)
+    found = everything.every(3).on(device, middle_us)
+    expected = CalibrationEvents(events[::3], encoder, everything.slope_of).on(device, middle_us)
+    n = found.count
+    assert found.total == n == expected.count
+    for name in ("x", "y", "layer", "turn", "time"):
+        one, other = (getattr(of.arrays, name).numpy()[:n] for of in (found, expected))
+        np.testing.assert_array_equal(one, other)
+    if drifts:
+        np.testing.assert_array_equal(found.slope.numpy()[:n], expected.slope.numpy()[:n])
+        found.drift(300.0)
+        assert np.any(found.arrays.turn.numpy() != expected.arrays.turn.numpy())
+        np.testing.assert_array_equal(found.base.numpy(), expected.base.numpy())
 
 
 def test_uncovered_events_are_refused(device: str) -> None:

@@ -14,13 +14,12 @@ import numpy as np
 import warp as wp
 
 from amiwarp.events.device_encoder import encoder_params
-from amiwarp.events.device_events import time_span
+from amiwarp.events.device_events import join, time_span
 from amiwarp.kernels import pairs as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.map_positions import find_places
 from amiwarp.kernels.pair_chains import BLOCK
 from amiwarp.kernels.photometric import HELD, Pairs
-from amiwarp.kernels.recorded_launches import BLOCK_DIM
 from amiwarp.kernels.square_sums import split_by_time
 from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
@@ -37,8 +36,6 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 
-COLUMNS = {"x": 1, "y": 1, "tile": 1, "on": 1, "azimuth": 4, "time": 2, "slope": 2}
-"""Number of values per pair in each array of the kernels' struct ``Pairs``."""
 SAMPLED = 1 << 15
 """Number of pairs whose times give the statistics of all."""
 
@@ -99,7 +96,7 @@ class PairSet:
         """
         first, second = self.some_times
         middle = 0.5 * (first + second)
-        late, long = (wp.zeros(self.arrays.stride, dtype=float, device=self.device) for _ in "ll")
+        late, long = (wp.empty(self.arrays.stride, dtype=float, device=self.device) for _ in "ll")
         spread = max(float(middle.std()), 1e-9)
         inputs = [self.arrays, float(middle.mean()), spread, float(np.median(second - first))]
         launch(split_by_time, len(self), inputs, [late, long], device=self.device)
@@ -137,32 +134,23 @@ class PairSet:
         out = _empty(sum(map(len, parts)), parts[0].device, weak=first.weak, drifts=drifts)
         at = 0
         for part in parts:
-            for name, columns in COLUMNS.items():
-                here, there = getattr(part.arrays, name), getattr(out, name)
-                for k in range(columns if len(there) and len(here) else 0):
-                    wp.copy(there, here, k * out.stride + at, k * part.arrays.stride, len(part))
+            launch(kernels.append, len(part), [part.arrays, at], [out], device=part.device)
             at += len(part)
         return cls(out, parts[0].device)
 
     def of_tiles(self, listed: NDArray[np.bool_]) -> PairSet:
         """Return the pairs on tiles whose value in ``listed`` is true, shape (tiles,)."""
-        return self._select(kernels.mark_listed, [self.arrays.tile, _int_array(listed, self.device)])
+        numbers = wp.array(listed.astype(np.int32), dtype=int, device=self.device)
+        return self._select(kernels.mark_listed, [self.arrays.tile, numbers])
 
     def of_square(self, left: int, top: int, side: int) -> PairSet:
         """Return the pairs of the pixels in a square of ``side`` px with corner (``left``, ``top``)."""
         return self._select(kernels.mark_square, [self.arrays, left, top, side])
 
-    def on_tiles(
-        self,
-        model: Model,
-        camera_rotation: CameraRotation,
-        drift: float,
-        tile_of: NDArray[np.int32],
-        listed: NDArray[np.bool_],
-    ) -> PairSet:
-        """Return the pairs whose compensated events both fall on the same tile, if ``listed`` is true for that tile.
+    def on_tiles(self, model: Model, camera_rotation: CameraRotation, drift: float, tile_of: Any) -> PairSet:
+        """Return the pairs whose compensated events both fall on the same tile.
 
-        ``tile_of`` gives the tile of each pixel of the map, or -1.
+        ``tile_of`` gives the tile of each pixel of the map, or -1, on the device.
         """
         places = wp.empty(len(self), dtype=wp.vec4, device=self.device)
         inputs = [
@@ -173,9 +161,7 @@ class PairSet:
             camera_rotation.params(),
         ]
         launch(find_places, len(self), inputs, [places], device=self.device)
-        tiles = wp.array(tile_of, dtype=int, device=self.device)
-        marked = [places, tiles, _int_array(listed, self.device)]
-        return self._select(kernels.mark_same_tile, marked, [self.arrays.tile])
+        return self._select(kernels.mark_same_tile, [places, tile_of], [self.arrays.tile])
 
     def hold_out(self, every: int) -> int:
         """Mark every ``every``-th pair of two events as held out, so that it is not fitted; return the number held out.
@@ -274,8 +260,8 @@ class EventTable:
         flag = wp.empty(base + spans, dtype=int, device=device)
         launch(kernels.mark_pairs, m, [self.arrays, times], [flag], device=device)
         launch(kernels.mark_ends, ends, [self.arrays], [flag], device=device)
-        edges_d = wp.array(edges, dtype=wp.int64, device=device)
         if spans:
+            edges_d = wp.array(edges, dtype=wp.int64, device=device)
             self._mark_quiet(edges_d, at_least, base, flag)
         place, count = _running_count(flag)
         out = _empty(count, device, weak=weak)
@@ -337,24 +323,13 @@ def off_excess(pairs: PairSet, *, with_leak: bool = False) -> float:
 
 
 def _upload(parts: Sequence[NDArray[Any] | wp.array], dtype: Any, device: Any) -> Any:
-    """Concatenate arrays on a device, without a concatenated copy on the host."""
-    if len(parts) == 1 and isinstance(parts[0], wp.array):
-        return parts[0].to(device)
-    if len(parts) == 1:
-        return wp.array(np.ascontiguousarray(parts[0]), dtype=dtype, device=device, copy=False)
-    out = wp.empty(sum(map(len, parts)), dtype=dtype, device=device)
-    at = 0
-    for part in parts:
-        on_device = isinstance(part, wp.array)
-        here = part if on_device else wp.array(np.ascontiguousarray(part), dtype=dtype, device="cpu", copy=False)
-        wp.copy(out, here, at, 0, len(part))
-        at += len(part)
-    return out
-
-
-def _int_array(values: NDArray[Any], device: Any) -> Any:
-    """Return values as an int32 array on the device."""
-    return wp.array(values.astype(np.int32), dtype=int, device=device)
+    """Return the values of arrays as one array on a device. NumPy arrays are joined first: many copies take longer."""
+    if not parts:
+        return wp.empty(0, dtype=dtype, device=device)
+    if isinstance(parts[0], wp.array):
+        return join(parts).to(device)
+    values = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
 
 
 def _running_count(flag: Any) -> tuple[Any, int]:
@@ -367,16 +342,23 @@ def _running_count(flag: Any) -> tuple[Any, int]:
 
 
 def _empty(count: int, device: Any, *, weak: float = 0.0, drifts: bool = False) -> Any:
-    """Return a set of ``count`` pairs to be filled, whose arrays are padded with zeros to whole blocks."""
+    """Return a set of ``count`` pairs to be filled, whose arrays are padded to whole blocks.
+
+    The padding is zero on a CPU, whose kernels process whole blocks. It is undefined on CUDA, where no kernel reads it.
+    Columns of one type share an array, because allocating is slow on CUDA.
+    """
     out = Pairs()
-    block = int(BLOCK) if wp.get_device(device).is_cpu else BLOCK_DIM
-    out.count, out.stride, out.weak = count, -(-count // block) * block, weak
-    dtypes = {"x": wp.uint16, "y": wp.uint16, "tile": int, "on": wp.uint8}
-    for name, columns in COLUMNS.items():
-        columns = columns if drifts or name != "slope" else 0
-        values = wp.empty(columns * out.stride, dtype=dtypes.get(name, float), device=device)
-        for k in range(columns if count < out.stride else 0):
-            values[k * out.stride + count : (k + 1) * out.stride].zero_()
-        setattr(out, name, values)
-    out.lag, out.offset = (wp.zeros(0, dtype=float, device=device) for _ in "lo")
+    block = int(BLOCK)
+    n = out.stride = max(1, -(-count // block)) * block
+    out.count, out.weak = count, weak
+    pixels, flags = wp.empty(2 * n, dtype=wp.uint16, device=device), wp.empty(n, dtype=wp.uint8, device=device)
+    values = wp.empty((9 if drifts else 7) * n, dtype=float, device=device)
+    nothing = wp.empty(0, dtype=float, device=device)
+    out.x, out.y, out.on = pixels[:n], pixels[n:], flags
+    out.tile, out.time, out.azimuth = values[:n].view(int), values[n : 3 * n], values[3 * n : 7 * n]
+    out.slope = values[7 * n :] if drifts else nothing
+    out.lag = out.offset = nothing
+    if pixels.device.is_cpu:
+        for array in (pixels, flags, values):
+            array.numpy().reshape(-1, n)[:, count:] = 0
     return out

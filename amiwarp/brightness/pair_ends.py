@@ -27,7 +27,7 @@ class PairEnds:
         """Allocate the arrays for ``pairs`` on the map of ``atlas``, whose positions ``geometry`` will hold."""
         self._pairs, self._atlas, self._geometry = pairs.arrays, atlas, geometry
         self._nodes = atlas.rows * atlas.columns * (atlas.origin.size // 2)
-        self.threads = stride = pairs.arrays.stride
+        self.threads, stride = len(pairs), pairs.arrays.stride
         """Number of threads of the kernels, each for a pair."""
         self._device = pairs.device
         self.arrays = Ends()
@@ -38,8 +38,8 @@ class PairEnds:
 
     def take_positions(self) -> None:
         """Take the present positions, and sort them."""
-        ends, nodes = 2 * self.threads, self._nodes
-        inputs, outputs = [self._geometry, nodes], [self.arrays.cell, self.arrays.order]
+        ends, nodes = 2 * self._geometry.stride, self._nodes
+        inputs, outputs = [self._geometry, self.threads, nodes], [self.arrays.cell, self.arrays.order]
         launch(list_ends, ends, inputs, outputs, device=self._device)
         wp.utils.radix_sort_pairs(*outputs, ends, end_bit=nodes.bit_length())
         launch(take_fractions, ends, [self._geometry], [self.arrays], device=self._device)
@@ -68,5 +68,6 @@ class PairEnds:
         self._add(program, weight, slices, squared=1)
 
     def _add(self, program: Any, values: Any, slices: list[Any], squared: int = 0) -> None:
-        inputs = [self.arrays, self.threads, self._atlas.columns, values, squared]
-        program.add(add_ends, 2 * self.threads, inputs, slices)
+        stride = self._geometry.stride
+        inputs = [self.arrays, stride, self._atlas.columns, values, squared]
+        program.add(add_ends, 2 * stride, inputs, slices)

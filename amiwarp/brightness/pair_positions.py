@@ -58,13 +58,14 @@ class PairPositions:
         With the map ``image``, on a CPU and if :meth:`_in_blocks`, ``out`` gets the changes of brightness instead.
         """
         arrays, turn = self.pairs.arrays, self._turn(camera_rotation)
+        n = arrays.stride if self.device.is_cpu else arrays.count  # CPU kernels also read the padding
         if not self._in_blocks(model, turn):
             inputs = [model.params(self.device), model_camera(model, self.device), arrays, self._atlas]
-            launch(kernels.place_pairs, arrays.stride, [*inputs, drift, turn.params()], [out], device=self.device)
+            launch(kernels.place_pairs, n, [*inputs, drift, turn.params()], [out], device=self.device)
             return
         inputs = [model.params(self.device), pinhole_params(model.camera), arrays, self._atlas]
         if not self.device.is_cpu:
-            launch(kernels.place_still, arrays.stride, inputs, [out], device=self.device)
+            launch(kernels.place_still, n, inputs, [out], device=self.device)
             return
         inputs += [drift, turn.params(), self._nothing if image is None else image]
         outputs = [out, self._nothing] if image is None else [self.geometry, out]
@@ -93,7 +94,7 @@ class PairPositions:
     def find_slope(self, plus: dict[str, Any], minus: dict[str, Any], width: float, image: Any) -> Any:
         """Return the derivative of the residuals for the map ``image``; see :meth:`BrightnessMap.find_slope`."""
         both = (plus, minus)
-        out = wp.zeros(self.pairs.arrays.stride, dtype=float, device=self.device)
+        out = wp.empty(self.pairs.arrays.stride, dtype=float, device=self.device)
         if self.device.is_cpu and all(self._in_blocks(at["model"], self._turn(at["camera_rotation"])) for at in both):
             for change, at in zip(self._changes, both, strict=True):
                 self._place(**at, out=change, image=image)

@@ -92,7 +92,7 @@ class Residuals:
         launch(
             find_squares, n, [self.pairs.arrays, values, side, columns, squares], [square, order], device=self.device
         )
-        wp.utils.radix_sort_pairs(square, order, n)
+        wp.utils.radix_sort_pairs(square, order, n, end_bit=squares.bit_length())
         starts = wp.empty(squares + 1, dtype=int, device=self.device)
         launch(find_starts, squares + 1, [square, n], [starts], device=self.device)
         upper = np.triu_indices(len(factors))
@@ -130,7 +130,7 @@ class Residuals:
         return threads, threads if self.device.is_cpu else -(-threads // BLOCK_DIM)
 
     def _doubles(self, *shape: int) -> Any:
-        return wp.zeros(shape, dtype=wp.float64, device=self.device)
+        return wp.empty(shape, dtype=wp.float64, device=self.device)
 
     def _launch_sum(self, kernel: Any, threads: int, inputs: list[Any], out: Any) -> None:
         program = Program(self.device)

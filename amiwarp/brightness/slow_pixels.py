@@ -51,7 +51,7 @@ def darkness(brightness: BrightnessMap, model: Model, *, ahead: float = 0.0) -> 
     pixels.ahead = ahead
 
     def compute(every: int, columns: int) -> Any:
-        out = wp.zeros((2, columns), dtype=float, device=device)
+        out = wp.empty((2, columns), dtype=float, device=device)
         inputs = [*brightness.path_arguments(model), pixels, every]
         launch(kernels.find_time_constants, -(-len(pairs) // every), inputs, [out], device=device)
         return out

@@ -38,9 +38,9 @@ def encoder_params(encoder: "Encoder", t_first: int, t_last: int, device: Any) -
     p = EncoderParams()
     p.origin, p.shift = origin, shift
     p.first = wp.array(first.astype(np.int32), dtype=int, device=device)
-    p.start = wp.array(start, dtype=wp.int64, device=device)
-    p.angle = wp.array(angle, dtype=wp.uint64, device=device)
-    p.slope = wp.array(slope, dtype=wp.uint64, device=device)
+    pieces = np.stack([start, angle.view(np.int64), slope.view(np.int64)])
+    rows = wp.array(pieces, dtype=wp.int64, device=device)  # one copy to the device instead of three
+    p.start, p.angle, p.slope = rows[0], rows[1].view(wp.uint64), rows[2].view(wp.uint64)
     return p
 
 

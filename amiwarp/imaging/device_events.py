@@ -74,6 +74,22 @@ class UploadedEvents:
         launch(layer_events, len(old), [old, parts, int(per_polarity)], [layer], device=old.device)
         return self._with(layer=layer)
 
+    def every(self, step: int) -> UploadedEvents:
+        """Return every ``step``-th event, copied on the device. The events must not be folded."""
+        a, base = self.arrays, self.base
+
+        def cut(values: Any) -> Any:
+            if values is None or not len(values):
+                return values
+            on_cpu = values.device.is_cpu
+            part = values.numpy()[: self.count : step] if on_cpu else values[: self.count : step].contiguous()
+            return _put(part, values.dtype, values.device)
+
+        turn = cut(a.turn if base is None else base)
+        few = self._with(x=cut(a.x), y=cut(a.y), layer=cut(a.layer), turn=turn, time=cut(a.time))
+        n, base = -(-self.count // step), None if base is None else wp.clone(turn)
+        return replace(few, count=n, total=n, base=base, slope=cut(self.slope))
+
     def at_angles(self, angles: NDArray[np.float64]) -> UploadedEvents:
         """Return the same events at other prism angles [rad], shape ``(n,)``. The other columns are not copied."""
         return self._with(turn=_put(_turns(angles), wp.uint16, self.arrays.turn.device))

@@ -69,7 +69,7 @@ class TileVotes:
         counts = wp.zeros(layers * across * down, dtype=int, device=device)
         inputs = [a.x, a.y, a.layer, layers, across, across * down, size]
         wp.launch(kernels.key_events, n, inputs, [keys, order, counts], device=device)
-        wp.utils.radix_sort_pairs(keys, order, n)
+        wp.utils.radix_sort_pairs(keys, order, n, end_bit=(layers * across * down).bit_length())
         slope = events.slope if events.slope is not None else wp.empty(0, dtype=float, device=device)
         out = kernels.TileEvents()
         out.packed = wp.empty(n, dtype=wp.uint32, device=device)
@@ -81,17 +81,18 @@ class TileVotes:
 
     def _chunks(self, counts: Any, size: int, across: int, down: int) -> Any:
         """Return runs of at most CHUNK events of one tile and layer, each with a vote window centred on the tile."""
-        stops = np.cumsum(counts)
-        pieces = [
-            (start, min(start + kernels.CHUNK, stop), key)
-            for key, (stop, count) in enumerate(zip(stops, counts, strict=True))
-            for start in range(stop - count, stop, kernels.CHUNK)
-        ]
+        pieces = -(-counts // kernels.CHUNK)
+        if not pieces.any():
+            pieces[0] = 1  # an empty chunk, if there are no events
+        key = np.repeat(np.arange(len(counts)), pieces)
+        first = np.cumsum(pieces) - pieces  # number of the first chunk of each tile and layer
         struct: Any = kernels.Chunk
-        chunks = np.zeros(max(1, len(pieces)), dtype=struct.numpy_dtype())
-        start, stop, key = np.array(pieces or [(0, 0, 0)]).T
-        tile = key % (across * down)
-        chunks["start"], chunks["stop"], chunks["layer"] = start, stop, key // (across * down)
+        chunks = np.zeros(len(key), dtype=struct.numpy_dtype())
+        stop = np.cumsum(counts)[key]
+        start = stop - counts[key] + (np.arange(len(key)) - first[key]) * kernels.CHUNK
+        chunks["start"], chunks["stop"] = start, np.minimum(start + kernels.CHUNK, stop)
+        layer, tile = np.divmod(key, across * down)
+        chunks["layer"] = layer
         chunks["x"], chunks["y"] = tile % across * size, tile // across * size
         for name, origin, window in (("column", "x", kernels.COLUMNS), ("row", "y", kernels.ROWS)):
             middle = (chunks[origin] + size / 2.0 + self.canvas.pad) * self.canvas.scale

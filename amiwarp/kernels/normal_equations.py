@@ -32,9 +32,12 @@ def find_flows(
     sums: wp.array(dtype=wp.int64),
 ):
     """Compute flow = W A vector for equations A with weights W, and the part of sums += Aᵀ flow off the map."""
-    i = start + wp.tid()
-    value = weight[i] * difference(vector, atlas, pairs, geometry, i)
-    flow[i] = value
+    thread = start + wp.tid()
+    i = wp.min(thread, pairs.count - 1)
+    value = float(0.0)
+    if thread < pairs.count:
+        value = weight[i] * difference(vector, atlas, pairs, geometry, i)
+        flow[i] = value
     add_extra(sums, atlas, pairs, i, value)
 
 
@@ -49,11 +52,12 @@ def weigh_residuals(
     sums: wp.array(dtype=wp.int64),
 ):
     """Compute flow = W residual for equations A with weights W, and the part of sums += Aᵀ flow off the map."""
-    i = start + wp.tid()
+    thread = start + wp.tid()
+    i = wp.min(thread, pairs.count - 1)
     value = float(0.0)
-    if weight[i] > 0.0:  # the residual of a pair off the map is NaN
-        value = weight[i] * residual[i]
-    flow[i] = value
+    if thread < pairs.count:
+        value = wp.where(weight[i] > 0.0, weight[i] * residual[i], 0.0)  # the residual of a pair off the map is NaN
+        flow[i] = value
     add_extra(sums, atlas, pairs, i, value)
 
 
@@ -78,8 +82,9 @@ def add_sensor_diagonal(
     pairs: Pairs, atlas: Atlas, weight: wp.array(dtype=float), start: int, sums: wp.array(dtype=wp.int64)
 ):
     """Compute the part of sums += diag(Aᵀ W A) off the map."""
-    i = start + wp.tid()
-    add_extra_diagonal(sums, atlas, pairs, i, weight[i])
+    thread = start + wp.tid()
+    i = wp.min(thread, pairs.count - 1)
+    add_extra_diagonal(sums, atlas, pairs, i, wp.where(thread < pairs.count, weight[i], 0.0))
 
 
 @wp.kernel

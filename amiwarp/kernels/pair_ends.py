@@ -30,7 +30,7 @@ class Ends:
 @wp.func
 def continues_previous(geometry: Geometry, i: int) -> bool:
     """Return whether pair i begins at the position on the map at which pair i - 1 ends."""
-    if i == 0 or i == geometry.stride:
+    if i == 0:
         return False
     before = geometry.stride + i - 1
     if geometry.cell[i] < 0 or geometry.cell[i] != geometry.cell[before]:
@@ -40,17 +40,23 @@ def continues_previous(geometry: Geometry, i: int) -> bool:
 
 
 @wp.kernel
-def list_ends(geometry: Geometry, nodes: int, start: int, cell: wp.array(dtype=int), order: wp.array(dtype=int)):
-    """List the cell and the number of the first and the second end of each pair."""
+def list_ends(
+    geometry: Geometry, count: int, nodes: int, start: int, cell: wp.array(dtype=int), order: wp.array(dtype=int)
+):  # fmt: skip
+    """List the cell and the number of the first and the second end of each of ``count`` pairs."""
     end = start + wp.tid()
     second = end >= geometry.stride
     i = end - wp.where(second, geometry.stride, 0)
-    if second and continues_previous(geometry, i + 1):
-        order[end] = end + geometry.stride
+    cell[end] = nodes
+    order[end] = end
+    if i >= count or geometry.cell[end] < 0:
+        return
+    if not second:
+        cell[end] = wp.where(continues_previous(geometry, i), nodes, geometry.cell[end])
     else:
-        order[end] = end
-    unused = geometry.cell[end] < 0 or (not second and continues_previous(geometry, i))
-    cell[end] = wp.where(unused, nodes, geometry.cell[end])
+        cell[end] = geometry.cell[end]
+        if i + 1 < count and continues_previous(geometry, i + 1):
+            order[end] = end + geometry.stride
 
 
 @wp.kernel
@@ -90,8 +96,8 @@ def add_ends(
     With ``squared``, add its value times the squares of the bilinear weights of both ends.
     """
     end = start + wp.tid()
-    cell = ends.cell[end]
-    used = cell < sums.shape[0] - EXTRA
+    cell = ends.cell[wp.min(end, 2 * stride - 1)]
+    used = end < 2 * stride and cell < sums.shape[0] - EXTRA
     share = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if used:
         share = bilinear(ends.part[end])

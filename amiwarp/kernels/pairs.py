@@ -276,20 +276,15 @@ def tile_at(tile_of: wp.array2d(dtype=int), x: float, y: float) -> int:
 
 @wp.kernel
 def mark_same_tile(
-    places: wp.array(dtype=wp.vec4), tile_of: wp.array2d(dtype=int), listed: wp.array(dtype=int), start: int,
-    tile: wp.array(dtype=int), flag: wp.array(dtype=int),
+    places: wp.array(dtype=wp.vec4), tile_of: wp.array2d(dtype=int), start: int, tile: wp.array(dtype=int),
+    flag: wp.array(dtype=int),
 ):  # fmt: skip
-    """Mark pairs whose events both fall on one tile that is ``listed`` (1, else 0).
-
-    That tile becomes the tile of the pair.
-    """
+    """Mark pairs whose events both fall on one tile, which becomes the tile of the pair."""
     i = start + wp.tid()
     a = tile_at(tile_of, places[i][0], places[i][1])
     b = tile_at(tile_of, places[i][2], places[i][3])
     tile[i] = a
-    flag[i] = 0
-    if a >= 0 and a == b:
-        flag[i] = listed[a]
+    flag[i] = wp.where(a >= 0 and a == b, 1, 0)
 
 
 @wp.kernel
@@ -308,13 +303,9 @@ def mark_square(pairs: Pairs, left: int, top: int, side: int, start: int, flag: 
     flag[i] = wp.where(x >= 0 and y >= 0 and x < side and y < side, 1, 0)
 
 
-@wp.kernel
-def select(pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, out: Pairs):
-    """Copy the marked pairs to contiguous arrays."""
-    i = start + wp.tid()
-    if flag[i] == 0:
-        return
-    at = place[i] - 1
+@wp.func
+def copy_pair(pairs: Pairs, i: int, out: Pairs, at: int):
+    """Copy pair ``i`` to the place ``at``, with its slopes if it has some."""
     out.x[at] = pairs.x[i]
     out.y[at] = pairs.y[i]
     out.tile[at] = pairs.tile[i]
@@ -323,8 +314,23 @@ def select(pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), 
         out.azimuth[k * out.stride + at] = pairs.azimuth[k * pairs.stride + i]
     for k in range(2):
         out.time[k * out.stride + at] = pairs.time[k * pairs.stride + i]
-        if out.slope.shape[0] > 0:
+        if pairs.slope.shape[0] > 0:
             out.slope[k * out.stride + at] = pairs.slope[k * pairs.stride + i]
+
+
+@wp.kernel
+def select(pairs: Pairs, flag: wp.array(dtype=int), place: wp.array(dtype=int), start: int, out: Pairs):
+    """Copy the marked pairs to contiguous arrays."""
+    i = start + wp.tid()
+    if flag[i] != 0:
+        copy_pair(pairs, i, out, place[i] - 1)
+
+
+@wp.kernel
+def append(pairs: Pairs, at: int, start: int, out: Pairs):
+    """Copy all pairs to the places from ``at`` on."""
+    i = start + wp.tid()
+    copy_pair(pairs, i, out, at + i)
 
 
 @wp.kernel

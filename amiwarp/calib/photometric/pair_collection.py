@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+import warp as wp
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
 from amiwarp.calib.photometric.scene_tiles import choose_tiles, one_tile
@@ -45,29 +46,31 @@ class _PairCollector:
     """Collector of pairs of events that fall on the same tile, compensated by the result of the sharpness stage."""
 
     def __init__(self, recording: Recording, search: Search, tile_of: NDArray[np.int32], sensor: SensorTiming) -> None:
-        from scipy import ndimage
-
-        self.recording, self.search, self.sensor, self.tile_of = recording, search, sensor, tile_of
-        far = math.ceil(reach(search.space, search.best)) + 1
-        near = ndimage.maximum_filter((tile_of >= 0).astype(np.uint8), size=2 * far + 1) > 0
-        self.near = np.where(near, 0, -1).astype(np.int32)
+        self.recording, self.search, self.sensor = recording, search, sensor
+        near = dilated(tile_of >= 0, math.ceil(reach(search.space, search.best)) + 1)
+        self._tile_of = wp.array(tile_of, dtype=int, device=search.device)
+        self._near = wp.array(near.astype(np.int32) - 1, dtype=int, device=search.device)
         self._found: list[PairSet] = []
         self._done = 0
 
-    def pairs_in(self, spans: list[tuple[int, int]]) -> PairSet:
-        """Return the pairs of events inside the time spans [us].
+    def read(self, spans: list[tuple[int, int]]) -> int:
+        """Collect the pairs of events inside the time spans [us], which extend those of earlier calls.
 
-        If ``spans`` extend those of an earlier call, only the new spans are read.
+        Return the number of all pairs. Only new spans are read.
         """
         if len(spans) > self._done:
             self._found.append(self._new_pairs(spans[self._done :]))
             self._done = len(spans)
+        return sum(map(len, self._found))
+
+    def pairs(self) -> PairSet:
+        """Return all pairs."""
         return PairSet.concatenate(self._found)
 
     def _new_pairs(self, spans: list[tuple[int, int]]) -> PairSet:
         search, source = self.search, self.recording.events
         space, best, calibration_events = search.space, search.best, search.calibration_events
-        table = EventTable([source.between(*span) for span in spans], self.near, search.device)
+        table = EventTable([source.between(*span) for span in spans], self._near, search.device)
         pairs = table.pairs(
             calibration_events.encoder, longest_gap_us=LONGEST_GAP_US, shortest_gap_us=2.0 * self.sensor.refractory_us,
             sensor=self.sensor, middle_us=space.middle_us,
@@ -76,8 +79,19 @@ class _PairCollector:
             return pairs
         if calibration_events.slope_of is not None:
             pairs = pairs.with_slope(calibration_events.slope_of, space.middle_us)
-        every = np.ones(int(self.tile_of.max()) + 1, np.bool_)
-        return pairs.on_tiles(space.build(best), space.camera_rotation(best), space.drift(best), self.tile_of, every)
+        return pairs.on_tiles(space.build(best), space.camera_rotation(best), space.drift(best), self._tile_of)
+
+
+def dilated(mask: NDArray[np.bool_], far: int) -> NDArray[np.bool_]:
+    """Return the pixels that are at most ``far`` pixels from a true one, along each axis."""
+    for _ in mask.shape:
+        mask, width = np.pad(mask, ((far, far), (0, 0))), 1
+        while width <= 2 * far:  # each element stands for ``width`` of the mask, from its own on
+            step = min(width, 2 * far + 1 - width)
+            mask = mask[:-step] | mask[step:]
+            width += step
+        mask = mask.T
+    return mask
 
 
 def turn_length(recording: Recording, encoder: Encoder) -> float:
@@ -99,17 +113,17 @@ def collect_pairs(recording: Recording, search: Search, settings: PhotometricSet
     if len(recording.events.between(first, first + int(FEWEST_TURNS * turn) + 1)) <= settings.pairs:
         tile_of, tiles = one_tile(*recording.events.size, settings.density, margin)
     else:
-        tile_of, tiles = choose_tiles(search.image(), settings.density, margin)
+        tile_of, tiles = choose_tiles(search.image, settings.density, margin)
     collector = _PairCollector(recording, search, tile_of, settings.sensor)
     spans = [(first + int(k * turn), first + int(k * turn) + int(turn)) for k in van_der_corput(turns)]
     if search.full_space.moving:
         spans = [(first, last + 1)]  # a rotating camera needs successive turns
     many = min(FEWEST_TURNS, len(spans))
-    pairs = collector.pairs_in(spans[:many])
-    while len(pairs) < settings.pairs and many < len(spans):
-        many = min(len(spans), max(many + 1, math.ceil(many * settings.pairs / max(len(pairs), 1))))
-        pairs = collector.pairs_in(spans[:many])
-    count = len(tiles.origin)
+    found = collector.read(spans[:many])
+    while found < settings.pairs and many < len(spans):
+        many = min(len(spans), max(many + 1, math.ceil(many * settings.pairs / max(found, 1))))
+        found = collector.read(spans[:many])
+    pairs, count = collector.pairs(), len(tiles.origin)
     keep = max(FEWEST_TILES, round(count * settings.pairs / max(len(pairs), 1)))
     if keep >= count:
         return pairs, tiles

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -251,7 +252,7 @@ class Search:
     def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
         """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the sharpness."""
         best = self.best
-        directions = pool().submit(checks.check_directions, self.image(), name) if self.space.sized else None
+        directions = pool().submit(checks.check_directions, self.image, name) if self.space.sized else None
         parts = self._objective_by_parts(self.settings.sharpness)
         if self.space.sized:
             self._check_sharper_than_chance(best, parts, name)
@@ -270,8 +271,9 @@ class Search:
         sharp, opposite, still = (variance.each(values) for values in points)
         checks.check_texture(sharp, opposite, still, name)
 
+    @cached_property
     def image(self) -> NDArray[np.float32]:
-        """Return the IWE at the calibrated parameters, cut to the sensor's size, summed over polarities."""
+        """IWE at the calibrated parameters, cut to the sensor's size, summed over polarities."""
         image = self.fine.image(self.best).sum(axis=0)
         pad = (image.shape[1] - self.space.camera.width) // 2
         return np.asarray(image[pad:-pad, pad:-pad])
