@@ -109,11 +109,11 @@ class CameraRotation:
             Largest displacement along x and y [px], shape (2,). It is the image size if every border pixel leaves the
             view.
         """
-        from scipy.spatial.transform import Rotation
-
         rotations = self.rotation(np.array([-half_s, half_s]))
         if not rotations.any():
             return np.zeros(2)
+        from scipy.spatial.transform import Rotation  # here, because a still camera does not need this slow import
+
         xy = border(camera)
         rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float32)), np.float64)
         moved = [camera.rays_to_pixels(Rotation.from_rotvec(r).apply(rays).astype(np.float32)) for r in rotations]
