@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,7 +55,7 @@ class CameraRotation:
         """
         later = (middle_us - self.middle_us) * 1e-6
         x, y, z = (r + c * later for r, c in zip(self.angular_velocity, self.angular_acceleration, strict=True))
-        return replace(self, angular_velocity=(x, y, z), middle_us=middle_us)
+        return CameraRotation((x, y, z), self.angular_acceleration, middle_us)
 
     @property
     def moves(self) -> bool:
