@@ -131,22 +131,24 @@ class _DirectImage:
 
 
 class _TiledImage:
-    """Image of warped events that is voted tile by tile, launched as one CUDA graph."""
+    """Image of warped events that is voted tile by tile, launched as one CUDA graph from the second time on."""
 
     def __init__(self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter, like: Model) -> None:
         self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
         self._graph: Any = None
+        self._launched = False
 
     def measure(self, model: Model, drift: float, camera_rotation: CameraRotation) -> None:
         self._tiles.set(0, model, drift=drift, camera_rotation=camera_rotation)
-        if self._graph is not None:
-            wp.capture_launch(self._graph)
-            return
-        self._launch()  # the first launch is not captured: it may load modules, which a capture forbids
-        wp.synchronize_stream(self._meter.device)
-        with wp.ScopedCapture(self._meter.device) as capture:
+        if not self._launched:  # not captured: it may load modules, which a capture forbids, or be the only one
             self._launch()
-        self._graph = capture.graph
+            self._launched = True
+            return
+        if self._graph is None:
+            with wp.ScopedCapture(self._meter.device) as capture:
+                self._launch()
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
 
     def _launch(self) -> None:
         self._tiles.launch()
