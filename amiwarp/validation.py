@@ -9,7 +9,7 @@ import enum
 import math
 import numbers
 import reprlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 from typing import Any, TypeVar
 
 import numpy as np
@@ -47,12 +47,13 @@ def choice(kind: type[Choice], value: object, what: str) -> Choice:
 
     Raises :class:`AmiwarpError` with the names of all members.
     """
+    if isinstance(value, kind):
+        return value
     return kind(one_of(value, [member.value for member in kind], what))
 
 
-def one_of(value: object, names: Iterable[str], what: str) -> str:
+def one_of(value: object, names: Collection[str], what: str) -> str:
     """Return ``value`` if it is one of ``names``; else raise :class:`AmiwarpError` with the names."""
-    names = list(names)
     if not isinstance(value, str) or value not in names:
         raise AmiwarpError(f"{what} is {shown(value)}; choose among {', '.join(names)}")
     return str(value)
@@ -71,6 +72,8 @@ def real(value: object, what: str, low: float = -math.inf, high: float = math.in
     Accepts numbers of Python and NumPy, but neither text nor truth values. Raises :class:`AmiwarpError`, whose message
     ends in ``hint``.
     """
+    if type(value) is float and low <= value <= high and math.isfinite(value):
+        return value  # a shortcut: a search builds thousands of models
     plain = _scalar(value)
     number = math.nan
     if not isinstance(plain, bool) and isinstance(plain, numbers.Real):

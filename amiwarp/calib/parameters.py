@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -111,7 +112,7 @@ class ParameterSpace:
         """Name of the parameter that sets the size of the orbit: ``apex`` or ``deflection``."""
         return size_name(self.model)
 
-    @property
+    @cached_property
     def cartesian(self) -> bool:
         """Whether the vector's first two entries are (size·cos phase, size·sin phase)."""
         full = self.high.get("phase", 0.0) - self.low.get("phase", 0.0) >= 2.0 * math.pi - 1e-9
@@ -206,12 +207,12 @@ class ParameterSpace:
             Values of all parameters of the model, in their units. A value outside its bounds is moved to the nearer
             bound.
         """
-        values = dict(self.start)
-        for name, entry in zip(self.names, v, strict=True):
-            values[name] = float(entry) / self.pixels[name]
+        values, entries = dict(self.start), v.tolist()
+        for name, entry in zip(self.names, entries, strict=True):
+            values[name] = entry / self.pixels[name]
         if self.cartesian:
-            values[self.size_name] = math.hypot(v[0], v[1]) / self.pixels[self.size_name]
-            values["phase"] = math.atan2(v[1], v[0])
+            x, y, size = entries[0], entries[1], self.names[0]
+            values[size], values["phase"] = math.hypot(x, y) / self.pixels[size], math.atan2(y, x)
         for name in self.names:
             values[name] = min(max(values[name], self.low[name]), self.high[name])
         return values
@@ -321,6 +322,8 @@ def size_name(model: str) -> str:
 
 def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraRotation:
     """Return the camera rotation that the parameter values describe; a missing rate is taken as 0."""
+    if values.keys().isdisjoint(MOTION):
+        return CameraRotation(middle_us=middle_us)
     x, y, z = (values.get(n, 0.0) for n in RATES)
     a, b, c = (values.get(n, 0.0) for n in CHANGES)
     return CameraRotation((x, y, z), (a, b, c), middle_us)
@@ -328,7 +331,7 @@ def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraR
 
 def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
     """Return the camera with those of its lens parameters (:data:`LENS`) that ``values`` contain."""
-    if not any(name in values for name in LENS):
+    if values.keys().isdisjoint(LENS):
         return camera
     fx = values.get("focal_length", camera.fx)
     lens = camera.distortion
@@ -346,6 +349,6 @@ def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, f
         return CircleModel(camera, values["deflection"], values["phase"], prism.flat_side)
     if model == "radial":
         return RadialCircleModel(camera, values["deflection"], values["phase"], prism.index, prism.flat_side)
-    wedge = replace(prism, apex=values["apex"], index=values.get("index", prism.index))
+    wedge = Prism(values["apex"], values.get("index", prism.index), prism.flat_side)
     exact = ExactModel(camera, wedge, values["phase"], (values.get("tilt_x", 0.0), values.get("tilt_y", 0.0)))
     return EllipseModel.from_model(exact) if model == "ellipse" else exact

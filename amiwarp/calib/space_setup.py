@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from amiwarp.calib.parameters import (
     size_name,
 )
 from amiwarp.errors import AmiwarpError
+from amiwarp.optics.displacement import points_on_host
 from amiwarp.optics.prism import deflection_from_apex
 
 if TYPE_CHECKING:
@@ -200,12 +201,12 @@ def _pixels_per_unit(
             indexing="ij",
         )
     )  # fmt: skip
-    xy = np.stack([x, y], axis=1)
+    at = points_on_host(np.stack([x, y], axis=1), theta)  # once, for all parameters
     kind = "exact" if model == "ellipse" else model  # the ellipse's tables are computed from the exact model
 
     def displaced(name: str, step: float) -> NDArray[np.float64]:
         built = build_model(kind, camera, prism, {**nominal, name: nominal[name] + step})
-        return cast("NDArray[np.float64]", built.compensate_points(xy, theta))
+        return np.asarray(built.compensate_points(*at).numpy(), np.float64)
 
     def rms(name: str, step: float) -> float:
         moved = (displaced(name, step) - displaced(name, -step)) / (2.0 * step)

@@ -45,7 +45,6 @@ class SharpnessMeter:
         """Image whose sharpness is measured [events per pixel]; the caller writes its pixels."""
         self._weights = wp.array(weights, dtype=float, device=device)
         layers, rows, columns = canvas.shape
-        self._parts = canvas.parts
         self._n = layers // canvas.parts * rows * columns
         strips = -(-rows // int(STRIP)) * self.image.frame.blocks
         self._sums = wp.empty((layers, strips), dtype=wp.vec2d, device=device)
@@ -54,7 +53,7 @@ class SharpnessMeter:
             few = (layers, min(strips, FEW_SUMS))
             self._few = wp.empty(few, dtype=wp.vec2d, device=device)
             self._host = wp.empty(few, dtype=wp.vec2d, device="cpu", pinned=True)
-        self._sums_on_host = self._host.numpy()
+        self._sums_on_host = self._host.numpy().reshape(canvas.parts, -1, 2)
 
     def launch(self) -> None:
         """Measure :attr:`image` on the device without waiting for the result."""
@@ -101,8 +100,7 @@ class SharpnessMeter:
         """Wait, and return the sharpness of each part of the last measured image."""
         if self.device.is_cuda:
             wp.synchronize_stream(self.device)
-        sums = self._sums_on_host.reshape(self._parts, -1, 2).sum(axis=1)
-        return [self._score(float(total), float(terms)) for total, terms in sums]
+        return [self._score(total, terms) for total, terms in self._sums_on_host.sum(axis=1).tolist()]
 
     @property
     def finite(self) -> bool:

@@ -54,6 +54,7 @@ class TileVotes:
         dtypes = (kind,) if still else (kind, float, CameraRotationParams)
         self._host = [wp.zeros(candidates, dtype=dtype, device="cpu", pinned=True) for dtype in dtypes]
         self._on_device = [wp.zeros(candidates, dtype=array.dtype, device=device) for array in self._host]
+        self._drifts = None if still else self._host[1].numpy()
         self._motion: Any = kernels.Still()
         if not still:
             self._motion = kernels.Motion()
@@ -104,13 +105,10 @@ class TileVotes:
 
         ``drift`` and ``camera_rotation`` move only events that have slopes or times.
         """
-        structs = [(self._host[0], model.params(self.device))]
-        if len(self._host) > 1:
-            self._host[1].numpy()[k] = drift
-            structs.append((self._host[2], (camera_rotation or CameraRotation()).params()))
-        for array, struct in structs:
-            size = wp.types.type_size_in_bytes(array.dtype)
-            ctypes.memmove(array.ptr + k * size, ctypes.byref(struct.__ctype__()), size)
+        _write(self._host[0], k, model.params(self.device))
+        if self._drifts is not None:
+            self._drifts[k] = drift
+            _write(self._host[2], k, (camera_rotation or CameraRotation()).params())
 
     def launch(self) -> None:
         """Compute the image of warped events of every candidate."""
@@ -124,3 +122,9 @@ class TileVotes:
     def read(self, k: int, image: Image) -> None:
         """Write the image of candidate ``k`` [events] to ``image``."""
         wp.launch(read_tiles, len(image.pixels), [self.votes[k], 0], [image.pixels], device=self.device)
+
+
+def _write(array: Any, k: int, struct: Any) -> None:
+    """Write a struct to element ``k`` of an array of structs on the host."""
+    size = wp.types.type_size_in_bytes(array.dtype)
+    ctypes.memmove(array.ptr + k * size, ctypes.byref(struct.__ctype__()), size)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,7 +55,7 @@ class CameraRotation:
         """
         later = (middle_us - self.middle_us) * 1e-6
         x, y, z = (r + c * later for r, c in zip(self.angular_velocity, self.angular_acceleration, strict=True))
-        return replace(self, angular_velocity=(x, y, z), middle_us=middle_us)
+        return CameraRotation((x, y, z), self.angular_acceleration, middle_us)
 
     @property
     def moves(self) -> bool:
@@ -109,11 +109,11 @@ class CameraRotation:
             Largest displacement along x and y [px], shape (2,). It is the image size if every border pixel leaves the
             view.
         """
-        from scipy.spatial.transform import Rotation
-
         rotations = self.rotation(np.array([-half_s, half_s]))
         if not rotations.any():
             return np.zeros(2)
+        from scipy.spatial.transform import Rotation  # here, because a still camera does not need this slow import
+
         xy = border(camera)
         rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float32)), np.float64)
         moved = [camera.rays_to_pixels(Rotation.from_rotvec(r).apply(rays).astype(np.float32)) for r in rotations]

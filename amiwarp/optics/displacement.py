@@ -100,14 +100,14 @@ def _run(kernel_name: str, model: HasParams, xy: Any, theta: Any) -> Any:
     xy, theta = array(xy, "xy"), array(theta, "theta")
     if xy.ndim != 2 or xy.shape[1] != 2 or theta.shape != xy.shape[:1]:
         raise AmiwarpError(f"xy has shape {xy.shape} and theta {theta.shape}; give (n, 2) and (n,)")
-    wrapped = wrap_angle(theta).astype(np.float32)
-    result = _run(
-        kernel_name,
-        model,
-        wp.array(xy.astype(np.float32), dtype=wp.vec2, device="cpu"),
-        wp.array(wrapped, dtype=float, device="cpu"),
-    )
+    result = _run(kernel_name, model, *points_on_host(xy, theta))
     return result.numpy().astype(xy.dtype if np.issubdtype(xy.dtype, np.floating) else np.float32, copy=False)
+
+
+def points_on_host(xy: NDArray[Any], theta: NDArray[Any]) -> tuple[Any, Any]:
+    """Return pixels, shape (n, 2), and prism angles [rad], shape (n,), as Warp arrays on the CPU."""
+    wrapped = wrap_angle(theta).astype(np.float32)
+    return wp.array(xy.astype(np.float32), dtype=wp.vec2, device="cpu"), wp.array(wrapped, dtype=float, device="cpu")
 
 
 def wrap_angle(angle: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,8 +18,8 @@ from amiwarp.validation import instance
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-UPRIGHT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
-"""Rotation of a prism axis without tilt: the identity matrix, row by row."""
+UPRIGHT = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+"""Rotation of a prism axis without tilt: the identity matrix."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class ExactModel(PointDisplacement):
         set_phase(p, self.phase)
         p.flat_to_scene = int(self.prism.flat_side is FlatSide.SCENE)
         p.tilted = int(any(self.tilt))
-        p.axis = wp.mat33(*(axis_rotation(*self.tilt).ravel().tolist() if p.tilted else UPRIGHT))
+        p.axis = wp.mat33(*axis_rotation(*self.tilt).ravel().tolist()) if p.tilted else UPRIGHT
         return p
 
 

@@ -16,6 +16,9 @@ LARGEST_INDEX = 4.0
 """Upper limit of the refractive index, which is that of germanium."""
 LARGEST_PHASE = 1e6
 """Largest accepted magnitude of a phase [rad]. Up to this phase float64 resolves 1e-10 rad."""
+_BELOW_LARGEST_APEX = math.nextafter(LARGEST_APEX, 0.0)
+_ABOVE_ONE, _BELOW_LARGEST_INDEX = math.nextafter(1.0, 2.0), math.nextafter(LARGEST_INDEX, 0.0)
+_BELOW_RIGHT_ANGLE = math.nextafter(math.pi / 2.0, 0.0)
 
 
 class FlatSide(enum.StrEnum):
@@ -53,9 +56,8 @@ class Prism:
     """Side that the flat face points to."""
 
     def __post_init__(self) -> None:
-        below = math.nextafter(LARGEST_APEX, 0.0)
         hint = " rad, 0 .. 30 deg; is it given in degrees?"
-        object.__setattr__(self, "apex", real(self.apex, "prism apex", 0.0, below, hint))
+        object.__setattr__(self, "apex", real(self.apex, "prism apex", 0.0, _BELOW_LARGEST_APEX, hint))
         object.__setattr__(self, "index", check_index(self.index, "prism index"))
         object.__setattr__(self, "flat_side", choice(FlatSide, self.flat_side, "prism flat_side"))
 
@@ -180,7 +182,7 @@ def check_index(value: object, what: str) -> float:
 
     Raises :class:`AmiwarpError` for any other value.
     """
-    return real(value, what, math.nextafter(1.0, 2.0), math.nextafter(LARGEST_INDEX, 0.0), "; N-BK7 has 1.5168")
+    return real(value, what, _ABOVE_ONE, _BELOW_LARGEST_INDEX, "; N-BK7 has 1.5168")
 
 
 def check_phase(value: object, what: str = "phase") -> float:
@@ -193,6 +195,9 @@ def check_tilt(value: object) -> tuple[float, float]:
 
     Raises :class:`AmiwarpError` for others.
     """
-    below = math.nextafter(math.pi / 2.0, 0.0)
-    x, y = vector(value, 2, "tilt", lambda entry, what: real(entry, what, -below, below, " rad"))
+    x, y = vector(value, 2, "tilt", _acute)
     return x, y
+
+
+def _acute(value: object, what: str) -> float:
+    return real(value, what, -_BELOW_RIGHT_ANGLE, _BELOW_RIGHT_ANGLE, " rad")

@@ -79,11 +79,12 @@ class LinearFit:
         The other columns are fixed.
         """
         k = [self.names.index(n) for n in names]
-        rows = np.ones(len(self.xy), np.bool_) if where is None else where
+        rows = slice(None) if where is None else where
         hessian, gradient = self.hessian[rows][:, k][:, :, k], self.gradient[rows][:, k]
         total = hessian.sum(axis=0)
         scale = np.sqrt(np.maximum(np.diag(total), 1e-30))
-        inverse = np.linalg.pinv(total / np.outer(scale, scale), rcond=1e-6, hermitian=True) / np.outer(scale, scale)
+        scales = np.outer(scale, scale)
+        inverse = np.linalg.pinv(total / scales, rcond=1e-6, hermitian=True) / scales
         change = -inverse @ gradient.sum(axis=0)
         gain = float(change @ total @ change) / max(self.squares_sum, 1e-30)
         return Estimate(change, gain, inverse, hessian, gradient)
