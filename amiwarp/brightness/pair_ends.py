@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from amiwarp.kernels import normal_equations
-from amiwarp.kernels.launch import launch
+from amiwarp.kernels.launch import RepeatedLaunches
 from amiwarp.kernels.pair_ends import Ends, add_ends, list_ends, take_fractions
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class PairEnds:
         self._nodes = atlas.rows * atlas.columns * (atlas.origin.size // 2)
         self.threads, stride = len(pairs), pairs.arrays.stride
         """Number of threads of the kernels, each for a pair."""
-        self._device = pairs.device
+        self._device, self._launch = pairs.device, RepeatedLaunches(pairs.device)
         self.arrays = Ends()
         """Columns of the ends: the kernels' struct ``Ends``."""
         self.arrays.part = wp.empty(2 * stride, dtype=wp.vec2, device=self._device)
@@ -40,9 +40,9 @@ class PairEnds:
         """Take the present positions, and sort them."""
         ends, nodes = 2 * self._geometry.stride, self._nodes
         inputs, outputs = [self._geometry, self.threads, nodes], [self.arrays.cell, self.arrays.order]
-        launch(list_ends, ends, inputs, outputs, device=self._device)
+        self._launch(list_ends, ends, inputs, outputs)
         wp.utils.radix_sort_pairs(*outputs, ends, end_bit=nodes.bit_length())
-        launch(take_fractions, ends, [self._geometry], [self.arrays], device=self._device)
+        self._launch(take_fractions, ends, [self._geometry], [self.arrays])
 
     @property
     def inputs(self) -> list[Any]:

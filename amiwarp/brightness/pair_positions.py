@@ -11,7 +11,7 @@ import warp as wp
 from amiwarp.brightness.pair_chains import FEW_BLOCKS, PairChains
 from amiwarp.brightness.pair_ends import PairEnds
 from amiwarp.kernels import map_positions as kernels
-from amiwarp.kernels.launch import launch
+from amiwarp.kernels.launch import RepeatedLaunches
 from amiwarp.kernels.pairs import keep_nodes
 from amiwarp.kernels.photometric import Geometry
 from amiwarp.kernels.residual_slopes import slope_between, slope_of_changes
@@ -37,6 +37,7 @@ class PairPositions:
         self.equations = (PairChains if self.device.is_cpu else PairEnds)(pairs, atlas, self.geometry)
         """Equations of the pairs at these positions."""
         self._nothing = wp.empty(0, dtype=float, device=self.device)
+        self._launch = RepeatedLaunches(self.device)
 
     def _new_geometry(self) -> Any:
         g = Geometry()
@@ -61,15 +62,15 @@ class PairPositions:
         n = arrays.stride if self.device.is_cpu else arrays.count  # CPU kernels also read the padding
         if not self._in_blocks(model, turn):
             inputs = [model.params(self.device), model_camera(model, self.device), arrays, self._atlas]
-            launch(kernels.place_pairs, n, [*inputs, drift, turn.params()], [out], device=self.device)
+            self._launch(kernels.place_pairs, n, [*inputs, drift, turn.params()], [out])
             return
         inputs = [model.params(self.device), pinhole_params(model.camera), arrays, self._atlas]
         if not self.device.is_cpu:
-            launch(kernels.place_still, n, inputs, [out], device=self.device)
+            self._launch(kernels.place_still, n, inputs, [out])
             return
         inputs += [drift, turn.params(), self._nothing if image is None else image]
         outputs = [out, self._nothing] if image is None else [self.geometry, out]
-        launch(kernels.place_blocks, self.equations.threads, inputs, outputs, device="cpu", smallest=FEW_BLOCKS)
+        self._launch(kernels.place_blocks, self.equations.threads, inputs, outputs, smallest=FEW_BLOCKS)
 
     def _turn(self, camera_rotation: CameraRotation | None) -> CameraRotation:
         return (camera_rotation or CameraRotation()).about(self._middle_us)
@@ -98,17 +99,17 @@ class PairPositions:
         if self.device.is_cpu and all(self._in_blocks(at["model"], self._turn(at["camera_rotation"])) for at in both):
             for change, at in zip(self._changes, both, strict=True):
                 self._place(**at, out=change, image=image)
-            launch(slope_of_changes, len(self.pairs), [*self._changes, width], [out], device="cpu")
+            self._launch(slope_of_changes, len(self.pairs), [*self._changes, width], [out])
             return out
         for side, at in zip(self._sides, both, strict=True):
             self._place(**at, out=side)
         inputs = [self.pairs.arrays, self._atlas, *self._sides, image, width]
-        launch(slope_between, len(self.pairs), inputs, [out], device=self.device)
+        self._launch(slope_between, len(self.pairs), inputs, [out])
         return out
 
     def keep(self, nodes: NDArray[np.bool_]) -> None:
         """Exclude pairs of two events that are off the ``nodes``; see :meth:`BrightnessMap.keep`."""
         on = wp.array(nodes.ravel().view(np.uint8), dtype=wp.uint8, device=self.device)
         inputs = [on, self.pairs.arrays.on, self.geometry.stride]
-        launch(keep_nodes, len(self.pairs), inputs, [self.geometry.cell], device=self.device)
+        self._launch(keep_nodes, len(self.pairs), inputs, [self.geometry.cell])
         self.equations.take_positions()

@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 from amiwarp.kernels.conjugate_gradients import CPU_WIDTH
-from amiwarp.kernels.launch import launch
+from amiwarp.kernels.launch import RepeatedLaunches, launch
 from amiwarp.kernels.photometric import HELD
-from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
+from amiwarp.kernels.recorded_launches import BLOCK_DIM
 from amiwarp.kernels.residual_slopes import add_clusters, magnitudes, sum_costs, sum_products
 from amiwarp.kernels.square_sums import MOST_ROWS, find_squares, find_starts, sum_square_products, sum_squares
 
@@ -38,6 +38,7 @@ class Residuals:
         n = pairs.arrays.stride
         self.values, self.weight = (wp.zeros(n, dtype=float, device=self.device) for _ in "vw")
         self._width = int(CPU_WIDTH) if self.device.is_cpu else 1
+        self._launch = RepeatedLaunches(self.device)
 
     def mean_cost(self, scale: float, *, missing: float = math.nan, held: bool = False) -> float:
         """Return the mean Cauchy cost, log(1 + (r / ``scale``)²), of the residuals r of all pairs or the held-out ones.
@@ -133,6 +134,5 @@ class Residuals:
         return wp.empty(shape, dtype=wp.float64, device=self.device)
 
     def _launch_sum(self, kernel: Any, threads: int, inputs: list[Any], out: Any) -> None:
-        program = Program(self.device)
-        program.add(kernel, threads, inputs, [out], smallest=CHUNKS)
-        program.launch()
+        full = threads if self.device.is_cpu else -(-threads // BLOCK_DIM) * BLOCK_DIM  # block sums need whole blocks
+        self._launch(kernel, full, inputs, [out], smallest=CHUNKS)

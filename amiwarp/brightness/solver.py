@@ -21,7 +21,7 @@ from amiwarp.brightness.residuals import Residuals
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import conjugate_gradients as cg
 from amiwarp.kernels.conjugate_gradients import add_multiple, dot, gather, gather_diagonal
-from amiwarp.kernels.launch import launch, slice_count
+from amiwarp.kernels.launch import RepeatedLaunches, slice_count
 from amiwarp.kernels.map_prior import EXTRA, Prior, link
 from amiwarp.kernels.photometric import Atlas
 from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
@@ -103,7 +103,7 @@ class BrightnessMap:
         self.residuals = Residuals(pairs, len(tiles.origin))
         self._scale, self._solved = self._zeros(1), False
         self._at = PairPositions(pairs, self._atlas, middle_us)
-        self._equations = self._at.equations
+        self._equations, self._launch = self._at.equations, RepeatedLaunches(self.device)
 
     def _zeros(self, n: int) -> Any:
         return wp.zeros(n, dtype=float, device=self.device)
@@ -199,7 +199,7 @@ class BrightnessMap:
 
     def add(self, change: Any, factor: float) -> None:
         """Add a change of the map times a factor to the map."""
-        launch(add_multiple, len(change), [change, factor], [self._image], device=self.device)
+        self._launch(add_multiple, len(change), [change, factor], [self._image])
 
     def unexplained(self, target: Any, change: Any = None, *, steps: int) -> tuple[Any, Any]:
         """Return the part of ``target`` (pairs, on the device) that no change of the map explains, and the change.
@@ -221,9 +221,7 @@ class BrightnessMap:
     def _subtract(self, vector: Any, residual: Any) -> None:
         """Subtract the left sides of the equations, for a ``vector`` of unknowns, from ``residual``."""
         equations, inputs = self._equations, [*self._equations.inputs, vector]
-        launch(
-            equations.kernels.subtract, equations.threads, inputs, [residual], device=self.device, smallest=FEW_BLOCKS
-        )
+        self._launch(equations.kernels.subtract, equations.threads, inputs, [residual], smallest=FEW_BLOCKS)
 
     @cached_property
     def _weigh(self) -> Any:

@@ -239,6 +239,43 @@ class RecordedLaunch:
         self._command.launch()
 
 
+class RepeatedLaunches:
+    """Launches on a device that are repeated with few changes.
+
+    On CUDA a launch keeps the arguments of the last one of its kernel, and converts only those that differ. That takes
+    less than half of the time of :func:`launch`.
+    """
+
+    def __init__(self, device: Any) -> None:
+        self._device = wp.get_device(device)
+        self._last: dict[Any, tuple[Any, list[Any]]] = {}
+
+    def __call__(
+        self,
+        kernel: Any,
+        n: int,
+        inputs: Sequence[Any],
+        outputs: Sequence[Any],
+        *,
+        smallest: int = SMALLEST_SLICE,
+    ) -> None:
+        """Run a kernel over ``range(n)`` as :func:`launch` does."""
+        if self._device.is_cpu or n == 0:
+            launch(kernel, n, inputs, outputs, device=self._device, smallest=smallest)
+            return
+        kernel, arguments = specialised(kernel, inputs), [*inputs, 0, *outputs]
+        command, last = self._last.get(kernel, (None, ()))
+        if command is None:
+            command = wp.launch(kernel, n, [*inputs, 0], list(outputs), device=self._device, record_cmd=True)
+        else:
+            command.set_dim(n)
+            for k, (value, old) in enumerate(zip(arguments, last, strict=True)):
+                if value is not old or hasattr(value, "_cls"):  # the values of a struct may have changed
+                    command.set_param_at_index(k, value)
+        self._last[kernel] = command, arguments
+        command.launch()
+
+
 def slice_count(device: Any) -> int:
     """Return the number of slices of a launch on ``device``."""
     return cpu_threads() if wp.get_device(device).is_cpu else 1
