@@ -280,8 +280,14 @@ class Search:
 
     def sharpness_in(self, space: ParameterSpace, values: Mapping[str, float]) -> float:
         """Return the sharpness at ``values`` with the camera and the prism of ``space``."""
-        events, smoothing = self.calibration_events, self.settings.smoothing_px
-        return self._objective(events, scale=1.0, smoothing=smoothing, space=space).values(values)
+        known, fine = self.space, self.fine
+        same = (space.model, space.names, space.camera, space.prism) == (
+            known.model, known.names, known.camera, known.prism
+        )  # fmt: skip
+        if not same:
+            smoothing = self.settings.smoothing_px
+            fine = self._objective(self.calibration_events, scale=1.0, smoothing=smoothing, space=space)
+        return fine.values(values)
 
     def _bound_warnings(self, best: dict[str, float]) -> tuple[str, ...]:
         """Return a warning for each parameter that ended on a bound."""
