@@ -96,23 +96,17 @@ class ChunkFile:
         ``dataset_of`` makes the dataset of a column's first chunk. ``before`` is called first in turn.
         """
         rows = {chunk.name: chunk.start + len(chunk.values) for chunk in chunks}
-        runs: list[tuple[int, list[bytes]]] = []
-        end = None
+        placed = []
         with self.turn(turn):
             before()
             for chunk in chunks:
                 if chunk.name not in self._columns:
                     self._columns[chunk.name] = ChunkedColumn(self, dataset_of(chunk))
                 column = self._columns[chunk.name]
-                at = column.place(chunk.start, chunk.parts, rows[chunk.name])
-                if at is None:
-                    continue
-                if at != end:
-                    runs.append((at, []))
-                runs[-1][1].extend(chunk.parts)
-                end = at + sum(map(len, chunk.parts))
-        for at, parts in runs:
-            self.output.write_at(parts, at)
+                placed.append((column.place(chunk.start, chunk.parts, rows[chunk.name]), chunk.parts))
+        for at, parts in placed:
+            if at is not None:
+                self.output.write_at(parts, at)
 
     def close(self) -> None:
         """Close the file, after all threads have written their chunks."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import enum
 import os
-import sys
 import zlib
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
@@ -44,14 +43,14 @@ turn."""
 CHECKSUM_ROW = 2048
 """Number of 16-bit words that the checksum sums at a time."""
 
-KERNELS = "amiwarp.kernels.launch"
-"""Name of a module that is loaded in every program that runs Warp's kernels."""
-
 BLOCK_BYTES = 1 << 18
 """Size of the blocks that Blosc compresses [bytes]. It decodes these faster than its smaller default."""
 
 GZIP_LEVEL = 1
 """Level of deflate: 1 is the fastest. Higher levels make event files only a few percent smaller."""
+
+_kernel: Callable[[Sequence[bytes | memoryview]], list[int]] | None = None
+"""Function that computes checksums with a kernel, after :func:`compile_checksums`."""
 
 
 class Codec(enum.StrEnum):
@@ -163,20 +162,21 @@ def _decompress(frame: memoryview, out: NDArray[Any]) -> bool:
         return False
 
 
-@cache
-def _compiled_checksums() -> Callable[[Sequence[bytes | memoryview]], list[int]]:
-    from amiwarp.kernels.checksum import Checksums
+def compile_checksums() -> None:
+    """Compute all later checksums with one of Warp's kernels, in less time and without Python's lock.
 
-    return Checksums()
+    For programs that run Warp's kernels. Others do not load Warp for it. Call it before threads use Warp.
+    """
+    global _kernel
+    if _kernel is None:
+        from amiwarp.kernels.checksum import Checksums
+
+        _kernel = Checksums()
 
 
 def checksums(parts: Sequence[bytes | memoryview]) -> list[int]:
-    """Return the checksum of each of several data.
-
-    A program that runs Warp's kernels computes them with one kernel, in less time and without Python's lock. Other
-    programs do not load Warp for them.
-    """
-    return _compiled_checksums()(parts) if KERNELS in sys.modules else [checksum(part) for part in parts]
+    """Return the checksum of each of several data."""
+    return [checksum(part) for part in parts] if _kernel is None else _kernel(parts)
 
 
 def checksum(data: bytes | memoryview) -> int:

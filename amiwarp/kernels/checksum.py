@@ -63,7 +63,8 @@ class Checksums:
     """Fletcher-32 checksums of several data at a time. Any thread may call it."""
 
     def __init__(self) -> None:
-        self._idle: list[tuple[wp.Launch, NDArray[np.uint64]]] = []
+        """Load the kernel."""
+        self._idle: list[tuple[wp.Launch, NDArray[np.uint64]]] = [_recorded()]
 
     def __call__(self, parts: Sequence[bytes | memoryview]) -> list[int]:
         """Return the checksum of each of the data, as :func:`amiwarp.io.chunks.checksum`."""
