@@ -27,7 +27,7 @@ def stored(path, columns):
     def write(turn, job):
         name, start = job
         part = columns[name][start : start + CHUNK]
-        parts = encode_parts(part)
+        (parts,) = encode_parts(part)
         time.sleep(0.01 * (3 - turn % 4))
         file.write(turn, [EncodedChunk(name, start, part, parts)], lambda chunk: datasets[chunk.name])
 
@@ -110,7 +110,7 @@ def test_a_thread_that_fails_stops_the_others(tmp_path):
 
 def test_the_parts_of_a_chunk_are_its_bytes():
     values = np.arange(CHUNK, dtype=np.uint8)
-    frame, checksum = encode_parts(values)
+    ((frame, checksum),) = encode_parts(values)
     assert len(frame) + len(checksum) == len(encode(values))
     assert len(checksum) == 4
 

@@ -439,5 +439,5 @@ def test_a_forged_chunk_of_the_native_layout(tmp_path):
         forged = bytearray(frame)
         at = int(rng.integers(16, 100) if rng.random() < 0.5 else rng.integers(16, len(frame)))
         forged[at : at + 4] = rng.bytes(len(forged[at : at + 4]))
-        outcomes.add(decode(bytes(forged) + checksum(forged).to_bytes(4, "little"), out))
+        outcomes.add(decode([bytes(forged) + checksum(forged).to_bytes(4, "little")], out))
     assert outcomes <= {True, False}

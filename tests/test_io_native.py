@@ -21,6 +21,7 @@ from amiwarp.events.events import Events, EventSource, MemoryEvents
 from amiwarp.events.recording import Recording, Truth
 from amiwarp.io import RecordingWriter, open_recording, save_recording
 from amiwarp.io.chunks import CHUNK, StoredColumn, checksum, decode, encode, in_order
+from amiwarp.kernels.checksum import Checksums
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import Fisheye, RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
@@ -372,7 +373,7 @@ def test_chunks_are_those_of_hdf5(tmp_path, kind, bits):
             whole = np.zeros(CHUNK, kind)
             whole[: len(values[start : start + CHUNK])] = values[start : start + CHUNK]
             out = np.empty_like(whole)
-            assert decode(encode(whole), out)
+            assert decode([encode(whole)], out)
             np.testing.assert_array_equal(out, whole)
 
 
@@ -414,6 +415,14 @@ def test_checksum_is_fletchers(data, fill):
         second += first
         second = (second & 0xFFFF) + (second >> 16)
     assert checksum(data) == second << 16 | first
+
+
+@given(st.lists(st.binary(max_size=200), max_size=40), st.integers(0, 25_000), st.sampled_from([0, 1, 255]))
+@settings(deadline=None, max_examples=100)
+def test_the_kernel_computes_the_same_checksums(parts, size, fill):
+    """Also if the sums are multiples of 65535 before a row of zeros."""
+    parts = [*parts, bytes([fill]) * size, bytes([fill]) * 11520 + bytes(size), b"".join(parts)]
+    assert Checksums()(parts) == [checksum(part) for part in parts]
 
 
 @pytest.mark.parametrize("name", ["x", "y", "t", "p"])
@@ -476,6 +485,18 @@ def test_filled_files_are_those_of_append(tmp_path):
     with h5py.File(tmp_path / "fill.h5") as filled, h5py.File(tmp_path / "append.h5") as appended:
         for name in ("events/x", "events/y", "events/t", "events/p", "events/inside", "ms_to_idx", "t_offset"):
             np.testing.assert_array_equal(filled[name][()], appended[name][()], strict=True)
+
+
+def test_an_infinite_position_outside_the_image_is_refused(tmp_path):
+    sensor = make(50)
+    events = Events(sensor.x.astype(np.float32), sensor.y.astype(np.float32), sensor.t - sensor.t[0], sensor.p)
+    events.y[7], inside = -np.inf, np.ones(50, np.uint8)
+    inside[7] = 0
+    known = {"events/t": [encode(events.t)], "events/p": [encode(events.p)]}
+    with pytest.raises(AmiwarpError, match=r"event 7 .*y=-inf.* infinite"):  # noqa: SIM117
+        with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+            writer.fill([lambda: (events, inside, known)], count=CHUNK, t_first=0, done=lambda *_: None)
+    assert_nothing_left(tmp_path)
 
 
 @pytest.mark.parametrize(

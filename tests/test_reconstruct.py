@@ -29,7 +29,7 @@ from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.choices import Fill, Tone
 from amiwarp.reconstruction.export import save_picture, save_video, tones
-from amiwarp.reconstruction.known import dilated, without_small_holes
+from amiwarp.reconstruction.known import dilated, without_small_holes, without_small_regions
 from amiwarp.reconstruction.picture import Reconstruction, reconstruct
 from amiwarp.reconstruction.result import Picture
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
@@ -225,6 +225,20 @@ def test_growing_is_a_dilation() -> None:
     before = mask.copy()
     assert np.array_equal(dilated(mask, 3), ndimage.binary_dilation(mask, iterations=3))
     assert np.array_equal(mask, before)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.4, 0.5, 0.6, 0.9])
+@pytest.mark.parametrize("shape", [(1, 60), (60, 1), (13, 17), (60, 80)])
+def test_small_regions_and_holes_are_found(share: float, shape: tuple[int, int]) -> None:
+    """Compare with the labels of SciPy."""
+    for seed in range(10):
+        mask = np.random.default_rng(seed).random(shape) < share
+        for values, least, found in (
+            (mask, 12, without_small_regions(mask)),
+            (~mask, 5, ~without_small_holes(mask)),
+        ):
+            label, _count = ndimage.label(values)
+            assert np.array_equal(found, values & (np.bincount(label.ravel()) >= least)[label])
 
 
 def test_the_mask_has_no_pinholes(picture: Picture) -> None:

@@ -21,7 +21,7 @@ from amiwarp.events.device_encoder import encoder_params
 from amiwarp.events.device_events import DeviceEvents, device_for, limits, wait
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
-from amiwarp.io.chunks import CHUNK
+from amiwarp.io.chunks import CHUNK, compile_checksums
 from amiwarp.io.native_reader import NativeEvents
 from amiwarp.io.native_writer import FlaggedEvents
 from amiwarp.kernels.event_arrays import join_columns
@@ -277,6 +277,7 @@ def compensate(
         if encoder is not None and n:
             first, last = recording.events.t_first, recording.events.t_last
             compensator = BlockCompensator(calibration.model, encoder, first, last, device)
+            compile_checksums()
             pieces = compensated_pieces(recording.events, compensator)
             writer.fill(pieces, count=PIECE, t_first=first, done=count)
     return CompensationSummary(done, outside, time.perf_counter() - began)

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.chunks import CHUNK
 
 
 class EncodedChunk(NamedTuple):
@@ -31,6 +32,13 @@ class EncodedChunk(NamedTuple):
     """Its values."""
     parts: Sequence[bytes]
     """Its encoded bytes, in one or several parts."""
+
+
+def chunks_of(name: str, start: int, column: NDArray[Any], parts: Iterable[Sequence[bytes]]) -> list[EncodedChunk]:
+    """Return the chunks of a column whose first element is element ``start``, and whose encoded bytes are ``parts``."""
+    return [
+        EncodedChunk(name, start + k * CHUNK, column[k * CHUNK : (k + 1) * CHUNK], part) for k, part in enumerate(parts)
+    ]
 
 
 class ChunkFile:
@@ -80,13 +88,14 @@ class ChunkFile:
             raise
 
     def write(
-        self, turn: int, chunks: Iterable[EncodedChunk], dataset_of: Callable[[EncodedChunk], Any],
+        self, turn: int, chunks: Sequence[EncodedChunk], dataset_of: Callable[[EncodedChunk], Any],
         before: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
         """Write encoded chunks at places that they get in turn.
 
         ``dataset_of`` makes the dataset of a column's first chunk. ``before`` is called first in turn.
         """
+        rows = {chunk.name: chunk.start + len(chunk.values) for chunk in chunks}
         placed = []
         with self.turn(turn):
             before()
@@ -94,7 +103,7 @@ class ChunkFile:
                 if chunk.name not in self._columns:
                     self._columns[chunk.name] = ChunkedColumn(self, dataset_of(chunk))
                 column = self._columns[chunk.name]
-                placed.append((column.place(chunk.start, chunk.parts, len(chunk.values)), chunk.parts))
+                placed.append((column.place(chunk.start, chunk.parts, rows[chunk.name]), chunk.parts))
         for at, parts in placed:
             if at is not None:
                 self.output.write_at(parts, at)
@@ -115,14 +124,15 @@ class ChunkedColumn:
         self._rows, *self._row = dataset.shape
 
     def place(self, start: int, stored: Sequence[bytes], rows: int) -> int | None:
-        """Return the place in the file [bytes] of an encoded chunk of ``rows`` elements from element ``start`` on.
+        """Return the place in the file [bytes] of an encoded chunk from element ``start`` on.
 
-        ``stored`` are the bytes of the chunk, in one or several parts. The dataset grows if it is too short. If the
-        place cannot be found, the chunk is written at once and None is returned. Call this method in turn.
+        ``stored`` are the bytes of the chunk, in one or several parts. A dataset of fewer than ``rows`` elements grows
+        to this number. If the place cannot be found, the chunk is written at once and None is returned. Call this
+        method in turn.
         """
         size, offset = sum(map(len, stored)), (start, *(0 for _ in self._row))
-        if self._rows < start + rows:
-            self._rows = start + rows
+        if self._rows < rows:
+            self._rows = rows
             self._id.set_extent((self._rows, *self._row))
         at = self._output.place_of(size, partial(self._id.write_direct_chunk, offset))
         if at is None:
@@ -158,11 +168,14 @@ class _Output(io.RawIOBase):
 
     def write_at(self, parts: Iterable[Any], place: int) -> None:
         """Write data in several parts, one after the other, at a place [bytes]. Any thread may call it."""
-        for part in parts:
-            rest = memoryview(part)
-            while rest:
-                done = os.pwrite(self._handle, rest, place)
-                rest, place = rest[done:], place + done
+        rest = [memoryview(part) for part in parts]
+        while rest:
+            done = os.pwritev(self._handle, rest, place)
+            place += done
+            while rest and done >= len(rest[0]):
+                done -= len(rest.pop(0))
+            if done:
+                rest[0] = rest[0][done:]
 
     def write(self, data: Any) -> int:
         size = len(data)

@@ -49,6 +49,9 @@ BLOCK_BYTES = 1 << 18
 GZIP_LEVEL = 1
 """Level of deflate: 1 is the fastest. Higher levels make event files only a few percent smaller."""
 
+_kernel: Callable[[Sequence[bytes | memoryview]], list[int]] | None = None
+"""Function that computes checksums with a kernel, after :func:`compile_checksums`."""
+
 
 class Codec(enum.StrEnum):
     """Compression of native recordings.
@@ -87,13 +90,16 @@ def in_order(jobs: Iterable[Callable[[], Result]]) -> Generator[Result, None, No
 
 @cache
 def _blosc() -> Any:
-    """Return the module of Blosc, set up for calls in several threads. Its own threads would only add to them."""
+    """Return Blosc's functions, set up for calls in several threads. Its own threads would only add to them.
+
+    The module's functions of the same names also check their arguments, which takes 15 us.
+    """
     import blosc
 
     blosc.set_nthreads(1)
     blosc.set_releasegil(True)
     blosc.set_blocksize(BLOCK_BYTES)
-    return blosc
+    return blosc.blosc_extension
 
 
 def blosc_shuffle(dtype: np.dtype[Any]) -> int:
@@ -106,23 +112,25 @@ def blosc_shuffle(dtype: np.dtype[Any]) -> int:
 
 def encode(values: NDArray[Any], codec: Codec = Codec.BLOSC) -> bytes:
     """Return the stored bytes of a chunk. A shorter array is padded with zeros, as HDF5 does."""
-    return b"".join(encode_parts(values, codec))
+    return b"".join(encode_parts(values, codec)[0])
 
 
-def encode_parts(values: NDArray[Any], codec: Codec = Codec.BLOSC) -> tuple[bytes, bytes]:
-    """Return the stored bytes of a chunk in two parts, which together are those of :func:`encode`."""
-    whole = values
-    if len(values) < CHUNK:
-        whole = np.concatenate([values, np.zeros((CHUNK - len(values), *values.shape[1:]), values.dtype)])
-    whole = np.ascontiguousarray(whole)
-    frame = _compress(whole) if codec is Codec.BLOSC else _deflate(whole)
-    return frame, checksum(frame).to_bytes(4, "little")
+def encode_parts(column: NDArray[Any], codec: Codec = Codec.BLOSC) -> list[tuple[bytes, bytes]]:
+    """Return the stored bytes of each chunk of a column in two parts, which together are those of :func:`encode`."""
+    frames = []
+    for at in range(0, len(column), CHUNK):
+        values = column[at : at + CHUNK]
+        if len(values) < CHUNK:
+            values = np.concatenate([values, np.zeros((CHUNK - len(values), *values.shape[1:]), values.dtype)])
+        values = np.ascontiguousarray(values)
+        frames.append(_compress(values) if codec is Codec.BLOSC else _deflate(values))
+    return [(frame, value.to_bytes(4, "little")) for frame, value in zip(frames, checksums(frames), strict=True)]
 
 
 def _compress(values: NDArray[Any]) -> bytes:
     """Compress the bytes of values as HDF5's Blosc filter does."""
     shuffle, place = blosc_shuffle(values.dtype), values.ctypes.data
-    compressed: bytes = _blosc().compress_ptr(place, values.size, values.itemsize, 1, shuffle, "lz4")
+    compressed: bytes = _blosc().compress_ptr(place, values.nbytes, values.itemsize, 1, shuffle, "lz4")
     return compressed
 
 
@@ -132,19 +140,43 @@ def _deflate(values: NDArray[Any]) -> bytes:
     return zlib.compress(shuffled.tobytes(), GZIP_LEVEL)
 
 
-def decode(stored: bytes, out: NDArray[Any]) -> bool:
-    """Decode a stored chunk into ``out``, which is one chunk long. Return whether the chunk is undamaged."""
-    if len(stored) < BLOSC_HEADER_BYTES + 4:
+def decode(stored: Sequence[bytes], out: NDArray[Any]) -> bool:
+    """Decode stored chunks, one after the other, into ``out``. Return whether all chunks are undamaged."""
+    places = [out[at : at + CHUNK] for at in range(0, len(out), CHUNK)]
+    if any(len(chunk) < BLOSC_HEADER_BYTES + 4 for chunk in stored):
         return False
-    frame = memoryview(stored)[:-4]
+    frames = [memoryview(chunk)[:-4] for chunk in stored]
+    if [int.from_bytes(chunk[-4:], "little") for chunk in stored] != checksums(frames):
+        return False
+    return all(_decompress(frame, place) for frame, place in zip(frames, places, strict=True))
+
+
+def _decompress(frame: memoryview, out: NDArray[Any]) -> bool:
+    """Decompress a Blosc frame into ``out``. Return whether it has the right size and can be decoded."""
     # After four bytes, the header holds the sizes before and after compression. Blosc itself would trust them.
-    sizes = [int.from_bytes(frame[at : at + 4], "little") for at in (4, 12)]
-    if sizes != [out.nbytes, len(frame)] or checksum(frame).to_bytes(4, "little") != stored[-4:]:
+    if [int.from_bytes(frame[at : at + 4], "little") for at in (4, 12)] != [out.nbytes, len(frame)]:
         return False
     try:
         return int(_blosc().decompress_ptr(frame, out.ctypes.data)) == out.nbytes
-    except _blosc().blosc_extension.error:  # a frame that it cannot decode
+    except _blosc().error:  # a frame that it cannot decode
         return False
+
+
+def compile_checksums() -> None:
+    """Compute all later checksums with one of Warp's kernels, in less time and without Python's lock.
+
+    For programs that run Warp's kernels. Others do not load Warp for it. Call it before threads use Warp.
+    """
+    global _kernel
+    if _kernel is None:
+        from amiwarp.kernels.checksum import Checksums
+
+        _kernel = Checksums()
+
+
+def checksums(parts: Sequence[bytes | memoryview]) -> list[int]:
+    """Return the checksum of each of several data."""
+    return [checksum(part) for part in parts] if _kernel is None else _kernel(parts)
 
 
 def checksum(data: bytes | memoryview) -> int:
@@ -202,29 +234,27 @@ class StoredColumn:
         if first == last and (stop - start < CHUNK and stop != self._count):
             chunk = self._chunk(first)
             return None if chunk is None else chunk[start - first * CHUNK : stop - first * CHUNK].copy()
-        out = np.empty(((last + 1 - first) * CHUNK, *self._row), self._dtype)
-        for at in range(first, last + 1):
-            if not self._decode(at, out[(at - first) * CHUNK : (at + 1 - first) * CHUNK]):
-                return None
-        return out[start - first * CHUNK : stop - first * CHUNK]
+        out = self._decoded(first, last)
+        return None if out is None else out[start - first * CHUNK : stop - first * CHUNK]
 
     def _chunk(self, at: int) -> NDArray[Any] | None:
         """Return a whole chunk, or None if it is damaged. The latest chunk is kept, for searches within it."""
-        if self._last is not None and self._last[0] == at:
-            return self._last[1]
-        out = np.empty((CHUNK, *self._row), self._dtype)
-        if not self._decode(at, out):
-            return None
-        self._last = at, out
-        return out
+        if self._last is None or self._last[0] != at:
+            out = self._decoded(at, at)
+            if out is None:
+                return None
+            self._last = at, out
+        return self._last[1]
 
     def encoded(self, at: int) -> bytes:
         """Return the stored bytes of chunk ``at``."""
         offset, size = self._places[at]
         return os.pread(self._handle, size, offset)
 
-    def _decode(self, at: int, out: NDArray[Any]) -> bool:
-        return decode(self.encoded(at), out)
+    def _decoded(self, first: int, last: int) -> NDArray[Any] | None:
+        """Return the chunks from ``first`` to ``last``, or None if one of them is damaged."""
+        out = np.empty(((last + 1 - first) * CHUNK, *self._row), self._dtype)
+        return out if decode([self.encoded(at) for at in range(first, last + 1)], out) else None
 
 
 def append_chunk(dataset: Any, start: int, stored: bytes, count: int) -> None:

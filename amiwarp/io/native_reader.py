@@ -173,8 +173,8 @@ class NativeEvents:
         return self._since_zero(as_times(self._read("t", start, stop)))
 
     def _since_zero(self, t: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return stored times with the file's offset added."""
-        return t + self._offset if self._offset else t
+        """Add the file's offset to stored times, which were read for this."""
+        return np.add(t, self._offset, out=t if t.flags.writeable else None) if self._offset else t
 
     def _read(self, name: str, start: int, stop: int) -> NDArray[Any]:
         return self._columns[name].read(start, stop)

@@ -9,7 +9,7 @@ import contextlib
 import itertools
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -25,7 +25,7 @@ from amiwarp.events.events import Events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.events.truth import EventTruth, WorldLabels
 from amiwarp.io.atomic_output import NewFile, spare_space
-from amiwarp.io.chunk_file import ChunkFile, EncodedChunk
+from amiwarp.io.chunk_file import ChunkFile, EncodedChunk, chunks_of
 from amiwarp.io.chunks import CHUNK, Codec, encode_parts, in_order
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import (
@@ -219,8 +219,8 @@ class RecordingWriter(RecordAppender):
         ----------
         pieces : iterable of callable
             Functions that return events, their ``inside`` flags, and encoded chunks of columns by name, in order.
-            Threads call them. Blosc's encoded chunks are stored as they are; other columns are encoded. Times and
-            polarities are not checked if both are encoded.
+            Threads call them. Blosc's encoded chunks are stored as they are; other columns are encoded. If times and
+            polarities are both encoded, they are not checked, nor are positions whose flag is 1.
         count : int
             Number of events of each piece: a whole number of chunks. Only the last piece may be shorter.
         t_first : int
@@ -254,22 +254,25 @@ class RecordingWriter(RecordAppender):
             events, inside, known = piece()
             known = known if self._codec is Codec.BLOSC else {}
             with errors_name(self.path, lambda: f"after {start} events"):
-                # The reader has checked encoded times and polarities.
-                check = check_events if known.keys() < {"events/t", "events/p"} else check_coordinates
-                check(events, *self._size, where=str(self.path), first_index=start, allow_nan=True)
+                self._check_piece(events, inside, start, known)
                 # only the size of an encoded column counts
                 t = events.t if "events/t" in known else events.t - self._t_offset
                 columns = {"events/x": events.x, "events/y": events.y, "events/t": t}
                 columns |= {"events/p": events.p, "events/inside": inside}
-                chunks = []
+                chunks: list[EncodedChunk] = []
                 for name, column in columns.items():
-                    stored = iter(known.get(name, ()))
-                    for at in range(0, len(column), CHUNK):
-                        values, part = column[at : at + CHUNK], next(stored, None)
-                        parts: Sequence[bytes] = encode_parts(values, self._codec) if part is None else (part,)
-                        chunks.append(EncodedChunk(name, start + at, values, parts))
+                    stored = [(part,) for part in known.get(name, ())]
+                    chunks += chunks_of(name, start, column, stored or encode_parts(column, self._codec))
                 self._chunks.write(turn, chunks, self._dataset_of, lambda: self._follow(events, start))
         return events, inside
+
+    def _check_piece(self, events: Events, inside: NDArray[np.uint8], start: int, known: Collection[str]) -> None:
+        """Check a piece. The reader has checked encoded times and polarities. Positions in the image are finite."""
+        outside = np.flatnonzero(inside == 0)
+        if not {"events/t", "events/p"}.issubset(known):
+            self._check(events, start, allow_nan=True)
+        elif events.whole_pixels or np.isinf(events.x[outside]).any() or np.isinf(events.y[outside]).any():
+            check_coordinates(events, *self._size, where=str(self.path), first_index=start, allow_nan=True)
 
     def _follow(self, events: Events, start: int) -> None:
         """Check that a piece is not earlier than the one before, and extend the index. Called in turn."""
@@ -341,8 +344,8 @@ class RecordingWriter(RecordAppender):
     def _write_chunk(self, name: str, start: int, values: NDArray[Any], turn: int) -> None:
         """Encode and write the values of a chunk that begins at element ``start``. Runs in a thread."""
         with self._chunks.stopping():
-            chunk = EncodedChunk(name, start, values, encode_parts(values, self._codec))
-            self._chunks.write(turn, [chunk], self._dataset_of)
+            chunks = chunks_of(name, start, values, encode_parts(values, self._codec))
+            self._chunks.write(turn, chunks, self._dataset_of)
 
     def _dataset_of(self, chunk: EncodedChunk) -> Any:
         return self._dataset(chunk.name, chunk.values.dtype, chunk.values.shape[1:])

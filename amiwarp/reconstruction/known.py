@@ -5,6 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import warp as wp
+
+from amiwarp.kernels.launch import load
+from amiwarp.kernels.regions import find_large_regions
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -45,18 +49,18 @@ def dilated(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
 
 def without_small_regions(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the mask without connected regions of fewer than :data:`SMALLEST_REGION` pixels."""
-    from scipy import ndimage
-
-    label, count = ndimage.label(known)
-    size = np.bincount(label.ravel(), minlength=count + 1)
-    size[0] = 0
-    return np.asarray((size >= SMALLEST_REGION)[label])
+    return _large_regions(known, SMALLEST_REGION)
 
 
 def without_small_holes(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the mask with holes of up to :data:`LARGEST_HOLE` pixels filled."""
-    from scipy import ndimage
+    return ~_large_regions(~known, LARGEST_HOLE + 1)
 
-    label, count = ndimage.label(~known)
-    size = np.bincount(label.ravel(), minlength=count + 1)
-    return np.asarray(known | (size[label] <= LARGEST_HOLE))
+
+def _large_regions(mask: NDArray[np.bool_], least: int) -> NDArray[np.bool_]:
+    """Return the connected regions of a mask of at least ``least`` pixels. The mask is on the host on any device."""
+    large, cpu = np.zeros(mask.shape, np.bool_), wp.get_device("cpu")
+    arrays = [wp.array(values.view(np.uint8), device=cpu, copy=False) for values in (np.ascontiguousarray(mask), large)]
+    load(find_large_regions, cpu)
+    wp.launch(find_large_regions, 1, [arrays[0], least, arrays[1]], device=cpu)
+    return large
