@@ -5,6 +5,7 @@ Each is followed by the structs of its generic arguments. The other kernels of i
 
 from amiwarp.imaging.sharpness_costs import gaussian
 from amiwarp.kernels.camera import PinholeParams
+from amiwarp.kernels.checksum import compute_checksums
 from amiwarp.kernels.compensation import compensate_blocks
 from amiwarp.kernels.conjugate_gradients import descend
 from amiwarp.kernels.equation_blocks import apply_normal
@@ -21,6 +22,7 @@ from amiwarp.kernels.refraction import (
     RadialCircleParams,
     compensate_points,
 )
+from amiwarp.kernels.regions import find_large_regions
 from amiwarp.kernels.residual_slopes import sum_costs
 from amiwarp.kernels.slow_pixels import find_time_constants
 from amiwarp.kernels.square_sums import find_squares
@@ -41,8 +43,10 @@ EXACT_KERNELS = (
     (find_time_constants, ExactParams),
     (find_squares,),
     (compensate_blocks, ExactParams, PinholeParams),
+    (compute_checksums,),
     (link,),
     (prolong,),
+    (find_large_regions,),
 )
 """Kernels of calibration, compensation and reconstruction by the exact model, in the order of their use."""
 FIGURE_KERNELS = (
