@@ -53,7 +53,9 @@ class GridHierarchy:
 
     def correct(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
         """Add to ``program`` the step ``out`` = sum of the grids' corrections for the finest grid's ``residual``."""
-        if program.device.is_cpu:
+        if not self._correction:
+            program.add(k.divide, len(out), [diagonal, residual], [out])
+        elif program.device.is_cpu:
             self._correct_by_rows(program, diagonal, prior, residual, out)
         else:
             self._correct_by_nodes(program, diagonal, prior, residual, out)
@@ -67,22 +69,21 @@ class GridHierarchy:
 
     def _correct_by_rows(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
         """Correct with a row of nodes per thread."""
-        program.add(k.divide, len(out), [diagonal, residual], [out])
-        for (rows, columns), (inputs, outputs) in zip(
-            self.shapes[1:], self._restrictions(residual, prior), strict=True
-        ):
+        grids = zip(self.shapes[1:], self._restrictions(residual, prior), strict=True)
+        for (rows, columns), (inputs, outputs) in grids:
             program.add(k.restrict_rows, rows, inputs, outputs, smallest=SMALLEST_SLICE // (4 * columns) + 1)
         for level in range(len(self._correction) - 1, -1, -1):
             rows, columns = self.shapes[level]
-            inputs = [self._correction[level], self.shapes[level + 1][1], columns]
-            target = self._correction[level - 1] if level else out
-            program.add(k.prolong_rows, rows, inputs, [target], smallest=SMALLEST_SLICE // columns + 1)
+            inputs, smallest = [self._correction[level], self.shapes[level + 1][1]], SMALLEST_SLICE // columns + 1
+            if level:
+                outputs = [self._correction[level - 1]]
+                program.add(k.prolong_rows, rows, [*inputs, columns], outputs, smallest=smallest)
+            else:
+                inputs += [rows, columns, diagonal, residual]
+                program.add(k.prolong_rows_to_finest, rows, inputs, [out], smallest=smallest)
 
     def _correct_by_nodes(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
         """Correct with a node per thread, and the small grids in one block of threads."""
-        if not self._correction:
-            program.add(k.divide, len(out), [diagonal, residual], [out])
-            return
         small = sum(rows * columns <= SMALL for rows, columns in self.shapes[2:])
         large = len(self._correction) - small
         for inputs, outputs in islice(self._restrictions(residual, prior), large):

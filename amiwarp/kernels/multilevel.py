@@ -281,3 +281,33 @@ def prolong_rows(
 ):  # fmt: skip
     """Add the correction as :func:`prolong` does, one row of the finer grid per thread. For CPUs."""
     prolong_row(coarse, columns, fine_columns, start + wp.tid(), fine)
+
+
+@wp.func_native("""
+    const float* d = (const float*)diagonal.data;
+    const float* r = (const float*)residual.data;
+    float* to = (float*)out.data;
+    for (int i = first; i < last; ++i) to[i] = r[i] / d[i];
+""")
+def divide_range(
+    diagonal: wp.array(dtype=float), residual: wp.array(dtype=float), first: int, last: int, out: wp.array(dtype=float)
+):
+    """Compute :func:`divide` from ``first`` to ``last``."""
+
+
+@wp.kernel
+def prolong_rows_to_finest(
+    coarse: wp.array(dtype=float),
+    columns: int,
+    fine_rows: int,
+    fine_columns: int,
+    diagonal: wp.array(dtype=float),
+    residual: wp.array(dtype=float),
+    start: int,
+    out: wp.array(dtype=float),
+):
+    """Compute :func:`prolong_to_finest`, one row per thread; the last one also computes what follows the map."""
+    row = start + wp.tid()
+    last = wp.where(row + 1 < fine_rows, (row + 1) * fine_columns, out.shape[0])
+    divide_range(diagonal, residual, row * fine_columns, last, out)
+    prolong_row(coarse, columns, fine_columns, row, out)
