@@ -183,7 +183,7 @@ def test_single_precision_is_enough(recording: Recording, device: str) -> None:
     residual = brightness.residuals.values.numpy()
     cell = brightness._at.geometry.cell.numpy().reshape(2, -1)
     part = brightness._at.geometry.part.numpy().reshape(2, 2, -1)
-    on = np.flatnonzero(cell[0] >= 0)
+    on = np.flatnonzero(cell[0, : len(pairs)] >= 0)
     rows, columns, values = [], [], []
     for side, sign in ((1, 1.0), (0, -1.0)):
         fx, fy = part[side][:, on].astype(np.float64)

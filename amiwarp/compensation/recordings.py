@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp.compensation.launch_plan import LaunchPlan
+from amiwarp.compensation.piece_buffers import GpuPieces
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import check_sensor
 from amiwarp.events.device_encoder import encoder_params
@@ -78,23 +78,21 @@ class BlockCompensator:
         self._device = wp.get_device(device)
         self._plan = LaunchPlan(model, self._device)
         self._encoder = encoder_params(encoder, t_first, t_last, str(self._device))
-        # Warp's bookkeeping on CUDA allows one thread at a time
-        self._one_thread = contextlib.nullcontext() if self._device.is_cpu else threading.Lock()
+        self._pieces = None if self._device.is_cpu else GpuPieces(self._plan, self._encoder, self._device)
 
     def __call__(self, events: Events, *, all_cores: bool = False) -> tuple[Events, NDArray[np.uint8]]:
         """Return compensated events (NaN without coordinates), and 1 for each inside the image, shape ``(n,)``."""
         check_sensor(events)
         if not len(events):
             return Events(np.zeros(0, np.float32), np.zeros(0, np.float32), events.t, events.p), np.zeros(0, np.uint8)
-        with self._one_thread:
-            x, y, inside = self._compensate(events, all_cores)
+        x, y, inside = self._compensate(events, all_cores) if self._pieces is None else self._pieces(events)
         return Events(x, y, events.t, events.p), inside
 
     def on_device(self, events: DeviceEvents) -> tuple[wp.array, wp.array]:
         """Return compensated x and y of at least one event, as Warp arrays of shape ``(n,)``."""
         check_sensor(events)
         _, _, max_x, max_y, _, _ = limits(events)
-        with self._one_thread:
+        with self._pieces.one_thread if self._pieces else contextlib.nullcontext():
             c = self._plan.run(self._plan.device_columns(events), self._encoder, max_x, max_y)
         return c.out_x[: len(events)], c.out_y[: len(events)]
 
