@@ -32,7 +32,7 @@ BLOSC, FLETCHER32 = 32001, 3
 BLOSC_HEADER_BYTES = 16
 """Size of the header of a Blosc frame [bytes]."""
 
-MAX_THREADS = 16
+MAX_THREADS = 12
 """Largest number of threads that encode or decode chunks. More hinder each other, because they take turns to hold
 Python's lock."""
 
