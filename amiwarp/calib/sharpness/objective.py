@@ -136,14 +136,9 @@ class _TiledImage:
     def __init__(self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter, like: Model) -> None:
         self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
         self._graph: Any = None
-        self._loaded = False
 
     def measure(self, model: Model, drift: float, camera_rotation: CameraRotation) -> None:
         self._tiles.set(0, model, drift=drift, camera_rotation=camera_rotation)
-        if not self._loaded:  # the first launch may load modules, which a capture forbids; it is often the only one
-            self._launch()
-            self._loaded = True
-            return
         if self._graph is None:
             with wp.ScopedCapture(self._meter.device) as capture:
                 self._launch()
