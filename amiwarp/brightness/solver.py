@@ -162,20 +162,21 @@ class BrightnessMap:
 
     # -- solving
 
-    def solve(self, scale: float, *, steps: int, rounds: int = 1) -> None:
-        """Solve for the map: ``rounds`` times, set the Cauchy weights and run ``steps`` conjugate-gradient steps.
+    def solve(self, *scales: float, steps: int, rounds: int = 1) -> None:
+        """Solve for the map: for each of ``scales``, ``rounds`` times, set the Cauchy weights and run ``steps`` steps.
 
-        ``scale`` is the residual at which an equation gets half weight [thresholds]. Afterwards ``residuals`` holds the
+        The steps are those of conjugate gradients. A scale is the residual at which an equation gets half weight [thresholds]. Afterwards ``residuals`` holds the
         residual of every pair [thresholds] on the device, NaN for pairs off the map.
         """
-        self._scale.fill_(scale)
-        for _ in range(rounds):
-            self._weigh.run()
-            self._prepare.run()
-            if not self._solved:  # the coarser grids need not follow the weights
-                self._prepare_grids.run()
-            self._solved = True
-            self._descent.run(steps)
+        for scale in scales:
+            self._scale.fill_(scale)
+            for _ in range(rounds):
+                self._weigh.run()
+                self._prepare.run()
+                if not self._solved:  # the coarser grids need not follow the weights
+                    self._prepare_grids.run()
+                self._solved = True
+                self._descent.run(steps)
         self._weigh.run()
 
     def restart(self, smoothness: float) -> None:

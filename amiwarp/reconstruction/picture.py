@@ -24,8 +24,9 @@ from amiwarp.events.encoder_speed import turn_between
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.reconstruction.choices import Fill
 from amiwarp.reconstruction.result import Picture, upload_picture
-from amiwarp.reconstruction.rounds import SCALES, STEPS, solve_rounds
+from amiwarp.reconstruction.rounds import SCALES, solve_rounds
 from amiwarp.reconstruction.window import (
+    CHOICE_STEPS,
     SMOOTHNESS,
     choice_square,
     lowest_weight,
@@ -299,8 +300,7 @@ class Reconstruction:
 
         def cost(weight: float) -> float:
             solver.restart(weight)
-            for scale in SCALES[:2]:
-                solver.solve(scale, steps=STEPS)
+            solver.solve(*SCALES[:2], steps=CHOICE_STEPS)
             return solver.residuals.mean_cost(SCALES[0], held=True)
 
         return lowest_weight(cost)

@@ -32,8 +32,7 @@ def solve_rounds(solver: BrightnessMap, pair_count: int, last: Picture | None) -
         unknowns = last.to_host().unknowns.copy()
         unknowns[nodes:] = solver.unknowns[nodes:]
         solver.unknowns = unknowns
-    for scale in SCALES[:-1] if last is None else SCALES[1:-1]:
-        solver.solve(scale, steps=STEPS)
+    solver.solve(*SCALES[0 if last is None else 1 : -1], steps=STEPS)
     residual = solver.residuals.median(pair_count)
     covered = known_nodes(solver)
     if covered.any():
