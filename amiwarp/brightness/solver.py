@@ -165,8 +165,9 @@ class BrightnessMap:
     def solve(self, *scales: float, steps: int, rounds: int = 1) -> None:
         """Solve for the map: for each of ``scales``, ``rounds`` times, set the Cauchy weights and run ``steps`` steps.
 
-        The steps are those of conjugate gradients. A scale is the residual at which an equation gets half weight [thresholds]. Afterwards ``residuals`` holds the
-        residual of every pair [thresholds] on the device, NaN for pairs off the map.
+        The steps are those of conjugate gradients. A scale is the residual at which an equation gets half weight
+        [thresholds]. Afterwards ``residuals`` holds the residual of every pair [thresholds] on the device, NaN for
+        pairs off the map.
         """
         for scale in scales:
             self._scale.fill_(scale)
