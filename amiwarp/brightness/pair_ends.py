@@ -26,7 +26,7 @@ class PairEnds:
     def __init__(self, pairs: PairSet, atlas: Any, geometry: Any) -> None:
         """Allocate the arrays for ``pairs`` on the map of ``atlas``, whose positions ``geometry`` will hold."""
         self._pairs, self._atlas, self._geometry = pairs.arrays, atlas, geometry
-        self._nodes = atlas.rows * atlas.columns * (atlas.origin.size // 2)
+        self._nodes = int(atlas.rows * atlas.columns * (atlas.origin.size // 2))
         self.threads, stride = len(pairs), pairs.arrays.stride
         """Number of threads of the kernels, each for a pair."""
         self._device, self._launch = pairs.device, RepeatedLaunches(pairs.device)

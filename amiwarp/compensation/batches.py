@@ -195,7 +195,7 @@ class BatchPipeline:
         out, done = None, None
         if self._device.is_cuda:
             out = self._copy_back(at, end, s.pooled_t is not None)
-            done = wp.record_event(wp.Event(self._device))
+            done = self._device.stream.record_event()
         self._vote(least=LEAST_VOTED)
         t = s.t if s.pooled_t else s.t.copy() if len(s.parts) > 1 else s.parts[0].t
         return BatchInFlight(at=at, end=end, t=t, p=s.p, unknown=unknown, arrived_us=s.arrived_us, out=out, done=done)

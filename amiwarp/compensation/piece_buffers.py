@@ -54,7 +54,7 @@ class PieceBuffers:
         self._launches[outside](0, n)
         for name in FOUND:
             wp.copy(self._locked[name], getattr(self._columns, name), count=n)
-        wp.record_event(self._done)
+        self._device.stream.record_event(self._done)
 
     def take(self, found: list[NDArray[Any]]) -> None:
         """Wait for the GPU, and store x and y [px] and 1 for each event inside the image in arrays."""
@@ -97,4 +97,5 @@ class GpuPieces:
                 buffers = self._idle.pop()
                 if buffers.room >= n:
                     return buffers
-            return PieceBuffers(n, self._plan, self._encoder, self._device)
+            # a power of two, so that blocks of growing size seldom need new buffers
+            return PieceBuffers(1 << (n - 1).bit_length(), self._plan, self._encoder, self._device)

@@ -53,7 +53,8 @@ class SharpnessMeter:
             few = (layers, min(strips, FEW_SUMS))
             self._few = wp.empty(few, dtype=wp.vec2d, device=device)
             self._host = wp.empty(few, dtype=wp.vec2d, device="cpu", pinned=True)
-            _ = self._smoothed  # a captured graph must not allocate it
+            if len(weights) > 1:
+                _ = self._smoothed  # a captured graph must not allocate it
         self._sums_on_host = self._host.numpy().reshape(canvas.parts, -1, 2)
 
     def launch(self) -> None:

@@ -111,7 +111,7 @@ def blosc_shuffle(dtype: np.dtype[Any]) -> int:
 
 
 def encode(values: NDArray[Any], codec: Codec = Codec.BLOSC) -> bytes:
-    """Return the stored bytes of a chunk. A shorter array is padded with zeros, as HDF5 does."""
+    """Return the stored bytes of a chunk of at least one element. A shorter one is padded with zeros, as by HDF5."""
     return b"".join(encode_parts(values, codec)[0])
 
 
@@ -175,7 +175,7 @@ def compile_checksums() -> None:
 
 
 def checksums(parts: Sequence[bytes | memoryview]) -> list[int]:
-    """Return the checksum of each of several data."""
+    """Return the checksum of each block of bytes."""
     return [checksum(part) for part in parts] if _kernel is None else _kernel(parts)
 
 
@@ -239,12 +239,13 @@ class StoredColumn:
 
     def _chunk(self, at: int) -> NDArray[Any] | None:
         """Return a whole chunk, or None if it is damaged. The latest chunk is kept, for searches within it."""
-        if self._last is None or self._last[0] != at:
+        last = self._last  # another thread may replace it
+        if last is None or last[0] != at:
             out = self._decoded(at, at)
             if out is None:
                 return None
-            self._last = at, out
-        return self._last[1]
+            last = self._last = at, out
+        return last[1]
 
     def encoded(self, at: int) -> bytes:
         """Return the stored bytes of chunk ``at``."""

@@ -173,7 +173,7 @@ class NativeEvents:
         return self._since_zero(as_times(self._read("t", start, stop)))
 
     def _since_zero(self, t: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Add the file's offset to stored times, which were read for this."""
+        """Add the file's offset to times, in the same array if it can be written."""
         return np.add(t, self._offset, out=t if t.flags.writeable else None) if self._offset else t
 
     def _read(self, name: str, start: int, stop: int) -> NDArray[Any]:

@@ -261,13 +261,15 @@ class RecordingWriter(RecordAppender):
                 columns |= {"events/p": events.p, "events/inside": inside}
                 chunks: list[EncodedChunk] = []
                 for name, column in columns.items():
-                    stored = [(part,) for part in known.get(name, ())]
-                    chunks += chunks_of(name, start, column, stored or encode_parts(column, self._codec))
+                    stored: Sequence[Sequence[bytes]] = [(part,) for part in known.get(name, ())]
+                    if len(stored) * CHUNK < len(column):
+                        stored = encode_parts(column, self._codec)
+                    chunks += chunks_of(name, start, column, stored)
                 self._chunks.write(turn, chunks, self._dataset_of, lambda: self._follow(events, start))
         return events, inside
 
     def _check_piece(self, events: Events, inside: NDArray[np.uint8], start: int, known: Collection[str]) -> None:
-        """Check a piece. The reader has checked encoded times and polarities. Positions in the image are finite."""
+        """Check a piece. The reader has checked encoded times and polarities. A position whose flag is 1 is finite."""
         outside = np.flatnonzero(inside == 0)
         if not {"events/t", "events/p"}.issubset(known):
             self._check(events, start, allow_nan=True)

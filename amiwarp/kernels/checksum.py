@@ -11,7 +11,7 @@ from amiwarp.kernels.launch import load
 wp.set_module_options({"enable_backward": False})
 
 ROWS = 16
-"""Largest number of data whose checksums a launch computes."""
+"""Largest number of blocks of bytes whose checksums a launch computes."""
 
 
 @wp.func_native("""
@@ -54,20 +54,20 @@ def fletcher32(address: wp.uint64, size: wp.uint64) -> wp.uint64:
 
 @wp.kernel
 def compute_checksums(table: wp.array2d(dtype=wp.uint64)):
-    """Compute the checksum of each row of a table: address and size of the data [bytes], and the checksum."""
+    """Compute the checksum of each row of a table: address and size of a block [bytes], and the checksum."""
     row = wp.tid()
     table[row, 2] = fletcher32(table[row, 0], table[row, 1])
 
 
 class Checksums:
-    """Fletcher-32 checksums of several data at a time. Any thread may call it."""
+    """Fletcher-32 checksums of several blocks of bytes at a time. Any thread may call it."""
 
     def __init__(self) -> None:
         """Load the kernel."""
         self._idle: list[tuple[wp.Launch, NDArray[np.uint64]]] = [_recorded()]
 
     def __call__(self, parts: Sequence[bytes | memoryview]) -> list[int]:
-        """Return the checksum of each of the data, as :func:`amiwarp.io.chunks.checksum`."""
+        """Return the checksum of each block, as :func:`amiwarp.io.chunks.checksum`."""
         return [value for first in range(0, len(parts), ROWS) for value in self._run(parts[first : first + ROWS])]
 
     def _run(self, parts: Sequence[bytes | memoryview]) -> list[int]:

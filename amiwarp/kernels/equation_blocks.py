@@ -1,6 +1,7 @@
 """All equations of a brightness map together, on a CPU: a thread processes a block of pairs in vectorised loops.
 
-:mod:`amiwarp.kernels.normal_equations` has the same for CUDA. So each device compiles only what it runs.
+:mod:`amiwarp.kernels.normal_equations` and :mod:`amiwarp.kernels.pair_ends` do the same on CUDA. So each device
+compiles only what it runs.
 """
 
 import warp as wp

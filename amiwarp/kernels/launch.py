@@ -243,7 +243,7 @@ class RepeatedLaunches:
     """Launches on a device that are repeated with few changes.
 
     On CUDA a launch keeps the arguments of the last one of its kernel, and converts only those that differ. That takes
-    less than half of the time of :func:`launch`.
+    less than half of the time of :func:`launch`. The last arguments live as long as this object.
     """
 
     def __init__(self, device: Any) -> None:
@@ -264,7 +264,7 @@ class RepeatedLaunches:
             launch(kernel, n, inputs, outputs, device=self._device, smallest=smallest)
             return
         kernel, arguments = specialised(kernel, inputs), [*inputs, 0, *outputs]
-        command, last = self._last.get(kernel, (None, ()))
+        command, last = self._last.pop(kernel, (None, ()))
         if command is None:
             command = wp.launch(kernel, n, [*inputs, 0], list(outputs), device=self._device, record_cmd=True)
         else:

@@ -51,7 +51,7 @@ def add_coarse_diagonal(
 ):
     """Compute sums += diag(Pᵀ Aᵀ W A P) of the grid of that ``spacing``, from every ``stride``-th pair."""
     i = (start + wp.tid()) * stride
-    if i >= weight.shape[0] or geometry.cell[i] < 0:
+    if geometry.cell[i] < 0:
         return
     a = coarse_coordinates(atlas, geometry.cell[i], fractions_of(geometry, 0, i), spacing)
     b = coarse_coordinates(atlas, geometry.cell[geometry.stride + i], fractions_of(geometry, 1, i), spacing)

@@ -1,6 +1,7 @@
-"""All equations of a brightness map together: the operator of the weighted equations, their residuals and weights.
+"""All equations of a brightness map together, on CUDA: residuals, weights, and the value of each pair.
 
-A thread processes one pair. These kernels are for CUDA; :mod:`amiwarp.kernels.equation_blocks` has them for CPUs.
+A thread processes one pair. :mod:`amiwarp.kernels.pair_ends` adds the values to the nodes of the map. On CPUs
+:mod:`amiwarp.kernels.equation_blocks` does both.
 """
 
 import warp as wp
@@ -31,7 +32,7 @@ def find_flows(
     flow: wp.array(dtype=float),
     sums: wp.array(dtype=wp.int64),
 ):
-    """Compute flow = W A vector for equations A with weights W, and the part of sums += Aᵀ flow off the map."""
+    """Compute flow = W A vector for equations A with weights W, and sums += Aᵀ flow for leak and OFF threshold."""
     thread = start + wp.tid()
     i = wp.min(thread, pairs.count - 1)
     value = float(0.0)
@@ -51,7 +52,7 @@ def weigh_residuals(
     flow: wp.array(dtype=float),
     sums: wp.array(dtype=wp.int64),
 ):
-    """Compute flow = W residual for equations A with weights W, and the part of sums += Aᵀ flow off the map."""
+    """Compute flow = W residual for equations A with weights W, and sums += Aᵀ flow for leak and OFF threshold."""
     thread = start + wp.tid()
     i = wp.min(thread, pairs.count - 1)
     value = float(0.0)
@@ -81,7 +82,7 @@ def subtract(
 def add_sensor_diagonal(
     pairs: Pairs, atlas: Atlas, weight: wp.array(dtype=float), start: int, sums: wp.array(dtype=wp.int64)
 ):
-    """Compute the part of sums += diag(Aᵀ W A) off the map."""
+    """Compute sums += diag(Aᵀ W A) for the leak and the OFF threshold."""
     thread = start + wp.tid()
     i = wp.min(thread, pairs.count - 1)
     add_extra_diagonal(sums, atlas, pairs, i, wp.where(thread < pairs.count, weight[i], 0.0))

@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Ends:
-    """Ends in the order of the map. If a pair begins where the one before it ends, that is one end.
+    """Ends in the order of the map. If a pair begins where the one before it ends, both are stored as one end.
 
     The number of an end is the index of its pair, plus the stride for a second event, plus twice the stride if the next
     pair begins there.
@@ -96,7 +96,7 @@ def add_ends(
     With ``squared``, add its value times the squares of the bilinear weights of both ends.
     """
     end = start + wp.tid()
-    cell = ends.cell[wp.min(end, 2 * stride - 1)]
+    cell = ends.cell[wp.min(end, 2 * stride - 1)]  # no warp has ends and further threads: the stride is 64 n
     used = end < 2 * stride and cell < sums.shape[0] - EXTRA
     share = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if used:

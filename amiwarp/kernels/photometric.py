@@ -149,7 +149,8 @@ def add_extra(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, i: int
 
 @wp.func
 def add_extra_diagonal(sums: wp.array(dtype=wp.int64), atlas: Atlas, pairs: Pairs, i: int, weight: float):
-    """Add the squared coefficients of the leak and the OFF threshold times a weight to their sums."""
+    """Add the squared coefficients of the leak and the OFF threshold times a weight to their sums; see
+    :func:`add_extra`."""
     extra = sums.shape[0] - EXTRA
     if atlas.with_leak > 0.0:
         gap = pairs.time[pairs.stride + i] - pairs.time[i]

@@ -73,7 +73,7 @@ class Program:
             run_together(stage)
 
     def run(self, times: int = 1) -> None:
-        """Run all stages ``times`` times; many launches on CUDA run as graphs, which the first call captures."""
+        """Run all stages ``times`` times; more than a few launches on CUDA run as graphs."""
         if self.device.is_cpu or times * len(self._stages) <= FEW_LAUNCHES:
             for _ in range(times):
                 self.launch()

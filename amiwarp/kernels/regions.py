@@ -56,7 +56,9 @@ def copy_answers(mask: wp.array2d(dtype=wp.uint8), first: int, large: wp.array2d
 
 @wp.kernel
 def find_large_regions(mask: wp.array2d(dtype=wp.uint8), least: int, large: wp.array2d(dtype=wp.uint8)):
-    """Set ``large``, 0 at first, to 1 in the regions of a mask that have at least ``least`` elements, 2 to 64.
+    """Set ``large``, 0 at first, to 1 in the regions of a mask that have at least ``least`` elements.
+
+    ``least`` is 2 to 64.
 
     Neighbours in a row or a column belong to the same region, so most elements copy the answer of a neighbour.
     """

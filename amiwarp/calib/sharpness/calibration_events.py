@@ -34,7 +34,7 @@ class CalibrationEvents:
     fold: int = 0
     """Number of angle bins per turn into which a pixel's events are merged; 0: events are not merged."""
     every_of: tuple[CalibrationEvents, int] | None = None
-    """Events of which these are every n-th, and n; None if there are none."""
+    """Events of which these are every n-th, and n; None if these are all events."""
     _uploaded: dict[tuple[str, int | None], UploadedEvents] = field(default_factory=dict, repr=False, init=False)
 
     def on(self, device: Any, middle_us: int | None) -> UploadedEvents:

@@ -281,8 +281,8 @@ class Search:
     def sharpness_in(self, space: ParameterSpace, values: Mapping[str, float]) -> float:
         """Return the sharpness at ``values`` with the camera and the prism of ``space``."""
         known, fine = self.space, self.fine
-        same = (space.model, space.names, space.camera, space.prism) == (
-            known.model, known.names, known.camera, known.prism
+        same = (space.model, space.names, space.camera, space.prism, space.moving, padding(space)) == (
+            known.model, known.names, known.camera, known.prism, known.moving, self._pad
         )  # fmt: skip
         if not same:
             smoothing = self.settings.smoothing_px
