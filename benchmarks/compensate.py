@@ -35,7 +35,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.compensation.recordings import PIECE, BlockCompensator, compensate, inside_image
+from amiwarp.compensation.piece_buffers import PIECE
+from amiwarp.compensation.recordings import BlockCompensator, compensate, inside_image
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording

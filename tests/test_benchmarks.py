@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from amiwarp.compensation.recordings import PIECE
+from amiwarp.compensation.piece_buffers import PIECE
 from amiwarp.events.events import Events
 from amiwarp.imaging.choices import Vote
 from benchmarks import __main__ as runner

@@ -64,8 +64,7 @@ class GridHierarchy:
         """Yield inputs and outputs of the restriction to each grid but the finest."""
         fines = [residual, *self._residual]
         for level, (fine, *outputs) in enumerate(zip(fines, self._residual, self._correction, strict=False)):
-            columns = self.shapes[level + 1][1]
-            yield [fine, *self.shapes[level], columns, self._diagonal[level], prior, 4.0 ** (level + 1)], outputs
+            yield [fine, *self.shapes[level], self._diagonal[level], prior, 4.0 ** (level + 1)], outputs
 
     def _correct_by_rows(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
         """Correct with a row of nodes per thread."""

@@ -49,7 +49,7 @@ class Residuals:
         threads, parts = self._sum_shape
         partial = self._doubles(2, parts)
         inputs = [self.values, self.pairs.arrays.on, int(HELD) * held, self.count, scale, missing, self._width]
-        self._launch_sum(sum_costs, threads, inputs, partial)
+        self._launch(sum_costs, threads, inputs, [partial], smallest=CHUNKS)
         total, number = partial.numpy().sum(axis=1)
         return float(total / number) if number else math.nan
 
@@ -58,7 +58,8 @@ class Residuals:
         threads, parts = self._sum_shape
         partial = self._doubles(len(factors), parts)
         for k, (a, b) in enumerate(factors):
-            self._launch_sum(sum_products, threads, [a, b, self.weight, self.count, self._width], partial[k])
+            inputs = [a, b, self.weight, self.count, self._width]
+            self._launch(sum_products, threads, inputs, [partial[k]], smallest=CHUNKS)
         return np.asarray(partial.numpy().sum(axis=1))
 
     def clusters(self, slopes: list[Any]) -> NDArray[np.float64]:
@@ -127,12 +128,11 @@ class Residuals:
     @cached_property
     def _sum_shape(self) -> tuple[int, int]:
         """Numbers of threads and of partial sums for a sum over all pairs."""
-        threads = -(-self.count // self._width)
-        return threads, threads if self.device.is_cpu else -(-threads // BLOCK_DIM)
+        if self.device.is_cpu:
+            threads = -(-self.count // self._width)
+            return threads, threads
+        blocks = -(-self.count // BLOCK_DIM)  # block sums need whole blocks
+        return blocks * BLOCK_DIM, blocks
 
     def _doubles(self, *shape: int) -> Any:
         return wp.empty(shape, dtype=wp.float64, device=self.device)
-
-    def _launch_sum(self, kernel: Any, threads: int, inputs: list[Any], out: Any) -> None:
-        full = threads if self.device.is_cpu else -(-threads // BLOCK_DIM) * BLOCK_DIM  # block sums need whole blocks
-        self._launch(kernel, full, inputs, [out], smallest=CHUNKS)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from amiwarp.io.chunks import CHUNK
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.launch import RecordedLaunch
 
@@ -21,8 +22,9 @@ GIVEN = {"x": wp.uint16, "y": wp.uint16, "t": wp.int64}
 FOUND = {"out_x": wp.float32, "out_y": wp.float32, "inside": wp.uint8}
 BUFFERS = 3
 """Number of pieces that threads process on the GPU at a time. Page-locking the memory of a piece takes 5 ms."""
-LARGEST = 1 << 20
-"""Largest number of events of a piece."""
+PIECE = 4 * CHUNK
+"""Number of events that a thread reads, compensates and writes at a time. With fewer, threads wait more often for
+Python's lock; more events need more memory."""
 
 
 class PieceBuffers:
@@ -77,8 +79,8 @@ class GpuPieces:
         """Return compensated x and y [px] and 1 for each event inside the image, shape ``(n,)``."""
         n, outside = len(events), self._plan.any_outside(int(events.x.max()), int(events.y.max()))
         found = [np.empty(n, wp.dtype_to_numpy(dtype)) for dtype in FOUND.values()]
-        for first in range(0, n, LARGEST):
-            self._run(events[first : first + LARGEST], outside, [a[first : first + LARGEST] for a in found])
+        for first in range(0, n, PIECE):
+            self._run(events[first : first + PIECE], outside, [a[first : first + PIECE] for a in found])
         return found
 
     def _run(self, events: Events, outside: bool, found: list[NDArray[Any]]) -> None:

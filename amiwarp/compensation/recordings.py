@@ -14,14 +14,14 @@ import numpy as np
 import warp as wp
 
 from amiwarp.compensation.launch_plan import LaunchPlan
-from amiwarp.compensation.piece_buffers import GpuPieces
+from amiwarp.compensation.piece_buffers import PIECE, GpuPieces
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import check_sensor
 from amiwarp.events.device_encoder import encoder_params
 from amiwarp.events.device_events import DeviceEvents, device_for, limits, wait
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
-from amiwarp.io.chunks import CHUNK, compile_checksums
+from amiwarp.io.chunks import compile_checksums
 from amiwarp.io.native_reader import NativeEvents
 from amiwarp.io.native_writer import FlaggedEvents
 from amiwarp.kernels.event_arrays import join_columns
@@ -39,9 +39,6 @@ if TYPE_CHECKING:
 
 DEFAULT_BLOCK = 1 << 20
 """Number of events per block if the caller does not give one."""
-PIECE = 4 * CHUNK
-"""Number of events that a thread reads, compensates and writes at a time. With fewer, threads wait more often for
-Python's lock; more events need more memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,18 +94,19 @@ class BlockCompensator:
         return c.out_x[: len(events)], c.out_y[: len(events)]
 
     def _compensate(self, events: Events, all_cores: bool) -> list[NDArray[Any]]:
+        """Return compensated x and y [px] and 1 for each event inside the image, on a CPU."""
         padded = self._plan.padded(len(events))
-        columns = [_column(self._device, values, wp.uint16, padded) for values in (events.x, events.y)]
-        columns.append(_column(self._device, events.t, wp.int64, padded))
+        columns = [_column(values, wp.uint16, padded) for values in (events.x, events.y)]
+        columns.append(_column(events.t, wp.int64, padded))
         c = self._plan.run(columns, self._encoder, events.x.max(), events.y.max(), all_cores=all_cores)
         return [values.numpy()[: len(events)] for values in (c.out_x, c.out_y, c.inside)]
 
 
-def _column(device: Any, values: NDArray[Any], dtype: Any, padded: int) -> Any:
-    """Return values as a padded column on the device; on CPUs without a copy if possible."""
+def _column(values: NDArray[Any], dtype: Any, padded: int) -> Any:
+    """Return values as a padded column on a CPU, without a copy if possible."""
     if len(values) < padded:
         values = np.concatenate([values, np.zeros(padded - len(values), values.dtype)])
-    return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device, copy=False)
+    return wp.array(np.ascontiguousarray(values), dtype=dtype, device="cpu", copy=False)
 
 
 @overload

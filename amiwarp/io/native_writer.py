@@ -219,8 +219,8 @@ class RecordingWriter(RecordAppender):
         ----------
         pieces : iterable of callable
             Functions that return events, their ``inside`` flags, and encoded chunks of columns by name, in order.
-            Threads call them. Blosc's encoded chunks are stored as they are; other columns are encoded. If times and
-            polarities are both encoded, they are not checked, nor are positions whose flag is 1.
+            Threads call them. If the codec is Blosc, encoded chunks are stored unchanged; the rest is encoded. If times
+            and polarities are both encoded, they are not checked, nor are positions whose flag is 1.
         count : int
             Number of events of each piece: a whole number of chunks. Only the last piece may be shorter.
         t_first : int

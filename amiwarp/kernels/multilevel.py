@@ -92,9 +92,9 @@ def restricted(fine: wp.array(dtype=float), at: int, rows: int, columns: int, i:
 
 
 @wp.func
-def corrected(total: float, diagonal: float, prior: Prior, four: float) -> float:
-    """Return the correction of a node with the residual ``total``; ``four`` is 4 to the power of its grid's level."""
-    return total / (diagonal + prior.smooth[0] * HAT + prior.damping[0] * four)
+def prior_part(prior: Prior, four: float) -> float:
+    """Return the prior's part of a coarse grid's diagonal; ``four`` is 4 to the power of the grid's level."""
+    return prior.smooth[0] * HAT + prior.damping[0] * four
 
 
 @wp.kernel
@@ -102,7 +102,6 @@ def restrict(
     fine: wp.array(dtype=float),
     fine_rows: int,
     fine_columns: int,
-    columns: int,
     diagonal: wp.array(dtype=float),
     prior: Prior,
     four: float,
@@ -116,7 +115,7 @@ def restrict(
         return
     total = restricted(fine, 0, fine_rows, fine_columns, i)
     coarse[i] = total
-    correction[i] = corrected(total, diagonal[i], prior, four)
+    correction[i] = total / (diagonal[i] + prior_part(prior, four))
 
 
 @wp.func_native("""
@@ -155,7 +154,6 @@ def restrict_rows(
     fine: wp.array(dtype=float),
     fine_rows: int,
     fine_columns: int,
-    columns: int,
     diagonal: wp.array(dtype=float),
     prior: Prior,
     four: float,
@@ -164,9 +162,9 @@ def restrict_rows(
     correction: wp.array(dtype=float),
 ):
     """Compute residual and correction as :func:`restrict` does, one row of the coarser grid per thread. For CPUs."""
-    least = prior.smooth[0] * HAT + prior.damping[0] * four
+    least = prior_part(prior, four)
     row = start + wp.tid()
-    restrict_row(fine, fine_rows, fine_columns, columns, diagonal, least, row, coarse, correction)
+    restrict_row(fine, fine_rows, fine_columns, fine_columns / 2 + 1, diagonal, least, row, coarse, correction)
 
 
 @wp.func
@@ -247,10 +245,11 @@ def correct_small(
         r, c, fine = grid_below(rows, columns, at, level)
         coarse = fine + r * c
         power *= 4.0
+        least = prior_part(prior, power)
         for i in range(thread, (r / 2 + 1) * (c / 2 + 1), wp.block_dim()):
             total = restricted(residual, fine, r, c, i)
             residual[coarse + i] = total
-            correction[coarse + i] = corrected(total, diagonal[coarse + i], prior, power)
+            correction[coarse + i] = total / (diagonal[coarse + i] + least)
         wait_for_block()
     for above in range(1, levels):
         r, c, fine = grid_below(rows, columns, at, levels - above)

@@ -153,7 +153,7 @@ class FittedCandidate:
 
 
 def fit_models(trial: Trial) -> tuple[FittedCandidate, ...]:
-    """Fit every model. Chosen is the smallest one that keeps the budget and is not clearly worse on held-out turns.
+    """Fit every model, and choose the smallest that keeps the budget and is not clearly worse on held-out turns.
 
     Models are measured on held-out turns only if that may change the choice, or if no photometric stage has confirmed
     the exact model, and measuring shows whether the recording contradicts it.
