@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,10 @@ from scipy.sparse.linalg import spsolve
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
 from amiwarp.brightness.residuals import Residuals
-from amiwarp.brightness.solver import BrightnessMap
+from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap
 from amiwarp.brightness.tiles import Tiles
 from amiwarp.calib import Calibration, calibrate
+from amiwarp.calib.photometric.events_ahead import EventsAhead
 from amiwarp.calib.photometric.pair_collection import dilated, van_der_corput
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.errors import AmiwarpError
@@ -24,6 +26,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
+from amiwarp.kernels.page_locked import page_locked
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import FlatSide, Prism
@@ -237,6 +240,54 @@ def test_pairs_of_spans_add_up(recording: Recording, device: str) -> None:
     for name in ("azimuth", "time", "slope"):
         one, other = (getattr(p.arrays, name).numpy().reshape(-1, p.arrays.stride)[:, : len(p)] for p in (parts, whole))
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-6)
+
+
+def test_events_copied_ahead_are_those_of_their_spans(recording: Recording) -> None:
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    source = recording.events
+    assert isinstance(source, MemoryEvents)
+    edges = np.linspace(source.t_first, source.t_last + 1, 7).astype(int).tolist()
+    spans = list(pairwise(edges))[::-1]
+    most = sum(len(source.between(*span)) for span in spans[:4])
+    with EventsAhead(source, spans, most, "cuda:0") as ahead:
+        for taken in (spans[:4], spans[1:3]):
+            found = ahead.take(taken)
+            assert found is not None
+            expected = Events.concatenate([source.between(*span) for span in taken])
+            for name in ("x", "y", "t", "p"):
+                assert np.array_equal(getattr(found.to_host(), name), getattr(expected, name))
+        assert ahead.take(spans[3:5]) is None
+
+
+def test_page_locked_memory_is_used_again() -> None:
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+
+    class Owner:
+        pass
+
+    one, other = Owner(), Owner()
+    first, second = (page_locked(owner, (3, 5), wp.float64).ptr for owner in (one, other))
+    assert first != second
+    del one
+    assert page_locked(other, (3, 5), wp.float64).ptr == first
+
+
+def test_damping_follows_the_contrast_of_the_seen_nodes(recording: Recording, device: str) -> None:
+    width, height = recording.events.size
+    table = EventTable([recording.events.slice(0, 3000)], np.zeros((height, width), np.int32), device)
+    assert recording.encoder is not None
+    pairs = table.pairs(recording.encoder, longest_gap_us=20_000)
+    solver = BrightnessMap(pairs, Tiles(np.zeros((1, 2), np.float32), 90, 100))
+    values = np.zeros(9002, np.float32)
+    values[100:3100] = np.random.default_rng(0).normal(size=3000)
+    solver.unknowns = values
+    assert not solver.relax_damping()
+    solver.unknowns = 4.0 * values
+    assert solver.relax_damping()
+    square = np.mean((4.0 * values[100:3100].astype(np.float64)) ** 2)
+    assert solver._prior.damping.numpy()[0] == pytest.approx(DAMPING * CONTRAST / square, rel=1e-6)
 
 
 def test_no_pair_is_an_error() -> None:

@@ -63,6 +63,8 @@ class PairSet:
     arrays: Any
     """Columns of the pairs: the kernels' struct ``Pairs``."""
     device: Any
+    of_two_events: int | None = None
+    """Number of pairs of two events, which come first; None if it was not counted."""
 
     def __len__(self) -> int:
         return int(self.arrays.count)
@@ -184,10 +186,18 @@ class PairSet:
 class EventTable:
     """Events of one or more time spans on a device, sorted by pixel."""
 
-    def __init__(self, spans: Sequence[Events | DeviceEvents], tile_of: Any, device: Any) -> None:
+    def __init__(
+        self,
+        spans: Sequence[Events | DeviceEvents],
+        tile_of: Any,
+        device: Any,
+        *,
+        joined: DeviceEvents | None = None,
+    ) -> None:
         """Copy the events of the time spans to the device, without sorting them; a single span on it is not copied.
 
-        Only pixels with ``tile_of`` >= 0 are used: shape (height, width), NumPy or on the device.
+        ``joined`` gives the events of all spans, if they are on the device already. Only pixels with ``tile_of`` >= 0
+        are used: shape (height, width), NumPy or on the device.
         """
         self.device = wp.get_device(device)
         if isinstance(tile_of, np.ndarray):
@@ -199,7 +209,8 @@ class EventTable:
         side = int(kernels.SQUARE)
         self.arrays.places = math.prod(-(-n // side) * side for n in tile_of.shape)
         for name, dtype in (("x", wp.uint16), ("y", wp.uint16), ("t", wp.int64), ("p", wp.uint8)):
-            setattr(self.arrays, name, _upload([getattr(span, name) for span in self.spans], dtype, self.device))
+            parts = [getattr(span, name) for span in ([joined] if joined else self.spans)]
+            setattr(self.arrays, name, _upload(parts, dtype, self.device))
         self.arrays.count = 0
 
     @property
@@ -264,9 +275,10 @@ class EventTable:
             edges_d = wp.array(edges, dtype=wp.int64, device=device)
             self._mark_quiet(edges_d, at_least, base, flag)
         place, count = _running_count(flag)
+        of_two_events = int(place[m - 1 : m].numpy()[0]) if m else 0
         out = _empty(count, device, weak=weak)
         if not count:
-            return PairSet(out, device)
+            return PairSet(out, device, 0)
         span = self.covers if window is None else (min(self.covers[0], window[0]), max(self.covers[1], window[1]))
         angles = encoder_params(encoder, *span, device)
         launch(kernels.write_pairs, base, [self.arrays, times, angles, self.tile_of, flag, place], [out], device=device)
@@ -275,7 +287,7 @@ class EventTable:
             launch(kernels.write_spans, len(edges) - 1, [edges_d, times, angles], [of_spans], device=device)
             inputs = [of_spans, self.tile_of, base, flag, place]
             launch(kernels.write_quiet, spans, inputs, [out], device=device)
-        return PairSet(out, device)
+        return PairSet(out, device, of_two_events)
 
     def _mark_quiet(self, edges: Any, at_least: int, base: int, flag: Any) -> None:
         """Mark the time spans in which pixels are silent."""

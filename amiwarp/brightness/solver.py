@@ -20,7 +20,7 @@ from amiwarp.brightness.pair_positions import PairPositions
 from amiwarp.brightness.residuals import Residuals
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import conjugate_gradients as cg
-from amiwarp.kernels.conjugate_gradients import add_multiple, dot, gather, gather_diagonal
+from amiwarp.kernels.conjugate_gradients import add_multiple, dot, gather, gather_diagonal, sum_seen
 from amiwarp.kernels.launch import RepeatedLaunches, slice_count
 from amiwarp.kernels.map_prior import EXTRA, Prior, link
 from amiwarp.kernels.photometric import Atlas
@@ -182,17 +182,23 @@ class BrightnessMap:
 
     def restart(self, smoothness: float) -> None:
         """Set the map to zero and change the weight of the smoothness prior."""
-        self._image[: self.tiles.nodes].zero_()
+        self.clear()
         self._prior.smooth.fill_(smoothness)
+
+    def clear(self) -> None:
+        """Set the map to zero; leak and threshold remain."""
+        self._image[: self.tiles.nodes].zero_()
 
     def relax_damping(self) -> bool:
         """Reduce the damping if the solved map has a large contrast, and return whether it has."""
-        maps = self.maps()
-        seen = maps[maps != 0.0]
-        square = float(np.mean(seen**2, dtype=np.float64)) if len(seen) else 0.0
-        if square <= CONTRAST:
+        parts = len(self._dots.pq)
+        partial = wp.empty((2, parts), dtype=wp.float64, device=self.device)
+        threads = parts if self.device.is_cpu else parts * BLOCK_DIM  # block sums need whole blocks
+        self._launch(sum_seen, threads, [self._image[: self.tiles.nodes], self._width], [partial], smallest=FEW_CHUNKS)
+        squares, number = partial.numpy().sum(axis=1).tolist()
+        if squares <= CONTRAST * number:
             return False
-        self._prior.damping.fill_(DAMPING * CONTRAST / square)
+        self._prior.damping.fill_(DAMPING * CONTRAST * number / squares)
         return True
 
     def prepare_projection(self) -> None:
@@ -274,8 +280,12 @@ class BrightnessMap:
         return values.copy() if self.device.is_cpu else values
 
     @unknowns.setter
-    def unknowns(self, values: NDArray[np.float32]) -> None:
+    def unknowns(self, values: NDArray[np.float32] | wp.array) -> None:
         self._image.assign(values)
+
+    def copy_unknowns(self) -> wp.array:
+        """Return a copy of the unknowns on the device."""
+        return wp.clone(self._image)
 
     def maps(self) -> NDArray[np.float32]:
         """Return the map [ON thresholds], shape (tiles, rows, columns)."""
@@ -303,7 +313,8 @@ class BrightnessMap:
     @property
     def extra(self) -> NDArray[np.float32]:
         """Unknowns after the map: the leak [thresholds/s], and OFF threshold over ON threshold, minus 1."""
-        return self.unknowns[self.tiles.nodes :]
+        values: NDArray[np.float32] = self._image[self.tiles.nodes :].numpy()
+        return values.copy() if self.device.is_cpu else values
 
 
 class _ConjugateGradients:

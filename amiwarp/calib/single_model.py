@@ -15,6 +15,7 @@ from amiwarp.calib import checks
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.parameters import LENS, MOTION, RATES, size_name, with_lens
 from amiwarp.calib.photometric.acceptance import LARGEST_COST_RATIO, LARGEST_ROTATION_GAIN, LARGEST_STILL_COST
+from amiwarp.calib.photometric.pair_collection import upload_ahead
 from amiwarp.calib.photometric.stage import refine
 from amiwarp.calib.preparation import linear_unknowns, prepare, rotation_window, zero_time
 from amiwarp.calib.prism_speed import encoder_turns_per_period
@@ -25,6 +26,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
+    from amiwarp.calib.photometric.events_ahead import EventsAhead
     from amiwarp.events.recording import Recording
 
 LEAST_BAD_SHARE = 0.01
@@ -217,9 +219,22 @@ def _calibrate_once(recording: Recording, settings: Settings, device: Any, progr
     began = time.perf_counter()
     recording = rotation_window(recording, settings)
     searches = prepare(recording, settings, device=device, progress=progress)
+    with upload_ahead(recording, searches[0]) as ahead:
+        return replace(_run_stages(recording, searches, ahead, progress), seconds=time.perf_counter() - began)
+
+
+def _run_stages(
+    recording: Recording, searches: list[Search], ahead: EventsAhead | None, progress: Progress | None
+) -> Calibration:
+    """Return the calibration by the sharpest of the searches, and by the photometric stage if the settings name it.
+
+    ``ahead``: events of the photometric stage that are already on the device.
+    """
+    began = time.perf_counter()
     for search in searches:
         search.run()
     search = max(searches, key=lambda s: s.score)
+    settings = search.settings
     best = search.best
     warnings, uncertainty = search.check_answer(recording.name)
     still = {n: 0.0 for n in (search.space.size_name, *MOTION) if n in best}
@@ -242,16 +257,21 @@ def _calibrate_once(recording: Recording, settings: Settings, device: Any, progr
         warnings=warnings,
     )
     if "photometric" in settings.stages:
-        result = _photometric_stage(recording, search, result, progress)
-    return replace(result, seconds=time.perf_counter() - began)
+        result = _photometric_stage(recording, search, result, ahead, progress)
+    return result
 
 
 def _photometric_stage(
-    recording: Recording, search: Search, result: Calibration, progress: Progress | None
+    recording: Recording,
+    search: Search,
+    result: Calibration,
+    ahead: EventsAhead | None,
+    progress: Progress | None,
 ) -> Calibration:
     """Return the photometric stage's result, or the sharpness stage's result with a warning that says why."""
     try:
-        found, summary, space = refine(recording, search, linear_unknowns(search.settings), progress=progress)
+        linear = linear_unknowns(search.settings)
+        found, summary, space = refine(recording, search, linear, ahead=ahead, progress=progress)
     except AmiwarpError as error:
         return replace(result, warnings=(*result.warnings, f"the photometric stage failed: {error}"))
     if found.held:

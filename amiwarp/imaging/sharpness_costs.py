@@ -17,6 +17,7 @@ from amiwarp.imaging.warped_image import CanvasShape
 from amiwarp.kernels import iwe as kernels
 from amiwarp.kernels.iwe import STRIP
 from amiwarp.kernels.launch import launch
+from amiwarp.kernels.page_locked import page_locked
 from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
 from amiwarp.validation import array, choice, on_gpu, real
 
@@ -52,7 +53,7 @@ class SharpnessMeter:
         if self.device.is_cuda:
             few = (layers, min(strips, FEW_SUMS))
             self._few = wp.empty(few, dtype=wp.vec2d, device=device)
-            self._host = wp.empty(few, dtype=wp.vec2d, device="cpu", pinned=True)
+            self._host = page_locked(self, few, wp.vec2d)
             if len(weights) > 1:
                 _ = self._smoothed  # a captured graph must not allocate it
         self._sums_on_host = self._host.numpy().reshape(canvas.parts, -1, 2)

@@ -353,6 +353,19 @@ def descend(width: int, start: int, image: wp.array(dtype=float), u: Unknowns, d
 
 
 @wp.kernel
+def sum_seen(image: wp.array(dtype=float), width: int, start: int, partial: wp.array2d(dtype=wp.float64)):
+    """Compute partial sums of the squares of a map, and of the number of its nodes that are not 0."""
+    thread = start + wp.tid()
+    squares = wp.float64(0.0)
+    number = wp.float64(0.0)
+    for i in range(thread * width, wp.min((thread + 1) * width, image.shape[0])):
+        squares += wp.float64(image[i]) * wp.float64(image[i])
+        number += wp.where(image[i] != 0.0, wp.float64(1.0), wp.float64(0.0))
+    store_partial_sum(partial[0], thread, squares)
+    store_partial_sum(partial[1], thread, number)
+
+
+@wp.kernel
 def dot(
     a: wp.array(dtype=float), b: wp.array(dtype=float), width: int, start: int, partial: wp.array(dtype=wp.float64)
 ):

@@ -189,7 +189,7 @@ class Reconstruction:
         width, height = recording.events.size
         table, count = self._table(start_us, length_us)
         pairs = self._pairs(table, start_us, length_us)
-        pair_count = int((pairs.column("on") < 2).sum())
+        pair_count = pairs.of_two_events
         if not pair_count:
             where = f"{start_us} .. {start_us + length_us} us"
             raise AmiwarpError(f"{recording.name}: no pixel fires twice in {where}; give a longer window")

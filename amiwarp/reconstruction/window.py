@@ -79,8 +79,10 @@ def choice_square(count: NDArray[np.int32]) -> tuple[int, int, int]:
     ``(height, width)``.
     """
     for side in CHOICE_SQUARES:
-        rows = np.add.reduceat(count, np.arange(0, count.shape[0], side), axis=0)
-        cells = np.add.reduceat(rows, np.arange(0, count.shape[1], side), axis=1)
+        down, across = (-(-n // side) for n in count.shape)
+        padded = np.zeros((down * side, across * side), count.dtype)
+        padded[: count.shape[0], : count.shape[1]] = count
+        cells = padded.reshape(down, side, across * side).sum(axis=1).reshape(down, across, side).sum(axis=2)
         row, column = np.unravel_index(int(cells.argmax()), cells.shape)
         if cells.max() >= CHOICE_EVENTS:
             break

@@ -145,7 +145,7 @@ def _evaluate(
     covariance = slopes.covariance() / left**2
     of_sharpness = np.array([n not in DEGENERATE_WITH_APEX for n in space.names])
     of_prism = np.array([n not in (*DEGENERATE_WITH_APEX, *MOTION) for n in space.names])
-    solved = cost.brightness.unknowns
+    solved = cost.brightness.copy_unknowns()
     leak, excess = (float(x) for x in cost.brightness.extra)
     around = cost_around_optimum(cost, best, final)
     # the map is better converged now than at the start of the search, so the cost at the start is measured again

@@ -121,7 +121,7 @@ def _significant(found: _Corrected) -> bool:
 def _comparable_cost(search: AnswerSearch, v: NDArray[np.float64]) -> float:
     """Return the cost at ``v`` with a new map: a map that was improved for longer has another cost."""
     cost = search.cost
-    present = cost.brightness.unknowns
+    present = cost.brightness.copy_unknowns()
     cost.renew(v)
     cost.residuals(v, rounds=2, steps=2 * cost.steps)
     mean = cost.mean()

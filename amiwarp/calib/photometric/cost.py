@@ -11,6 +11,7 @@ from amiwarp.calib.photometric.causes import place_arguments
 from amiwarp.calib.photometric.gauss_newton import Slopes
 
 if TYPE_CHECKING:
+    import warp as wp
     from numpy.typing import NDArray
 
     from amiwarp.brightness.solver import BrightnessMap
@@ -63,13 +64,12 @@ class Cost:
 
     def renew(self, v: NDArray[np.float64]) -> None:
         """Discard the brightness map and solve a new one at ``v``: a map is biased to the parameters of its fit."""
-        unknowns = self.brightness.unknowns
-        unknowns[: self.brightness.tiles.nodes] = 0.0
-        self.replace_map(unknowns)
+        self.brightness.clear()
+        self._solved, self.columns = None, {}
         self.brightness.place(**self.at(v))
         self.brightness.solve(FIRST_SCALE, steps=2 * self.steps, rounds=3)
 
-    def replace_map(self, unknowns: NDArray[np.float32]) -> None:
+    def replace_map(self, unknowns: wp.array) -> None:
         """Replace the brightness map and the other unknowns; the residuals remain."""
         self.brightness.unknowns = unknowns
         self._solved, self.columns = None, {}

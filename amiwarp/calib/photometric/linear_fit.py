@@ -18,6 +18,8 @@ from amiwarp.kernels.launch import launch
 from amiwarp.kernels.square_sums import multiply
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from amiwarp.calib.photometric.cost import Cost
@@ -40,15 +42,13 @@ class Estimate:
     """Share of the sum of squared weighted residuals that the change removes."""
     inverse: Vector
     """Inverse of the sum of the Hessians, shape (n, n)."""
-    hessian: Vector
-    """Hessian of each square, shape (squares, n, n)."""
-    gradient: Vector
-    """Gradient of each square, shape (squares, n)."""
+    parts: Callable[[], Vector]
+    """Function that returns the gradient of each square after the change, shape (squares, n)."""
 
     @cached_property
     def covariance(self) -> Vector:
         """Covariance of the change by the sandwich estimate, shape (n, n)."""
-        parts = self.gradient + self.hessian @ self.change
+        parts = self.parts()
         spare = len(parts) / max(1, len(parts) - len(self.change))
         return np.asarray(self.inverse @ (parts.T @ parts) @ self.inverse * spare)
 
@@ -79,15 +79,29 @@ class LinearFit:
         The other columns are fixed.
         """
         k = [self.names.index(n) for n in names]
-        rows = slice(None) if where is None else where
-        hessian, gradient = self.hessian[rows][:, k][:, :, k], self.gradient[rows][:, k]
-        total = hessian.sum(axis=0)
-        scale = np.sqrt(np.maximum(np.diag(total), 1e-30))
+        hessian, gradient = self._total if where is None else self._sums(where)
+        hessian, gradient = hessian[np.ix_(k, k)], gradient[k]
+        scale = np.sqrt(np.maximum(np.diag(hessian), 1e-30))
         scales = np.outer(scale, scale)
-        inverse = np.linalg.pinv(total / scales, rcond=1e-6, hermitian=True) / scales
-        change = -inverse @ gradient.sum(axis=0)
-        gain = float(change @ total @ change) / max(self.squares_sum, 1e-30)
-        return Estimate(change, gain, inverse, hessian, gradient)
+        inverse = np.linalg.pinv(hessian / scales, rcond=1e-6, hermitian=True) / scales
+        change = -inverse @ gradient
+        gain = float(change @ hessian @ change) / max(self.squares_sum, 1e-30)
+
+        def parts() -> Vector:
+            all_changes, rows = np.zeros(len(self.names)), slice(None) if where is None else where
+            all_changes[k] = change
+            return np.asarray((self.gradient[rows] + self.hessian[rows] @ all_changes)[:, k])
+
+        return Estimate(change, gain, inverse, parts)
+
+    @cached_property
+    def _total(self) -> tuple[Vector, Vector]:
+        """Sums over all squares."""
+        return self._sums(slice(None))
+
+    def _sums(self, where: NDArray[np.bool_] | slice) -> tuple[Vector, Vector]:
+        """Return the sums of the Hessians and of the gradients over some of the squares."""
+        return self.hessian[where].sum(axis=0), self.gradient[where].sum(axis=0)
 
     def adding(self, names: tuple[str, ...], more: tuple[str, ...]) -> tuple[Estimate, float, float]:
         """Return the fit of the columns ``names`` and ``more``, and what ``more`` contributes.

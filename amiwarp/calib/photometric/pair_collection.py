@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
+from amiwarp.calib.photometric.events_ahead import EventsAhead
 from amiwarp.calib.photometric.scene_tiles import choose_tiles, one_tile
 from amiwarp.calib.sharpness.objective import reach
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import MemoryEvents
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,6 +41,8 @@ FINE_PAIRS_PER_NODE, FINE_PAIRS_PER_NODE_OF_MANY = 4.2, 3.9
 with few pairs, and of one with :data:`MANY_PAIRS`."""
 FEWEST_TURNS = 2
 """Number of turns of the prism that are always used, if the recording has them."""
+EVENTS_PER_PAIR = 10
+"""Number of events that are copied ahead for each wanted pair. The tiles hold about a tenth of the events as pairs."""
 FEWEST_TILES = 6
 """Number of tiles of the scene that are always used."""
 
@@ -45,8 +50,15 @@ FEWEST_TILES = 6
 class _PairCollector:
     """Collector of pairs of events that fall on the same tile, compensated by the result of the sharpness stage."""
 
-    def __init__(self, recording: Recording, search: Search, tile_of: NDArray[np.int32], sensor: SensorTiming) -> None:
-        self.recording, self.search, self.sensor = recording, search, sensor
+    def __init__(
+        self,
+        recording: Recording,
+        search: Search,
+        tile_of: NDArray[np.int32],
+        sensor: SensorTiming,
+        ahead: EventsAhead | None,
+    ) -> None:
+        self.recording, self.search, self.sensor, self._ahead = recording, search, sensor, ahead
         near = dilated(tile_of >= 0, math.ceil(reach(search.space, search.best)) + 1)
         self._tile_of = wp.array(tile_of, dtype=int, device=search.device)
         self._near = wp.array(near.astype(np.int32) - 1, dtype=int, device=search.device)
@@ -70,7 +82,8 @@ class _PairCollector:
     def _new_pairs(self, spans: list[tuple[int, int]]) -> PairSet:
         search, source = self.search, self.recording.events
         space, best, calibration_events = search.space, search.best, search.calibration_events
-        table = EventTable([source.between(*span) for span in spans], self._near, search.device)
+        joined = None if self._ahead is None else self._ahead.take(spans)
+        table = EventTable([source.between(*span) for span in spans], self._near, search.device, joined=joined)
         pairs = table.pairs(
             calibration_events.encoder, longest_gap_us=LONGEST_GAP_US, shortest_gap_us=2.0 * self.sensor.refractory_us,
             sensor=self.sensor, middle_us=space.middle_us,
@@ -100,24 +113,48 @@ def turn_length(recording: Recording, encoder: Encoder) -> float:
     return min(60e6 / max(abs(encoder.rpm), 1e-6), whole)
 
 
-def collect_pairs(recording: Recording, search: Search, settings: PhotometricSettings) -> tuple[PairSet, Tiles]:
+def time_spans(recording: Recording, search: Search) -> list[tuple[int, int]]:
+    """Return the time spans whose events give pairs, in the order of their use [us]: turns of the prism.
+
+    A rotating camera needs successive turns, so it gets one span.
+    """
+    first, last = recording.events.t_first, recording.events.t_last
+    if search.full_space.moving:
+        return [(first, last + 1)]
+    turn = turn_length(recording, search.calibration_events.encoder)
+    turns = max(1, int((last - first + 1) / turn))
+    return [(first + int(k * turn), first + int(k * turn) + int(turn)) for k in van_der_corput(turns)]
+
+
+def upload_ahead(recording: Recording, search: Search) -> AbstractContextManager[EventsAhead | None]:
+    """Start to copy the events that :func:`collect_pairs` will probably need to a GPU.
+
+    Only events in memory are copied. On a CPU, or without a photometric stage, the context gives None.
+    """
+    device, source, settings = wp.get_device(search.device), recording.events, search.settings
+    if device.is_cpu or not isinstance(source, MemoryEvents) or "photometric" not in settings.stages:
+        return nullcontext()
+    most = EVENTS_PER_PAIR * settings.photometric.pairs
+    return EventsAhead(source, time_spans(recording, search), most, device)
+
+
+def collect_pairs(
+    recording: Recording, search: Search, settings: PhotometricSettings, ahead: EventsAhead | None = None
+) -> tuple[PairSet, Tiles]:
     """Return about ``settings.pairs`` pairs of events, from whole turns spread over the recording, and the map's tiles.
 
     At least :data:`FEWEST_TURNS` turns are used, if the recording has them. If these hold too many pairs, whole tiles
-    are left out: fewer pairs on the same tiles would not determine the map.
+    are left out: fewer pairs on the same tiles would not determine the map. ``ahead``: events already on the device.
     """
-    first, last = recording.events.t_first, recording.events.t_last
+    first = recording.events.t_first
     turn = turn_length(recording, search.calibration_events.encoder)
-    turns = max(1, int((last - first + 1) / turn))
     margin = ROTATION_MARGIN_PX if search.full_space.moving else MARGIN_PX
     if len(recording.events.between(first, first + int(FEWEST_TURNS * turn) + 1)) <= settings.pairs:
         tile_of, tiles = one_tile(*recording.events.size, settings.density, margin)
     else:
         tile_of, tiles = choose_tiles(search.image, settings.density, margin)
-    collector = _PairCollector(recording, search, tile_of, settings.sensor)
-    spans = [(first + int(k * turn), first + int(k * turn) + int(turn)) for k in van_der_corput(turns)]
-    if search.full_space.moving:
-        spans = [(first, last + 1)]  # a rotating camera needs successive turns
+    collector = _PairCollector(recording, search, tile_of, settings.sensor, ahead)
+    spans = time_spans(recording, search)
     many = min(FEWEST_TURNS, len(spans))
     found = collector.read(spans[:many])
     while found < settings.pairs and many < len(spans):

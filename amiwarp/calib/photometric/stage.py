@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from amiwarp.brightness.tiles import Tiles
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.photometric.answer_search import Answer
+    from amiwarp.calib.photometric.events_ahead import EventsAhead
     from amiwarp.calib.sharpness.search import Search
     from amiwarp.events.recording import Recording
     from amiwarp.progress import Progress
@@ -117,11 +118,17 @@ class _Equations:
 
 
 def refine(
-    recording: Recording, search: Search, linear: tuple[str, ...], *, progress: Progress | None = None
+    recording: Recording,
+    search: Search,
+    linear: tuple[str, ...],
+    *,
+    ahead: EventsAhead | None = None,
+    progress: Progress | None = None,
 ) -> tuple[PhotometricSummary, StageSummary, ParameterSpace]:
     """Run the photometric stage, which starts at the result of the sharpness stage.
 
-    ``linear`` names the free ones of ``off_ratio`` and ``leak``. Return the result, the summary of the search, and the
+    ``linear`` names the free ones of ``off_ratio`` and ``leak``. ``ahead``: events already on the device, of
+    :func:`upload_ahead`. Return the result, the summary of the search, and the
     space of the result, whose camera and prism are corrected. Raises :class:`AmiwarpError` for too few pairs.
     """
 
@@ -130,7 +137,10 @@ def refine(
             progress(*stage_share(search.settings, "photometric", share))
 
     def equations(sensor: SensorTiming) -> _Equations:
-        return _equations(recording, search, linear, sensor, report)
+        settings = replace(search.settings.photometric, sensor=sensor)
+        return _equations(
+            recording, search, linear, settings, collect_pairs(recording, search, settings, ahead), report
+        )
 
     given = search.settings.photometric.sensor
     found = equations(given)
@@ -178,11 +188,15 @@ def _with_slow_pixels(found: _Equations, answer: Answer, first: float, direction
 
 
 def _equations(
-    recording: Recording, search: Search, linear: tuple[str, ...], sensor: SensorTiming, report: Callable[[float], None]
+    recording: Recording,
+    search: Search,
+    linear: tuple[str, ...],
+    settings: PhotometricSettings,
+    collected: tuple[PairSet, Tiles],
+    report: Callable[[float], None],
 ) -> _Equations:
-    """Return the equations of a recording. Raises :class:`AmiwarpError` for too few pairs."""
-    settings: PhotometricSettings = replace(search.settings.photometric, sensor=sensor)
-    pairs, tiles = collect_pairs(recording, search, settings)
+    """Return the equations of ``collected`` pairs. Raises :class:`AmiwarpError` for too few pairs."""
+    pairs, tiles = collected
     full = search.full_space
     space = full.holding({n: x for n, x in search.best.items() if n not in full.names})
     # the count of OFF and ON events gives the ratio of thresholds only if brightness returns after a whole turn

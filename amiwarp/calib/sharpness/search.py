@@ -274,7 +274,8 @@ class Search:
     @cached_property
     def image(self) -> NDArray[np.float32]:
         """IWE at the calibrated parameters, cut to the sensor's size, summed over polarities."""
-        image = self.fine.image(self.best).sum(axis=0)
+        layers = self.fine.image(self.best)
+        image = layers[0] if len(layers) == 1 else layers.sum(axis=0)
         pad = (image.shape[1] - self.space.camera.width) // 2
         return np.asarray(image[pad:-pad, pad:-pad])
 

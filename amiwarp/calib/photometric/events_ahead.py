@@ -1,0 +1,64 @@
+"""Events of time spans, copied to a GPU in the background while the sharpness stage runs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from amiwarp.events.device_events import NAMES, DeviceEvents
+from amiwarp.kernels.launch import pool
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from amiwarp.events.events import MemoryEvents
+
+TYPES = (wp.uint16, wp.uint16, wp.int64, wp.uint8)
+
+
+class EventsAhead:
+    """Events of the first of some time spans, which a thread copies to a GPU. Closed by ``with``."""
+
+    def __init__(self, source: MemoryEvents, spans: list[tuple[int, int]], most: int, device: Any) -> None:
+        """Start to copy the events of the first of ``spans`` [us], ``most`` events together."""
+        self._device = wp.get_device(device)
+        events = [source.between(*span) for span in spans]
+        self._first = np.cumsum([0, *map(len, events)])
+        count = int(np.searchsorted(self._first, most, side="right")) - 1
+        self._spans, self._parts = spans[:count], events[:count]
+        n = int(self._first[count])
+        self._events = DeviceEvents(*(wp.empty(n, dtype=dtype, device=self._device) for dtype in TYPES))
+        self._stream = wp.Stream(self._device)  # Warp's own one may be recording a graph
+        self._stream.wait_stream(self._device.stream)  # which allocated the arrays
+        self._copied = pool().submit(self._copy)
+
+    def _copy(self) -> None:
+        for name in NAMES:
+            out = getattr(self._events, name)
+            for first, part in zip(self._first.tolist(), self._parts, strict=False):
+                values = np.ascontiguousarray(getattr(part, name))
+                if len(values):
+                    host = wp.array(values, dtype=out.dtype, device="cpu", copy=False)
+                    wp.copy(out, host, dest_offset=first, stream=self._stream)
+
+    def take(self, spans: list[tuple[int, int]]) -> DeviceEvents | None:
+        """Return the events of successive ``spans``, joined; None if not all of them were copied."""
+        if not {*spans} <= {*self._spans}:
+            return None
+        self._wait()
+        first = self._spans.index(spans[0])
+        return self._events[int(self._first[first]) : int(self._first[first + len(spans)])]
+
+    def _wait(self) -> None:
+        self._copied.result()
+        self._device.stream.wait_stream(self._stream)
+
+    def __enter__(self) -> EventsAhead:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._wait()  # the memory must not be freed before
