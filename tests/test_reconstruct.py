@@ -8,6 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+import warp as wp
 from calibration_sample import exact_calibration
 from numpy.typing import NDArray
 from PIL import Image
@@ -29,7 +30,7 @@ from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.choices import Fill, Tone
 from amiwarp.reconstruction.export import save_picture, save_video, tones
-from amiwarp.reconstruction.known import dilated, without_small_holes, without_small_regions
+from amiwarp.reconstruction.known import nodes_near, without_small_holes, without_small_regions
 from amiwarp.reconstruction.picture import Reconstruction, reconstruct
 from amiwarp.reconstruction.result import Picture
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
@@ -220,33 +221,37 @@ def test_hot_pixels_are_those_of_a_percentile_filter(device: str) -> None:
     assert np.array_equal(table.tile_of.numpy() < 0, expected)
 
 
-def test_growing_is_a_dilation() -> None:
+def test_growing_is_a_dilation(device: str) -> None:
     mask = np.random.default_rng(2).random((30, 40)) < 0.05
-    before = mask.copy()
-    assert np.array_equal(dilated(mask, 3), ndimage.binary_dilation(mask, iterations=3))
-    assert np.array_equal(mask, before)
+    known = wp.array(mask.view(np.uint8), device=device)
+    near = nodes_near(known, 3).numpy().reshape(mask.shape)
+    assert np.array_equal(near, ndimage.binary_dilation(mask, iterations=3))
+    assert np.array_equal(known.numpy(), mask)
+    assert nodes_near(wp.zeros_like(known), 3).numpy().all()
 
 
 @pytest.mark.parametrize("share", [0.1, 0.4, 0.5, 0.6, 0.9])
 @pytest.mark.parametrize("shape", [(1, 60), (60, 1), (13, 17), (60, 80)])
-def test_small_regions_and_holes_are_found(share: float, shape: tuple[int, int]) -> None:
+def test_small_regions_and_holes_are_found(share: float, shape: tuple[int, int], device: str) -> None:
     """Compare with the labels of SciPy."""
     for seed in range(10):
         mask = np.random.default_rng(seed).random(shape) < share
+        known = wp.array(mask.view(np.uint8), device=device)
         for values, least, found in (
-            (mask, 12, without_small_regions(mask)),
-            (~mask, 5, ~without_small_holes(mask)),
+            (mask, 12, without_small_regions(known).numpy() == 1),
+            (~mask, 5, without_small_holes(known).numpy() == 0),
         ):
             label, _count = ndimage.label(values)
             assert np.array_equal(found, values & (np.bincount(label.ravel()) >= least)[label])
+        assert np.array_equal(known.numpy(), mask)
 
 
 def test_the_mask_has_no_pinholes(picture: Picture) -> None:
-    known = np.ones((20, 30), np.bool_)
+    known = np.ones((20, 30), np.uint8)
     known[5, 7] = known[9, 12:16] = known[14, 20:25] = False
     expected = np.ones((20, 30), np.bool_)
     expected[14, 20:25] = False
-    assert np.array_equal(without_small_holes(known), expected)
+    assert np.array_equal(without_small_holes(wp.array(known, device="cpu")).numpy() == 1, expected)
     label, count = ndimage.label(~picture.known)
     inside = [np.argwhere(label == k + 1) for k in range(count) if (label == k + 1).sum() <= 4]
     size = np.array(picture.known.shape) - 1

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import warp as wp
 
 from amiwarp.brightness.pair_chains import FEW_BLOCKS, PairChains
@@ -20,8 +19,6 @@ from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from amiwarp.brightness.event_pairs import PairSet
     from amiwarp.optics.models import Model
 
@@ -107,9 +104,8 @@ class PairPositions:
         self._launch(slope_between, len(self.pairs), inputs, [out])
         return out
 
-    def keep(self, nodes: NDArray[np.bool_]) -> None:
+    def keep(self, nodes: wp.array) -> None:
         """Exclude pairs of two events that are off the ``nodes``; see :meth:`BrightnessMap.keep`."""
-        on = wp.array(nodes.ravel().view(np.uint8), dtype=wp.uint8, device=self.device)
-        inputs = [on, self.pairs.arrays.on, self.geometry.stride]
+        inputs = [nodes, self.pairs.arrays.on, self.geometry.stride]
         self._launch(keep_nodes, len(self.pairs), inputs, [self.geometry.cell])
         self.equations.take_positions()

@@ -17,6 +17,8 @@ from amiwarp.kernels.residual_slopes import add_clusters, magnitudes, sum_costs,
 from amiwarp.kernels.square_sums import MOST_ROWS, find_squares, find_starts, sum_square_products, sum_squares
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from amiwarp.brightness.event_pairs import PairSet
@@ -111,19 +113,30 @@ class Residuals:
         found[:, upper[0], upper[1]] = found[:, upper[1], upper[0]] = sums.numpy()[used]
         return found, used
 
-    def median(self, first: int | None = None) -> float:
-        """Return the median absolute residual of the ``first`` pairs, or of all; NaN if there is none."""
-        n = self.count if first is None else first
+    def median(self) -> float:
+        """Return the median absolute residual; NaN if there is none."""
+        return self.start_median(self.count)()
+
+    def start_median(self, n: int) -> Callable[[], float]:
+        """Start to compute the median absolute residual of the first ``n`` pairs, NaN if there is none.
+
+        Return a function that waits for it.
+        """
         if self.device.is_cpu:
             values = np.abs(self.values.numpy()[:n])
             values = values[np.isfinite(values)]
-            return float(np.median(values)) if len(values) else math.nan
+            found = float(np.median(values)) if len(values) else math.nan
+            return lambda: found
         keys, order = (wp.empty(2 * n, dtype=t, device=self.device) for t in (float, int))
         number = wp.zeros(1, dtype=int, device=self.device)
         wp.launch(magnitudes, n, inputs=[self.values, 0, keys, number], device=self.device)
         wp.utils.radix_sort_pairs(keys, order, n)
-        known = int(number.numpy()[0])
-        return float(keys[(known - 1) // 2 : known // 2 + 1].numpy().mean()) if known else math.nan
+
+        def result() -> float:
+            known = int(number.numpy()[0])
+            return float(keys[(known - 1) // 2 : known // 2 + 1].numpy().mean()) if known else math.nan
+
+        return result
 
     @cached_property
     def _sum_shape(self) -> tuple[int, int]:

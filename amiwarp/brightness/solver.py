@@ -153,10 +153,10 @@ class BrightnessMap:
         """
         return self._at.find_slope(plus, minus, width, self._image)
 
-    def keep(self, nodes: NDArray[np.bool_]) -> None:
-        """Exclude pairs of two events, as noise, if either event is off the nodes for which ``nodes`` is true.
+    def keep(self, nodes: wp.array) -> None:
+        """Exclude pairs of two events, as noise, if either event is off the nodes for which ``nodes`` is 1.
 
-        ``nodes`` has shape (tiles, rows, columns).
+        ``nodes`` is uint8, shape (nodes,), on the device.
         """
         self._at.keep(nodes)
 
@@ -297,6 +297,12 @@ class BrightnessMap:
 
         Each equation contributes its weight for the Cauchy scale ``scale`` [thresholds].
         """
+        shape = (len(self.tiles.origin), self.tiles.rows, self.tiles.columns)
+        found: NDArray[np.float32] = self.coverage_on_device(scale).numpy()
+        return found[: self.tiles.nodes].reshape(shape)
+
+    def coverage_on_device(self, scale: float) -> wp.array:
+        """Return :meth:`coverage` as one vector on the device, followed by values of the other unknowns."""
         self._scale.fill_(scale)
         weak, self.pairs.arrays.weak = self.pairs.arrays.weak, 0.0
         program = Program(self.device)
@@ -306,9 +312,7 @@ class BrightnessMap:
         program.add(gather, len(out), [self._sums], [out])
         program.launch()
         self.pairs.arrays.weak = weak
-        shape = (len(self.tiles.origin), self.tiles.rows, self.tiles.columns)
-        diagonal: NDArray[np.float32] = out.numpy()[: self.tiles.nodes].reshape(shape)
-        return diagonal
+        return out
 
     @property
     def extra(self) -> NDArray[np.float32]:

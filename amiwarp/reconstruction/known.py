@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from amiwarp.kernels.launch import load
+from amiwarp.kernels import known_nodes as kernels
+from amiwarp.kernels.launch import launch, load
 from amiwarp.kernels.regions import find_large_regions
+from amiwarp.kernels.regions_by_node import drop_small_regions
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from amiwarp.brightness.solver import BrightnessMap
 
 LEAST_COVERAGE = 0.5
@@ -30,37 +30,48 @@ LARGEST_HOLE = 4
 hole."""
 
 
-def known_nodes(solver: BrightnessMap) -> NDArray[np.bool_]:
-    """Return the nodes that events determine: nodes with enough equations, most of which hold."""
-    hold, everything = solver.coverage(HOLDS_SCALE)[0], solver.coverage(1e6)[0]
-    return without_small_holes(without_small_regions((hold >= LEAST_COVERAGE) & (hold >= LEAST_AGREEMENT * everything)))
+def known_nodes(solver: BrightnessMap) -> wp.array:
+    """Return 1 for the nodes that events determine, else 0: uint8, shape (rows, columns), on the device.
+
+    These are nodes with enough equations, most of which hold.
+    """
+    hold, everything = (solver.coverage_on_device(scale) for scale in (HOLDS_SCALE, 1e6))
+    known = wp.empty((solver.tiles.rows, solver.tiles.columns), dtype=wp.uint8, device=solver.device)
+    inputs = [hold, everything, LEAST_COVERAGE, LEAST_AGREEMENT]
+    launch(kernels.mark_known, known.size, inputs, [known.flatten()], device=solver.device)
+    return without_small_holes(without_small_regions(known))
 
 
-def dilated(mask: NDArray[np.bool_], by: int) -> NDArray[np.bool_]:
-    """Extend the true regions of a mask by ``by`` px, along rows and columns."""
-    for _ in range(by):
-        out = mask.copy()
-        for one, other in ((out, mask), (out.T, mask.T)):
-            one[1:] |= other[:-1]
-            one[:-1] |= other[1:]
-        mask = out
-    return mask
+def nodes_near(known: wp.array, by: int) -> wp.array:
+    """Return 1 for the nodes at most ``by`` steps from known ones, else 0, shape (nodes,); all 1 if none is known.
+
+    Steps go along rows and columns.
+    """
+    found = wp.zeros(1, dtype=int, device=known.device)
+    launch(kernels.find_marked, known.size, [known.flatten()], [found], device=known.device)
+    out = wp.empty(known.size, dtype=wp.uint8, device=known.device)
+    launch(kernels.widen, known.size, [known, found, by], [out], device=known.device)
+    return out
 
 
-def without_small_regions(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def without_small_regions(known: wp.array) -> wp.array:
     """Return the mask without connected regions of fewer than :data:`SMALLEST_REGION` pixels."""
-    return _large_regions(known, SMALLEST_REGION)
+    return _without_small(known, 1, SMALLEST_REGION)
 
 
-def without_small_holes(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def without_small_holes(known: wp.array) -> wp.array:
     """Return the mask with holes of up to :data:`LARGEST_HOLE` pixels filled."""
-    return ~_large_regions(~known, LARGEST_HOLE + 1)
+    return _without_small(known, 0, LARGEST_HOLE + 1)
 
 
-def _large_regions(mask: NDArray[np.bool_], least: int) -> NDArray[np.bool_]:
-    """Return the connected regions of a mask of at least ``least`` pixels. The mask is on the host on any device."""
-    large, cpu = np.zeros(mask.shape, np.bool_), wp.get_device("cpu")
-    arrays = [wp.array(values.view(np.uint8), device=cpu, copy=False) for values in (np.ascontiguousarray(mask), large)]
-    load(find_large_regions, cpu)
-    wp.launch(find_large_regions, 1, [arrays[0], least, arrays[1]], device=cpu)
-    return large
+def _without_small(mask: wp.array, value: int, least: int) -> wp.array:
+    """Return the mask without regions of ``value`` that have fewer than ``least`` pixels."""
+    if mask.device.is_cuda:
+        out = wp.empty_like(mask)
+        launch(drop_small_regions, mask.size, [mask, value, least], [out], device=mask.device)
+        return out
+    large = np.zeros(mask.shape, np.uint8)
+    arrays = [wp.array(array, device="cpu", copy=False) for array in (mask.numpy() ^ np.uint8(1 - value), large)]
+    load(find_large_regions, mask.device)
+    wp.launch(find_large_regions, 1, [arrays[0], least, arrays[1]], device="cpu")
+    return wp.array(large ^ np.uint8(1 - value), device="cpu", copy=False)

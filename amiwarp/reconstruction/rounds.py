@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.reconstruction.known import dilated, known_nodes
+from amiwarp.reconstruction.known import known_nodes, nodes_near
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,7 +23,7 @@ NOISE_DISTANCE = 2
 
 
 def solve_rounds(solver: BrightnessMap, pair_count: int, last: Picture | None) -> tuple[float, NDArray[np.bool_]]:
-    """Solve for the map; return the median residual and the known nodes.
+    """Solve for the map; return the median residual and the known nodes, shape (rows, columns).
 
     ``last`` is the picture of the previous window, from which the solution starts.
     """
@@ -33,9 +33,9 @@ def solve_rounds(solver: BrightnessMap, pair_count: int, last: Picture | None) -
         unknowns[nodes:] = solver.unknowns[nodes:]
         solver.unknowns = unknowns
     solver.solve(*SCALES[0 if last is None else 1 : -1], steps=STEPS)
-    residual = solver.residuals.median(pair_count)
+    residual = solver.residuals.start_median(pair_count)
     covered = known_nodes(solver)
-    if covered.any():
-        solver.keep(dilated(covered, NOISE_DISTANCE)[None])
+    solver.keep(nodes_near(covered, NOISE_DISTANCE))
     solver.solve(SCALES[-1], steps=STEPS)
-    return residual, covered
+    # nothing is read before all work for a GPU is in its queue
+    return residual(), covered.numpy().view(np.bool_)

@@ -10,6 +10,7 @@ from amiwarp.kernels.compensation import compensate_blocks
 from amiwarp.kernels.conjugate_gradients import descend
 from amiwarp.kernels.equation_blocks import apply_normal
 from amiwarp.kernels.iwe import read_sums, smooth_and_sum
+from amiwarp.kernels.known_nodes import mark_known
 from amiwarp.kernels.map_positions import find_places, place_blocks
 from amiwarp.kernels.map_prior import link
 from amiwarp.kernels.multilevel import prolong
@@ -46,6 +47,7 @@ EXACT_KERNELS = (
     (compute_checksums,),
     (link,),
     (prolong,),
+    (mark_known,),
     (find_large_regions,),
 )
 """Kernels of calibration, compensation and reconstruction by the exact model, in the order of their use."""
