@@ -119,9 +119,12 @@ class TileVotes:
         inputs = [self._on_device[0], self._camera, self._arrays, self._motion, self._params, self._layout]
         wp.launch(vote_tiles, (blocks, int(THREADS)), inputs, [self.votes], device=self.device, block_dim=int(THREADS))
 
-    def read(self, k: int, image: Image) -> None:
-        """Write the image of candidate ``k`` [events] to ``image``."""
-        wp.launch(read_tiles, len(image.pixels), [self.votes[k], 0], [image.pixels], device=self.device)
+    def read(self, k: int, image: Image, *, first_layer: int = 0) -> None:
+        """Write the image of candidate ``k`` [events] to the layers of ``image`` from ``first_layer`` on."""
+        f = image.frame
+        n, at = self.canvas.layers * f.layer, f.first + first_layer * f.layer
+        votes, pixels = self.votes[k][f.first : f.first + n], image.pixels[at : at + n]
+        wp.launch(read_tiles, n, [votes, 0], [pixels], device=self.device)
 
 
 def _write(array: Any, k: int, struct: Any) -> None:
