@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 
-SAMPLED = 1 << 15
-"""Number of pairs whose times give the statistics of all."""
+SAMPLED = 1 << 13
+"""Number of pairs that give the statistics of all."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from amiwarp.brightness.event_pairs import SAMPLED
 from amiwarp.kernels import slow_pixels as kernels
 from amiwarp.kernels.launch import launch
 
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
 
 THRESHOLD = 0.25
 """Assumed ON threshold [log intensity], which turns the map's brightness into light. Data sheets state 0.1 to 0.4."""
-MEDIAN_EVERY = 16
-"""Every how many pairs one counts for the median brightness, which need not be exact."""
 
 
 def darkness(brightness: BrightnessMap, model: Model, *, ahead: float = 0.0) -> tuple[Any, float]:
@@ -56,7 +55,8 @@ def darkness(brightness: BrightnessMap, model: Model, *, ahead: float = 0.0) -> 
         launch(kernels.find_time_constants, -(-len(pairs) // every), inputs, [out], device=device)
         return out
 
-    pixels.middle = float(np.nanmedian(compute(MEDIAN_EVERY, -(-len(pairs) // MEDIAN_EVERY)).numpy()))
+    every = max(1, len(pairs) // SAMPLED)
+    pixels.middle = float(np.nanmedian(compute(every, -(-len(pairs) // every)).numpy()))
     pixels.threshold = THRESHOLD
     return compute(1, pairs.arrays.stride), pixels.middle
 

@@ -79,10 +79,8 @@ def choice_square(count: NDArray[np.int32]) -> tuple[int, int, int]:
     ``(height, width)``.
     """
     for side in CHOICE_SQUARES:
-        down, across = (-(-n // side) for n in count.shape)
-        padded = np.zeros((down * side, across * side), count.dtype)
-        padded[: count.shape[0], : count.shape[1]] = count
-        cells = padded.reshape(down, side, across * side).sum(axis=1).reshape(down, across, side).sum(axis=2)
+        rows = [count[k : k + side].sum(axis=0, dtype=count.dtype) for k in range(0, count.shape[0], side)]
+        cells = np.add.reduceat(rows, np.arange(0, count.shape[1], side), axis=1)
         row, column = np.unravel_index(int(cells.argmax()), cells.shape)
         if cells.max() >= CHOICE_EVENTS:
             break

@@ -13,7 +13,7 @@ from amiwarp.kernels.launch import pool
 if TYPE_CHECKING:
     from types import TracebackType
 
-    from amiwarp.events.events import MemoryEvents
+    from amiwarp.events.events import Events, MemoryEvents
 
 TYPES = (wp.uint16, wp.uint16, wp.int64, wp.uint8)
 
@@ -24,11 +24,14 @@ class EventsAhead:
     def __init__(self, source: MemoryEvents, spans: list[tuple[int, int]], most: int, device: Any) -> None:
         """Start to copy the events of the first of ``spans`` [us], ``most`` events together."""
         self._device = wp.get_device(device)
-        events = [source.between(*span) for span in spans]
-        self._first = np.cumsum([0, *map(len, events)])
-        count = int(np.searchsorted(self._first, most, side="right")) - 1
-        self._spans, self._parts = spans[:count], events[:count]
-        n = int(self._first[count])
+        self._parts: list[Events] = []
+        self._first = [0]
+        for part in (source.between(*span) for span in spans):
+            if self._first[-1] + len(part) > most:
+                break
+            self._parts.append(part)
+            self._first.append(self._first[-1] + len(part))
+        self._spans, n = spans[: len(self._parts)], self._first[-1]
         self._events = DeviceEvents(*(wp.empty(n, dtype=dtype, device=self._device) for dtype in TYPES))
         self._stream = wp.Stream(self._device)  # Warp's own one may be recording a graph
         self._stream.wait_stream(self._device.stream)  # which allocated the arrays
@@ -37,7 +40,7 @@ class EventsAhead:
     def _copy(self) -> None:
         for name in NAMES:
             out = getattr(self._events, name)
-            for first, part in zip(self._first.tolist(), self._parts, strict=False):
+            for first, part in zip(self._first, self._parts, strict=False):
                 values = np.ascontiguousarray(getattr(part, name))
                 if len(values):
                     host = wp.array(values, dtype=out.dtype, device="cpu", copy=False)
@@ -49,7 +52,7 @@ class EventsAhead:
             return None
         self._wait()
         first = self._spans.index(spans[0])
-        return self._events[int(self._first[first]) : int(self._first[first + len(spans)])]
+        return self._events[self._first[first] : self._first[first + len(spans)]]
 
     def _wait(self) -> None:
         self._copied.result()

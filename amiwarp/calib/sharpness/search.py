@@ -285,8 +285,8 @@ class Search:
     def sharpness_in(self, space: ParameterSpace, values: Mapping[str, float]) -> float:
         """Return the sharpness at ``values`` with the camera and the prism of ``space``."""
         known, fine = self.space, self.fine
-        same = (space.model, space.names, space.camera, space.prism, space.moving, padding(space)) == (
-            known.model, known.names, known.camera, known.prism, known.moving, self._pad
+        same = (space.model, space.names, space.camera, space.prism, space.moving, space.start, space.high) == (
+            known.model, known.names, known.camera, known.prism, known.moving, known.start, known.high
         )  # fmt: skip
         if not same:
             smoothing = self.settings.smoothing_px
