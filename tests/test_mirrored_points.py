@@ -13,17 +13,17 @@ from amiwarp.events.recording import Recording
 @pytest.mark.parametrize("algorithm", ["GN_DIRECT_L", "GN_DIRECT", "GN_DIRECT_L_NOSCAL", "GN_ORIG_DIRECT_L"])
 @pytest.mark.parametrize(("low", "high"), [([-13.3, -13.3], [13.7, 13.7]), ([-2.1, -1.0, 0.0], [7.3, 2.0, 5.0])])
 def test_most_second_points_are_guessed(algorithm: str, low: list[float], high: list[float]) -> None:
-    mirrored = MirroredPoints(np.subtract(high, low))
-    guess: np.ndarray | None = None
+    mirrored = MirroredPoints(np.subtract(high, low).tolist())
+    guess: list[float] | None = None
     right = 0
 
     def cost(x: np.ndarray, _gradient: np.ndarray) -> float:
         nonlocal guess, right
         if guess is not None and np.allclose(guess, x, rtol=0.0, atol=1e-10):
-            mirrored.confirm(x)
+            mirrored.confirm(x.tolist())
             guess, right = None, right + 1
         else:
-            guess = mirrored.guess(x)
+            guess = mirrored.guess(x.tolist())
         return float(((x - 1.1) ** 2).sum() + np.cos(3.0 * x).sum())
 
     optimiser = nlopt.opt(getattr(nlopt, algorithm), len(low))
@@ -36,10 +36,10 @@ def test_most_second_points_are_guessed(algorithm: str, low: list[float], high: 
 
 
 def test_points_off_all_axes_give_no_guess() -> None:
-    mirrored = MirroredPoints(np.array([9.0, 9.0]))
-    assert mirrored.guess(np.array([0.0, 0.0])) is None
-    assert mirrored.guess(np.array([3.0, 1.0])) is None
-    np.testing.assert_allclose(mirrored.guess(np.array([3.0, 0.0])), [-3.0, 0.0])
+    mirrored = MirroredPoints([9.0, 9.0])
+    assert mirrored.guess([0.0, 0.0]) is None
+    assert mirrored.guess([3.0, 1.0]) is None
+    np.testing.assert_allclose(mirrored.guess([3.0, 0.0]), [-3.0, 0.0])
 
 
 def test_guesses_change_no_score(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:

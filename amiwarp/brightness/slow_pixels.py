@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from amiwarp.brightness.event_pairs import SAMPLED
 from amiwarp.kernels import slow_pixels as kernels
 from amiwarp.kernels.launch import launch
 
@@ -22,6 +21,8 @@ if TYPE_CHECKING:
     from amiwarp.brightness.solver import BrightnessMap
     from amiwarp.optics.models import Model
 
+SAMPLED = 1 << 13
+"""Number of pairs whose brightness gives the median of all."""
 THRESHOLD = 0.25
 """Assumed ON threshold [log intensity], which turns the map's brightness into light. Data sheets state 0.1 to 0.4."""
 

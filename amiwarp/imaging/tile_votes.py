@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 
+FEW_BLOCKS = 1000
+"""Number of blocks of threads that a large GPU runs in two turns."""
+
+
 class TileVotes:
     """Events sorted by image tile, and the vote images of a few candidate parameter sets.
 
@@ -115,8 +119,11 @@ class TileVotes:
         for host, there in zip(self._host, self._on_device, strict=True):
             wp.copy(there, host)
         self.votes.zero_()
-        blocks = len(self._arrays.chunks) * -(-self.candidates // int(AT_ONCE))
-        inputs = [self._on_device[0], self._camera, self._arrays, self._motion, self._params, self._layout]
+        chunks = len(self._arrays.chunks)
+        # few blocks run at the same time, so that separate ones for each candidate take less time
+        at_once = int(AT_ONCE) if chunks * self.candidates > FEW_BLOCKS else 1
+        blocks = chunks * -(-self.candidates // at_once)
+        inputs = [self._on_device[0], self._camera, self._arrays, self._motion, self._params, self._layout, at_once]
         wp.launch(vote_tiles, (blocks, int(THREADS)), inputs, [self.votes], device=self.device, block_dim=int(THREADS))
 
     def read(self, k: int, image: Image, *, first_layer: int = 0) -> None:

@@ -323,13 +323,13 @@ def cast_remaining(
 @wp.kernel(launch_bounds=(int(THREADS), BLOCKS))
 def vote_tiles(
     models: wp.array(dtype=Any), camera: Any, events: TileEvents, motion: Any, canvas: Canvas, layout: Layout,
-    images: wp.array2d(dtype=wp.int64),
+    at_once: int, images: wp.array2d(dtype=wp.int64),
 ):  # fmt: skip
-    """Vote one chunk of events under up to :data:`AT_ONCE` candidates per block."""
+    """Vote one chunk of events under up to ``at_once`` candidates per block, :data:`AT_ONCE` at most."""
     block, thread = wp.tid()
     chunk = events.chunks[block % events.chunks.shape[0]]
-    first = (block / events.chunks.shape[0]) * AT_ONCE
-    many = wp.min(AT_ONCE, images.shape[0] - first)
+    first = (block / events.chunks.shape[0]) * at_once
+    many = wp.min(at_once, images.shape[0] - first)
     a = models[first]
     b = models[first + wp.min(1, many - 1)]
     c = models[first + many - 1]

@@ -87,7 +87,7 @@ class Objective:
         tiled = wp.get_device(device).is_cuda and "focal_length" not in space.names
         still = len(events.arrays.time) == 0 and events.slope is None
         in_pairs = by_direct and tiled and still and canvas.layers == 1
-        self._direct = MirroredPoints(np.subtract(*space.bounds()[::-1])) if in_pairs else None
+        self._direct = MirroredPoints(np.subtract(*space.bounds()[::-1]).tolist()) if in_pairs else None
         both = canvas if self._direct is None else replace(canvas, parts=2)
         self._meter = SharpnessMeter(both, kind, smoothing=smoothing * scale, device=device)
         self._image: _DirectImage | _TiledImage
@@ -123,11 +123,11 @@ class Objective:
         model = self._model(self.space.to_values(v))
         guessed, score = self._next
         if guessed == self._bytes(model):
-            self._direct.confirm(v)
+            self._direct.confirm(v.tolist())
             self._next = b"", 0.0
             return score
-        mirrored = self._direct.guess(v)
-        other = model if mirrored is None else self._model(self.space.to_values(mirrored))
+        mirrored = self._direct.guess(v.tolist())
+        other = model if mirrored is None else self._model(self.space.to_values(np.array(mirrored)))
         self._image.measure([model, other], 0.0, CameraRotation())
         score, of_other = self._meter.results()
         self._next = (b"" if mirrored is None else self._bytes(other)), of_other
