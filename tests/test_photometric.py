@@ -19,7 +19,8 @@ from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap
 from amiwarp.brightness.tiles import Tiles
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.photometric.events_ahead import EventsAhead
-from amiwarp.calib.photometric.pair_collection import dilated, van_der_corput
+from amiwarp.calib.photometric.pair_collection import van_der_corput
+from amiwarp.calib.photometric.scene_tiles import choose_tiles, near_tiles, one_tile
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
@@ -300,9 +301,11 @@ def test_no_pair_is_an_error() -> None:
 
 @pytest.mark.parametrize("far", [0, 1, 6, 30])
 def test_the_pixels_near_tiles(far: int) -> None:
-    mask = np.random.default_rng(1).random((24, 40)) < 0.01
-    expected = ndimage.maximum_filter(mask.astype(np.uint8), size=2 * far + 1) > 0
-    np.testing.assert_array_equal(dilated(mask, far), expected)
+    image = np.random.default_rng(1).random((250, 330)).astype(np.float32)
+    cases = [(choose_tiles(image, 2.0, 3), 3), (choose_tiles(image, 0.7, 8), 8), (one_tile(330, 250, 2.0, 3), 3)]
+    for (tile_of, tiles), margin in cases:
+        expected = ndimage.maximum_filter(tile_of >= 0, size=2 * far + 1)
+        np.testing.assert_array_equal(near_tiles(tiles, margin, far, image.shape) == 0, expected)
 
 
 def test_turns_are_spread() -> None:

@@ -11,7 +11,7 @@ import warp as wp
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
 from amiwarp.calib.photometric.events_ahead import EventsAhead
-from amiwarp.calib.photometric.scene_tiles import choose_tiles, one_tile
+from amiwarp.calib.photometric.scene_tiles import choose_tiles, near_tiles, one_tile
 from amiwarp.calib.sharpness.objective import reach
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import MemoryEvents
@@ -55,13 +55,13 @@ class _PairCollector:
         recording: Recording,
         search: Search,
         tile_of: NDArray[np.int32],
+        near: NDArray[np.int32],
         sensor: SensorTiming,
         ahead: EventsAhead | None,
     ) -> None:
+        """``tile_of`` is the tile of each pixel of the map, or -1; events of the pixels with ``near`` >= 0 are used."""
         self.recording, self.search, self.sensor, self._ahead = recording, search, sensor, ahead
-        near = dilated(tile_of >= 0, math.ceil(reach(search.space, search.best)) + 1)
-        self._tile_of = wp.array(tile_of, dtype=int, device=search.device)
-        self._near = wp.array(near.astype(np.int32) - 1, dtype=int, device=search.device)
+        self._tile_of, self._near = (wp.array(a, dtype=int, device=search.device) for a in (tile_of, near))
         self._found: list[PairSet] = []
         self._done = 0
 
@@ -93,18 +93,6 @@ class _PairCollector:
         if calibration_events.slope_of is not None:
             pairs = pairs.with_slope(calibration_events.slope_of, space.middle_us)
         return pairs.on_tiles(space.build(best), space.camera_rotation(best), space.drift(best), self._tile_of)
-
-
-def dilated(mask: NDArray[np.bool_], far: int) -> NDArray[np.bool_]:
-    """Return the pixels that are at most ``far`` pixels from a true one, along each axis."""
-    for _ in mask.shape:
-        mask, width = np.pad(mask, ((far, far), (0, 0))), 1
-        while width <= 2 * far:  # each element stands for ``width`` of the mask, from its own on
-            step = min(width, 2 * far + 1 - width)
-            mask = mask[:-step] | mask[step:]
-            width += step
-        mask = mask.T
-    return mask
 
 
 def turn_length(recording: Recording, encoder: Encoder) -> float:
@@ -153,7 +141,8 @@ def collect_pairs(
         tile_of, tiles = one_tile(*recording.events.size, settings.density, margin)
     else:
         tile_of, tiles = choose_tiles(search.image, settings.density, margin)
-    collector = _PairCollector(recording, search, tile_of, settings.sensor, ahead)
+    near = near_tiles(tiles, margin, math.ceil(reach(search.space, search.best)) + 1, tile_of.shape)
+    collector = _PairCollector(recording, search, tile_of, near, settings.sensor, ahead)
     spans = time_spans(recording, search)
     many = min(FEWEST_TURNS, len(spans))
     found = collector.read(spans[:many])

@@ -41,6 +41,18 @@ def choose_tiles(image: NDArray[np.float32], density: float, margin: int) -> tup
     return tile_of, Tiles(np.array(corners, dtype=np.float32), side, side, density)
 
 
+def near_tiles(tiles: Tiles, margin: int, far: int, shape: tuple[int, ...]) -> NDArray[np.int32]:
+    """Return 0 for the pixels that are at most ``far`` pixels from a tile, along each axis, else -1.
+
+    ``margin`` is that of the tiles, ``shape`` the image's (height, width).
+    """
+    near = np.full(shape, -1, dtype=np.int32)
+    down, across = (int((n - 2) / tiles.density) - 2 * margin for n in (tiles.rows, tiles.columns))
+    for left, top in (tiles.origin.astype(int) + margin).tolist():
+        near[max(0, top - far) : top + down + far, max(0, left - far) : left + across + far] = 0
+    return near
+
+
 def one_tile(width: int, height: int, density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
     """Return the whole image as one tile, for recordings with few events; see :func:`choose_tiles`."""
     origin = np.array([[-margin, -margin]], dtype=np.float32)
