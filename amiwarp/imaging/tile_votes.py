@@ -25,10 +25,6 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 
-FEW_BLOCKS = 1000
-"""Number of blocks of threads that a large GPU runs in two turns."""
-
-
 class TileVotes:
     """Events sorted by image tile, and the vote images of a few candidate parameter sets.
 
@@ -119,19 +115,13 @@ class TileVotes:
         for host, there in zip(self._host, self._on_device, strict=True):
             wp.copy(there, host)
         self.votes.zero_()
-        chunks = len(self._arrays.chunks)
-        # few blocks run at the same time, so that separate ones for each candidate take less time
-        at_once = int(AT_ONCE) if chunks * self.candidates > FEW_BLOCKS else 1
-        blocks = chunks * -(-self.candidates // at_once)
-        inputs = [self._on_device[0], self._camera, self._arrays, self._motion, self._params, self._layout, at_once]
+        blocks = len(self._arrays.chunks) * -(-self.candidates // int(AT_ONCE))
+        inputs = [self._on_device[0], self._camera, self._arrays, self._motion, self._params, self._layout]
         wp.launch(vote_tiles, (blocks, int(THREADS)), inputs, [self.votes], device=self.device, block_dim=int(THREADS))
 
-    def read(self, k: int, image: Image, *, first_layer: int = 0) -> None:
-        """Write the image of candidate ``k`` [events] to the layers of ``image`` from ``first_layer`` on."""
-        f = image.frame
-        n, at = self.canvas.layers * f.layer, f.first + first_layer * f.layer
-        votes, pixels = self.votes[k][f.first : f.first + n], image.pixels[at : at + n]
-        wp.launch(read_tiles, n, [votes, 0], [pixels], device=self.device)
+    def read(self, k: int, image: Image) -> None:
+        """Write the image of candidate ``k`` [events] to ``image``."""
+        wp.launch(read_tiles, len(image.pixels), [self.votes[k], 0], [image.pixels], device=self.device)
 
 
 def _write(array: Any, k: int, struct: Any) -> None:

@@ -26,6 +26,7 @@ SIZE = wp.constant(4 * 61 * 64)  # size of a window [bytes]
 THREADS = wp.constant(256)  # number of threads per block
 BLOCKS = 4  # number of resident blocks per multiprocessor
 AT_ONCE = wp.constant(3)  # number of candidates voted per reading of an event; their windows fill 48 KiB
+FEW_EVENTS = wp.constant(1024)  # fewer votes of a chunk take less time in the image than through a window
 CHUNK = 1 << 17  # events per chunk: at most 63 * 2**25 votes of 1/256, so that no word of the window overflows
 
 
@@ -323,13 +324,20 @@ def cast_remaining(
 @wp.kernel(launch_bounds=(int(THREADS), BLOCKS))
 def vote_tiles(
     models: wp.array(dtype=Any), camera: Any, events: TileEvents, motion: Any, canvas: Canvas, layout: Layout,
-    at_once: int, images: wp.array2d(dtype=wp.int64),
+    images: wp.array2d(dtype=wp.int64),
 ):  # fmt: skip
-    """Vote one chunk of events under up to ``at_once`` candidates per block, :data:`AT_ONCE` at most."""
+    """Vote one chunk of events under up to :data:`AT_ONCE` candidates per block."""
     block, thread = wp.tid()
     chunk = events.chunks[block % events.chunks.shape[0]]
-    first = (block / events.chunks.shape[0]) * at_once
-    many = wp.min(at_once, images.shape[0] - first)
+    first = (block / events.chunks.shape[0]) * AT_ONCE
+    many = wp.min(AT_ONCE, images.shape[0] - first)
+    if chunk.stop - chunk.start < FEW_EVENTS:
+        for j in range(chunk.start + thread, chunk.stop, THREADS):
+            one = unpack(int(load_uint32(events.packed, j)), chunk, canvas, layout, j)
+            cast_remaining(
+                models, camera, motion, events, canvas, layout, chunk, images, first, (1 << many) - 1, j, one
+            )
+        return
     a = models[first]
     b = models[first + wp.min(1, many - 1)]
     c = models[first + many - 1]

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from amiwarp.calib.parameters import MOTION, build_model
-from amiwarp.calib.sharpness.mirrored_points import MirroredPoints
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.tile_votes import TileVotes
 from amiwarp.imaging.warped_image import CanvasShape, Votes
-from amiwarp.optics.camera_rotation import CameraRotation, border
+from amiwarp.optics.camera_rotation import border
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,6 +22,7 @@ if TYPE_CHECKING:
 
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.imaging.device_events import UploadedEvents
+    from amiwarp.optics.camera_rotation import CameraRotation
     from amiwarp.optics.models import Model
 
 ROTATION_MARGIN_PX = 16.0
@@ -47,7 +46,6 @@ class Objective:
         scale: float = 1.0,
         per_polarity: bool = False,
         parts: int = 1,
-        by_direct: bool = False,
         device: Any = "cpu",
     ) -> None:
         """Allocate the buffers and copy the parameters of the image of events to the device.
@@ -70,8 +68,6 @@ class Objective:
             Whether ON and OFF events form separate images.
         parts : int
             Number of disjoint parts of the events that :meth:`each` measures separately.
-        by_direct : bool
-            Whether DIRECT searches, whose next point can be guessed. On CUDA both are then measured together.
         device : str or warp.context.Device
             The device.
         """
@@ -83,19 +79,12 @@ class Objective:
         canvas = CanvasShape(camera.width, camera.height, pad, scale, per_polarity, parts=parts, dither=dither)
         if parts > 1:
             events = events.in_parts(parts, per_polarity=per_polarity)
+        self._meter = SharpnessMeter(canvas, kind, smoothing=smoothing * scale, device=device)
         # tiles are prepared for one camera, so a free focal length excludes them
-        tiled = wp.get_device(device).is_cuda and "focal_length" not in space.names
-        still = len(events.arrays.time) == 0 and events.slope is None
-        in_pairs = by_direct and tiled and still and canvas.layers == 1
-        self._direct = MirroredPoints(np.subtract(*space.bounds()[::-1]).tolist()) if in_pairs else None
-        both = canvas if self._direct is None else replace(canvas, parts=2)
-        self._meter = SharpnessMeter(both, kind, smoothing=smoothing * scale, device=device)
-        self._image: _DirectImage | _TiledImage
-        if tiled:
-            self._image = _TiledImage(canvas, events, self._meter, self._model(space.start), both.parts // parts)
+        if self._meter.device.is_cuda and "focal_length" not in space.names:
+            self._image: _DirectImage | _TiledImage = _TiledImage(canvas, events, self._meter, self._model(space.start))
         else:
             self._image = _DirectImage(canvas, events, self._meter)
-        self._next: tuple[bytes, float] = b"", 0.0  # model that was guessed, and its sharpness
 
     def _model(self, values: Mapping[str, float]) -> Model:
         """Return the model to evaluate: the exact model instead of the ellipse, which is its first harmonic.
@@ -107,8 +96,7 @@ class Objective:
 
     def _measure(self, values: Mapping[str, float]) -> list[float]:
         self.evaluations += 1
-        models = [self._model(values)] * (1 if self._direct is None else 2)
-        self._image.measure(models, self.space.drift(values), self.space.camera_rotation(values))
+        self._image.measure(self._model(values), self.space.drift(values), self.space.camera_rotation(values))
         return self._meter.results()
 
     def values(self, values: Mapping[str, float]) -> float:
@@ -117,25 +105,7 @@ class Objective:
 
     def __call__(self, v: NDArray[np.float64]) -> float:
         """Return the sharpness at a search vector [px]."""
-        if self._direct is None:
-            return self.values(self.space.to_values(v))
-        self.evaluations += 1
-        model = self._model(self.space.to_values(v))
-        guessed, score = self._next
-        if guessed == self._bytes(model):
-            self._direct.confirm(v.tolist())
-            self._next = b"", 0.0
-            return score
-        mirrored = self._direct.guess(v.tolist())
-        other = model if mirrored is None else self._model(self.space.to_values(np.array(mirrored)))
-        self._image.measure([model, other], 0.0, CameraRotation())
-        score, of_other = self._meter.results()
-        self._next = (b"" if mirrored is None else self._bytes(other)), of_other
-        return score
-
-    def _bytes(self, model: Model) -> bytes:
-        """Return the parameters that the kernels get: the sharpness of equal ones is equal."""
-        return bytes(model.params(self._meter.device).__ctype__())
+        return self.values(self.space.to_values(v))
 
     def each(self, values: Mapping[str, float]) -> NDArray[np.float64]:
         """Return the sharpness of each part at parameter values, shape (parts,)."""
@@ -153,25 +123,22 @@ class _DirectImage:
     def __init__(self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter) -> None:
         self._votes, self._events, self._meter = Votes(canvas, meter.device), events, meter
 
-    def measure(self, models: list[Model], drift: float, camera_rotation: CameraRotation) -> None:
+    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation) -> None:
         self._votes.clear()
-        self._votes.add_events(models[0], self._events, drift=drift, camera_rotation=camera_rotation)
+        self._votes.add_events(model, self._events, drift=drift, camera_rotation=camera_rotation)
         self._votes.read(self._meter.image)
         self._meter.launch()
 
 
 class _TiledImage:
-    """Images of warped events for one or two models, voted tile by tile and launched as one CUDA graph."""
+    """Image of warped events that is voted tile by tile, launched as one CUDA graph."""
 
-    def __init__(
-        self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter, like: Model, models: int
-    ) -> None:
-        self._tiles, self._meter = TileVotes(meter.image, canvas, events, like, candidates=models), meter
+    def __init__(self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter, like: Model) -> None:
+        self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
         self._graph: Any = None
 
-    def measure(self, models: list[Model], drift: float, camera_rotation: CameraRotation) -> None:
-        for k, model in enumerate(models):
-            self._tiles.set(k, model, drift=drift, camera_rotation=camera_rotation)
+    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation) -> None:
+        self._tiles.set(0, model, drift=drift, camera_rotation=camera_rotation)
         if self._graph is None:
             with wp.ScopedCapture(self._meter.device) as capture:
                 self._launch()
@@ -180,8 +147,7 @@ class _TiledImage:
 
     def _launch(self) -> None:
         self._tiles.launch()
-        for k in range(self._tiles.candidates):
-            self._tiles.read(k, self._meter.image, first_layer=k * self._tiles.canvas.layers)
+        self._tiles.read(0, self._meter.image)
         self._meter.launch()
 
 

@@ -161,7 +161,6 @@ class Search:
         kind: Sharpness | None = None,
         space: ParameterSpace | None = None,
         parts: int = 1,
-        by_direct: bool = False,
     ) -> Objective:
         s = self.settings
         kind, space = kind or s.sharpness, space or self.space
@@ -171,7 +170,7 @@ class Search:
         return Objective(
             space, events.on(self.device, space.middle_us if space.moving else None),
             kind=kind, smoothing=smoothing, pad=pad, scale=scale,
-            per_polarity=s.per_polarity, parts=parts, by_direct=by_direct, device=self.device,
+            per_polarity=s.per_polarity, parts=parts, device=self.device,
         )  # fmt: skip
 
     def run(self) -> None:
@@ -188,11 +187,9 @@ class Search:
         self.stages.extend(StageSummary.of("local", run, self.space) for run in runs)
         self.best, self.score = self.space.to_values(best.x), best.score
 
-    def _coarse_objective(
-        self, events: CalibrationEvents, space: ParameterSpace, *, by_direct: bool = False
-    ) -> Objective:
+    def _coarse_objective(self, events: CalibrationEvents, space: ParameterSpace) -> Objective:
         step = max(1, len(events.events) // (self.settings.events // 3 + 1))
-        return self._objective(events.every(step), scale=0.5, smoothing=4.0, space=space, by_direct=by_direct)
+        return self._objective(events.every(step), scale=0.5, smoothing=4.0, space=space)
 
     def _run_global(self, algorithm: str) -> list[NDArray[np.float64]]:
         """Run the global search and return the starts of the local search.
@@ -203,7 +200,7 @@ class Search:
         if not space.names:
             return [self.space.to_vector(self.space.start)]
         start = space.to_vector(space.start)
-        objective = self._coarse_objective(self.calibration_events, space, by_direct="DIRECT" in algorithm)
+        objective = self._coarse_objective(self.calibration_events, space)
         stage = self._maximise(objective, algorithm, start, self.settings.global_evaluations, step=1.0)
         self.stages.append(StageSummary.of("global", stage, space))
         return [self.space.to_vector(space.to_values(v)) for v in distinct_optima(stage, CANDIDATES)]
