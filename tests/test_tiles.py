@@ -33,11 +33,13 @@ def events(n: int = 300_000) -> Events:
     return Events.from_arrays(x, y, np.sort(rng.integers(0, 250_000, n)), rng.integers(0, 2, n))
 
 
-def both(canvas: CanvasShape, models: list[Model], **kwargs: object) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def both(
+    canvas: CanvasShape, models: list[Model], n: int = 300_000, **kwargs: object
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return the images of all models, by tiles and by a single pass."""
     camera_rotation = kwargs.pop("camera_rotation", None)
     middle = None if camera_rotation is None else camera_rotation.middle_us
-    uploaded = upload_events(events(), Encoder.constant_speed(720.0, 0, 250_000), "cuda:0", middle_us=middle, **kwargs)
+    uploaded = upload_events(events(n), Encoder.constant_speed(720.0, 0, 250_000), "cuda:0", middle_us=middle, **kwargs)
     image = Image(canvas, 3, "cuda:0")
     tiles = TileVotes(image, canvas, uploaded, models[0], candidates=len(models))
     for k, model in enumerate(models):
@@ -68,6 +70,16 @@ def test_tiles_vote_as_one_pass_does(vote: Vote, scale: float, apex_deg: float) 
         assert moved < (400_000 if vote is Vote.NEAREST else 3000)
         if vote is Vote.BILINEAR:
             assert np.abs(a - b).max() < 0.004 * max(1.0, b.max())
+
+
+@pytest.mark.parametrize("vote", list(Vote))
+def test_tiles_of_few_events_vote_as_one_pass_does(vote: Vote) -> None:
+    """All tiles but one have so few events that they are voted without a window."""
+    canvas = CanvasShape(200, 150, 5, per_polarity=True, vote=vote)
+    models = [ExactModel(CAMERA, Prism(math.radians(2.0)), 0.3 * k) for k in range(4)]
+    for a, b in zip(*both(canvas, models, 20_000), strict=True):
+        assert a.sum(dtype=np.float64) == pytest.approx(b.sum(dtype=np.float64), abs=5)
+        assert np.abs(a - b).sum() < (27_000 if vote is Vote.NEAREST else 200)
 
 
 def test_distorted_and_turning_cameras() -> None:
