@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
-from amiwarp.imaging.sharpness_costs import PAPER_ETA, gaussian, sharpness
+from amiwarp.imaging.sharpness_costs import PAPER_ETA, SharpnessMeter, gaussian, sharpness
+from amiwarp.imaging.warped_image import CanvasShape
 
 
 @pytest.fixture
@@ -41,6 +43,20 @@ def test_against_numpy(kind: Sharpness, image: np.ndarray, device: str) -> None:
 def test_smoothed_against_scipy(kind: Sharpness, image: np.ndarray, device: str) -> None:
     smooth = ndimage.gaussian_filter(image.astype(np.float64), 1.0, mode="constant", truncate=3.0)
     assert sharpness(image, kind, smoothing=1.0, device=device) == pytest.approx(reference(smooth, kind), rel=1e-4)
+
+
+def test_votes_are_measured_as_their_image(image: np.ndarray) -> None:
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    canvas = CanvasShape(image.shape[1], image.shape[0])
+    meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=1.5, device="cuda:0")
+    meter.image.write(np.round(95.0 * image)[None].astype(np.float32) / 256.0)
+    of_image = meter.measure()
+    votes = wp.array(np.rint(256.0 * meter.image.pixels.numpy()).astype(np.int64), device="cuda:0")
+    meter.image.pixels.zero_()
+    meter.launch(votes)
+    assert meter.results() == [of_image]
+    assert of_image > 0.0
 
 
 @pytest.mark.parametrize("kind", list(Sharpness))

@@ -16,6 +16,7 @@ from amiwarp.imaging.device_image import Image
 from amiwarp.imaging.warped_image import CanvasShape
 from amiwarp.kernels import iwe as kernels
 from amiwarp.kernels.iwe import STRIP
+from amiwarp.kernels.iwe_sums import gather_sums, smooth_and_add, smooth_votes
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.page_locked import page_locked
 from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
@@ -48,26 +49,46 @@ class SharpnessMeter:
         layers, rows, columns = canvas.shape
         self._n = layers // canvas.parts * rows * columns
         strips = -(-rows // int(STRIP)) * self.image.frame.blocks
+        unrolled = self.device.is_cuda and 1 < len(weights) <= kernels.MOST_UNROLLED
+        self.takes_votes = unrolled and self.kind is Sharpness.VARIANCE
+        """Whether :meth:`launch` takes votes."""
+        if self.takes_votes:
+            strips = -(-rows * columns // BLOCK_DIM)
         self._sums = wp.empty((layers, strips), dtype=wp.vec2d, device=device)
         self._host = self._sums
         if self.device.is_cuda:
             few = (layers, min(strips, FEW_SUMS))
-            self._few = wp.empty(few, dtype=wp.vec2d, device=device)
             self._host = page_locked(self, few, wp.vec2d)
+            # the same memory, into which a kernel writes: a copy would take longer
+            self._few = wp.array(ptr=self._host.ptr, dtype=wp.vec2d, shape=few, device=self.device)
             if len(weights) > 1:
                 _ = self._smoothed  # a captured graph must not allocate it
         self._sums_on_host = self._host.numpy().reshape(canvas.parts, -1, 2)
 
-    def launch(self) -> None:
-        """Measure :attr:`image` on the device without waiting for the result."""
+    def launch(self, votes: Any = None) -> None:
+        """Measure :attr:`image` on the device without waiting for the result.
+
+        Instead of the image, its ``votes`` [1/256 event] may be given in the same memory layout.
+        """
         if self.device.is_cpu:
             self._program.launch()
             return
-        for kernel, n, inputs, out, _ in self._steps():
+        for kernel, n, inputs, out, _ in self._fused_steps(votes) if self.takes_votes else self._steps():
             launch(kernel, n, inputs, [out], device=self.device)
         threads = self._few.size * BLOCK_DIM
-        wp.launch(kernels.gather_sums, threads, [self._sums], [self._few], device=self.device, block_dim=BLOCK_DIM)
-        wp.copy(self._host, self._few)
+        wp.launch(gather_sums, threads, [self._sums], [self._few], device=self.device, block_dim=BLOCK_DIM)
+
+    def _fused_steps(self, votes: Any) -> Iterator[tuple[Any, int, list[Any], Any, int]]:
+        """Yield what :meth:`_steps` does, in fewer kernels: for the variance on CUDA."""
+        taps, frame, out = len(self._weights), self.image.frame, self._smoothed[0]
+        if votes is None:
+            inputs = [self.image.pixels, self._weights, 1, frame]
+            yield kernels.smooth_few(taps), self.image.blocks, inputs, out, 512
+        else:
+            yield smooth_votes(taps), self.image.blocks, [votes, self._weights, frame], out, 512
+        threads = self._sums.shape[1] * BLOCK_DIM
+        inputs = [out, self._weights, frame, threads]
+        yield smooth_and_add(taps), self._sums.size * BLOCK_DIM, inputs, self._sums.flatten(), 512
 
     def _steps(self) -> Iterator[tuple[Any, int, list[Any], Any, int]]:
         """Yield each kernel with its number of threads, inputs, output, and the fewest threads of a CPU slice."""

@@ -9,9 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.conjugate_gradients import block_sum
 from amiwarp.kernels.vector_code import load_float, load_int, load_word, store_float, store_int
-from amiwarp.kernels.votes import Canvas
+from amiwarp.kernels.votes import Canvas, events_of
 from amiwarp.kernels.word_votes import Cells
 
 OPTIONS = {"enable_backward": False, "fuse_fp": False}
@@ -125,7 +124,7 @@ def read_votes(cells: Cells, canvas: Canvas, frame: Frame, start: int, image: wp
     block = start + wp.tid()
     cell = cell_of(canvas, frame, block, 1)
     total = cells.totals[cell] + wp.int64(votes_of_pixel(cells.words, cell, canvas.columns))
-    image[block_start(frame, block, 1, 1)] = float(wp.float64(total) / wp.float64(256.0))
+    image[block_start(frame, block, 1, 1)] = events_of(total)
 
 
 @wp.kernel
@@ -151,7 +150,7 @@ def read_sums(
     if totals.shape[0] != 0:
         for k in range(wp.min(CPU_WIDTH, frame.columns - column)):
             total = totals[cell + k] + wp.int64(votes[k])
-            image[at + k] = float(wp.float64(total) / wp.float64(256.0))
+            image[at + k] = events_of(total)
 
 
 @wp.kernel
@@ -330,18 +329,3 @@ def smooth_and_sum(taps: int) -> Any:
         sums[block] = sum_of(total, terms, wp.min(width, frame.columns - block_column(frame, block, width)))
 
     return smooth_and_sum
-
-
-@wp.kernel(module="unique", module_options=OPTIONS)  # for CUDA only
-def gather_sums(sums: wp.array2d(dtype=wp.vec2d), out: wp.array2d(dtype=wp.vec2d)):
-    """Add up the partial sums in each row, one block of threads for each element of ``out``."""
-    thread = wp.tid()
-    block = thread / wp.block_dim()
-    row = block / out.shape[1]
-    total = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
-    first = (block % out.shape[1]) * wp.block_dim() + thread % wp.block_dim()
-    for k in range(first, sums.shape[1], out.shape[1] * wp.block_dim()):
-        total += sums[row, k]
-    both = wp.vec2d(block_sum(total[0]), block_sum(total[1]))
-    if thread % wp.block_dim() == 0:
-        out[row, block % out.shape[1]] = both

@@ -14,7 +14,7 @@ from amiwarp.kernels.encoder_angle import THETA_U16_RAD
 from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams, displace
 from amiwarp.kernels.shared_memory import add_to_word, get_word, set_word, wait_for_block, window
 from amiwarp.kernels.vector_code import load_uint32
-from amiwarp.kernels.votes import Canvas, dither_offset
+from amiwarp.kernels.votes import Canvas, dither_offset, events_of
 
 # Fast math is on: these sums need not equal those of a CPU bit for bit.
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -321,6 +321,18 @@ def cast_remaining(
             cast_outside(layout, canvas, chunk, images[first + k], u, v, event.weight)
 
 
+@wp.func
+def cast_directly(
+    models: wp.array(dtype=Any), camera: Any, motion: Any, events: TileEvents, canvas: Canvas, layout: Layout,
+    chunk: Chunk, images: wp.array2d(dtype=wp.int64), first: int, thread: int,
+):  # fmt: skip
+    """Vote a chunk of events into the images of up to :data:`AT_ONCE` candidates, without windows."""
+    every = (1 << wp.min(AT_ONCE, images.shape[0] - first)) - 1
+    for i in range(chunk.start + thread, chunk.stop, THREADS):
+        event = unpack(int(load_uint32(events.packed, i)), chunk, canvas, layout, i)
+        cast_remaining(models, camera, motion, events, canvas, layout, chunk, images, first, every, i, event)
+
+
 @wp.kernel(launch_bounds=(int(THREADS), BLOCKS))
 def vote_tiles(
     models: wp.array(dtype=Any), camera: Any, events: TileEvents, motion: Any, canvas: Canvas, layout: Layout,
@@ -332,11 +344,7 @@ def vote_tiles(
     first = (block / events.chunks.shape[0]) * AT_ONCE
     many = wp.min(AT_ONCE, images.shape[0] - first)
     if chunk.stop - chunk.start < FEW_EVENTS:
-        for j in range(chunk.start + thread, chunk.stop, THREADS):
-            one = unpack(int(load_uint32(events.packed, j)), chunk, canvas, layout, j)
-            cast_remaining(
-                models, camera, motion, events, canvas, layout, chunk, images, first, (1 << many) - 1, j, one
-            )
+        cast_directly(models, camera, motion, events, canvas, layout, chunk, images, first, thread)
         return
     a = models[first]
     b = models[first + wp.min(1, many - 1)]
@@ -366,4 +374,4 @@ for _struct in (CircleParams, RadialCircleParams, ExactParams):
 def read_tiles(votes: wp.array(dtype=wp.int64), start: int, image: wp.array(dtype=float)):
     """Convert votes [1/256 event] to an image [events]."""
     i = start + wp.tid()
-    image[i] = float(wp.float64(votes[i]) / wp.float64(256.0))
+    image[i] = events_of(votes[i])

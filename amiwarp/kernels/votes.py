@@ -50,6 +50,12 @@ class Canvas:
 
 
 @wp.func
+def events_of(votes: wp.int64) -> float:
+    """Return a number of events from votes [1/256 event]."""
+    return float(wp.float64(votes) / wp.float64(256.0))
+
+
+@wp.func
 def dither_offset(i: int):
     """Return a random offset in the pixel, uniform over it, for event ``i``.
 

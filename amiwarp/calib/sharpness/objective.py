@@ -114,6 +114,7 @@ class Objective:
     def image(self, values: Mapping[str, float]) -> NDArray[np.float32]:
         """Return the IWE at parameter values, with the border outside the sensor, shape (layers, rows, columns)."""
         self._measure(values)
+        self._image.read()
         return self._meter.image.numpy()
 
 
@@ -126,8 +127,12 @@ class _DirectImage:
     def measure(self, model: Model, drift: float, camera_rotation: CameraRotation) -> None:
         self._votes.clear()
         self._votes.add_events(model, self._events, drift=drift, camera_rotation=camera_rotation)
-        self._votes.read(self._meter.image)
+        self.read()
         self._meter.launch()
+
+    def read(self) -> None:
+        """Write the votes to the meter's image."""
+        self._votes.read(self._meter.image)
 
 
 class _TiledImage:
@@ -147,8 +152,15 @@ class _TiledImage:
 
     def _launch(self) -> None:
         self._tiles.launch()
+        if self._meter.takes_votes:
+            self._meter.launch(self._tiles.votes[0])
+        else:
+            self.read()
+            self._meter.launch()
+
+    def read(self) -> None:
+        """Write the votes to the meter's image."""
         self._tiles.read(0, self._meter.image)
-        self._meter.launch()
 
 
 def padding(space: ParameterSpace) -> int:

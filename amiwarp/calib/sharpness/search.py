@@ -303,7 +303,7 @@ def distinct_optima(stage: SearchStage, most: int, apart: float = 6.0) -> list[N
     """Return at most ``most`` best points of a stage, each at least ``apart`` px away from all better points."""
     chosen: list[NDArray[np.float64]] = []
     for k in np.argsort(-stage.scores, kind="stable"):
-        if all(np.linalg.norm(stage.points[k] - other) >= apart for other in chosen):
+        if all(math.dist(stage.points[k], other) >= apart for other in chosen):
             chosen.append(stage.points[k])
             if len(chosen) == most:
                 break
