@@ -513,3 +513,19 @@ def test_wrong_arrays_are_named() -> None:
 def test_wrap_angle_before_rounding() -> None:
     angle = np.array([0.5, -np.pi, np.pi, 0.5 + 2e7 * np.pi])
     np.testing.assert_allclose(wrap_angle(angle), [0.5, -np.pi, -np.pi, 0.5], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        ExactModel(Camera(20, 10, 30.0, 30.0, 9.5, 4.5), Prism(0.03), 0.7),
+        ExactModel(Camera(20, 10, 30.0, 30.0, 9.5, 4.5), Prism(0.03, 1.6, FlatSide.CAMERA), -2.7, (0.02, -0.01)),
+        CircleModel(Camera(20, 10, 30.0, 30.0, 9.5, 4.5), 0.013, 1.1),
+        RadialCircleModel(Camera(20, 10, 30.0, 30.0, 9.5, 4.5), 0.013, 1.1, 1.6, FlatSide.CAMERA),
+    ],
+)
+def test_kernel_values_are_the_fields_of_the_struct(model: ExactModel | CircleModel | RadialCircleModel) -> None:
+    params = model.params("cpu")
+    row = wp.zeros(1, dtype=params._cls, device="cpu").numpy()
+    row[0] = model.kernel_values()
+    assert row.tobytes() == bytes(params.__ctype__())

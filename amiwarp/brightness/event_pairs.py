@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,7 +81,7 @@ class PairSet:
         values: NDArray[np.float32] = self.arrays.time.numpy()
         return values.reshape(2, -1)[:, : len(self)]
 
-    @property
+    @cached_property
     def some_times(self) -> NDArray[np.float64]:
         """Times of some pairs, evenly chosen [s], shape (2, m).
 

@@ -109,8 +109,8 @@ class SharpnessMeter:
 
     @cached_property
     def _smoothed(self) -> list[Any]:
-        """Buffers for the image, smoothed along rows and along both axes."""
-        return [wp.zeros_like(self.image.pixels) for _ in range(2)]
+        """Buffers for the image, smoothed along rows and, if that is stored, along both axes."""
+        return [wp.zeros_like(self.image.pixels) for _ in range(1 if self.takes_votes else 2)]
 
     @cached_property
     def _program(self) -> Program:

@@ -16,6 +16,7 @@ from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
 from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
+from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ class TileVotes:
         dtypes = (kind,) if still else (kind, float, CameraRotationParams)
         self._host = [wp.zeros(candidates, dtype=dtype, device="cpu", pinned=True) for dtype in dtypes]
         self._on_device = [wp.zeros(candidates, dtype=array.dtype, device=device) for array in self._host]
+        self._rows = self._host[0].numpy()
         self._drifts = None if still else self._host[1].numpy()
         self._motion: Any = kernels.Still()
         if not still:
@@ -105,7 +107,8 @@ class TileVotes:
 
         ``drift`` and ``camera_rotation`` move only events that have slopes or times.
         """
-        _write(self._host[0], k, model.params(self.device))
+        assert not isinstance(model, EllipseModel)
+        self._rows[k] = model.kernel_values()
         if self._drifts is not None:
             self._drifts[k] = drift
             _write(self._host[2], k, (camera_rotation or CameraRotation()).params())

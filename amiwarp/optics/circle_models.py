@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 from amiwarp.kernels.refraction import CircleParams, RadialCircleParams
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.displacement import PointDisplacement, set_phase
+from amiwarp.optics.displacement import PointDisplacement, phase_values, struct_of
 from amiwarp.optics.prism import FlatSide, Prism, check_index, check_phase
 from amiwarp.validation import choice, instance, real
 
@@ -83,11 +83,18 @@ class CircleModel(PointDisplacement):
         amiwarp.kernels.refraction.CircleParams
             Deflection and phase as a Warp struct.
         """
-        p = CircleParams()
-        p.sine = math.sin(self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection)
-        p.versine = 2.0 * math.sin(self.deflection / 2.0) ** 2
-        set_phase(p, self.phase)
-        return p
+        return struct_of(CircleParams, self.kernel_values())
+
+    def kernel_values(self) -> tuple[Any, ...]:
+        """Return the values of the parameters for kernels, in the order of the fields of their struct.
+
+        Returns
+        -------
+        tuple
+            The fields of :class:`amiwarp.kernels.refraction.CircleParams`.
+        """
+        sine = math.sin(self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection)
+        return sine, 2.0 * math.sin(self.deflection / 2.0) ** 2, *phase_values(self.phase)
 
 
 @dataclass(frozen=True)
@@ -164,11 +171,18 @@ class RadialCircleModel(PointDisplacement):
         amiwarp.kernels.refraction.RadialCircleParams
             Deflection, phase and index as a Warp struct.
         """
-        p = RadialCircleParams()
-        p.deflection = self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection
-        set_phase(p, self.phase)
-        p.index = self.index
-        return p
+        return struct_of(RadialCircleParams, self.kernel_values())
+
+    def kernel_values(self) -> tuple[Any, ...]:
+        """Return the values of the parameters for kernels, in the order of the fields of their struct.
+
+        Returns
+        -------
+        tuple
+            The fields of :class:`amiwarp.kernels.refraction.RadialCircleParams`.
+        """
+        deflection = self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection
+        return deflection, *phase_values(self.phase), self.index
 
 
 def _check_circle(model: CircleModel | RadialCircleModel) -> None:

@@ -16,6 +16,8 @@ from amiwarp.optics.device_camera import camera_params
 from amiwarp.validation import array
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
 Points = TypeVar("Points")
@@ -120,6 +122,14 @@ def model_camera(model: HasParams, device: Any) -> Any:
     return camera_params(model.camera, str(device))
 
 
-def set_phase(params: Any, phase: float) -> None:
-    """Set the phase [rad] of a kernel's model parameters, with its cosine and sine."""
-    params.phase, params.phase_cos, params.phase_sin = phase, math.cos(phase), math.sin(phase)
+def phase_values(phase: float) -> tuple[float, float, float]:
+    """Return a phase [rad] with its cosine and sine: three fields of a model's parameters for kernels."""
+    return phase, math.cos(phase), math.sin(phase)
+
+
+def struct_of(kind: Any, values: Sequence[Any]) -> Any:
+    """Return a Warp struct whose first fields have the given values."""
+    struct = kind()
+    for name, value in zip(kind.vars, values, strict=False):
+        setattr(struct, name, value)
+    return struct

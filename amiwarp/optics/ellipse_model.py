@@ -14,7 +14,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.refraction import EllipseParams, fit_harmonics
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.displacement import PointDisplacement, model_camera, set_phase
+from amiwarp.optics.displacement import PointDisplacement, model_camera, phase_values
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import check_phase
 from amiwarp.validation import array, instance
@@ -196,7 +196,7 @@ class EllipseModel(PointDisplacement):
             p = EllipseParams()
             table = np.concatenate([self.offset, self.cosine, self.sine], axis=2)
             p.table = wp.array(table, dtype=float, device=device)
-            set_phase(p, self.phase)
+            p.phase, p.phase_cos, p.phase_sin = phase_values(self.phase)
             self._tables[str(device)] = p
         return self._tables[str(device)]
 

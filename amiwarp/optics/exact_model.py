@@ -11,7 +11,7 @@ import warp as wp
 
 from amiwarp.kernels.refraction import ExactParams
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.displacement import PointDisplacement, set_phase
+from amiwarp.optics.displacement import PointDisplacement, phase_values, struct_of
 from amiwarp.optics.prism import FlatSide, Prism, check_phase, check_tilt
 from amiwarp.validation import instance
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 UPRIGHT = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+UPRIGHT_ROWS = np.eye(3)
 """Rotation of a prism axis without tilt: the identity matrix."""
 
 
@@ -95,15 +96,25 @@ class ExactModel(PointDisplacement):
         amiwarp.kernels.refraction.ExactParams
             Apex angle, index, phase and tilt as a Warp struct.
         """
-        p = ExactParams()
-        p.sin_apex = math.sin(self.prism.apex)
-        p.cos_apex = math.cos(self.prism.apex)
-        p.index2 = self.prism.index**2
-        set_phase(p, self.phase)
-        p.flat_to_scene = int(self.prism.flat_side is FlatSide.SCENE)
-        p.tilted = int(any(self.tilt))
-        p.axis = wp.mat33(*axis_rotation(*self.tilt).ravel().tolist()) if p.tilted else UPRIGHT
+        *numbers, axis = self.kernel_values()
+        p = struct_of(ExactParams, numbers)
+        p.axis = UPRIGHT if axis is UPRIGHT_ROWS else wp.mat33(*axis.ravel().tolist())
         return p
+
+    def kernel_values(self) -> tuple[Any, ...]:
+        """Return the values of the parameters for kernels, in the order of the fields of their struct.
+
+        Returns
+        -------
+        tuple
+            The fields of :class:`amiwarp.kernels.refraction.ExactParams`.
+        """
+        tilted = any(self.tilt)
+        return (
+            math.sin(self.prism.apex), math.cos(self.prism.apex), self.prism.index**2, *phase_values(self.phase),
+            int(self.prism.flat_side is FlatSide.SCENE), int(tilted),
+            axis_rotation(*self.tilt) if tilted else UPRIGHT_ROWS,
+        )  # fmt: skip
 
 
 def axis_rotation(tilt_x: float, tilt_y: float) -> NDArray[np.float64]:
