@@ -529,3 +529,16 @@ def test_kernel_values_are_the_fields_of_the_struct(model: ExactModel | CircleMo
     row = wp.zeros(1, dtype=params._cls, device="cpu").numpy()
     row[0] = model.kernel_values()
     assert row.tobytes() == bytes(params.__ctype__())
+    side = 1.0 if getattr(model, "prism", model).flat_side is FlatSide.SCENE else -1.0
+    expected = {"phase": model.phase, "phase_cos": math.cos(model.phase), "phase_sin": math.sin(model.phase)}
+    if isinstance(model, ExactModel):
+        apex, tilted = model.prism.apex, any(model.tilt)
+        expected |= {"sin_apex": math.sin(apex), "cos_apex": math.cos(apex), "index2": model.prism.index**2}
+        expected |= {"flat_to_scene": (1 + side) / 2, "tilted": tilted}
+        assert np.allclose(row["axis"][0], np.eye(3), atol=1e-9) != tilted
+    elif isinstance(model, CircleModel):
+        expected |= {"sine": side * math.sin(model.deflection), "versine": 1.0 - math.cos(model.deflection)}
+    else:
+        expected |= {"deflection": side * model.deflection, "index": model.index}
+    for name, value in expected.items():
+        assert float(row[name][0]) == pytest.approx(value, rel=1e-5), name

@@ -269,10 +269,10 @@ def test_page_locked_memory_is_used_again() -> None:
         pass
 
     one, other = Owner(), Owner()
-    first, second = (page_locked(owner, (3, 5), wp.float64).ptr for owner in (one, other))
+    first, second = (page_locked(owner, (3, 5), wp.float64, "cuda:0").ptr for owner in (one, other))
     assert first != second
     del one
-    assert page_locked(other, (3, 5), wp.float64).ptr == first
+    assert page_locked(other, (3, 5), wp.float64, "cuda:0").ptr == first
 
 
 def test_damping_follows_the_contrast_of_the_seen_nodes(recording: Recording, device: str) -> None:

@@ -277,7 +277,7 @@ class EventTable:
             edges_d = wp.array(edges, dtype=wp.int64, device=device)
             self._mark_quiet(edges_d, at_least, base, flag)
         place, count = _running_count(flag)
-        of_two_events = int(place[m - 1 : m].numpy()[0]) if m else 0
+        of_two_events = count if len(flag) == m else int(place[m - 1 : m].numpy()[0]) if m else 0
         out = _empty(count, device, weak=weak)
         if not count:
             return PairSet(out, device, 0)

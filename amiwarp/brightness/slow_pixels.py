@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 SAMPLED = 1 << 13
-"""Number of pairs whose brightness gives the median of all."""
+"""Smallest number of pairs whose brightness gives the median of all; all are used if there are fewer."""
 THRESHOLD = 0.25
 """Assumed ON threshold [log intensity], which turns the map's brightness into light. Data sheets state 0.1 to 0.4."""
 

@@ -42,8 +42,7 @@ class Image:
 
     def numpy(self) -> NDArray[np.float32]:
         """Return a copy, shape (layers, rows, columns)."""
-        image = self._view(self.pixels.numpy())
-        return image.copy() if self.device.is_cpu else image
+        return self._view(self.pixels.numpy()).copy()
 
     def _device_view(self) -> Any:
         """Return the pixels inside the padding as a Warp array with gaps, shape (layers, rows, columns)."""

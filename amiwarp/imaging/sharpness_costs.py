@@ -58,7 +58,7 @@ class SharpnessMeter:
         self._host = self._sums
         if self.device.is_cuda:
             few = (layers, min(strips, FEW_SUMS))
-            self._host = page_locked(self, few, wp.vec2d)
+            self._host = page_locked(self, few, wp.vec2d, self.device)
             # the same memory, into which a kernel writes: a copy would take longer
             self._few = wp.array(ptr=self._host.ptr, dtype=wp.vec2d, shape=few, device=self.device)
             if len(weights) > 1:
@@ -70,6 +70,7 @@ class SharpnessMeter:
 
         Instead of the image, its ``votes`` [1/256 event] may be given in the same memory layout.
         """
+        assert votes is None or self.takes_votes
         if self.device.is_cpu:
             self._program.launch()
             return

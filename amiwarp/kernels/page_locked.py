@@ -8,15 +8,16 @@ from typing import Any
 
 import warp as wp
 
-_idle: defaultdict[tuple[tuple[int, ...], Any], list[wp.array]] = defaultdict(list)
+_idle: defaultdict[tuple[tuple[int, ...], Any, str], list[wp.array]] = defaultdict(list)
 
 
-def page_locked(owner: object, shape: tuple[int, ...], dtype: Any) -> wp.array:
+def page_locked(owner: object, shape: tuple[int, ...], dtype: Any, device: Any) -> wp.array:
     """Return a page-locked array with undefined values, which another owner may get once ``owner`` is deleted.
 
-    Keep no reference to it beyond ``owner``.
+    Only ``device`` may write to it, on Warp's stream, so that what an earlier owner left there comes first. Keep no
+    reference to it beyond ``owner``.
     """
-    idle = _idle[shape, dtype]
+    idle = _idle[shape, dtype, str(device)]
     try:
         array = idle.pop()
     except IndexError:

@@ -26,7 +26,7 @@ SIZE = wp.constant(4 * 61 * 64)  # size of a window [bytes]
 THREADS = wp.constant(256)  # number of threads per block
 BLOCKS = 4  # number of resident blocks per multiprocessor
 AT_ONCE = wp.constant(3)  # number of candidates voted per reading of an event; their windows fill 48 KiB
-FEW_EVENTS = wp.constant(1024)  # fewer votes of a chunk take less time in the image than through a window
+FEW_EVENTS = wp.constant(1024)  # chunks with fewer events are voted faster into the image than through a window
 CHUNK = 1 << 17  # events per chunk: at most 63 * 2**25 votes of 1/256, so that no word of the window overflows
 
 

@@ -128,8 +128,8 @@ def phase_values(phase: float) -> tuple[float, float, float]:
 
 
 def struct_of(kind: Any, values: Sequence[Any]) -> Any:
-    """Return a Warp struct whose first fields have the given values."""
+    """Return a Warp struct with the given values of its fields, in their order."""
     struct = kind()
-    for name, value in zip(kind.vars, values, strict=False):
+    for name, value in zip(kind.vars, values, strict=True):
         setattr(struct, name, value)
     return struct

@@ -97,9 +97,8 @@ class ExactModel(PointDisplacement):
             Apex angle, index, phase and tilt as a Warp struct.
         """
         *numbers, axis = self.kernel_values()
-        p = struct_of(ExactParams, numbers)
-        p.axis = UPRIGHT if axis is UPRIGHT_ROWS else wp.mat33(*axis.ravel().tolist())
-        return p
+        matrix = UPRIGHT if axis is UPRIGHT_ROWS else wp.mat33(*axis.ravel().tolist())
+        return struct_of(ExactParams, [*numbers, matrix])
 
     def kernel_values(self) -> tuple[Any, ...]:
         """Return the values of the parameters for kernels, in the order of the fields of their struct.

@@ -24,7 +24,7 @@ sum of full weights at a known node.
 A node is known only if enough of the equations around it hold.
 """
 SMALLEST_REGION = 12
-"""Smallest number of pixels of a connected known region; smaller regions are noise."""
+"""Smallest number of pixels of a connected known region, at most 16; smaller regions are noise."""
 LARGEST_HOLE = 4
 """Largest hole of unknown pixels inside a known region that is marked as known [px], because equations surround the
 hole."""

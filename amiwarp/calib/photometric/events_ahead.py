@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import wait
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +23,7 @@ class EventsAhead:
     """Events of the first of some time spans, which a thread copies to a GPU. Closed by ``with``."""
 
     def __init__(self, source: MemoryEvents, spans: list[tuple[int, int]], most: int, device: Any) -> None:
-        """Start to copy the events of the first of ``spans`` [us], ``most`` events together."""
+        """Start to copy the events of the first of ``spans`` [us], at most ``most`` events in all."""
         self._device = wp.get_device(device)
         self._parts: list[Events] = []
         self._first = [0]
@@ -51,11 +52,13 @@ class EventsAhead:
         if not {*spans} <= {*self._spans}:
             return None
         self._wait()
+        if self._copied.exception() is not None:
+            return None
         first = self._spans.index(spans[0])
         return self._events[self._first[first] : self._first[first + len(spans)]]
 
     def _wait(self) -> None:
-        self._copied.result()
+        wait([self._copied])
         self._device.stream.wait_stream(self._stream)
 
     def __enter__(self) -> EventsAhead:

@@ -114,7 +114,8 @@ class Objective:
     def image(self, values: Mapping[str, float]) -> NDArray[np.float32]:
         """Return the IWE at parameter values, with the border outside the sensor, shape (layers, rows, columns)."""
         self._measure(values)
-        self._image.read()
+        if self._meter.takes_votes:
+            self._image.read()
         return self._meter.image.numpy()
 
 
