@@ -44,8 +44,8 @@ def choose_tiles(image: NDArray[np.float32], density: float, margin: int) -> tup
 def near_tiles(tiles: Tiles, margin: int, far: int, shape: tuple[int, ...]) -> NDArray[np.int32]:
     """Return 0 for the pixels that are at most ``far`` pixels from a tile, along each axis, else -1.
 
-    ``margin`` is that of the tiles, ``shape`` the image's (height, width). With few nodes per pixel, tiles count as larger
-    than they are, by up to the distance of two nodes.
+    ``margin`` is that of the tiles, ``shape`` the image's (height, width). With few nodes per pixel, tiles count as
+    larger than they are, by up to the distance of two nodes.
     """
     near = np.full(shape, -1, dtype=np.int32)
     down, across = (int((n - 2) / tiles.density) - 2 * margin for n in (tiles.rows, tiles.columns))
