@@ -534,7 +534,7 @@ def test_kernel_values_are_the_fields_of_the_struct(model: ExactModel | CircleMo
     if isinstance(model, ExactModel):
         apex, tilted = model.prism.apex, any(model.tilt)
         expected |= {"sin_apex": math.sin(apex), "cos_apex": math.cos(apex), "index2": model.prism.index**2}
-        expected |= {"flat_to_scene": (1 + side) / 2, "tilted": tilted}
+        expected |= {"flat_to_scene": (1 + side) / 2, "tilted": int(tilted)}
         assert np.allclose(row["axis"][0], np.eye(3), atol=1e-9) != tilted
     elif isinstance(model, CircleModel):
         expected |= {"sine": side * math.sin(model.deflection), "versine": 1.0 - math.cos(model.deflection)}
