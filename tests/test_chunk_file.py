@@ -1,9 +1,12 @@
 """Writing of encoded chunks by several threads, and what remains of it on a full disk."""
 
+import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
 
 import h5py
 import hdf5plugin
@@ -154,3 +157,25 @@ def test_a_full_disk_leaves_nothing(tmp_path, way, limit):
     assert done.stdout.startswith(f"{path}: ")
     assert "File too large" in done.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_waits_until_the_file_is_created(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """HDF5 cannot close a file that it is creating when an interrupt is raised in the functions that it calls."""
+    created = h5py.File
+
+    def interrupted(*args: Any, **kwargs: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        files.append(created(*args, **kwargs))
+        return files[-1]
+
+    files: list[Any] = []
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        monkeypatch.setattr(h5py, "File", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            ChunkFile(tmp_path / "new.h5")
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert len(files) == 1
+    files[0].close()

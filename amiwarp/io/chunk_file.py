@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
@@ -48,18 +49,19 @@ class ChunkFile:
         """Create the file. Raises OSError if it exists."""
         import h5py
 
-        self.output = _Output(path)
         self._columns: dict[str, ChunkedColumn] = {}
         self._turns = threading.Condition()
         self._turn = 0
         self._stopped = False
-        try:
-            # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
-            self.hdf5 = h5py.File(self.output, "w", libver=("v110", "v110"))
-            """The file as h5py gives it."""
-        except BaseException:
-            self.output.close()
-            raise
+        with _interrupts_later():
+            self.output = _Output(path)
+            try:
+                # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
+                self.hdf5 = h5py.File(self.output, "w", libver=("v110", "v110"))
+                """The file as h5py gives it."""
+            except BaseException:
+                self.output.close()
+                raise
 
     @contextlib.contextmanager
     def turn(self, number: int) -> Iterator[None]:
@@ -114,6 +116,29 @@ class ChunkFile:
             self.hdf5.close()
         finally:
             self.output.close()
+
+
+@contextlib.contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Postpone Ctrl-C and signals that act like it to the end of the ``with`` block.
+
+    HDF5 calls :class:`_Output`. If an interrupt is raised there while HDF5 creates a file, it cannot close the file.
+    """
+    arrived: list[int] = []
+    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers:
+            if callable(handler := signal.getsignal(number)):
+                before[number] = handler
+                signal.signal(number, lambda number, _frame: arrived.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if arrived:
+            signal.raise_signal(arrived[0])
 
 
 class ChunkedColumn:
