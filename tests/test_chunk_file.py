@@ -178,4 +178,4 @@ def test_an_interrupt_waits_until_the_file_is_created(tmp_path: Path, monkeypatc
     finally:
         signal.signal(signal.SIGINT, handler)
     assert len(files) == 1
-    files[0].close()
+    assert not files[0]  # closed

@@ -53,15 +53,15 @@ class ChunkFile:
         self._turns = threading.Condition()
         self._turn = 0
         self._stopped = False
-        with _interrupts_later():
-            self.output = _Output(path)
-            try:
+        with contextlib.ExitStack() as undo:
+            with _interrupts_later():
+                self.output = _Output(path)
+                undo.callback(self.output.close)
                 # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
                 self.hdf5 = h5py.File(self.output, "w", libver=("v110", "v110"))
                 """The file as h5py gives it."""
-            except BaseException:
-                self.output.close()
-                raise
+                undo.callback(self.hdf5.close)
+            undo.pop_all()
 
     @contextlib.contextmanager
     def turn(self, number: int) -> Iterator[None]:
