@@ -11,7 +11,6 @@ from conftest import NOMINAL_PRISM, TRUE_PRISM
 
 from amiwarp import calib
 from amiwarp.calib import Calibration, Settings
-from amiwarp.calib.checks import edge_coherence
 from amiwarp.calib.preparation import prepare
 from amiwarp.calib.prism_speed import estimate_rpm
 from amiwarp.calib.sharpness.search import PARTS
@@ -299,13 +298,6 @@ def test_unknown_camera(recording: Recording) -> None:
 def test_bad_settings(recording: Recording, changes: dict[str, object], text: str) -> None:
     with pytest.raises(AmiwarpError, match=text):
         calibrate(recording, **changes)
-
-
-def test_coherence_of_edges() -> None:
-    rng = np.random.default_rng(3)
-    assert edge_coherence(rng.poisson(3.0, (80, 100)).astype(np.float32)) < 0.2
-    stripes = np.tile(rng.poisson(9.0, 100).astype(np.float32), (80, 1))
-    assert edge_coherence(stripes) > 0.99
 
 
 def test_a_drift_that_is_held_still_turns_the_angles(recording: Recording) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from amiwarp.calib.parameters import size_name
 from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.edge_directions import edge_coherence
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
     from amiwarp.calib.bad_pixels import BadPixelSummary
     from amiwarp.events.encoder import Encoder
+    from amiwarp.imaging.device_image import Image
     from amiwarp.optics.prism import Prism
 
 FEWEST_EVENTS = 2000
@@ -188,25 +190,12 @@ def check_texture(
         )
 
 
-def edge_coherence(image: NDArray[np.float32], smoothing: float = 1.5) -> float:
-    """Return the coherence of an image's edge directions, |Σ g² e^{2iφ}| / Σ g² over gradients (g, φ), 0 to 1.
+def check_directions(image: Image, inset: int, name: str) -> None:
+    """Check that the image has edges of more than one direction: motion along an edge is invisible.
 
-    Noise has no direction and lowers the coherence, so weak gradients are left out: those with g² below a tenth of the
-    largest.
+    Pixels within ``inset`` of its border do not count.
     """
-    from scipy.ndimage import gaussian_filter
-
-    slopes: Any = np.gradient(gaussian_filter(image.astype(np.float32), smoothing))
-    energy = slopes[0] ** 2 + slopes[1] ** 2
-    strong = energy > 0.1 * energy.max()
-    gy, gx = (slope[strong].astype(np.float64) for slope in slopes)
-    total = float(np.sum(gx**2 + gy**2))
-    return math.hypot(float(np.sum(gx**2 - gy**2)), float(np.sum(2.0 * gx * gy))) / total if total > 0.0 else 0.0
-
-
-def check_directions(image: NDArray[np.float32], name: str) -> None:
-    """Check that the image has edges of more than one direction: motion along an edge is invisible."""
-    coherence = edge_coherence(image)
+    coherence = edge_coherence(image, inset)
     if coherence > LARGEST_COHERENCE:
         raise AmiwarpError(
             f"{name}: all edges run in one direction (coherence {coherence:.2f} of 1), so motion along them is "

@@ -27,10 +27,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+_Step = tuple[Any, int, list[Any], Any, int]
+"""Kernel with its number of threads, its inputs, its output, and the fewest threads of a CPU slice."""
 PAPER_ETA = 1.0
 """Parameter η of the paper's sharpness cost J [events]; He et al. do not state the value that they used."""
 LARGEST_SMOOTHING = 1000.0
 """Largest accepted standard deviation of the smoothing Gaussian [px]."""
+LEAST_PADDING = 6
+"""Smallest padding of a meter's image [px]; :mod:`amiwarp.imaging.edge_directions` smooths it, too."""
 FEW_SUMS = 8
 """Number of partial sums per image layer that the device computes and the host adds up."""
 
@@ -43,7 +47,7 @@ class SharpnessMeter:
         weights = gaussian(smoothing)
         self.kind = choice(Sharpness, kind, "sharpness")
         self.device = wp.get_device(device)
-        self.image = Image(canvas, len(weights), self.device)
+        self.image = Image(canvas, max(len(weights), LEAST_PADDING), self.device)
         """Image whose sharpness is measured [events per pixel]; the caller writes its pixels."""
         self._weights = wp.array(weights, dtype=float, device=device)
         layers, rows, columns = canvas.shape
@@ -79,7 +83,7 @@ class SharpnessMeter:
         threads = self._few.size * BLOCK_DIM
         wp.launch(gather_sums, threads, [self._sums], [self._few], device=self.device, block_dim=BLOCK_DIM)
 
-    def _fused_steps(self, votes: Any) -> Iterator[tuple[Any, int, list[Any], Any, int]]:
+    def _fused_steps(self, votes: Any) -> Iterator[_Step]:
         """Yield what :meth:`_steps` does, in fewer kernels: for the variance on CUDA."""
         taps, frame, out = len(self._weights), self.image.frame, self._smoothed[0]
         if votes is None:
@@ -91,7 +95,7 @@ class SharpnessMeter:
         inputs = [out, self._weights, frame, threads]
         yield smooth_and_add(taps), self._sums.size * BLOCK_DIM, inputs, self._sums.flatten(), 512
 
-    def _steps(self) -> Iterator[tuple[Any, int, list[Any], Any, int]]:
+    def _steps(self) -> Iterator[_Step]:
         """Yield each kernel with its number of threads, inputs, output, and the fewest threads of a CPU slice."""
         smoothed, frame, width = self.image.pixels, self.image.frame, self.image.width
         taps = len(self._weights)
@@ -100,11 +104,8 @@ class SharpnessMeter:
             yield kernel, self._sums.size, inputs, self._sums.flatten(), 64
             return
         if taps > 1:
-            unrolled = self.device.is_cuda and taps <= kernels.MOST_UNROLLED
-            smooth = kernels.smooth_few(taps) if unrolled else kernels.smooth(width)
-            for step, out in zip((1, frame.stride), self._smoothed, strict=True):
-                yield smooth, self.image.blocks, [smoothed, self._weights, step, frame], out, 512
-                smoothed = out
+            yield from smoothing_steps(self.image, self._weights, self._smoothed)
+            smoothed = self._smoothed[-1]
         kernel = kernels.sum_terms(width, list(Sharpness).index(self.kind))
         yield kernel, self._sums.size, [smoothed, frame, PAPER_ETA], self._sums.flatten(), 64
 
@@ -148,6 +149,19 @@ class SharpnessMeter:
         if self.kind is Sharpness.ENTROPY:
             return terms / total - math.log(total)
         return terms / total
+
+
+def smoothing_steps(image: Image, weights: wp.array, out: list[wp.array]) -> Iterator[_Step]:
+    """Yield the two steps that smooth an image along its rows and columns, as :meth:`SharpnessMeter._steps` does.
+
+    ``out``: buffers of the layout of the image for the result of each step.
+    """
+    unrolled = image.device.is_cuda and len(weights) <= kernels.MOST_UNROLLED
+    smooth = kernels.smooth_few(len(weights)) if unrolled else kernels.smooth(image.width)
+    smoothed = image.pixels
+    for step, result in zip((1, image.frame.stride), out, strict=True):
+        yield smooth, image.blocks, [smoothed, weights, step, image.frame], result, 512
+        smoothed = result
 
 
 def gaussian(sigma: float) -> NDArray[np.float32]:

@@ -8,8 +8,9 @@ from amiwarp.kernels.camera import PinholeParams
 from amiwarp.kernels.checksum import compute_checksums
 from amiwarp.kernels.compensation import compensate_blocks
 from amiwarp.kernels.conjugate_gradients import descend
+from amiwarp.kernels.edge_directions import find_largest
 from amiwarp.kernels.equation_blocks import apply_normal
-from amiwarp.kernels.iwe import read_sums, smooth_and_sum
+from amiwarp.kernels.iwe import CPU_WIDTH, read_sums, smooth, smooth_and_sum
 from amiwarp.kernels.known_nodes import mark_known
 from amiwarp.kernels.map_positions import find_places, place_blocks
 from amiwarp.kernels.map_prior import link
@@ -34,6 +35,8 @@ EXACT_KERNELS = (
     (vote_event_blocks, ExactParams, PinholeParams),
     (read_sums,),
     *((smooth_and_sum(len(gaussian(sigma))),) for sigma in (2.0, 1.0)),  # coarse and fine images of a calibration
+    (smooth(int(CPU_WIDTH)),),
+    (find_largest,),
     (mark_spans,),
     (find_places, ExactParams, PinholeParams),
     (place_blocks, ExactParams),

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.imaging.device_events import UploadedEvents
+    from amiwarp.imaging.device_image import Image
     from amiwarp.optics.camera_rotation import CameraRotation
     from amiwarp.optics.models import Model
 
@@ -111,12 +112,12 @@ class Objective:
         """Return the sharpness of each part at parameter values, shape (parts,)."""
         return np.array(self._measure(values))
 
-    def image(self, values: Mapping[str, float]) -> NDArray[np.float32]:
-        """Return the IWE at parameter values, with the border outside the sensor, shape (layers, rows, columns)."""
+    def image(self, values: Mapping[str, float]) -> Image:
+        """Return the IWE at parameter values, with the border outside the sensor, until the next evaluation."""
         self._measure(values)
         if self._meter.takes_votes:
             self._image.read()
-        return self._meter.image.numpy()
+        return self._meter.image
 
 
 class _DirectImage:

@@ -20,7 +20,6 @@ from amiwarp.calib.sharpness.objective import Objective, padding
 from amiwarp.calib.summaries import StageSummary
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
-from amiwarp.kernels.launch import pool
 from amiwarp.optics.models import MODELS
 from amiwarp.progress import Progress
 from amiwarp.validation import choice, one_of, real, shown, whole
@@ -252,14 +251,12 @@ class Search:
     def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
         """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the sharpness."""
         best = self.best
-        directions = pool().submit(checks.check_directions, self.image, name) if self.space.sized else None
         parts = self._objective_by_parts(self.settings.sharpness)
         if self.space.sized:
             self._check_sharper_than_chance(best, parts, name)
+            checks.check_directions(self.fine.image(best), self._edge_inset, name)
         v = self.space.to_vector(best)
         covariance, warnings = estimate_covariance(parts, v)
-        if directions is not None:
-            directions.result()
         return self._bound_warnings(best) + warnings, self.space.deviations(v, covariance)
 
     def _check_sharper_than_chance(self, best: dict[str, float], parts: Objective, name: str) -> None:
@@ -271,10 +268,16 @@ class Search:
         sharp, opposite, still = (variance.each(values) for values in points)
         checks.check_texture(sharp, opposite, still, name)
 
+    @property
+    def _edge_inset(self) -> int:
+        """Width of the border of the fine image in which the view ends, and not an edge of the scene [px]."""
+        camera = self.space.camera
+        return self._pad + min(self._pad, min(camera.width, camera.height) // 4)
+
     @cached_property
     def image(self) -> NDArray[np.float32]:
         """IWE at the calibrated parameters, cut to the sensor's size, summed over polarities."""
-        layers = self.fine.image(self.best)
+        layers = self.fine.image(self.best).numpy()
         image = layers[0] if len(layers) == 1 else layers.sum(axis=0)
         pad = (image.shape[1] - self.space.camera.width) // 2
         return np.asarray(image[pad:-pad, pad:-pad])
