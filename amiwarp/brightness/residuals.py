@@ -11,6 +11,7 @@ import warp as wp
 
 from amiwarp.kernels.conjugate_gradients import CPU_WIDTH
 from amiwarp.kernels.launch import RepeatedLaunches, launch
+from amiwarp.kernels.page_locked import start_read
 from amiwarp.kernels.photometric import HELD
 from amiwarp.kernels.recorded_launches import BLOCK_DIM
 from amiwarp.kernels.residual_slopes import add_clusters, magnitudes, sum_costs, sum_products
@@ -48,24 +49,40 @@ class Residuals:
         ``held``: whether only held-out pairs count. ``missing``: residual of pairs off the map; NaN excludes these
         pairs.
         """
+        return self.start_mean_cost(scale, missing=missing, held=held)()
+
+    def start_mean_cost(self, scale: float, *, missing: float, held: bool = False) -> Callable[[], float]:
+        """Start to compute :meth:`mean_cost` for the present residuals. Return a function that waits for it."""
         threads, parts = self._sum_shape
         partial = self._doubles(2, parts)
         inputs = [self.values, self.pairs.arrays.on, int(HELD) * held, self.count, scale, missing, self._width]
         self._launch(sum_costs, threads, inputs, [partial], smallest=CHUNKS)
-        total, number = partial.numpy().sum(axis=1)
-        return float(total / number) if number else math.nan
+        sums = start_read(partial)
 
-    def products(self, factors: list[tuple[Any, Any]]) -> NDArray[np.float64]:
-        """Return the sum over the pairs of a · b · weight, for each (a, b) on the device."""
+        def result() -> float:
+            total, number = sums().sum(axis=1)
+            return float(total / number) if number else math.nan
+
+        return result
+
+    def start_products(self, factors: list[tuple[Any, Any]]) -> Callable[[], NDArray[np.float64]]:
+        """Start to sum a · b · weight over the pairs, for each (a, b) on the device.
+
+        Return a function that waits for the sums.
+        """
         threads, parts = self._sum_shape
         partial = self._doubles(len(factors), parts)
         for k, (a, b) in enumerate(factors):
             inputs = [a, b, self.weight, self.count, self._width]
             self._launch(sum_products, threads, inputs, [partial[k]], smallest=CHUNKS)
-        return np.asarray(partial.numpy().sum(axis=1))
+        sums = start_read(partial)
+        return lambda: np.asarray(sums().sum(axis=1))
 
-    def clusters(self, slopes: list[Any]) -> NDArray[np.float64]:
-        """Return sums of slope · weight · residual over clusters of neighbouring pairs, shape (slopes, clusters)."""
+    def start_clusters(self, slopes: list[Any]) -> Callable[[], NDArray[np.float64]]:
+        """Start to sum slope · weight · residual over clusters of neighbouring pairs.
+
+        Return a function that waits for the sums, shape (slopes, clusters).
+        """
         size = self.tiles if self.tiles > 1 else 1 << 20
         rows = []
         for slope in slopes:
@@ -75,9 +92,13 @@ class Residuals:
             inputs = [self.pairs.arrays, self.tiles, copies, slope, self.weight, self.values, 0, sums]
             # one CPU thread only: several would add to the same sums
             wp.launch(add_clusters, self.count, inputs=inputs, device=self.device)
-            total, number = sums.numpy().reshape(2, size, copies).sum(axis=2)
-            rows.append(total[number > 0] / 2.0**32)
-        return np.array(rows)
+            rows.append(start_read(sums))
+
+        def result() -> NDArray[np.float64]:
+            both = [row().reshape(2, size, -1).sum(axis=2) for row in rows]
+            return np.array([total[number > 0] / 2.0**32 for total, number in both])
+
+        return result
 
     def products_by_square(
         self, factors: list[Any], side: int, columns: int, rows: int

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import weakref
 from collections import defaultdict
+from collections.abc import Callable
 from typing import Any
 
 import warp as wp
+from numpy.typing import NDArray
 
 _idle: defaultdict[tuple[tuple[int, ...], Any, str], list[wp.array]] = defaultdict(list)
 
@@ -24,3 +26,25 @@ def page_locked(owner: object, shape: tuple[int, ...], dtype: Any, device: Any) 
         array = wp.empty(shape, dtype=dtype, device="cpu", pinned=True)
     weakref.finalize(owner, idle.append, array).atexit = False
     return array
+
+
+def start_read(array: wp.array) -> Callable[[], NDArray[Any]]:
+    """Start to copy a small contiguous array to the host. Return a function that waits and returns a copy.
+
+    It does not wait for what is launched later. The array is not kept alive.
+    """
+    if array.device.is_cpu:
+        found = array.numpy().copy()
+        return lambda: found
+    size = array.size * wp.types.type_size_in_bytes(array.dtype)
+
+    def result() -> NDArray[Any]:
+        wp.synchronize_event(copied)
+        values: NDArray[Any] = host.numpy()[:size].view(wp.dtype_to_numpy(array.dtype))
+        return values.reshape(array.shape).copy()
+
+    # sizes are powers of two, so that arrays of other sizes can use the memory, too
+    host = page_locked(result, (1 << (size - 1).bit_length(),), wp.uint8, array.device)
+    wp.copy(host, wp.array(ptr=array.ptr, dtype=wp.uint8, shape=size, device=array.device), count=size)
+    copied = array.device.stream.record_event()
+    return result

@@ -13,7 +13,7 @@ from amiwarp.calib.nlopt_solver import SearchStage, maximise
 from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, MOTION
 from amiwarp.calib.photometric.acceptance import LARGEST_MOVE_PX, judge_optimum
 from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON, iterate
-from amiwarp.calib.photometric.minimum_check import cost_around_optimum
+from amiwarp.calib.photometric.minimum_check import start_costs_around
 from amiwarp.calib.summaries import PhotometricSummary
 
 if TYPE_CHECKING:
@@ -95,8 +95,10 @@ class AnswerSearch:
             return cost(at)
 
         if settings.algorithm == GAUSS_NEWTON:
+            # a GPU computes slopes while the host waits for the score; a CPU would do so in vain if the score is low
+            slopes = (lambda at: lambda: cost.slopes(at)) if cost.brightness.device.is_cpu else cost.start_slopes
             return iterate(
-                cost.settled, cost.slopes, start, low=low, high=high, tolerance=settings.tolerance_px,
+                cost.start_settled, slopes, start, low=low, high=high, tolerance=settings.tolerance_px,
                 report=report_steps,
             )  # fmt: skip
 
@@ -140,20 +142,23 @@ def _evaluate(
     space, best = cost.space, stage.x
     cost.predict(best)
     cost.residuals(best, rounds=2)
-    final, residual = cost.mean(), cost.brightness.residuals.median()
-    slopes = cost.slopes(best, with_parts=True)
-    covariance = slopes.covariance() / left**2
-    of_sharpness = np.array([n not in DEGENERATE_WITH_APEX for n in space.names])
-    of_prism = np.array([n not in (*DEGENERATE_WITH_APEX, *MOTION) for n in space.names])
+    # everything is started before the first result is waited for
+    waiting_final, residuals = cost.start_mean(), cost.brightness.residuals
+    waiting_residual = residuals.start_median(residuals.count)
+    waiting_slopes = cost.start_slopes(best, with_parts=True)
     solved = cost.brightness.copy_unknowns()
-    leak, excess = (float(x) for x in cost.brightness.extra)
-    around = cost_around_optimum(cost, best, final)
+    waiting_around = start_costs_around(cost, best, waiting_final)
     # the map is better converged now than at the start of the search, so the cost at the start is measured again
     cost.predict(v)
     cost.residuals(v)
-    at_start = cost.mean()
+    waiting_at_start = cost.start_mean()
     cost.replace_map(solved)
     cost.residuals(best, rounds=0)
+    slopes, final, around = waiting_slopes(), waiting_final(), waiting_around()
+    covariance = slopes.covariance() / left**2
+    of_sharpness = np.array([n not in DEGENERATE_WITH_APEX for n in space.names])
+    of_prism = np.array([n not in (*DEGENERATE_WITH_APEX, *MOTION) for n in space.names])
+    leak, excess = (float(x) for x in cost.brightness.extra)
     rise = around[0][1] if around else math.inf
     next_step = float(np.linalg.norm(slopes.step()[of_prism]))
     moved = float(np.linalg.norm((best - v)[of_prism]))
@@ -166,8 +171,8 @@ def _evaluate(
         sharpness_parameters={},
         moved_px=float(np.linalg.norm((best - v)[of_sharpness])),
         cost=final,
-        cost_at_sharpness=at_start,
-        residual=residual,
+        cost_at_sharpness=waiting_at_start(),
+        residual=waiting_residual(),
         pairs=0,
         off_over_on=1.0 + excess,
         leak=leak,

@@ -11,6 +11,8 @@ from amiwarp.calib.photometric.causes import place_arguments
 from amiwarp.calib.photometric.gauss_newton import Slopes
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import warp as wp
     from numpy.typing import NDArray
 
@@ -94,7 +96,12 @@ class Cost:
 
         Pairs of events off the map keep their cost without a map.
         """
-        return self.brightness.residuals.mean_cost(self.scale, missing=1.0) / math.log1p(1.0 / self.scale**2)
+        return self.start_mean()()
+
+    def start_mean(self) -> Callable[[], float]:
+        """Start to compute :meth:`mean` for the present residuals. Return a function that waits for it."""
+        mean, without_map = self.brightness.residuals.start_mean_cost(self.scale, missing=1.0), 1.0 / self.scale**2
+        return lambda: mean() / math.log1p(without_map)
 
     def __call__(self, v: NDArray[np.float64], *, steps: int | None = None) -> float:
         """Return the negative cost at the search vector ``v``, a score to be maximised."""
@@ -102,10 +109,16 @@ class Cost:
         self.residuals(v, steps=steps)
         return -self.mean()
 
-    def settled(self, v: NDArray[np.float64]) -> float:
-        """Return the score at ``v``, with the map first changed by :meth:`predict`."""
+    def start_settled(self, v: NDArray[np.float64]) -> Callable[[], float]:
+        """Start to compute the score at ``v``, with the map first changed by :meth:`predict`.
+
+        Return a function that waits for it.
+        """
         self.predict(v)
-        return self(v)
+        self.evaluations += 1
+        self.residuals(v)
+        mean = self.start_mean()
+        return lambda: -mean()
 
     def predict(self, v: NDArray[np.float64]) -> None:
         """Change the map as its derivatives by the parameters predict for a ``v`` nearby, if :meth:`slopes` found them.
@@ -125,15 +138,24 @@ class Cost:
         The gradient uses these differences too. The derivatives themselves are a biased gradient: damping makes the map
         too flat, so that a larger orbit explains more.
         """
+        return self.start_slopes(v, with_parts=with_parts)()
+
+    def start_slopes(self, v: NDArray[np.float64], *, with_parts: bool = False) -> Callable[[], Slopes]:
+        """Start to compute :meth:`slopes`. Return a function that waits for them."""
         b, n = self.brightness, len(v)
         left = self._unexplained_slopes(v)
         upper = np.triu_indices(n)
         pairs = [(left[i], left[j]) for i, j in zip(*upper, strict=True)]
-        sums = b.residuals.products([*pairs, *((row, b.residuals.values) for row in left)])
-        hessian = np.zeros((n, n))
-        hessian[upper] = sums[:-n]
-        hessian.T[upper] = sums[:-n]
-        return Slopes(hessian, sums[-n:], b.residuals.clusters(left) if with_parts else np.empty((n, 0)))
+        products = b.residuals.start_products([*pairs, *((row, b.residuals.values) for row in left)])
+        clusters = b.residuals.start_clusters(left) if with_parts else lambda: np.empty((n, 0))
+
+        def result() -> Slopes:
+            sums, hessian = products(), np.zeros((n, n))
+            hessian[upper] = sums[:-n]
+            hessian.T[upper] = sums[:-n]
+            return Slopes(hessian, sums[-n:], clusters())
+
+        return result
 
     def _unexplained_slopes(self, v: NDArray[np.float64]) -> list[Any]:
         """Return for each parameter the part of the residuals' derivative that no change of the map explains."""

@@ -98,8 +98,8 @@ def determined(slopes: Slopes, space: ParameterSpace, left: float) -> tuple[str,
 
 
 def iterate(
-    score: Callable[[Vector], float],
-    slopes: Callable[[Vector], Slopes],
+    start_score: Callable[[Vector], Callable[[], float]],
+    start_slopes: Callable[[Vector], Callable[[], Slopes]],
     start: Vector,
     *,
     low: Vector,
@@ -110,29 +110,35 @@ def iterate(
     """Maximise a score by Gauss-Newton steps until they are shorter than ``tolerance`` [px] in every parameter.
 
     A step that lowers the score is halved. The search stays in the box ``low .. high`` [px]. Its answer is the best
-    evaluated point. ``report`` gets the number of steps done and the largest number.
+    evaluated point. ``report`` gets the number of steps done and the largest number. ``start_score`` and
+    ``start_slopes`` return functions that wait for the result at a point; slopes are also started where the score may
+    turn out lower, and then not waited for.
     """
     began = time.perf_counter()
     v, points, scores, ended = np.clip(start, low, high), [], [], "budget"
-    here = score(v)
+    waiting, slopes = start_score(v), start_slopes(v)
+    here = waiting()
     points.append(v)
     scores.append(here)
     for k in range(MOST_STEPS):
         report(k, MOST_STEPS)
-        step = slopes(v).step()
+        step = slopes().step()
         step *= min(1.0, LONGEST_STEP_PX / max(float(np.abs(step).max()), 1e-12))
         for _ in range(HALVINGS):
             trial = np.clip(v + step, low, high)
-            value = score(trial)
+            moved = float(np.abs(trial - v).max())
+            waiting = start_score(trial)
+            following = start_slopes(trial) if moved >= tolerance else None
+            value = waiting()
             points.append(trial)
             scores.append(value)
             if value >= here:
                 break
             step = step / 2.0
-        moved = float(np.abs(trial - v).max())
         if value >= here:
             v, here = trial, value
-        if moved < tolerance or value < here:
+        if following is None or value < here:
             ended = "tolerance" if moved < tolerance else "no better step"
             break
+        slopes = following
     return best_of(GAUSS_NEWTON, points, scores, seconds=time.perf_counter() - began, ended=ended)

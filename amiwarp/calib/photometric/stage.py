@@ -215,9 +215,9 @@ def _equations(
 
     v = space.to_vector({**space.start, **search.best})
     cost = cost_on(tiles)
-    coverage = cost.brightness.coverage(cost.scale)
+    mean, coverage = cost.start_mean(), cost.brightness.coverage(cost.scale)
     few = not fine_map_is_determined(coverage, len(pairs))
-    noisy = cost.mean() > LARGEST_FINE_COST
+    noisy = mean() > LARGEST_FINE_COST
     # a fine map converges too slowly for parameters that make nearly the same motion
     if tiles.density > 1.0 and (few or noisy or any(n in DEGENERATE_WITH_APEX for n in space.names)):
         cost = cost_on(tiles.at_density(1.0))
