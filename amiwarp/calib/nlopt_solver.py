@@ -189,7 +189,7 @@ class _EvaluationLog:
     @property
     def near_known(self) -> bool:
         """Whether the last point is near a known optimum."""
-        return bool(self.points) and any(math.dist(self.points[-1], k) < SAME_OPTIMUM_PX for k in self._known)
+        return any(math.dist(self.points[-1], k) < SAME_OPTIMUM_PX for k in self._known) if self.points else False
 
     def release(self) -> None:
         """Drop the reference to the score function, because NLopt never frees its callbacks."""

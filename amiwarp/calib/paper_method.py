@@ -74,7 +74,7 @@ def calibrate_as_paper(
         sharpness_name=Sharpness.PAPER_J.value,
         sharpness_before=search.fine.values({**best, search.space.size_name: 0.0}),
         sharpness_after=stage.score,
-        stages=(StageSummary.of("grid", stage, search.space),),
+        stages=(StageSummary.of("grid", stage, search.space.names, map(search.space.to_values, stage.points)),),
         events=len(cut),
         seconds=time.perf_counter() - began,
     )

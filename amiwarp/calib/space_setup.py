@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.calib.parameters import (
     CHANGES,
@@ -19,7 +21,9 @@ from amiwarp.calib.parameters import (
     size_name,
 )
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.displacement import points_on_host
+from amiwarp.kernels.launch import RecordedLaunch
+from amiwarp.kernels.refraction import compensate_points
+from amiwarp.optics.displacement import model_camera, points_on_host
 from amiwarp.optics.prism import deflection_from_apex
 
 if TYPE_CHECKING:
@@ -194,19 +198,22 @@ def _pixels_per_unit(
     size.
     """
     nominal = {**values, "apex": prism.apex, "deflection": prism.deflection}
-    x, y, theta = (
-        m.ravel()
-        for m in np.meshgrid(
-            np.linspace(0, camera.width - 1, 8), np.linspace(0, camera.height - 1, 6), np.arange(8) * (np.pi / 4),
-            indexing="ij",
-        )
-    )  # fmt: skip
-    at = points_on_host(np.stack([x, y], axis=1), theta)  # once, for all parameters
+    at = _grid_points(camera.width, camera.height)
     kind = "exact" if model == "ellipse" else model  # the ellipse's tables are computed from the exact model
 
-    def displaced(name: str, step: float) -> NDArray[np.float64]:
+    out = wp.empty_like(at[0])
+
+    def arguments(name: str, step: float) -> list[Any]:
         built = build_model(kind, camera, prism, {**nominal, name: nominal[name] + step})
-        return np.asarray(built.compensate_points(*at).numpy(), np.float64)
+        return [built.params("cpu"), model_camera(built, "cpu")]
+
+    compensate = RecordedLaunch(compensate_points, [*arguments(names[0], 0.0), *at], [out], device="cpu")
+
+    def displaced(name: str, step: float) -> NDArray[np.float64]:
+        for k, value in enumerate(arguments(name, step)):
+            compensate.set(k, value)
+        compensate(0, len(out))
+        return out.numpy().astype(np.float64)
 
     def rms(name: str, step: float) -> float:
         moved = (displaced(name, step) - displaced(name, -step)) / (2.0 * step)
@@ -236,3 +243,12 @@ def _pixels_per_unit(
             "a free parameter moves no event; give a nominal apex above 0 and an encoder whose angle changes"
         )
     return {n: shifts[n] for n in names}
+
+
+@lru_cache(maxsize=16)
+def _grid_points(width: int, height: int) -> tuple[wp.array, wp.array]:
+    """Return a grid of pixels [px] and prism angles [rad] as Warp arrays on the CPU."""
+    x, y, theta = np.meshgrid(
+        np.linspace(0, width - 1, 8), np.linspace(0, height - 1, 6), np.arange(8) * (np.pi / 4), indexing="ij"
+    )
+    return points_on_host(np.stack([x.ravel(), y.ravel()], axis=1), theta.ravel())

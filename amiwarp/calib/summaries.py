@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from amiwarp.calib.nlopt_solver import SearchStage
-    from amiwarp.calib.parameters import ParameterSpace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,7 +31,9 @@ class StageSummary:
     """Values of the free parameters at every evaluation, each with its ``score``, in the order of evaluation."""
 
     @classmethod
-    def of(cls, name: str, stage: SearchStage, space: ParameterSpace) -> StageSummary:
+    def of(
+        cls, name: str, stage: SearchStage, names: tuple[str, ...], values: Iterable[Mapping[str, float]]
+    ) -> StageSummary:
         """Return the summary of one run of a search algorithm.
 
         Parameters
@@ -41,18 +42,18 @@ class StageSummary:
             Stage: ``global``, ``local``, ``photometric`` or ``grid``.
         stage : SearchStage
             The run.
-        space : ParameterSpace
-            Space whose vectors the run evaluated.
+        names : tuple of str
+            Names of the free parameters.
+        values : iterable of mappings
+            Parameter values at every evaluated point of the run, in their units.
 
         Returns
         -------
         StageSummary
             The summary.
         """
-        points = []
-        for x, score in zip(stage.points, stage.scores, strict=True):
-            values = space.to_values(x)
-            points.append({**{n: values[n] for n in space.names}, "score": float(score)})
+        both = zip(values, stage.scores.tolist(), strict=True)
+        points = [{**{n: at[n] for n in names}, "score": score} for at, score in both]
         return cls(
             name=name, algorithm=stage.algorithm, evaluations=stage.evaluations, seconds=stage.seconds,
             sharpness=stage.score, ended=stage.ended, points=points,

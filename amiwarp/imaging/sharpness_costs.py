@@ -35,8 +35,6 @@ LARGEST_SMOOTHING = 1000.0
 """Largest accepted standard deviation of the smoothing Gaussian [px]."""
 LEAST_PADDING = 6
 """Smallest padding of a meter's image [px]; :mod:`amiwarp.imaging.edge_directions` smooths it, too."""
-FEW_SUMS = 8
-"""Number of partial sums per image layer that the device computes and the host adds up."""
 
 
 class SharpnessMeter:
@@ -61,10 +59,9 @@ class SharpnessMeter:
         self._sums = wp.empty((layers, strips), dtype=wp.vec2d, device=device)
         self._host = self._sums
         if self.device.is_cuda:
-            few = (layers, min(strips, FEW_SUMS))
-            self._host = page_locked(self, few, wp.vec2d, self.device)
+            self._host = page_locked(self, (layers,), wp.vec2d, self.device)
             # the same memory, into which a kernel writes: a copy would take longer
-            self._few = wp.array(ptr=self._host.ptr, dtype=wp.vec2d, shape=few, device=self.device)
+            self._sum = wp.array(ptr=self._host.ptr, dtype=wp.vec2d, shape=layers, device=self.device)
             if len(weights) > 1:
                 _ = self._smoothed  # a captured graph must not allocate it
         self._sums_on_host = self._host.numpy().reshape(canvas.parts, -1, 2)
@@ -80,8 +77,8 @@ class SharpnessMeter:
             return
         for kernel, n, inputs, out, _ in self._fused_steps(votes) if self.takes_votes else self._steps():
             launch(kernel, n, inputs, [out], device=self.device)
-        threads = self._few.size * BLOCK_DIM
-        wp.launch(gather_sums, threads, [self._sums], [self._few], device=self.device, block_dim=BLOCK_DIM)
+        threads = self._sum.size * BLOCK_DIM
+        wp.launch(gather_sums, threads, [self._sums], [self._sum], device=self.device, block_dim=BLOCK_DIM)
 
     def _fused_steps(self, votes: Any) -> Iterator[_Step]:
         """Yield what :meth:`_steps` does, in fewer kernels: for the variance on CUDA."""
@@ -126,7 +123,9 @@ class SharpnessMeter:
         """Wait, and return the sharpness of each part of the last measured image."""
         if self.device.is_cuda:
             wp.synchronize_stream(self.device)
-        return [self._score(total, terms) for total, terms in self._sums_on_host.sum(axis=1).tolist()]
+        sums = self._sums_on_host
+        few = sums[:, 0] if sums.shape[1] == 1 else sums.sum(axis=1)  # NumPy takes microseconds even for sums of one
+        return [self._score(total, terms) for total, terms in few.tolist()]
 
     @property
     def finite(self) -> bool:

@@ -62,15 +62,13 @@ def smooth_and_add(taps: int) -> Any:
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
-def gather_sums(sums: wp.array2d(dtype=wp.vec2d), out: wp.array2d(dtype=wp.vec2d)):
-    """Add up the partial sums in each row, one block of threads for each element of ``out``."""
-    thread = wp.tid()
-    block = thread / wp.block_dim()
-    row = block / out.shape[1]
+def gather_sums(sums: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.vec2d)):
+    """Add up the partial sums in each row, one block of threads per row."""
+    row = wp.tid() / wp.block_dim()
+    first = wp.tid() % wp.block_dim()
     total = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
-    first = (block % out.shape[1]) * wp.block_dim() + thread % wp.block_dim()
-    for k in range(first, sums.shape[1], out.shape[1] * wp.block_dim()):
+    for k in range(first, sums.shape[1], wp.block_dim()):
         total += sums[row, k]
     both = wp.vec2d(block_sum(total[0]), block_sum(total[1]))
-    if thread % wp.block_dim() == 0:
-        out[row, block % out.shape[1]] = both
+    if first == 0:
+        out[row] = both

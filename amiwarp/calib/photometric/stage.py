@@ -171,7 +171,9 @@ def refine(
         answer.result, sharpness_parameters=answers.sharpest, pairs=len(found.pairs), held=found.held, warnings=notes,
         refractory_us=sensor.refractory_us, time_constant_us=time_constant,
     )  # fmt: skip
-    return result, StageSummary.of("photometric", answer.stage, answers.cost.space), answers.cost.space
+    space = answers.cost.space
+    values = map(space.to_values, answer.stage.points)
+    return result, StageSummary.of("photometric", answer.stage, space.names, values), space
 
 
 def _with_slow_pixels(found: _Equations, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from amiwarp.imaging.sharpness_costs import SharpnessMeter
 from amiwarp.imaging.tile_votes import TileVotes
 from amiwarp.imaging.warped_image import CanvasShape, Votes
 from amiwarp.optics.camera_rotation import border
+from amiwarp.optics.displacement import points_on_host
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.imaging.device_events import UploadedEvents
     from amiwarp.imaging.device_image import Image
+    from amiwarp.optics.camera import Camera
     from amiwarp.optics.camera_rotation import CameraRotation
     from amiwarp.optics.models import Model
 
@@ -182,10 +185,16 @@ def reach(space: ParameterSpace, values: Mapping[str, float]) -> float:
     """Return the largest displacement of events at ``values`` [px], by the prism and the camera's rotation."""
     camera = space.camera
     kind = "exact" if space.model == "ellipse" else space.model
-    at = border(camera)
-    theta = np.repeat(np.arange(16) * (np.pi / 8), len(at))
-    xy = np.tile(at, (16, 1))
-    moved = build_model(kind, camera, space.prism, values).compensate_points(xy, theta) - xy
+    xy, *points = _border_points(camera)
+    moved = build_model(kind, camera, space.prism, values).compensate_points(*points).numpy() - xy
     radius = np.linalg.norm(moved[np.isfinite(moved).all(axis=1)], axis=1)
     turned = space.camera_rotation(values).reach(camera, space.duration_us * 0.5e-6)
     return float(radius.max(initial=0.0)) + float(np.linalg.norm(turned))
+
+
+@lru_cache(maxsize=16)
+def _border_points(camera: Camera) -> tuple[NDArray[np.float64], wp.array, wp.array]:
+    """Return pixels of the image's border at 16 prism angles [px], shape (n, 2); and both as Warp arrays on the CPU."""
+    at = border(camera)
+    xy = np.tile(at, (16, 1))
+    return xy, *points_on_host(xy, np.repeat(np.arange(16) * (np.pi / 8), len(at)))

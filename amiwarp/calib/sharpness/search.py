@@ -183,7 +183,6 @@ class Search:
         for start in starts:
             runs.append(self._run_local(start, [run.x for run in runs]))
         best = max(runs, key=lambda run: run.score)
-        self.stages.extend(StageSummary.of("local", run, self.space) for run in runs)
         self.best, self.score = self.space.to_values(best.x), best.score
 
     def _coarse_objective(self, events: CalibrationEvents, space: ParameterSpace) -> Objective:
@@ -201,7 +200,6 @@ class Search:
         start = space.to_vector(space.start)
         objective = self._coarse_objective(self.calibration_events, space)
         stage = self._maximise(objective, algorithm, start, self.settings.global_evaluations, step=1.0)
-        self.stages.append(StageSummary.of("global", stage, space))
         return [self.space.to_vector(space.to_values(v)) for v in distinct_optima(stage, CANDIDATES)]
 
     def _track_rotation(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -216,7 +214,6 @@ class Search:
                 objective, self.settings.local_algorithm, start, self.settings.local_evaluations, step=2.0
             )
             start = stage.x
-            self.stages.append(StageSummary.of("local", stage, self.space))
         return start
 
     def _run_local(self, start: NDArray[np.float64], known: Sequence[NDArray[np.float64]]) -> SearchStage:
@@ -234,19 +231,24 @@ class Search:
         step: float,
         known: Sequence[NDArray[np.float64]] = (),
     ) -> SearchStage:
-        low, high = objective.space.bounds()
+        """Run a search algorithm and append its summary to ``stages``."""
+        space, values = objective.space, []
+        low, high = space.bounds()
         name = "global" if algorithm.startswith("G") else "local"
 
         def score(v: NDArray[np.float64]) -> float:
             if self.progress is not None:
                 self.progress(*stage_share(self.settings, name, objective.evaluations / budget))
-            return objective(v)
+            values.append(space.to_values(v))
+            return objective.values(values[-1])
 
         s = self.settings
-        return maximise(
+        stage = maximise(
             score, algorithm, low=low, high=high, start=start, evaluations=budget, tolerance=s.tolerance_px, step=step,
             inner=s.local_algorithm, seed=s.seed, known=known,
         )  # fmt: skip
+        self.stages.append(StageSummary.of(name, stage, space.names, values))
+        return stage
 
     def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
         """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the sharpness."""
@@ -304,13 +306,14 @@ class Search:
 
 def distinct_optima(stage: SearchStage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:
     """Return at most ``most`` best points of a stage, each at least ``apart`` px away from all better points."""
-    chosen: list[NDArray[np.float64]] = []
-    for k in np.argsort(-stage.scores, kind="stable"):
-        if all(math.dist(stage.points[k], other) >= apart for other in chosen):
-            chosen.append(stage.points[k])
+    points = stage.points.tolist()
+    chosen: list[int] = []
+    for k in np.argsort(-stage.scores, kind="stable").tolist():
+        if all(math.dist(points[k], points[other]) >= apart for other in chosen):
+            chosen.append(k)
             if len(chosen) == most:
                 break
-    return chosen
+    return [stage.points[k] for k in chosen]
 
 
 def estimate_covariance(parts: Objective, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[str, ...]]:
