@@ -20,13 +20,15 @@ from amiwarp.brightness.tiles import Tiles
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.photometric.events_ahead import EventsAhead
 from amiwarp.calib.photometric.pair_collection import van_der_corput
-from amiwarp.calib.photometric.scene_tiles import choose_tiles, near_tiles, one_tile
+from amiwarp.calib.photometric.scene_tiles import TILE, choose_tiles, near_tiles, one_tile
 from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
+from amiwarp.imaging.device_image import Image
 from amiwarp.imaging.metrics import model_error, truth_model
+from amiwarp.imaging.warped_image import CanvasShape
 from amiwarp.kernels.page_locked import page_locked
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
@@ -301,11 +303,29 @@ def test_no_pair_is_an_error() -> None:
 
 @pytest.mark.parametrize("far", [0, 1, 6, 30])
 def test_the_pixels_near_tiles(far: int) -> None:
-    image = np.random.default_rng(1).random((250, 330)).astype(np.float32)
-    cases = [(choose_tiles(image, 2.0, 3), 3), (choose_tiles(image, 0.7, 8), 8), (one_tile(330, 250, 2.0, 3), 3)]
+    image = Image(CanvasShape(330, 250), 1, "cpu")
+    image.write(np.random.default_rng(1).random((1, 250, 330)).astype(np.float32))
+    cases = [(choose_tiles(image, 0, 2.0, 3), 3), (choose_tiles(image, 0, 0.7, 8), 8), (one_tile(330, 250, 2.0, 3), 3)]
     for (tile_of, tiles), margin in cases:
         expected = ndimage.maximum_filter(tile_of >= 0, size=2 * far + 1)
-        np.testing.assert_array_equal(near_tiles(tiles, margin, far, image.shape) == 0, expected)
+        np.testing.assert_array_equal(near_tiles(tiles, margin, far, (250, 330)) == 0, expected)
+
+
+@pytest.mark.parametrize(("width", "height"), [(330, 250), (40, 20)])
+def test_tiles_have_most_events_of_their_part(width: int, height: int, device: str) -> None:
+    pad = 5
+    layers = np.random.default_rng(2).integers(0, 50, (2, height + 2 * pad, width + 2 * pad)).astype(np.float32)
+    image = Image(CanvasShape(width, height, pad, per_polarity=True), 1, device)
+    image.write(layers)
+    tile_of, tiles = choose_tiles(image, pad, 2.0, 3)
+    events = layers.sum(axis=0)[pad : pad + height, pad : pad + width]
+    across, down = max(1, width // TILE), max(1, height // TILE)
+    cells = [(row * TILE, column * TILE) for row in range(down) for column in range(across)]
+    counts = np.array([events[y : y + TILE, x : x + TILE].sum() for y, x in cells]).reshape(down, across)
+    parts = [counts[np.ix_(r, c)] for r in np.array_split(np.arange(down), min(3, down))
+             for c in np.array_split(np.arange(across), min(4, across))]  # fmt: skip
+    chosen = [events[tile_of == k].sum() for k in range(len(tiles.origin))]
+    assert chosen == [part.max() for part in parts]
 
 
 def test_turns_are_spread() -> None:

@@ -164,6 +164,23 @@ def add_sums(sums: wp.array2d(dtype=int), start: int, totals: wp.array(dtype=wp.
 # -- smoothing and sums
 
 
+@wp.kernel
+def sum_cells(
+    image: wp.array(dtype=float), frame: Frame, layers: int, border: int, sides: wp.vec2i, start: int,
+    sums: wp.array2d(dtype=wp.float64),
+):  # fmt: skip
+    """Sum the pixels of each cell of all layers. The cells begin ``border`` px inside; ``sides``: width and height."""
+    cell = start + wp.tid()
+    row, column = cell / sums.shape[1], cell % sums.shape[1]
+    at = frame.first + (border + row * sides[1]) * frame.stride + border + column * sides[0]
+    total = wp.float64(0.0)
+    for layer in range(layers):
+        for y in range(sides[1]):
+            for x in range(sides[0]):
+                total += wp.float64(image[at + layer * frame.layer + y * frame.stride + x])
+    sums[row, column] = total
+
+
 @cache
 def smooth(width: int) -> Any:
     """Return the kernel that smooths ``width`` pixels per thread along one axis; the weights begin at the centre."""

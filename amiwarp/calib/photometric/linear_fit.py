@@ -7,7 +7,7 @@ is then a small linear problem. Its sums are kept for each square of pixels, who
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -55,7 +55,7 @@ class Estimate:
     def significance(self, first: int) -> float:
         """Return how many standard deviations the parameters from number ``first`` on are away from 0."""
         x = self.change[first:]
-        return math.sqrt(max(0.0, float(x @ np.linalg.pinv(self.covariance[first:, first:]) @ x)))
+        return math.sqrt(max(0.0, float(x @ np.linalg.lstsq(self.covariance[first:, first:], x, rcond=1e-15)[0])))
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,21 @@ class LinearFit:
     """Middle of each square [px], shape (squares, 2)."""
     squares_sum: float
     """Sum of the squared weighted residuals [thresholds²]."""
+    _known: dict[tuple[str, ...], Estimate] = field(default_factory=dict, repr=False, init=False)
+    """Fits in all squares, by the names of their columns."""
 
     def fit(self, names: tuple[str, ...], where: NDArray[np.bool_] | None = None) -> Estimate:
         """Return the changes of the columns ``names`` that minimise the residuals, in the squares ``where`` or in all.
 
         The other columns are fixed.
         """
+        if where is not None:
+            return self._fit(names, where)
+        if names not in self._known:
+            self._known[names] = self._fit(names, None)
+        return self._known[names]
+
+    def _fit(self, names: tuple[str, ...], where: NDArray[np.bool_] | None) -> Estimate:
         k = [self.names.index(n) for n in names]
         hessian, gradient = self._total if where is None else self._sums(where)
         hessian, gradient = hessian[np.ix_(k, k)], gradient[k]

@@ -140,7 +140,7 @@ def collect_pairs(
     if len(recording.events.between(first, first + int(FEWEST_TURNS * turn) + 1)) <= settings.pairs:
         tile_of, tiles = one_tile(*recording.events.size, settings.density, margin)
     else:
-        tile_of, tiles = choose_tiles(search.image, settings.density, margin)
+        tile_of, tiles = choose_tiles(search.fine.image(search.best), search.pad, settings.density, margin)
     near = near_tiles(tiles, margin, math.ceil(reach(search.space, search.best)) + 1, tile_of.shape)
     collector = _PairCollector(recording, search, tile_of, near, settings.sensor, ahead)
     spans = time_spans(recording, search)

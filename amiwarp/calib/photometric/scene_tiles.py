@@ -3,31 +3,41 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.brightness.tiles import Tiles
+from amiwarp.kernels.iwe import sum_cells
+from amiwarp.kernels.launch import launch
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.imaging.device_image import Image
+
 TILE = 32
 """Side of a tile of the scene [px]."""
+FEW_CELLS = 64
+"""Smallest number of possible tiles for which a second CPU thread counts events."""
 GRID = (4, 3)
 """Number of columns and rows into which the image is divided. The tile with most events is chosen from each part."""
 
 
-def choose_tiles(image: NDArray[np.float32], density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
+def choose_tiles(image: Image, pad: int, density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
     """Choose the tile with most events from each part of the scene.
 
-    ``image`` is the IWE at the answer of the sharpness stage, shape (height, width); ``density`` gives map nodes per
-    pixel, and ``margin`` the border of a tile's map [px]. Return the tile number of each pixel, or -1, and the tiles.
+    ``image`` is the IWE at the answer of the sharpness stage, with a border of ``pad`` px outside the sensor;
+    ``density`` gives map nodes per pixel, and ``margin`` the border of a tile's map [px]. Return the tile number of
+    each of the sensor's pixels, or -1, and the tiles.
     """
-    height, width = image.shape
+    layers, height, width = image.shape[0], image.shape[1] - 2 * pad, image.shape[2] - 2 * pad
     columns, rows = max(1, width // TILE), max(1, height // TILE)
-    cells = image[: rows * TILE, : columns * TILE]
-    counts = cells.reshape(rows, cells.shape[0] // rows, columns, cells.shape[1] // columns).sum(axis=(1, 3))
+    sums: Any = wp.empty((rows, columns), dtype=wp.float64, device=image.device)
+    inputs = [image.pixels, image.frame, layers, pad, wp.vec2i(min(TILE, width), min(TILE, height))]
+    launch(sum_cells, rows * columns, inputs, [sums], device=image.device, smallest=FEW_CELLS)
+    counts = sums.numpy()
     tile_of = np.full((height, width), -1, dtype=np.int32)
     corners: list[tuple[int, int]] = []
     for part_rows in np.array_split(np.arange(rows), min(GRID[1], rows)):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -143,7 +142,8 @@ class Search:
         self.calibration_events, self.settings, self.device = calibration_events, settings, device
         self.progress = progress
         self.stages: list[StageSummary] = []
-        self._pad = padding(self.space)
+        self.pad = padding(self.space)
+        """Border of the fine image outside the sensor [px]."""
         self.fine = self._objective(calibration_events, scale=1.0, smoothing=settings.smoothing_px)
 
     def _objective_by_parts(self, kind: Sharpness) -> Objective:
@@ -163,7 +163,7 @@ class Search:
     ) -> Objective:
         s = self.settings
         kind, space = kind or s.sharpness, space or self.space
-        pad = self._pad if space is self.space else padding(space)
+        pad = self.pad if space is self.space else padding(space)
         if kind is Sharpness.PAPER_J:
             smoothing = 0.0  # J counts pixels with h > 0, and a Gaussian's tails would make almost all of them positive
         return Objective(
@@ -274,15 +274,7 @@ class Search:
     def _edge_inset(self) -> int:
         """Width of the border of the fine image in which the view ends, and not an edge of the scene [px]."""
         camera = self.space.camera
-        return self._pad + min(self._pad, min(camera.width, camera.height) // 4)
-
-    @cached_property
-    def image(self) -> NDArray[np.float32]:
-        """IWE at the calibrated parameters, cut to the sensor's size, summed over polarities."""
-        layers = self.fine.image(self.best).numpy()
-        image = layers[0] if len(layers) == 1 else layers.sum(axis=0)
-        pad = (image.shape[1] - self.space.camera.width) // 2
-        return np.asarray(image[pad:-pad, pad:-pad])
+        return self.pad + min(self.pad, min(camera.width, camera.height) // 4)
 
     def sharpness_in(self, space: ParameterSpace, values: Mapping[str, float]) -> float:
         """Return the sharpness at ``values`` with the camera and the prism of ``space``."""
