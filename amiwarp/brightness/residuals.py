@@ -43,16 +43,12 @@ class Residuals:
         self._width = int(CPU_WIDTH) if self.device.is_cpu else 1
         self._launch = RepeatedLaunches(self.device)
 
-    def mean_cost(self, scale: float, *, missing: float = math.nan, held: bool = False) -> float:
-        """Return the mean Cauchy cost, log(1 + (r / ``scale``)²), of the residuals r of all pairs or the held-out ones.
+    def start_mean_cost(self, scale: float, *, missing: float = math.nan, held: bool = False) -> Callable[[], float]:
+        """Start to compute the mean Cauchy cost of the residuals, and return a function that waits for it.
 
-        ``held``: whether only held-out pairs count. ``missing``: residual of pairs off the map; NaN excludes these
-        pairs.
+        That is log(1 + (r / ``scale``)²) for the residuals r of all pairs or the held-out ones. ``held``: whether only
+        held-out pairs count. ``missing``: residual of pairs off the map; NaN excludes these pairs.
         """
-        return self.start_mean_cost(scale, missing=missing, held=held)()
-
-    def start_mean_cost(self, scale: float, *, missing: float, held: bool = False) -> Callable[[], float]:
-        """Start to compute :meth:`mean_cost` for the present residuals. Return a function that waits for it."""
         threads, parts = self._sum_shape
         partial = self._doubles(2, parts)
         inputs = [self.values, self.pairs.arrays.on, int(HELD) * held, self.count, scale, missing, self._width]

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_source import DeviceMemoryEvents, device_of, read_between
 from amiwarp.events.encoder_speed import turn_between
+from amiwarp.kernels.page_locked import start_read
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.reconstruction.choices import Fill
 from amiwarp.reconstruction.result import Picture, upload_picture
@@ -29,10 +31,10 @@ from amiwarp.reconstruction.window import (
     CHOICE_STEPS,
     SMOOTHNESS,
     choice_square,
-    lowest_weight,
     map_tile,
     off_excess_by_counts,
     settled_span,
+    start_lowest_weight,
 )
 from amiwarp.validation import choice
 
@@ -188,6 +190,7 @@ class Reconstruction:
         recording, began = self.recording, time.perf_counter()
         width, height = recording.events.size
         table, count = self._table(start_us, length_us)
+        tile_of = start_read(table.tile_of)
         pairs = self._pairs(table, start_us, length_us)
         pair_count = pairs.of_two_events
         if not pair_count:
@@ -195,10 +198,14 @@ class Reconstruction:
             raise AmiwarpError(f"{recording.name}: no pixel fires twice in {where}; give a longer window")
         off = off_excess_by_counts(recording.events, self.turn_us, start_us, length_us)
         left, top, tiles = self._tile(start_us, length_us)
-        if self.smoothness is None:
-            self.smoothness = self._choose(count, pairs, start_us + length_us // 2, (left, top), off)
-        solver = self._solver(pairs, tiles, off, start_us + length_us // 2)
-        residual, covered = solve_rounds(solver, pair_count, last)
+        middle_us = start_us + length_us // 2
+        choice = self._start_choice(count, pairs, middle_us, (left, top), off)
+        solver = self._solver(pairs, tiles, off, middle_us)
+        smoothness = self.smoothness = choice()
+        solver.restart(smoothness)
+        waiting_residual, waiting_covered = solve_rounds(solver, pair_count, last)
+        hot = int((tile_of() < 0).sum())  # while a GPU still solves
+        residual, covered = waiting_residual(), waiting_covered()
         cut = np.s_[top : top + height, left : left + width]
         unknowns = solver.unknowns
         log, known = unknowns[: tiles.nodes].reshape(tiles.rows, tiles.columns)[cut], covered[cut]
@@ -207,7 +214,7 @@ class Reconstruction:
             log = np.where(known, log, np.float32(np.nan))
         found = Picture(
             log=log.astype(np.float32), known=known, start_us=start_us, length_us=length_us, pairs=pair_count,
-            off_excess=off, smoothness=self.smoothness, residual=residual, hot=int((table.tile_of.numpy() < 0).sum()),
+            off_excess=off, smoothness=smoothness, residual=residual, hot=hot,
             seconds=time.perf_counter() - began, unknowns=unknowns,
         )  # fmt: skip
         return upload_picture(found, self.device) if isinstance(recording.events, DeviceMemoryEvents) else found
@@ -286,24 +293,29 @@ class Reconstruction:
         solver.place(self.model, camera_rotation=self.camera_rotation)
         return solver
 
-    def _choose(
+    def _start_choice(
         self, count: NDArray[np.int32], pairs: PairSet, middle_us: int, margin: tuple[int, int], off: float
-    ) -> float:
-        """Return the smoothness weight with the lowest cost of held-out pairs, in the busiest part of the image."""
+    ) -> Callable[[], float]:
+        """Start to find the smoothness weight with the lowest cost of held-out pairs, in the busiest part of the image.
+
+        Return a function that waits for it. If there is a weight already, it is kept.
+        """
+        if self.smoothness is not None:
+            return partial(float, self.smoothness)
         x0, y0, side = choice_square(count)
         part = pairs.of_square(x0, y0, side)
         if part.hold_out(HOLD_OUT_EVERY) < 50:
-            return SMOOTHNESS[-1]
+            return lambda: SMOOTHNESS[-1]
         left, top = margin
         tiles = Tiles(np.array([[x0 - left, y0 - top]], np.float32), side + 2 * top, side + 2 * left, 1.0)
         solver = self._solver(part, tiles, off, middle_us)
 
-        def cost(weight: float) -> float:
+        def start_cost(weight: float) -> Callable[[], float]:
             solver.restart(weight)
             solver.solve(*SCALES[:2], steps=CHOICE_STEPS)
-            return solver.residuals.mean_cost(SCALES[0], held=True)
+            return solver.residuals.start_mean_cost(SCALES[0], held=True)
 
-        return lowest_weight(cost)
+        return start_lowest_weight(start_cost)
 
     def _tile(self, start_us: int, length_us: int) -> tuple[int, int, Tiles]:
         """Return the map's margin left of and above the image (columns, rows), and the map of a window."""

@@ -9,6 +9,8 @@ import numpy as np
 from amiwarp.reconstruction.known import known_nodes, nodes_near
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from amiwarp.brightness.solver import BrightnessMap
@@ -22,10 +24,13 @@ NOISE_DISTANCE = 2
 """Distance from known pixels beyond which pairs of events are excluded as noise [px]."""
 
 
-def solve_rounds(solver: BrightnessMap, pair_count: int, last: Picture | None) -> tuple[float, NDArray[np.bool_]]:
-    """Solve for the map; return the median residual and the known nodes, shape (rows, columns).
+def solve_rounds(
+    solver: BrightnessMap, pair_count: int, last: Picture | None
+) -> tuple[Callable[[], float], Callable[[], NDArray[np.bool_]]]:
+    """Solve for the map. Return functions that wait for the median residual and for the known nodes.
 
-    ``last`` is the picture of the previous window, from which the solution starts.
+    The known nodes have shape (rows, columns). A GPU still works when this returns. ``last`` is the picture of the
+    previous window, from which the solution starts.
     """
     nodes = solver.tiles.nodes
     if last is not None:
@@ -37,5 +42,4 @@ def solve_rounds(solver: BrightnessMap, pair_count: int, last: Picture | None) -
     covered = known_nodes(solver)
     solver.keep(nodes_near(covered, NOISE_DISTANCE))
     solver.solve(SCALES[-1], steps=STEPS)
-    # nothing is read before all work for a GPU is in its queue
-    return residual(), covered.numpy().view(np.bool_)
+    return residual, lambda: covered.numpy().view(np.bool_)

@@ -87,16 +87,23 @@ def choice_square(count: NDArray[np.int32]) -> tuple[int, int, int]:
     return int(column) * side, int(row) * side, side
 
 
-def lowest_weight(cost: Callable[[float], float]) -> float:
-    """Return the largest weight of :data:`SMOOTHNESS` whose cost is nearly the lowest; see :data:`TIE`.
+def start_lowest_weight(start_cost: Callable[[float], Callable[[], float]]) -> Callable[[], float]:
+    """Start to find the largest weight of :data:`SMOOTHNESS` whose cost is nearly the lowest; see :data:`TIE`.
 
-    The cost falls and then rises with the weight. So the two middle weights show on which side the lowest cost is.
+    ``start_cost`` starts to compute the cost of a weight and returns a function that waits for it. Return a function
+    that waits for the weight. The cost falls and then rises with the weight. So the two middle weights show on which
+    side the lowest cost is.
     """
     weakest, weak, strong, strongest = SMOOTHNESS
-    weak_cost, strong_cost = cost(weak), cost(strong)
-    if strong_cost <= TIE * weak_cost:
-        return strongest if cost(strongest) <= TIE * min(weak_cost, strong_cost) else strong
-    return weak if weak_cost <= TIE * cost(weakest) else weakest
+    waiting = start_cost(weak), start_cost(strong)
+
+    def result() -> float:
+        weak_cost, strong_cost = (cost() for cost in waiting)
+        if strong_cost <= TIE * weak_cost:
+            return strongest if start_cost(strongest)() <= TIE * min(weak_cost, strong_cost) else strong
+        return weak if weak_cost <= TIE * start_cost(weakest)() else weakest
+
+    return result
 
 
 def off_excess_by_counts(source: EventSource, turn_us: float | None, start_us: int, length_us: int) -> float:
