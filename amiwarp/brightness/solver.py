@@ -209,8 +209,8 @@ class BrightnessMap:
         """Add a change of the map times a factor to the map."""
         self._launch(add_multiple, len(change), [change, factor], [self._image])
 
-    def unexplained(self, target: Any, change: Any = None, *, steps: int) -> tuple[Any, Any]:
-        """Return the part of ``target`` (pairs, on the device) that no change of the map explains, and the change.
+    def unexplained(self, target: Any, change: Any = None, *, steps: int) -> Any:
+        """Return the part of ``target`` (pairs, on the device) that no change of the map explains.
 
         This is the projection of variable projection (Golub and Pereyra 1973). It is solved by conjugate gradients that
         start from ``change``, or from none.
@@ -222,9 +222,13 @@ class BrightnessMap:
             wp.copy(self._projection.image, change)
             self._subtract(change, self._projection.residual)
         self._projection.run(steps)
-        change, rest = wp.clone(self._projection.image), wp.clone(target)
-        self._subtract(change, rest)
-        return rest, change
+        rest = wp.clone(target)
+        self._subtract(self._projection.image, rest)
+        return rest
+
+    def explaining_change(self) -> Any:
+        """Return a copy of the change of the map that explains the rest of the last target of :meth:`unexplained`."""
+        return wp.clone(self._projection.image)
 
     def _subtract(self, vector: Any, residual: Any) -> None:
         """Subtract the left sides of the equations, for a ``vector`` of unknowns, from ``residual``."""

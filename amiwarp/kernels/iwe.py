@@ -165,19 +165,17 @@ def add_sums(sums: wp.array2d(dtype=int), start: int, totals: wp.array(dtype=wp.
 
 
 @wp.kernel
-def sum_cells(
-    image: wp.array(dtype=float), frame: Frame, layers: int, border: int, sides: wp.vec2i, start: int,
+def sum_segments(
+    image: wp.array(dtype=float), frame: Frame, layers: int, border: int, length: int, start: int,
     sums: wp.array2d(dtype=wp.float64),
 ):  # fmt: skip
-    """Sum the pixels of each cell of all layers. The cells begin ``border`` px inside; ``sides``: width and height."""
-    cell = start + wp.tid()
-    row, column = cell / sums.shape[1], cell % sums.shape[1]
-    at = frame.first + (border + row * sides[1]) * frame.stride + border + column * sides[0]
+    """Sum the pixels of all layers over segments of rows that begin ``border`` px inside: ``sums[row, segment]``."""
+    row, column = (start + wp.tid()) / sums.shape[1], (start + wp.tid()) % sums.shape[1]
+    at = frame.first + (border + row) * frame.stride + border + column * length
     total = wp.float64(0.0)
     for layer in range(layers):
-        for y in range(sides[1]):
-            for x in range(sides[0]):
-                total += wp.float64(image[at + layer * frame.layer + y * frame.stride + x])
+        for x in range(length):
+            total += wp.float64(image[at + layer * frame.layer + x])
     sums[row, column] = total
 
 

@@ -166,7 +166,8 @@ class Cost:
         b.prepare_projection()
         steps = np.eye(n) * SLOPE_PX
         slopes = [b.find_slope(self.at(v + step), self.at(v - step), 2.0 * SLOPE_PX) for step in steps]
-        both = zip(slopes, changes, strict=True)
-        found = [b.unexplained(slope, change, steps=self.steps // 2) for slope, change in both]
-        self._changes = [change for _, change in found]
-        return [left for left, _ in found]
+        left, self._changes = [], []
+        for slope, change in zip(slopes, changes, strict=True):
+            left.append(b.unexplained(slope, change, steps=self.steps // 2))
+            self._changes.append(b.explaining_change())
+        return left

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp.brightness.tiles import Tiles
-from amiwarp.kernels.iwe import sum_cells
+from amiwarp.kernels.iwe import sum_segments
 from amiwarp.kernels.launch import launch
 
 if TYPE_CHECKING:
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 TILE = 32
 """Side of a tile of the scene [px]."""
-FEW_CELLS = 64
-"""Smallest number of possible tiles for which a second CPU thread counts events."""
+FEW_SEGMENTS = 2048
+"""Smallest number of segments of rows for which a second CPU thread counts events."""
 GRID = (4, 3)
 """Number of columns and rows into which the image is divided. The tile with most events is chosen from each part."""
 
@@ -34,10 +34,11 @@ def choose_tiles(image: Image, pad: int, density: float, margin: int) -> tuple[N
     """
     layers, height, width = image.shape[0], image.shape[1] - 2 * pad, image.shape[2] - 2 * pad
     columns, rows = max(1, width // TILE), max(1, height // TILE)
-    sums: Any = wp.empty((rows, columns), dtype=wp.float64, device=image.device)
-    inputs = [image.pixels, image.frame, layers, pad, wp.vec2i(min(TILE, width), min(TILE, height))]
-    launch(sum_cells, rows * columns, inputs, [sums], device=image.device, smallest=FEW_CELLS)
-    counts = sums.numpy()
+    used = rows * min(TILE, height)
+    sums: Any = wp.empty((used, columns), dtype=wp.float64, device=image.device)
+    inputs = [image.pixels, image.frame, layers, pad, min(TILE, width)]
+    launch(sum_segments, sums.size, inputs, [sums], device=image.device, smallest=FEW_SEGMENTS)
+    counts = sums.numpy().reshape(rows, -1, columns).sum(axis=1)
     tile_of = np.full((height, width), -1, dtype=np.int32)
     corners: list[tuple[int, int]] = []
     for part_rows in np.array_split(np.arange(rows), min(GRID[1], rows)):

@@ -75,7 +75,7 @@ class Objective:
         device : str or warp.context.Device
             The device.
         """
-        self.space = space
+        self.space, self._moving = space, space.moving
         self.evaluations = 0
         camera = space.camera
         # the paper's J is computed as published, without dithering
@@ -100,7 +100,8 @@ class Objective:
 
     def _measure(self, values: Mapping[str, float]) -> list[float]:
         self.evaluations += 1
-        self._image.measure(self._model(values), self.space.drift(values), self.space.camera_rotation(values))
+        rotation = self.space.camera_rotation(values) if self._moving else None
+        self._image.measure(self._model(values), self.space.drift(values), rotation)
         return self._meter.results()
 
     def values(self, values: Mapping[str, float]) -> float:
@@ -129,7 +130,7 @@ class _DirectImage:
     def __init__(self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter) -> None:
         self._votes, self._events, self._meter = Votes(canvas, meter.device), events, meter
 
-    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation) -> None:
+    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation | None) -> None:
         self._votes.clear()
         self._votes.add_events(model, self._events, drift=drift, camera_rotation=camera_rotation)
         self.read()
@@ -147,7 +148,7 @@ class _TiledImage:
         self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
         self._graph: Any = None
 
-    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation) -> None:
+    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation | None) -> None:
         self._tiles.set(0, model, drift=drift, camera_rotation=camera_rotation)
         if self._graph is None:
             with wp.ScopedCapture(self._meter.device) as capture:
