@@ -10,7 +10,7 @@ from amiwarp.kernels.launch import SMALLEST_SLICE, run_together, slices
 
 BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks
 FEW_LAUNCHES = 6  # launches that take less time than the capture of a graph
-RUNS_PER_GRAPH = 4  # runs that one CUDA graph holds: launching a graph takes longer than a few small kernels
+MOST_RUNS = 6  # runs that one CUDA graph may hold: launching a graph takes longer than a few small kernels
 
 
 class Program:
@@ -78,10 +78,10 @@ class Program:
             for _ in range(times):
                 self.launch()
             return
-        many, rest = divmod(times, RUNS_PER_GRAPH)
-        for runs, count in ((RUNS_PER_GRAPH, many), (1, rest)):
-            for _ in range(count):
-                wp.capture_launch(self._graph(runs))
+        runs = max(n for n in range(1, MOST_RUNS + 1) if times % n == 0)
+        graph = self._graph(runs)
+        for _ in range(times // runs):
+            wp.capture_launch(graph)
 
     def _graph(self, runs: int) -> Any:
         """Return the CUDA graph of a number of runs. The first call captures it."""
