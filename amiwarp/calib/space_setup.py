@@ -200,7 +200,6 @@ def _pixels_per_unit(
     nominal = {**values, "apex": prism.apex, "deflection": prism.deflection}
     at = _grid_points(camera.width, camera.height)
     kind = "exact" if model == "ellipse" else model  # the ellipse's tables are computed from the exact model
-
     out = wp.empty_like(at[0])
 
     def arguments(name: str, step: float) -> list[Any]:
@@ -210,7 +209,8 @@ def _pixels_per_unit(
     compensate = RecordedLaunch(compensate_points, [*arguments(names[0], 0.0), *at], [out], device="cpu")
 
     def displaced(name: str, step: float) -> NDArray[np.float64]:
-        for k, value in enumerate(arguments(name, step)):
+        given = arguments(name, step)  # the launch needs their arrays
+        for k, value in enumerate(given):
             compensate.set(k, value)
         compensate(0, len(out))
         return out.numpy().astype(np.float64)

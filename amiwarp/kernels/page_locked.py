@@ -31,7 +31,7 @@ def page_locked(owner: object, shape: tuple[int, ...], dtype: Any, device: Any) 
 def start_read(array: wp.array) -> Callable[[], NDArray[Any]]:
     """Start to copy a small contiguous array to the host. Return a function that waits and returns a copy.
 
-    It does not wait for what is launched later. The array is not kept alive.
+    It does not wait for what is launched later.
     """
     if array.device.is_cpu:
         found = array.numpy().copy()
