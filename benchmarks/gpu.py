@@ -20,7 +20,7 @@ PICTURE = "china.jpg"
 TESTS = (
     "camera", "optics", "iwe", "tiles", "uploads", "sharpness", "calibrate", "photometric", "compensate", "compensator",
     "simulate", "translate", "benchmarks", "worlds", "sensor", "reconstruct", "auto", "arrays", "dataset",
-    "corners",
+    "corners", "edge_directions", "page_locked",
 )  # fmt: skip
 """Names of the test files that use a device and need neither the packages of the command line nor video."""
 PLUGIN = () if importlib.util.find_spec("hdf5plugin") else ("test_file_keeps",)

@@ -1,6 +1,7 @@
 """The photometric stage: no bias as in contrast maximisation, and a refusal if it cannot determine the answer."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +20,7 @@ from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap
 from amiwarp.brightness.tiles import Tiles
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.photometric.events_ahead import EventsAhead
+from amiwarp.calib.photometric.gauss_newton import Slopes, iterate
 from amiwarp.calib.photometric.pair_collection import van_der_corput
 from amiwarp.calib.photometric.scene_tiles import TILE, choose_tiles, near_tiles, one_tile
 from amiwarp.calib.photometric.stage import PhotometricSettings
@@ -29,7 +31,6 @@ from amiwarp.events.recording import Recording
 from amiwarp.imaging.device_image import Image
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.imaging.warped_image import CanvasShape
-from amiwarp.kernels.page_locked import page_locked
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import FlatSide, Prism
@@ -263,20 +264,6 @@ def test_events_copied_ahead_are_those_of_their_spans(recording: Recording) -> N
         assert ahead.take(spans[3:5]) is None
 
 
-def test_page_locked_memory_is_used_again() -> None:
-    if not wp.is_cuda_available():
-        pytest.skip("no CUDA device")
-
-    class Owner:
-        pass
-
-    one, other = Owner(), Owner()
-    first, second = (page_locked(owner, (3, 5), wp.float64, "cuda:0").ptr for owner in (one, other))
-    assert first != second
-    del one
-    assert page_locked(other, (3, 5), wp.float64, "cuda:0").ptr == first
-
-
 def test_damping_follows_the_contrast_of_the_seen_nodes(recording: Recording, device: str) -> None:
     width, height = recording.events.size
     table = EventTable([recording.events.slice(0, 3000)], np.zeros((height, width), np.int32), device)
@@ -374,3 +361,36 @@ def test_sums_of_products_by_square(recording: Recording, device: str) -> None:
     for k, square in enumerate(squares):
         of = exact[:, known & (number == square)]
         np.testing.assert_allclose(found[k], (of * weight[known & (number == square)]) @ of.T, rtol=1e-12, atol=1e-12)
+
+
+def test_gauss_newton_halves_steps_that_are_too_long() -> None:
+    """Slopes are started at each trial point before its score is known, and awaited only at points that are kept."""
+    started: list[float] = []
+    awaited: list[float] = []
+
+    def start_score(v: np.ndarray) -> Callable[[], float]:
+        x = float(v[0])
+        return lambda: -math.log(1.0 + x * x)
+
+    def start_slopes(v: np.ndarray) -> Callable[[], Slopes]:
+        x = float(v[0])
+        started.append(x)
+
+        def result() -> Slopes:
+            awaited.append(x)
+            weight = 1.0 / (1.0 + x * x)
+            curvature = 0.3 * weight  # too small, so that steps are too long
+            return Slopes(np.array([[curvature]]), np.array([x * weight]), np.empty((1, 0)))
+
+        return result
+
+    far = np.full(1, 5.0)
+    stage = iterate(
+        start_score, start_slopes, np.array([0.3]), low=-far, high=far, tolerance=1e-3, report=lambda *_: None
+    )
+    assert abs(stage.x[0]) < 1e-3
+    assert len(stage.scores) == stage.evaluations
+    kept = np.maximum.accumulate(stage.scores) == stage.scores
+    assert not kept.all()
+    assert set(awaited) <= set(stage.points[kept, 0])
+    assert set(awaited) < set(started)
