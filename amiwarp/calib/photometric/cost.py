@@ -103,10 +103,10 @@ class Cost:
         mean, without_map = self.brightness.residuals.start_mean_cost(self.scale, missing=1.0), 1.0 / self.scale**2
         return lambda: mean() / math.log1p(without_map)
 
-    def __call__(self, v: NDArray[np.float64], *, steps: int | None = None) -> float:
+    def __call__(self, v: NDArray[np.float64]) -> float:
         """Return the negative cost at the search vector ``v``, a score to be maximised."""
         self.evaluations += 1
-        self.residuals(v, steps=steps)
+        self.residuals(v)
         return -self.mean()
 
     def start_settled(self, v: NDArray[np.float64]) -> Callable[[], float]:
