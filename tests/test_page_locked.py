@@ -33,9 +33,16 @@ def test_a_started_read_gives_the_values_at_its_start(device: str) -> None:
     for k, read in enumerate(reads[1:]):
         np.testing.assert_array_equal(read(), np.full(values.shape, float(k)), strict=True)
     first = reads[0]()
-    del reads, read  # the memory may be used again now
+    del reads, read  # now the memory is used again
     start_read(wp.zeros((3, 1000), dtype=wp.float64, device=device))()
     np.testing.assert_array_equal(first, values, strict=True)
+
+
+def test_a_read_that_nobody_waits_for_does_not_disturb_others(device: str) -> None:
+    for k in range(20):
+        start_read(wp.full(5000, k, dtype=int, device=device))
+        found = start_read(wp.full(4500, -k, dtype=int, device=device))()
+        np.testing.assert_array_equal(found, np.full(4500, -k, np.int32), strict=True)
 
 
 @pytest.mark.parametrize("dtype", [wp.int32, wp.int64, wp.float32])

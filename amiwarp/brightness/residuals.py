@@ -88,7 +88,8 @@ class Residuals:
             inputs = [self.pairs.arrays, self.tiles, copies, slope, self.weight, self.values, 0, sums]
             # one CPU thread only: several would add to the same sums
             wp.launch(add_clusters, self.count, inputs=inputs, device=self.device)
-            rows.append(start_read(sums))
+            # the sums of one tile are too large for page-locked memory
+            rows.append(start_read(sums) if self.tiles > 1 else sums.numpy)
 
         def result() -> NDArray[np.float64]:
             both = [row().reshape(2, size, -1).sum(axis=2) for row in rows]

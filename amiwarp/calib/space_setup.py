@@ -206,7 +206,7 @@ def _pixels_per_unit(
         built = build_model(kind, camera, prism, {**nominal, name: nominal[name] + step})
         return [built.params("cpu"), model_camera(built, "cpu")]
 
-    compensate = RecordedLaunch(compensate_points, [*arguments(names[0], 0.0), *at], [out], device="cpu")
+    compensate = RecordedLaunch(compensate_points, [*arguments(size_name(model), 0.0), *at], [out], device="cpu")
 
     def displaced(name: str, step: float) -> NDArray[np.float64]:
         given = arguments(name, step)  # the launch needs their arrays

@@ -29,7 +29,7 @@ def page_locked(owner: object, shape: tuple[int, ...], dtype: Any, device: Any) 
 
 
 def start_read(array: wp.array) -> Callable[[], NDArray[Any]]:
-    """Start to copy a small contiguous array to the host. Return a function that waits and returns a copy.
+    """Start to copy a small contiguous array of numbers to the host. Return a function that waits and returns a copy.
 
     It does not wait for what is launched later.
     """

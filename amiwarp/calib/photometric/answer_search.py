@@ -95,7 +95,8 @@ class AnswerSearch:
             return cost(at)
 
         if settings.algorithm == GAUSS_NEWTON:
-            # a GPU computes slopes while the host waits for the score; a CPU would do so in vain if the score is low
+            # A GPU computes slopes while the host waits for the score. A CPU would do so in vain if the score is low.
+            # After a low score, the map on a GPU converges from the derivatives there, to the same solution.
             slopes = (lambda at: lambda: cost.slopes(at)) if cost.brightness.device.is_cpu else cost.start_slopes
             return iterate(
                 cost.start_settled, slopes, start, low=low, high=high, tolerance=settings.tolerance_px,

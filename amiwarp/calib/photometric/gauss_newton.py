@@ -128,7 +128,7 @@ def iterate(
             trial = np.clip(v + step, low, high)
             moved = float(np.abs(trial - v).max())
             waiting = start_score(trial)
-            following = start_slopes(trial) if moved >= tolerance else None
+            following = start_slopes(trial) if moved >= tolerance and k + 1 < MOST_STEPS else None
             value = waiting()
             points.append(trial)
             scores.append(value)
@@ -137,8 +137,8 @@ def iterate(
             step = step / 2.0
         if value >= here:
             v, here = trial, value
-        if following is None or value < here:
+        if moved < tolerance or value < here:
             ended = "tolerance" if moved < tolerance else "no better step"
             break
-        slopes = following
+        slopes = following or slopes
     return best_of(GAUSS_NEWTON, points, scores, seconds=time.perf_counter() - began, ended=ended)

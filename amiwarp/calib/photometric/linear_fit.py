@@ -122,7 +122,10 @@ class LinearFit:
 
 
 def _pseudo_inverse(matrix: Vector) -> Vector:
-    """Return the pseudo-inverse of a symmetric, positive semidefinite matrix, as ``numpy.linalg.pinv`` but faster."""
+    """Return the pseudo-inverse of a symmetric, positive semidefinite matrix, faster than ``numpy.linalg.pinv``.
+
+    Eigenvalues below a millionth of the largest count as 0.
+    """
     values, vectors = np.linalg.eigh(matrix)
     large = values > 1e-6 * values[-1]
     return np.asarray(vectors[:, large] / values[large] @ vectors[:, large].T)

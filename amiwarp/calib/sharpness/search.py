@@ -272,7 +272,10 @@ class Search:
 
     @property
     def _edge_inset(self) -> int:
-        """Width of the border of the fine image in which the view ends, and not an edge of the scene [px]."""
+        """Border of the fine image that the check of edge directions leaves out [px].
+
+        It is the part outside the sensor and as much inside, where the view ends, but at most a quarter of the sensor.
+        """
         camera = self.space.camera
         return self.pad + min(self.pad, min(camera.width, camera.height) // 4)
 
