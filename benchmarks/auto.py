@@ -84,7 +84,7 @@ def true_errors(recording: Recording, c: Calibration) -> dict[str, float]:
     found = {"ellipse": places.distance(EllipseModel.from_model(truth), truth), "exact": 0.0}
     for name in ("circle", "radial"):
         space = candidate_space(name, exact, (), rad_per_us=1e-4, duration_us=1e6)
-        found[name] = fit(space, places.compensated(truth), places)[1]
+        ((_, found[name]),) = fit([space], places.compensated(truth), places)
     return {name: found[name] for name in MODELS}
 
 

@@ -17,7 +17,6 @@ from amiwarp.calib.selection.smaller_models import Places, candidate_space, enco
 from amiwarp.calib.selection.trial import CONVERSION_FACTOR, TILT, make_trial
 from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
 from amiwarp.calib.sharpness.held_out import split_turns
-from amiwarp.calib.thinning import thin
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
@@ -97,7 +96,8 @@ def test_a_wide_lens_does_not(found: Calibration, wide: Recording) -> None:
     exact = replace(found.exact, parameters={"apex": truth.prism.apex, "phase": truth.phase})
     for name in ("circle", "radial"):
         space = candidate_space(name, exact, (), rad_per_us=7.5e-5, duration_us=3e5)
-        assert rungs[name].predicted_px == pytest.approx(fit(space, places.compensated(truth), places)[1], rel=0.05)
+        ((_, error),) = fit([space], places.compensated(truth), places)
+        assert rungs[name].predicted_px == pytest.approx(error, rel=0.05)
     assert rungs["circle"].predicted_px > 10 * found.ladder.budget_px
     assert rungs["exact"].predicted_px == 0.0
 
@@ -108,9 +108,7 @@ def test_the_answer_is_the_best_fit_to_the_exact_one(as_circle: Calibration, wid
     assert found.ladder is not None
     assert found.photometric is not None
     assert found.photometric.accepted
-    events = thin(wide, 120_000)
-    assert wide.encoder is not None
-    places = Places.of(events, wide.encoder)
+    places = places_of(wide)
     away = places.distance(found.model, found.exact.model)
     assert away == pytest.approx(found.ladder.rungs[0].predicted_px, abs=1e-4)
     local = [s.sharpness for s in found.stages if s.name == "local"]  # the photometric answer is a little less sharp
@@ -121,7 +119,8 @@ def test_the_answer_is_the_best_fit_to_the_exact_one(as_circle: Calibration, wid
     apex = found.exact.parameters["apex"]
     larger = replace(found.exact, parameters={**found.exact.parameters, "apex": 1.01 * apex})
     space = candidate_space("circle", larger, (), rad_per_us=7.5e-5, duration_us=3e5)
-    deflection = fit(space, places.compensated(larger.model), places)[0]["deflection"]
+    ((values, _),) = fit([space], places.compensated(larger.model), places)
+    deflection = values["deflection"]
     assert ratio == pytest.approx((deflection - found.parameters["deflection"]) / (0.01 * apex), rel=0.02)
     # an independent method finds no closer circle
     target = places.compensated(found.exact.model)
@@ -154,7 +153,7 @@ def test_held_out_turns_are_not_measured_if_they_cannot_change_the_choice(found:
 
 def test_a_judge_s_objection_is_heard(found: Calibration, wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     """Even if the predicted error of the circle is zero, the check on held-out turns rejects it."""
-    monkeypatch.setattr(auto, "fit", lambda *given: (fit(*given)[0], 0.0))
+    monkeypatch.setattr(auto, "fit", lambda *given: [(values, 0.0) for values, _ in fit(*given)])
     trial = make_trial(wide, found.exact, SHARPNESS, (), device="cpu", budget_px=None)
     circle, exact = (f.candidate for f in auto.fit_models(trial)[:2])
     assert not circle.chosen

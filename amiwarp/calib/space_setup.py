@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import warp as wp
 
 from amiwarp.calib.parameters import (
     CHANGES,
@@ -21,9 +20,7 @@ from amiwarp.calib.parameters import (
     size_name,
 )
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels.launch import RecordedLaunch
-from amiwarp.kernels.refraction import compensate_points
-from amiwarp.optics.displacement import model_camera, points_on_host
+from amiwarp.optics.displacement import compensate_by_each, rms, wrap_angle
 from amiwarp.optics.prism import deflection_from_apex
 
 if TYPE_CHECKING:
@@ -54,6 +51,7 @@ def make_space(
     rad_per_us: float,
     duration_us: float,
     middle_us: int = 0,
+    pixels: Mapping[str, float] | None = None,
 ) -> ParameterSpace:
     """Return the parameter space: check names and bounds, and measure how far each parameter moves events.
 
@@ -77,6 +75,8 @@ def make_space(
         Duration of the events [us].
     middle_us : int
         Time to whose camera orientation events are rotated back [us].
+    pixels : mapping of str to float, optional
+        Displacement of events per unit of each free parameter [px rms]. None: it is measured.
 
     Returns
     -------
@@ -103,12 +103,13 @@ def make_space(
         if not low[name] < high[name]:
             raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower bound first")
         values[name] = min(max(values[name], low[name]), high[name])
-    shifts = _pixels_per_unit(
-        model, camera, prism, names=names, values=values, rad_per_us=rad_per_us, duration_us=duration_us
-    )
+    if pixels is None:
+        pixels = _pixels_per_unit(
+            model, camera, prism, names=names, values=values, rad_per_us=rad_per_us, duration_us=duration_us
+        )
     undrifted = {n: x for n, x in values.items() if n in DRIFTS}
     return ParameterSpace(
-        model=model, camera=camera, prism=prism, names=names, low=low, high=high, start=values, pixels=shifts,
+        model=model, camera=camera, prism=prism, names=names, low=low, high=high, start=values, pixels=pixels,
         middle_us=middle_us, duration_us=duration_us, undrifted=undrifted,
     )  # fmt: skip
 
@@ -198,36 +199,22 @@ def _pixels_per_unit(
     size.
     """
     nominal = {**values, "apex": prism.apex, "deflection": prism.deflection}
-    at = _grid_points(camera.width, camera.height)
     kind = "exact" if model == "ellipse" else model  # the ellipse's tables are computed from the exact model
-    out = wp.empty_like(at[0])
-
-    def arguments(name: str, step: float) -> list[Any]:
-        built = build_model(kind, camera, prism, {**nominal, name: nominal[name] + step})
-        return [built.params("cpu"), model_camera(built, "cpu")]
-
-    compensate = RecordedLaunch(compensate_points, [*arguments(size_name(model), 0.0), *at], [out], device="cpu")
-
-    def displaced(name: str, step: float) -> NDArray[np.float64]:
-        given = arguments(name, step)  # the launch needs their arrays
-        for k, value in enumerate(given):
-            compensate.set(k, value)
-        compensate(0, len(out))
-        return out.numpy().astype(np.float64)
-
-    def rms(name: str, step: float) -> float:
-        moved = (displaced(name, step) - displaced(name, -step)) / (2.0 * step)
-        moved = moved[np.isfinite(moved).all(axis=1)]
-        return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
-
     size = size_name(model)
     lens = {"center_x": 1.0, "center_y": 1.0, "k1": 0.01}
     steps = {size: 0.25 * nominal[size], "phase": 0.05, **dict.fromkeys(_EXACT_ONLY, 0.02), **lens}
-    shifts = {name: rms(name, step) for name, step in steps.items() if name in names}
+    steps = {n: h for n, h in steps.items() if n in names or (n == "phase" and set(DRIFTS) & set(names))}
+    if "focal_length" in names:
+        steps["focal_length"] = 0.01 * camera.fx
+    built = [
+        build_model(kind, camera, prism, {**nominal, n: nominal[n] + h}) for n, x in steps.items() for h in (x, -x)
+    ]
+    moved = compensate_by_each(built, *_grid_points(camera.width, camera.height))
+    moved = (moved[0::2] - moved[1::2]) / (2.0 * np.array([*steps.values()])[:, None, None])
+    shifts = dict(zip(steps, map(rms, moved), strict=True))
     if set(DRIFTS) & set(names):
-        phase = shifts["phase"] if "phase" in names else rms("phase", 0.05)
-        shifts["clock_offset"] = phase * abs(rad_per_us)
-        shifts["rpm"] = phase * 2.0 * math.pi / 60e6 * duration_us / math.sqrt(12.0)
+        shifts["clock_offset"] = shifts["phase"] * abs(rad_per_us)
+        shifts["rpm"] = shifts["phase"] * 2.0 * math.pi / 60e6 * duration_us / math.sqrt(12.0)
     seconds = duration_us * 1e-6
     radius = math.sqrt((camera.width**2 + camera.height**2) / 12.0)
     for name, lever in zip(MOTION, (camera.fy, camera.fx, radius) * 2, strict=True):
@@ -237,7 +224,7 @@ def _pixels_per_unit(
         )
     # at least the effect that a camera rotation of 0.5 rad/s would make visible
     if "focal_length" in names:
-        shifts["focal_length"] = max(rms("focal_length", 0.01 * camera.fx), 0.5 * seconds / math.sqrt(12.0))
+        shifts["focal_length"] = max(shifts["focal_length"], 0.5 * seconds / math.sqrt(12.0))
     if not all(math.isfinite(shifts[n]) and shifts[n] > 0.0 for n in names):
         raise AmiwarpError(
             "a free parameter moves no event; give a nominal apex above 0 and an encoder whose angle changes"
@@ -246,9 +233,9 @@ def _pixels_per_unit(
 
 
 @lru_cache(maxsize=16)
-def _grid_points(width: int, height: int) -> tuple[wp.array, wp.array]:
-    """Return a grid of pixels [px] and prism angles [rad] as Warp arrays on the CPU."""
+def _grid_points(width: int, height: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return a grid of pixels [px], shape (n, 2), and of wrapped prism angles [rad], shape (n,)."""
     x, y, theta = np.meshgrid(
         np.linspace(0, width - 1, 8), np.linspace(0, height - 1, 6), np.arange(8) * (np.pi / 4), indexing="ij"
     )
-    return points_on_host(np.stack([x.ravel(), y.ravel()], axis=1), theta.ravel())
+    return np.stack([x.ravel(), y.ravel()], axis=1), wrap_angle(theta.ravel())

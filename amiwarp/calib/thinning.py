@@ -19,20 +19,30 @@ RUN = 8
 
 
 def thin(recording: Recording, most: int) -> Events:
-    """Return about ``most`` events, evenly thinned: every k-th run of :data:`RUN` events. Files are read in blocks.
+    """Return about ``most`` events of a recording, evenly thinned. Files are read in blocks.
 
     All events of a recording in memory are not copied.
     """
     source = recording.events
-    step = max(1, -(-len(source) // most))
     if isinstance(source, MemoryEvents):
-        events = source.slice(0, len(source))
-        return events if step == 1 else _every_run(events, step)
+        return thin_events(source.slice(0, len(source)), most)
+    step = _step(len(source), most)
     if step == 1:
         return Events.concatenate(list(source.blocks()))
     # a block holds a whole number of steps, so that only the last run of the recording can be cut
     blocks = source.blocks(count=step * RUN * max(1, (1 << 20) // (step * RUN)))
     return Events.concatenate([_every_run(block, step) for block in blocks])
+
+
+def thin_events(events: Events, most: int) -> Events:
+    """Return about ``most`` of the events, evenly thinned: every k-th run of :data:`RUN` events; all are not copied."""
+    step = _step(len(events), most)
+    return events if step == 1 else _every_run(events, step)
+
+
+def _step(count: int, most: int) -> int:
+    """Return k such that every k-th run of ``count`` events holds about ``most`` of them."""
+    return max(1, -(-count // most))
 
 
 def _every_run(block: Events, step: int) -> Events:

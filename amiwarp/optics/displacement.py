@@ -10,7 +10,7 @@ import warp as wp
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import refraction as kernels
-from amiwarp.kernels.launch import launch
+from amiwarp.kernels.launch import RecordedLaunch, launch
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.device_camera import camera_params
 from amiwarp.validation import array
@@ -104,6 +104,40 @@ def _run(kernel_name: str, model: HasParams, xy: Any, theta: Any) -> Any:
         raise AmiwarpError(f"xy has shape {xy.shape} and theta {theta.shape}; give (n, 2) and (n,)")
     result = _run(kernel_name, model, *points_on_host(xy, theta))
     return result.numpy().astype(xy.dtype if np.issubdtype(xy.dtype, np.floating) else np.float32, copy=False)
+
+
+def compensate_by_each(models: Sequence[HasParams], xy: NDArray[Any], theta: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the same pixels compensated by each of several models, on the CPU [px], shape (models, n, 2).
+
+    ``xy`` holds the pixels, shape (n, 2). ``theta`` holds the prism angles, wrapped to a turn [rad], shape (n,), or
+    (models, n) if each model has its own. One call takes a fraction of the time of a call for each model.
+    """
+    n = len(xy)
+    pixels = wp.array(np.tile(xy.astype(np.float32), (len(models), 1)), dtype=wp.vec2, device="cpu", copy=False)
+    angles = np.empty((len(models), n), np.float32)
+    angles[:] = theta
+    points = [pixels, wp.array(angles.ravel(), dtype=float, device="cpu", copy=False)]
+    out = wp.empty_like(pixels)
+    launches: dict[type, RecordedLaunch] = {}
+    given = []  # the launches need their arrays
+    for k, model in enumerate(models):
+        if k == 0 or model is not models[k - 1]:
+            given.append([model.params("cpu"), model_camera(model, "cpu")])
+        compensate = launches.get(type(model))
+        if compensate is None:
+            compensate = RecordedLaunch(kernels.compensate_points, [*given[-1], *points], [out], device="cpu")
+            launches[type(model)] = compensate
+        else:
+            for index, value in enumerate(given[-1]):
+                compensate.set(index, value)
+        compensate(k * n, n)
+    return out.numpy().reshape(len(models), n, 2).astype(np.float64)
+
+
+def rms(moved: NDArray[np.float64]) -> float:
+    """Return the root mean square length of displacements [px], shape (n, 2), without those that are not finite."""
+    squares = np.sum(moved**2, axis=1)
+    return float(np.sqrt(np.mean(squares[np.isfinite(squares)])))
 
 
 def points_on_host(xy: NDArray[Any], theta: NDArray[Any]) -> tuple[Any, Any]:

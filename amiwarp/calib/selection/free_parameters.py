@@ -11,6 +11,7 @@ import numpy as np
 from amiwarp.calib.parameters import MOTION
 from amiwarp.calib.photometric.gauss_newton import LEAST_CURVATURE, UNDETERMINED_PX
 from amiwarp.calib.result import Calibration
+from amiwarp.calib.selection.smaller_models import motion_per_angle
 from amiwarp.calib.selection.trial import LARGEST_MOTION_PX, SIGNIFICANT_STD, TILT, Trial, in_pixels, largest_tilt
 from amiwarp.calib.summaries import FreedParameter
 
@@ -47,7 +48,7 @@ def judge_parameters(trial: Trial, names: tuple[str, ...]) -> tuple[FreedParamet
     found = [_judge(trial, group) for group, members in GROUPS.items() if set(members) <= set(names)]
     if "rpm" in trial.exact.uncertainty:
         angle = trial.exact.uncertainty["rpm"] * (math.tau / 60e6) * trial.duration_us / math.sqrt(12.0)
-        std = angle * trial.sample.motion_per_angle(trial.exact.model)
+        std = angle * motion_per_angle(trial.path)
         determined = std <= UNDETERMINED_PX
         verdict = (
             "free: there is no encoder" if determined else f"free: there is no encoder; not determined: {REMEDY['rpm']}"
@@ -126,7 +127,7 @@ def hold_all(parameters: tuple[FreedParameter, ...], why: str) -> tuple[FreedPar
 
 
 def _confirmed(trial: Trial, p: FreedParameter, again: Calibration) -> FreedParameter:
-    start = {**trial.space.start, "clock_offset": trial.calibration_events.encoder.clock_offset_us}
+    start = {**trial.space.start, "clock_offset": trial.encoder.clock_offset_us}
     moved, significant = 0.0, False
     for name in GROUPS[p.name]:
         k = trial.space.names.index(name)

@@ -158,18 +158,21 @@ def fit_models(trial: Trial) -> tuple[FittedCandidate, ...]:
     Models are measured on held-out turns only if that may change the choice, or if no photometric stage has confirmed
     the exact model, and measuring shows whether the recording contradicts it.
     """
-    target = trial.sample.compensated(trial.exact.model)
+    circles = ("circle", "radial")
+    fits = dict(
+        zip(circles, fit([trial.space_of(n, trial.exact) for n in circles], trial.path[0], trial.sample), strict=True)
+    )
     confirmed = accepted_photometric(trial.exact) is not None
     fitted: list[FittedCandidate] = []
     for name in MODELS:
         values, predicted, held_out = dict(trial.exact.parameters), 0.0, None
         found = any(f.candidate.chosen for f in fitted)
-        if name in ("circle", "radial"):
-            values, predicted = fit(trial.space_of(name, trial.exact), target, trial.sample)
+        if name in fits:
+            values, predicted = fits[name]
             if not found and (predicted <= trial.budget_px or not confirmed):
                 held_out = _refined(trial, name)
         elif name == "ellipse":
-            predicted = ellipse_error(trial.exact.model, trial.sample)
+            predicted = ellipse_error(trial.path)
         elif any(f.candidate.sharpness is not None for f in fitted):
             held_out = trial.reference
         fitted.append(FittedCandidate(_candidate(trial, name, predicted, held_out, found=found), values))
@@ -180,7 +183,7 @@ def _refined(trial: Trial, name: str) -> Vector:
     """Return the held-out sharpness of a smaller model, with the parameters that are sharpest on the training turns."""
     answer = sharpness_answer(trial.exact)
     space = trial.space_of(name, answer)
-    values, _ = fit(space, trial.sample.compensated(answer.model), trial.sample)
+    ((values, _),) = fit([space], trial.sample.compensated(answer.model), trial.sample)
     v = space.to_vector(values)
     step = trial.quadratic.restricted_to([0, 1]).step_to_maximum(gradient(trial.train, space, v))
     return trial.test.each(space, space.to_values(v + step))

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 
 from amiwarp.calib.parameters import EXACT_PARAMETERS, ParameterSpace, size_name
 from amiwarp.calib.space_setup import make_space
-from amiwarp.optics.displacement import wrap_angle
+from amiwarp.optics.displacement import compensate_by_each, rms, wrap_angle
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from numpy.typing import NDArray
 
     from amiwarp.calib.result import Calibration
@@ -26,15 +26,14 @@ if TYPE_CHECKING:
     from amiwarp.events.events import Events
     from amiwarp.optics.models import Model
 
-SAMPLED = 5_000
-"""Number of events at which models are compared: enough for an rms error accurate to 1 %."""
+SAMPLED = 1_000
+"""Number of events at which models are compared: enough for an rms error accurate to 2 %."""
 SLOPE_PX = 0.25
 """Step of the finite differences in the search vector [px]."""
-STEPS = 2
-"""Number of Gauss-Newton steps that fit a model, with the derivatives at the start. The displacement is nearly linear:
-one step is accurate to 0.00001 px."""
 TURN_ANGLES = 8
 """Number of prism angles that give the mean and the first harmonic of a motion. Higher harmonics fall off quickly."""
+TURN = math.tau * np.arange(TURN_ANGLES) / TURN_ANGLES
+"""These prism angles, from the event's own [rad]."""
 QUANTISATION_PX = 1.0 / math.sqrt(12.0)
 """Standard deviation of the error from rounding coordinates to whole pixels [px]."""
 CLOCK_US = 1.0 / math.sqrt(12.0)
@@ -56,7 +55,7 @@ class Places:
     xy: NDArray[np.float64]
     """Pixel coordinates of the events [px], shape ``(n, 2)``."""
     theta: NDArray[np.float64]
-    """Prism angle of each event according to the encoder [rad], shape ``(n,)``."""
+    """Prism angle of each event according to the encoder, wrapped to a turn [rad], shape ``(n,)``."""
     speed: NDArray[np.float64]
     """Speed of the prism at each event [rad/us], shape ``(n,)``."""
 
@@ -65,20 +64,19 @@ class Places:
         """Return about :data:`SAMPLED` evenly thinned events with their prism angles and speeds."""
         some = events[:: max(1, len(events) // SAMPLED)]
         xy = np.stack([some.x, some.y], axis=1).astype(np.float64)
-        return cls(xy, encoder.angle_at(some.t), encoder.speed_at(some.t) * 1e-6)
+        return cls(xy, wrap_angle(encoder.angle_at(some.t)), encoder.speed_at(some.t) * 1e-6)
 
-    def compensated(self, model: Model, ahead: float | NDArray[np.float64] = 0.0) -> NDArray[np.float64]:
-        """Return the events' compensated coordinates [px], shape (n, 2), with ``ahead`` [rad] added to the angles."""
-        theta = _on_cpu(self.theta + ahead) if np.any(ahead) else self._given_theta
-        return np.asarray(model.compensate_points(self._given_xy, theta).numpy(), np.float64)
+    def compensated(self, model: Model) -> NDArray[np.float64]:
+        """Return the events' compensated coordinates [px], shape (n, 2)."""
+        return self.by_each([model])[0]
 
-    @cached_property
-    def _given_xy(self) -> Any:
-        return wp.array(self.xy, dtype=wp.vec2, device="cpu")
+    def by_each(self, models: Sequence[Model], ahead: Iterable[Any] | None = None) -> NDArray[np.float64]:
+        """Return the events' coordinates compensated by each model [px], shape (models, n, 2).
 
-    @cached_property
-    def _given_theta(self) -> Any:
-        return _on_cpu(self.theta)
+        ``ahead`` are angles to add to those of the events [rad], one or n for each model.
+        """
+        theta = self.theta if ahead is None else np.array([self.theta + a for a in ahead])
+        return compensate_by_each(models, self.xy, theta)
 
     def distance(self, model: Model, other: Model, *, remove_lag: bool = False) -> float:
         """Return the rms distance of two models at the events [px].
@@ -87,31 +85,28 @@ class Places:
         """
         away = self.compensated(model) - self.compensated(other)
         if remove_lag:
-            h = 0.01
-            per_angle = (self.compensated(model, h) - self.compensated(model, -h)) / (2.0 * h)
+            later, earlier = self.by_each([model, model], [0.01, -0.01])
+            per_angle = later - earlier
             away = away - per_angle * (np.nansum(away * per_angle) / np.nansum(per_angle**2))
-        return _rms(away)
-
-    def motion_per_angle(self, model: Model) -> float:
-        """Return how far compensated events move per change of the prism angle [px rms per rad]."""
-        h = 0.01
-        return _rms(self.compensated(model, h) - self.compensated(model, -h)) / (2.0 * h)
+        return rms(away)
 
 
-def _on_cpu(theta: NDArray[np.float64]) -> Any:
-    """Return angles [rad] as a Warp array, for CPU launches: a few thousand events are faster there than on a GPU."""
-    return wp.array(wrap_angle(theta), dtype=float, device="cpu")
+def motion_per_angle(path: NDArray[np.float64]) -> float:
+    """Return how far compensated events move per change of the prism angle [px rms per rad].
+
+    ``path`` holds their coordinates at :data:`TURN` [px], shape (TURN_ANGLES, n, 2). The result is exact for the first
+    harmonic of the motion, next to which the others are small.
+    """
+    return rms(path[1] - path[-1]) / (2.0 * math.sin(TURN[1]))
 
 
-def _rms(shift: NDArray[np.float64]) -> float:
-    squares = np.sum(shift**2, axis=1)
-    return float(np.sqrt(np.mean(squares[np.isfinite(squares)])))
+def timing_blur(path: NDArray[np.float64], encoder: Encoder, speed: float) -> float:
+    """Return the blur [px rms] by encoder noise, clock resolution and latency jitter at a prism speed [rad/us].
 
-
-def timing_blur(model: Model, sample: Places, encoder: Encoder, speed: float) -> float:
-    """Return the blur [px rms] by encoder noise, clock resolution and latency jitter at a prism speed [rad/us]."""
+    ``path`` holds the compensated coordinates of n events at :data:`TURN` [px], shape (TURN_ANGLES, n, 2).
+    """
     noise = encoder_noise(encoder)
-    return sample.motion_per_angle(model) * math.hypot(noise, speed * math.hypot(CLOCK_US, LATENCY_JITTER_US))
+    return motion_per_angle(path) * math.hypot(noise, speed * math.hypot(CLOCK_US, LATENCY_JITTER_US))
 
 
 def encoder_noise(encoder: Encoder) -> float:
@@ -130,11 +125,18 @@ def encoder_noise(encoder: Encoder) -> float:
 
 
 def candidate_space(
-    model: str, exact: Calibration, free: tuple[str, ...], *, rad_per_us: float, duration_us: float
+    model: str,
+    exact: Calibration,
+    free: tuple[str, ...],
+    *,
+    rad_per_us: float,
+    duration_us: float,
+    like: ParameterSpace | None = None,
 ) -> ParameterSpace:
     """Return the parameter space of ``model`` about the exact calibration: size, phase and ``free`` are free.
 
-    ``rad_per_us`` is the mean speed of the prism [rad/us], ``duration_us`` the duration of the events [us].
+    ``rad_per_us`` is the mean speed of the prism [rad/us], ``duration_us`` the duration of the events [us]. ``like`` is
+    a space of the exact model whose scales in pixels hold for this space too; None: they are measured.
     """
     found = exact.parameters
     prism = replace(exact.prism, apex=found["apex"], index=found.get("index", exact.prism.index))
@@ -142,40 +144,45 @@ def candidate_space(
     start = {n: x for n, x in found.items() if size == "apex" or n not in EXACT_PARAMETERS}
     start[size] = found["apex"] if size == "apex" else prism.deflection
     start["phase"] = math.remainder(found["phase"], math.tau)
+    pixels = None
+    if like is not None:
+        pixels = {**like.pixels, size: like.pixels["apex"] * prism.apex / start[size]}
     return make_space(
         model, exact.camera, prism, free=(size, "phase", *free), start=start, bounds={size: (0.0, 2.0 * start[size])},
-        rad_per_us=rad_per_us, duration_us=duration_us, middle_us=exact.middle_us or 0,
+        rad_per_us=rad_per_us, duration_us=duration_us, middle_us=exact.middle_us or 0, pixels=pixels,
     )  # fmt: skip
 
 
-def fit(space: ParameterSpace, target: NDArray[np.float64], sample: Places) -> tuple[dict[str, float], float]:
-    """Fit a model's parameters to the compensated coordinates ``target`` [px], shape (n, 2).
+def fit(
+    spaces: Sequence[ParameterSpace], target: NDArray[np.float64], sample: Places
+) -> list[tuple[dict[str, float], float]]:
+    """Fit the parameters of each model to the compensated coordinates ``target`` [px], shape (n, 2).
 
-    Return the parameters and the remaining distance [px rms]. The phase is fitted too, which removes a constant lag.
+    Return the parameters and the remaining distance [px rms] of each model. The phase is fitted too, which removes a
+    constant lag. The displacement is nearly linear: one Gauss-Newton step is accurate to 0.00001 px.
     """
+    found = [space.to_vector(space.start) for space in spaces]
 
-    def away(v: NDArray[np.float64]) -> NDArray[np.float64]:
-        return sample.compensated(space.build(space.to_values(v))) - target
+    def away(of: Sequence[Sequence[NDArray[np.float64]]]) -> NDArray[np.float64]:
+        """Return the distances from the target, for the same number of search vectors of each space."""
+        models = [space.build(space.to_values(v)) for space, each in zip(spaces, of, strict=True) for v in each]
+        return (sample.by_each(models) - target).reshape(len(spaces), -1, *target.shape)
 
-    v = space.to_vector(space.start)
-    left = away(v)
-    slopes = [(away(v + h) - left) / SLOPE_PX for h in SLOPE_PX * np.eye(len(v))]
-    valid = np.isfinite(sum(slopes, left)).all(axis=1)
-    design = np.stack([slope[valid].ravel() for slope in slopes])
-    for _ in range(STEPS):
-        v = v - np.linalg.solve(design @ design.T, design @ np.nan_to_num(left[valid]).ravel())
-        left = away(v)
-    return space.to_values(v), _rms(left)
+    for k, (left, *moved) in enumerate(np.nan_to_num(away([[v, *(v + SLOPE_PX * np.eye(len(v)))] for v in found]))):
+        slopes = ((np.array(moved) - left) / SLOPE_PX).reshape(len(moved), -1)
+        found[k] = found[k] - np.linalg.solve(slopes @ slopes.T, slopes @ left.ravel())
+    left = away([[v] for v in found])
+    return [(space.to_values(v), rms(one)) for space, v, one in zip(spaces, found, left[:, 0], strict=True)]
 
 
-def ellipse_error(model: Model, sample: Places) -> float:
-    """Return the error of the ellipse model at the events [px rms]: the second and higher harmonics of the motion."""
-    turn = math.tau * np.arange(TURN_ANGLES) / TURN_ANGLES
-    xy, angles = np.repeat(sample.xy, len(turn), axis=0), (sample.theta[:, None] + turn).ravel()
-    path = model.compensate_points(xy, angles).reshape(-1, len(turn), 2)
+def ellipse_error(path: NDArray[np.float64]) -> float:
+    """Return the error of the ellipse model [px rms]: the second and higher harmonics of the motion ``path``.
+
+    ``path`` holds the compensated coordinates of n events [px] at :data:`TURN`, shape (TURN_ANGLES, n, 2).
+    """
     # mean and first harmonic of the motion at each event's own angle, the first of the turn
-    ellipse = np.mean(path * (1.0 + 2.0 * np.cos(turn))[:, None], axis=1)
-    return _rms(path[:, 0] - ellipse)
+    ellipse = np.tensordot(1.0 + 2.0 * np.cos(TURN), path, axes=1) / len(TURN)
+    return rms(path[0] - ellipse)
 
 
 def independent_directions(space: ParameterSpace, v: NDArray[np.float64], sample: Places) -> NDArray[np.float64]:
@@ -187,12 +194,11 @@ def independent_directions(space: ParameterSpace, v: NDArray[np.float64], sample
     """
     n = len(v)
 
-    def at(shift: NDArray[np.float64]) -> NDArray[np.float64]:
-        values = space.to_values(v + shift)
-        return sample.compensated(space.build(values), sample.speed * space.drift(values))
-
-    fields = np.array([at(h) - at(-h) for h in SLOPE_PX * np.eye(n)]) / (2.0 * SLOPE_PX)
-    fields = fields[:, np.isfinite(fields).all(axis=(0, 2))].reshape(n, -1)
+    both_ways = [v + sign * h for sign in (1.0, -1.0) for h in SLOPE_PX * np.eye(n)]
+    values = [space.to_values(at) for at in both_ways]
+    moved = sample.by_each([space.build(x) for x in values], [sample.speed * space.drift(x) for x in values])
+    fields = (moved[:n] - moved[n:]) / (2.0 * SLOPE_PX)
+    fields = fields[:, np.isfinite(fields.sum(axis=0)).all(axis=1)].reshape(n, -1)
     directions = np.eye(n)
     products = fields @ fields[:2].T
     for k in range(2, n):

@@ -14,6 +14,7 @@ from amiwarp.calib.preparation import rotation_window
 from amiwarp.calib.selection.smaller_models import (
     QUANTISATION_PX,
     SHARE,
+    TURN,
     Places,
     candidate_space,
     independent_directions,
@@ -23,7 +24,8 @@ from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
 from amiwarp.calib.sharpness.curvature import STEP_PX
 from amiwarp.calib.sharpness.held_out import HalfSharpness, Quadratic, split_turns
 from amiwarp.calib.sharpness.search import Settings
-from amiwarp.calib.thinning import thin
+from amiwarp.calib.thinning import thin, thin_events
+from amiwarp.events.events import MemoryEvents
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.result import Calibration
     from amiwarp.calib.summaries import PhotometricSummary
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.events.events import Events
     from amiwarp.events.recording import Recording
 
     Vector = NDArray[np.float64]
@@ -66,10 +70,16 @@ class Trial:
 
     exact: Calibration
     """Calibration of the exact model, with which smaller models are compared."""
-    calibration_events: CalibrationEvents
-    """All events of the trial with their encoder."""
+    encoder: Encoder
+    """Encoder that gives the prism angles of the events, with the calibrated clock offset."""
+    events: Events
+    """Events of the recording: all that are in memory, or a part of those in a file."""
+    most_events: int
+    """Largest number of events on which sharpness is measured."""
     sample: Places
     """Evenly thinned events at which the displacements of models are compared."""
+    path: Vector
+    """Coordinates of the sample compensated by the exact model at :data:`TURN` [px], shape ``(TURN_ANGLES, n, 2)``."""
     rad_per_us: float
     """Mean speed of the prism [rad/us]."""
     duration_us: float
@@ -88,6 +98,13 @@ class Trial:
     """One search direction per parameter (see :func:`independent_directions`), shape ``(n, n)``."""
     tested: tuple[str, ...]
     """Parameters that move events measurably within their tested range: size, phase and possibly others."""
+
+    @cached_property
+    def calibration_events(self) -> CalibrationEvents:
+        """Evenly thinned events on which sharpness is measured, with their encoder."""
+        drifts = "clock_offset" in self.space.names
+        slope_of = (lambda t: self.encoder.speed_at(t) * 1e-6) if drifts else None
+        return CalibrationEvents(thin_events(self.events, self.most_events), self.encoder, slope_of)
 
     @cached_property
     def _halves(self) -> tuple[HalfSharpness, ...]:
@@ -122,7 +139,9 @@ class Trial:
 
     def space_of(self, model: str, exact: Calibration) -> ParameterSpace:
         """Return the parameter space of ``model`` about the calibration ``exact``, with only size and phase free."""
-        return candidate_space(model, exact, (), rad_per_us=self.rad_per_us, duration_us=self.duration_us)
+        return candidate_space(
+            model, exact, (), rad_per_us=self.rad_per_us, duration_us=self.duration_us, like=self.space
+        )
 
     def motion_range(self, name: str) -> float:
         """Return how far a parameter moves events in its tested range [px rms], beyond what size and phase can do."""
@@ -175,18 +194,23 @@ def make_trial(
     ``names`` are these parameters; the tilt is left out if it cannot exceed the budget. ``budget_px`` is the largest
     tolerated model error [px rms]; None: :data:`SHARE` of the blur by quantisation and timing.
     """
-    events = thin(rotation_window(recording, settings), settings.events)
+    window = rotation_window(recording, settings)
+    source, most = window.events, settings.events
+    if isinstance(source, MemoryEvents):
+        events = source.slice(0, len(source))
+    else:
+        events = thin(window, most)
+        most = len(events)
     first, last = int(events.t[0]), int(events.t[-1])
     encoder = exact.encoder_for(recording.encoder, first, last)
     if not encoder.covers(first, last):  # a calibrated clock offset may uncover the first or the last events
         events = events[slice(*np.searchsorted(events.t, encoder.coverage))]
         first, last = int(events.t[0]), int(events.t[-1])
-    drifts = "clock_offset" in names
-    events_with_angles = CalibrationEvents(events, encoder, (lambda t: encoder.speed_at(t) * 1e-6) if drifts else None)
     duration = float(max(last - first, 1))
     speed = float(np.ptp(encoder.angle_at(events.t[[0, -1]]))) / duration
     sample = Places.of(events, encoder)
-    timing = timing_blur(exact.model, sample, encoder, speed)
+    path = sample.by_each([exact.model] * len(TURN), TURN)
+    timing = timing_blur(path, encoder, speed)
     budget = budget_px or SHARE * math.hypot(QUANTISATION_PX, timing)
     if largest_tilt(exact) <= budget:
         names = tuple(n for n in names if n not in TILT)
@@ -195,9 +219,9 @@ def make_trial(
     start = space.to_vector(space.start)
     rows = independent_directions(space, start, sample)
     return Trial(
-        exact=exact, calibration_events=events_with_angles, sample=sample, rad_per_us=speed, duration_us=duration,
-        budget_px=budget, timing_px=timing, device=device, space=space, start=start, directions=rows,
-        tested=tuple(n for n in space.names if _motion_range(space, rows, n) >= STEP_PX),
+        exact=exact, encoder=encoder, events=events, most_events=most, sample=sample, path=path,
+        rad_per_us=speed, duration_us=duration, budget_px=budget, timing_px=timing, device=device, space=space,
+        start=start, directions=rows, tested=tuple(n for n in space.names if _motion_range(space, rows, n) >= STEP_PX),
     )  # fmt: skip
 
 
