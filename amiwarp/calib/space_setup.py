@@ -107,6 +107,8 @@ def make_space(
         pixels = _pixels_per_unit(
             model, camera, prism, names=names, values=values, rad_per_us=rad_per_us, duration_us=duration_us
         )
+    pixels = {n: pixels[n] for n in names}
+    _check_scales(pixels)
     undrifted = {n: x for n, x in values.items() if n in DRIFTS}
     return ParameterSpace(
         model=model, camera=camera, prism=prism, names=names, low=low, high=high, start=values, pixels=pixels,
@@ -128,6 +130,7 @@ def widened(space: ParameterSpace, names: tuple[str, ...]) -> ParameterSpace:
     shifts = _pixels_per_unit(
         space.model, camera, space.prism, names=names, values=values, rad_per_us=0.0, duration_us=space.duration_us
     )
+    _check_scales(shifts)
     return replace(
         space, names=(*space.names, *names), start=values, pixels={**space.pixels, **shifts},
         low={**space.low, **{n: values[n] - half[n] for n in names}},
@@ -225,11 +228,15 @@ def _pixels_per_unit(
     # at least the effect that a camera rotation of 0.5 rad/s would make visible
     if "focal_length" in names:
         shifts["focal_length"] = max(shifts["focal_length"], 0.5 * seconds / math.sqrt(12.0))
-    if not all(math.isfinite(shifts[n]) and shifts[n] > 0.0 for n in names):
+    return {n: shifts[n] for n in names}
+
+
+def _check_scales(pixels: Mapping[str, float]) -> None:
+    """Raise :class:`AmiwarpError` if a parameter moves no event, or by an infinite distance."""
+    if not all(math.isfinite(x) and x > 0.0 for x in pixels.values()):
         raise AmiwarpError(
             "a free parameter moves no event; give a nominal apex above 0 and an encoder whose angle changes"
         )
-    return {n: shifts[n] for n in names}
 
 
 @lru_cache(maxsize=16)

@@ -18,6 +18,7 @@ from amiwarp.calib.selection.smaller_models import (
     Places,
     candidate_space,
     independent_directions,
+    scales,
     timing_blur,
 )
 from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
@@ -140,7 +141,7 @@ class Trial:
     def space_of(self, model: str, exact: Calibration) -> ParameterSpace:
         """Return the parameter space of ``model`` about the calibration ``exact``, with only size and phase free."""
         return candidate_space(
-            model, exact, (), rad_per_us=self.rad_per_us, duration_us=self.duration_us, like=self.space
+            model, exact, (), rad_per_us=self.rad_per_us, duration_us=self.duration_us, pixels=self.space.pixels
         )
 
     def motion_range(self, name: str) -> float:
@@ -214,7 +215,10 @@ def make_trial(
     budget = budget_px or SHARE * math.hypot(QUANTISATION_PX, timing)
     if largest_tilt(exact) <= budget:
         names = tuple(n for n in names if n not in TILT)
-    space = candidate_space("exact", sharpness_answer(exact), names, rad_per_us=speed, duration_us=duration)
+    space = candidate_space(
+        "exact", sharpness_answer(exact), names, rad_per_us=speed, duration_us=duration,
+        pixels=None if set(TILT) & set(names) else scales(path, sample, exact, speed),
+    )  # fmt: skip
     space = _with_search_range(space)
     start = space.to_vector(space.start)
     rows = independent_directions(space, start, sample)
