@@ -27,7 +27,7 @@ import warp as wp
 
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.selection.model_choice import calibrate_auto
-from amiwarp.calib.selection.smaller_models import Places, candidate_space, fit
+from amiwarp.calib.selection.smaller_models import Places, candidate_space, fit, linear_motions
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
@@ -84,7 +84,7 @@ def true_errors(recording: Recording, c: Calibration) -> dict[str, float]:
     found = {"ellipse": places.distance(EllipseModel.from_model(truth), truth), "exact": 0.0}
     for name in ("circle", "radial"):
         space = candidate_space(name, exact, (), rad_per_us=1e-4, duration_us=1e6)
-        ((_, found[name]),) = fit([space], places.compensated(truth), places)
+        ((_, found[name]),) = fit(linear_motions([space], places), places.compensated(truth), places)
     return {name: found[name] for name in MODELS}
 
 

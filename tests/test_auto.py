@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.selection import model_choice as auto
 from amiwarp.calib.selection.model_choice import calibrate_auto
-from amiwarp.calib.selection.smaller_models import Places, candidate_space, encoder_noise, fit
+from amiwarp.calib.selection.smaller_models import Places, candidate_space, encoder_noise, fit, linear_motions
 from amiwarp.calib.selection.trial import CONVERSION_FACTOR, TILT, make_trial
 from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
 from amiwarp.calib.sharpness.held_out import split_turns
@@ -96,7 +96,7 @@ def test_a_wide_lens_does_not(found: Calibration, wide: Recording) -> None:
     exact = replace(found.exact, parameters={"apex": truth.prism.apex, "phase": truth.phase})
     for name in ("circle", "radial"):
         space = candidate_space(name, exact, (), rad_per_us=7.5e-5, duration_us=3e5)
-        ((_, error),) = fit([space], places.compensated(truth), places)
+        ((_, error),) = fit(linear_motions([space], places), places.compensated(truth), places)
         assert rungs[name].predicted_px == pytest.approx(error, rel=0.05)
     assert rungs["circle"].predicted_px > 10 * found.ladder.budget_px
     assert rungs["exact"].predicted_px == 0.0
@@ -119,7 +119,7 @@ def test_the_answer_is_the_best_fit_to_the_exact_one(as_circle: Calibration, wid
     apex = found.exact.parameters["apex"]
     larger = replace(found.exact, parameters={**found.exact.parameters, "apex": 1.01 * apex})
     space = candidate_space("circle", larger, (), rad_per_us=7.5e-5, duration_us=3e5)
-    ((values, _),) = fit([space], places.compensated(larger.model), places)
+    ((values, _),) = fit(linear_motions([space], places), places.compensated(larger.model), places)
     deflection = values["deflection"]
     assert ratio == pytest.approx((deflection - found.parameters["deflection"]) / (0.01 * apex), rel=0.02)
     # an independent method finds no closer circle

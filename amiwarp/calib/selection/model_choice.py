@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from amiwarp.calib.result import Calibration
 from amiwarp.calib.selection import free_parameters
-from amiwarp.calib.selection.smaller_models import ellipse_error, fit
+from amiwarp.calib.selection.smaller_models import ellipse_error, fit, linear_motions
 from amiwarp.calib.selection.trial import (
+    CIRCLES,
     CONVERSION_FACTOR,
     TILT,
     Trial,
@@ -158,10 +159,7 @@ def fit_models(trial: Trial) -> tuple[FittedCandidate, ...]:
     Models are measured on held-out turns only if that may change the choice, or if no photometric stage has confirmed
     the exact model, and measuring shows whether the recording contradicts it.
     """
-    circles = ("circle", "radial")
-    fits = dict(
-        zip(circles, fit([trial.space_of(n, trial.exact) for n in circles], trial.path[0], trial.sample), strict=True)
-    )
+    fits = dict(zip(CIRCLES, fit(trial.circles, trial.path[0], trial.sample), strict=True))
     confirmed = accepted_photometric(trial.exact) is not None
     fitted: list[FittedCandidate] = []
     for name in MODELS:
@@ -183,7 +181,7 @@ def _refined(trial: Trial, name: str) -> Vector:
     """Return the held-out sharpness of a smaller model, with the parameters that are sharpest on the training turns."""
     answer = sharpness_answer(trial.exact)
     space = trial.space_of(name, answer)
-    ((values, _),) = fit([space], trial.sample.compensated(answer.model), trial.sample)
+    ((values, _),) = fit(linear_motions([space], trial.sample), trial.sample.compensated(answer.model), trial.sample)
     v = space.to_vector(values)
     step = trial.quadratic.restricted_to([0, 1]).step_to_maximum(gradient(trial.train, space, v))
     return trial.test.each(space, space.to_values(v + step))

@@ -15,9 +15,11 @@ from amiwarp.calib.selection.smaller_models import (
     QUANTISATION_PX,
     SHARE,
     TURN,
+    LinearMotion,
     Places,
     candidate_space,
     independent_directions,
+    linear_motions,
     scales,
     timing_blur,
 )
@@ -55,6 +57,8 @@ SEARCH_RANGE = {"clock_offset": 20_000.0, "tilt_x": math.radians(15.0), "tilt_y"
 """Half width of the tested range of each parameter that might be freed, in its unit (us, rad, 1)."""
 
 
+CIRCLES = ("circle", "radial")
+"""Models that are fitted to the exact one."""
 TILT = ("tilt_x", "tilt_y")
 """Parameters of the direction of the prism's axis."""
 TILT_FACTOR = 2.0
@@ -81,6 +85,8 @@ class Trial:
     """Evenly thinned events at which the displacements of models are compared."""
     path: Vector
     """Coordinates of the sample compensated by the exact model at :data:`TURN` [px], shape ``(TURN_ANGLES, n, 2)``."""
+    circles: tuple[LinearMotion, ...]
+    """Motion of the sample by each of the models :data:`CIRCLES`, about the exact model's parameters."""
     rad_per_us: float
     """Mean speed of the prism [rad/us]."""
     duration_us: float
@@ -220,12 +226,17 @@ def make_trial(
         pixels=None if set(TILT) & set(names) else scales(path, sample, exact, speed),
     )  # fmt: skip
     space = _with_search_range(space)
-    start = space.to_vector(space.start)
-    rows = independent_directions(space, start, sample)
+    circles = [
+        candidate_space(name, exact, (), rad_per_us=speed, duration_us=duration, pixels=space.pixels)
+        for name in CIRCLES
+    ]
+    motion, *smaller = linear_motions([space, *circles], sample)
+    rows = independent_directions(motion)
     return Trial(
         exact=exact, encoder=encoder, events=events, most_events=most, sample=sample, path=path,
-        rad_per_us=speed, duration_us=duration, budget_px=budget, timing_px=timing, device=device, space=space,
-        start=start, directions=rows, tested=tuple(n for n in space.names if _motion_range(space, rows, n) >= STEP_PX),
+        circles=tuple(smaller), rad_per_us=speed, duration_us=duration, budget_px=budget, timing_px=timing,
+        device=device, space=space, start=motion.v, directions=rows,
+        tested=tuple(n for n in space.names if _motion_range(space, rows, n) >= STEP_PX),
     )  # fmt: skip
 
 
