@@ -46,6 +46,8 @@ NEAR = 0.05
 """Relative difference of a model's true error from the budget below which choosing this model or a larger one is
 correct."""
 LEAST_RIGHT, MOST_OVER, MOST_REFUSED = 0.95, 1.1, 0.05
+JUDGED = 50_000
+"""Number of events at which the true errors are measured: many more than ``auto`` samples."""
 TURNS_PER_S = 12.0
 
 
@@ -77,7 +79,7 @@ def true_errors(recording: Recording, c: Calibration) -> dict[str, float]:
     assert recording.encoder is not None
     truth = truth_model(recording.camera, recording.truth, FlatSide.SCENE)
     source = recording.events
-    places = Places.of(source.slice(0, len(source)), recording.encoder)
+    places = Places.of(source.slice(0, len(source)), recording.encoder, JUDGED)
     values = {"apex": truth.prism.apex, "index": truth.prism.index, "phase": truth.phase}
     values |= dict(zip(("tilt_x", "tilt_y"), truth.tilt, strict=True))
     exact = replace(c, model_name="exact", parameters=values)

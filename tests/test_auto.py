@@ -13,7 +13,14 @@ from scipy.optimize import minimize
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.selection import model_choice as auto
 from amiwarp.calib.selection.model_choice import calibrate_auto
-from amiwarp.calib.selection.smaller_models import Places, candidate_space, encoder_noise, fit, linear_motions
+from amiwarp.calib.selection.smaller_models import (
+    SAMPLED,
+    Places,
+    candidate_space,
+    encoder_noise,
+    fit,
+    linear_motions,
+)
 from amiwarp.calib.selection.trial import CONVERSION_FACTOR, TILT, make_trial
 from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
 from amiwarp.calib.sharpness.held_out import split_turns
@@ -67,9 +74,9 @@ def as_circle(wide: Recording) -> Calibration:
     return calibrate_auto(wide, BOTH, budget_px=5.0)
 
 
-def places_of(recording: Recording) -> Places:
+def places_of(recording: Recording, most: int = SAMPLED) -> Places:
     assert recording.encoder is not None
-    return Places.of(recording.events.slice(0, len(recording.events)), recording.encoder)
+    return Places.of(recording.events.slice(0, len(recording.events)), recording.encoder, most)
 
 
 def true_exact(recording: Recording) -> ExactModel:
@@ -89,7 +96,7 @@ def test_a_narrow_lens_gets_a_circle(texture: np.ndarray) -> None:
 def test_a_wide_lens_does_not(found: Calibration, wide: Recording) -> None:
     assert found.model_name == "exact"
     assert found.ladder is not None
-    truth, places = true_exact(wide), places_of(wide)
+    truth, places = true_exact(wide), places_of(wide, 50_000)
     rungs = {r.model: r for r in found.ladder.rungs}
     assert list(rungs) == list(MODELS)
     assert [r.model for r in rungs.values() if r.chosen] == ["exact"]

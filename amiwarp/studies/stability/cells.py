@@ -39,6 +39,8 @@ LIMIT_PX = 0.1
 itself."""
 BEST_FIT = 1.5
 """Multiple of the error of the model's best fit to the truth that a successful calibration may have."""
+JUDGED = 5_000
+"""Number of events at which the error of a smaller model is measured: enough for an rms error accurate to 1 %."""
 FORMAT = 2
 """Version of the file format of a stored cell, which is part of the cell's identity."""
 
@@ -212,7 +214,7 @@ def _error_px(found: Calibration, sample: SimulatedSample, truth: ExactModel) ->
         recording = sample.recording
         assert recording.encoder is not None
         events = recording.events.slice(0, len(recording.events))
-        return Places.of(events, recording.encoder).distance(found.model, truth, remove_lag=True)
+        return Places.of(events, recording.encoder, JUDGED).distance(found.model, truth, remove_lag=True)
     try:
         return model_error(found.model, truth).rms
     except AmiwarpError:
