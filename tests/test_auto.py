@@ -31,6 +31,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import truth_model
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.circle_models import CircleModel
+from amiwarp.optics.displacement import rms
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide, Prism
@@ -139,6 +140,18 @@ def test_the_answer_is_the_best_fit_to_the_exact_one(as_circle: Calibration, wid
     start = [found.parameters["deflection"] * 1e2, found.parameters["phase"]]
     best = minimize(error, start, method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-6}).fun
     assert found.ladder.rungs[0].predicted_px == pytest.approx(best, abs=1e-4)
+
+
+def test_the_motion_by_a_clock_offset_follows_the_orbits(found: Calibration, wide: Recording) -> None:
+    """A step ahead alone would add 4 % by the orbit's curvature, which looks like an offset."""
+    places = places_of(wide)
+    places = replace(places, speed=places.speed * np.linspace(0.5, 1.5, len(places.speed)))
+    space = candidate_space("exact", found.exact, ("clock_offset",), rad_per_us=7.5e-5, duration_us=3e5)
+    (motion,) = linear_motions([space], places)
+    model, h = space.build(space.start), 0.03
+    later, earlier = places.by_each([model, model], np.array([[h], [-h]]))
+    expected = (later - earlier) / (2.0 * h) * places.speed[:, None] / space.pixels["clock_offset"]
+    assert rms(motion.slopes[2] - expected) < 2e-3 * rms(expected)
 
 
 def test_held_out_turns_see_the_circle_s_error_in_pixels(as_circle: Calibration) -> None:

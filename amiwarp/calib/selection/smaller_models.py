@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from amiwarp.calib.space_setup import make_space
 from amiwarp.optics.displacement import compensate_by_each, rms, wrap_angle
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -33,8 +33,8 @@ SLOPE_PX = 0.25
 TURN_ANGLES = 4
 """Number of prism angles that give the mean and the first harmonic of a motion. Four keep the ellipse model's error to
 0.3 %: higher harmonics fall off quickly."""
-TURN = math.tau * np.arange(TURN_ANGLES) / TURN_ANGLES
-"""These prism angles, from the event's own [rad]."""
+TURN = math.tau * np.arange(TURN_ANGLES)[:, None] / TURN_ANGLES
+"""These prism angles, from the event's own [rad], shape ``(TURN_ANGLES, 1)``."""
 QUANTISATION_PX = 1.0 / math.sqrt(12.0)
 """Standard deviation of the error from rounding coordinates to whole pixels [px]."""
 CLOCK_US = 1.0 / math.sqrt(12.0)
@@ -71,13 +71,12 @@ class Places:
         """Return the events' compensated coordinates [px], shape (n, 2)."""
         return self.by_each([model])[0]
 
-    def by_each(self, models: Sequence[Model], ahead: Iterable[Any] | None = None) -> NDArray[np.float64]:
+    def by_each(self, models: Sequence[Model], ahead: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
         """Return the events' coordinates compensated by each model [px], shape (models, n, 2).
 
-        ``ahead`` are angles to add to those of the events [rad], one or n for each model.
+        ``ahead`` are angles to add to those of the events [rad], shape (models, 1) or (models, n).
         """
-        theta = self.theta if ahead is None else np.array([self.theta + a for a in ahead])
-        return compensate_by_each(models, self.xy, theta)
+        return compensate_by_each(models, self.xy, self.theta + ahead)
 
     def distance(self, model: Model, other: Model, *, remove_lag: bool = False) -> float:
         """Return the rms distance of two models at the events [px].
@@ -86,7 +85,7 @@ class Places:
         """
         away = self.compensated(model) - self.compensated(other)
         if remove_lag:
-            later, earlier = self.by_each([model, model], [0.01, -0.01])
+            later, earlier = self.by_each([model, model], np.array([[0.01], [-0.01]]))
             per_angle = later - earlier
             away = away - per_angle * (np.nansum(away * per_angle) / np.nansum(per_angle**2))
         return rms(away)
@@ -98,7 +97,7 @@ def motion_per_angle(path: NDArray[np.float64]) -> float:
     ``path`` holds their coordinates at :data:`TURN` [px], shape (TURN_ANGLES, n, 2). The result is exact for the first
     harmonic of the motion, next to which the others are small.
     """
-    return rms(path[1] - path[-1]) / (2.0 * math.sin(TURN[1]))
+    return rms(path[1] - path[-1]) / (2.0 * math.sin(TURN[1, 0]))
 
 
 def scales(path: NDArray[np.float64], sample: Places, exact: Calibration, speed: float) -> dict[str, float]:
@@ -184,18 +183,27 @@ class LinearMotion:
 
 
 def linear_motions(spaces: Sequence[ParameterSpace], sample: Places) -> list[LinearMotion]:
-    """Return the motion of events about the start of each parameter space, by finite differences."""
+    """Return the motion of events about the start of each parameter space, by finite differences.
+
+    The motion is nearly linear in size and phase, which are Cartesian. The differences by other parameters take a step
+    both ways: a clock offset turns the orbits, and a tilt that moves events by :data:`SLOPE_PX` is large.
+    """
     starts = [space.to_vector(space.start) for space in spaces]
-    steps = [(0.0, *(SLOPE_PX * np.eye(len(v)))) for v in starts]
-    near = [(space, space.to_values(v + h)) for space, v, each in zip(spaces, starts, steps, strict=True) for h in each]
-    moved = sample.by_each(
-        [space.build(values) for space, values in near], [sample.speed * space.drift(values) for space, values in near]
-    )
-    each = np.split(moved, np.cumsum([len(h) for h in steps])[:-1])
-    return [
-        LinearMotion(space, v, at[0], (at[1:] - at[0]) / SLOPE_PX)
-        for space, v, at in zip(spaces, starts, each, strict=True)
+    steps = [SLOPE_PX * np.eye(len(v)) for v in starts]
+    near = [
+        [space.to_values(at) for at in (v, *(v + h), *(v - h[2:]))]
+        for space, v, h in zip(spaces, starts, steps, strict=True)
     ]
+    each = [(space, values) for space, several in zip(spaces, near, strict=True) for values in several]
+    drifts = np.array([[space.drift(values)] for space, values in each])
+    moved = sample.by_each([space.build(values) for space, values in each], drifts * sample.speed)
+    found = []
+    for space, v, part in zip(spaces, starts, np.split(moved, np.cumsum([len(n) for n in near])[:-1]), strict=True):
+        at, ahead, back = part[0], part[1 : 1 + len(v)], part[1 + len(v) :]
+        slopes = (ahead - at) / SLOPE_PX
+        slopes[2:] = (ahead[2:] - back) / (2.0 * SLOPE_PX)
+        found.append(LinearMotion(space, v, at, slopes))
+    return found
 
 
 def fit(
@@ -227,7 +235,7 @@ def ellipse_error(path: NDArray[np.float64]) -> float:
     ``path`` holds the compensated coordinates of n events [px] at :data:`TURN`, shape (TURN_ANGLES, n, 2).
     """
     # mean and first harmonic of the motion at each event's own angle, the first of the turn
-    ellipse = np.einsum("k,knx->nx", 1.0 + 2.0 * np.cos(TURN), path) / len(TURN)
+    ellipse = np.einsum("k,knx->nx", 1.0 + 2.0 * np.cos(TURN[:, 0]), path) / len(TURN)
     return rms(path[0] - ellipse)
 
 
