@@ -12,7 +12,8 @@ from scipy.optimize import minimize
 
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.selection import model_choice as auto
-from amiwarp.calib.selection.model_choice import calibrate_auto
+from amiwarp.calib.selection.groundwork import TILT, Groundwork
+from amiwarp.calib.selection.model_choice import calibrate_auto, compare_models, trial_for
 from amiwarp.calib.selection.smaller_models import (
     SAMPLED,
     Places,
@@ -21,7 +22,7 @@ from amiwarp.calib.selection.smaller_models import (
     fit,
     linear_motions,
 )
-from amiwarp.calib.selection.trial import CONVERSION_FACTOR, TILT, make_trial
+from amiwarp.calib.selection.trial import CONVERSION_FACTOR
 from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
 from amiwarp.calib.sharpness.held_out import split_turns
 from amiwarp.errors import AmiwarpError
@@ -171,16 +172,38 @@ def test_held_out_turns_are_not_measured_if_they_cannot_change_the_choice(found:
     assert found.warnings == ()
 
 
-def test_a_judge_s_objection_is_heard(found: Calibration, wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_judge_s_objection_is_heard(found: Calibration, wide: Recording) -> None:
     """Even if the predicted error of the circle is zero, the check on held-out turns rejects it."""
-    monkeypatch.setattr(auto, "fit", lambda *given: [(values, 0.0) for values, _ in fit(*given)])
-    trial = make_trial(wide, found.exact, SHARPNESS, (), device="cpu", budget_px=None)
-    circle, exact = (f.candidate for f in auto.fit_models(trial)[:2])
+    trial = trial_for(wide, found.exact, SHARPNESS, (), [], device="cpu", budget_px=None)
+    circle, exact = compare_models(replace(trial, predicted={**trial.predicted, "circle": 0.0}))[:2]
     assert not circle.chosen
     assert circle.seen_px is not None
     assert circle.seen_px[0] > trial.rejection_px
     assert circle.verdict.startswith("predicted under the budget, but held-out turns show an error")
     assert exact.chosen
+
+
+def test_the_groundwork_of_the_sharpness_answer_serves_the_final_one(
+    found: Calibration, wide: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is laid once, during the photometric stage; laid again for the final answer, it gives the same choice."""
+    laid: list[Groundwork] = []
+    lay = auto.lay_groundwork
+    monkeypatch.setattr(auto, "lay_groundwork", lambda *given: laid.append(lay(*given)) or laid[-1])
+    again = calibrate_auto(wide, BOTH)
+    assert len(laid) == 1
+    assert laid[0].answer.photometric is None
+    monkeypatch.setattr(Groundwork, "serves", lambda *_: False)
+    late = calibrate_auto(wide, BOTH)
+    assert len(laid) == 3
+    assert laid[2].answer.photometric is not None
+    for c in (found, again):
+        assert c.ladder is not None
+        assert late.ladder is not None
+        for a, b in zip(c.ladder.rungs, late.ladder.rungs, strict=True):
+            assert replace(a, predicted_px=0.0) == replace(b, predicted_px=0.0)
+            assert a.predicted_px == pytest.approx(b.predicted_px, abs=1e-4)
+        assert c.ladder.parameters == late.ladder.parameters
 
 
 def test_the_budget_decides(wide: Recording) -> None:
@@ -239,7 +262,7 @@ def test_a_tilt_that_the_photometric_stage_rules_out_is_not_measured(found: Cali
     assert tilt.verdict.startswith("held: the photometric stage finds that it moves events by at most 0.0")
     for center_px, names in (((0.0, 0.001), ()), ((0.1, 0.001), TILT), ((0.0, 0.1), TILT), (None, TILT)):
         exact = replace(found.exact, photometric=replace(found.photometric, center_px=center_px))
-        trial = make_trial(wide, exact, BOTH, TILT, device="cpu", budget_px=None)
+        trial = trial_for(wide, exact, BOTH, TILT, [], device="cpu", budget_px=None)
         assert trial.space.names == ("apex", "phase", *names)
 
 
@@ -296,7 +319,7 @@ def test_an_encoder_s_noise_is_told_from_its_speeding_up() -> None:
 
 
 def test_every_device_judges_alike(found: Calibration, wide: Recording, device: str) -> None:
-    trial = make_trial(wide, found.exact, SHARPNESS, (), device=device, budget_px=None)
+    trial = trial_for(wide, found.exact, SHARPNESS, (), [], device=device, budget_px=None)
     values = trial.sharpest([0, 1])
     assert trial.test.each(trial.space, values).mean() > trial.test.each(trial.space, {**values, "apex": 0.0}).mean()
     assert np.abs(trial.start - trial.space.to_vector(values)).max() < 0.3  # px

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.calib import checks
@@ -26,6 +27,8 @@ from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from amiwarp.calib.photometric.events_ahead import EventsAhead
     from amiwarp.events.recording import Recording
 
@@ -36,18 +39,24 @@ LEAST_SCALE_ERROR = 0.003
 
 
 def calibrate_model(
-    recording: Recording, settings: Settings, *, device: Any = "cpu", progress: Progress | None = None
+    recording: Recording,
+    settings: Settings,
+    *,
+    device: Any = "cpu",
+    progress: Progress | None = None,
+    meanwhile: Callable[[Calibration], None] | None = None,
 ) -> Calibration:
     """Return the calibration of ``settings.model``, by sharpness and then photometrically.
 
     If no brightness map explains the events, or a slow rotation of the camera explains much of what is left, the
-    camera's rotation is freed too.
+    camera's rotation is freed too. ``meanwhile`` is called with the answer of the sharpness stage while a GPU works on
+    the photometric stage.
     Raises :class:`AmiwarpError` as :func:`amiwarp.calibrate` does.
     """
     began = time.perf_counter()
     if "photometric" not in settings.stages:
         return _calibrate_once(recording, settings, device, progress)
-    found = _calibration_or_error(recording, settings, device, progress)
+    found = _calibration_or_error(recording, settings, device, progress, meanwhile)
     if recording.encoder is not None:
         if _unexplained(found):
             recording, found = _without_bad_pixels(recording, settings, found, device, progress)
@@ -64,10 +73,14 @@ def calibrate_model(
 
 
 def _calibration_or_error(
-    recording: Recording, settings: Settings, device: Any, progress: Progress | None
+    recording: Recording,
+    settings: Settings,
+    device: Any,
+    progress: Progress | None,
+    meanwhile: Callable[[Calibration], None] | None = None,
 ) -> Calibration | AmiwarpError:
     try:
-        return _calibrate_once(recording, settings, device, progress)
+        return _calibrate_once(recording, settings, device, progress, meanwhile)
     except AmiwarpError as error:
         return error
 
@@ -214,17 +227,29 @@ def _check_confirmed(found: Calibration, name: str) -> None:
     )
 
 
-def _calibrate_once(recording: Recording, settings: Settings, device: Any, progress: Progress | None) -> Calibration:
+def _calibrate_once(
+    recording: Recording,
+    settings: Settings,
+    device: Any,
+    progress: Progress | None,
+    meanwhile: Callable[[Calibration], None] | None = None,
+) -> Calibration:
     """Return the calibration by the stages of the settings, with the free parameters that they name."""
     began = time.perf_counter()
     recording = rotation_window(recording, settings)
     searches = prepare(recording, settings, device=device, progress=progress)
     with upload_ahead(recording, searches[0]) as ahead:
-        return replace(_run_stages(recording, searches, ahead, progress), seconds=time.perf_counter() - began)
+        return replace(
+            _run_stages(recording, searches, ahead, progress, meanwhile), seconds=time.perf_counter() - began
+        )
 
 
 def _run_stages(
-    recording: Recording, searches: list[Search], ahead: EventsAhead | None, progress: Progress | None
+    recording: Recording,
+    searches: list[Search],
+    ahead: EventsAhead | None,
+    progress: Progress | None,
+    meanwhile: Callable[[Calibration], None] | None,
 ) -> Calibration:
     """Return the calibration by the sharpest of the searches, and by the photometric stage if the settings name it.
 
@@ -256,7 +281,7 @@ def _run_stages(
         warnings=warnings,
     )
     if "photometric" in settings.stages:
-        result = _photometric_stage(recording, search, result, ahead, progress)
+        result = _photometric_stage(recording, search, result, ahead, progress, meanwhile)
     return result
 
 
@@ -266,11 +291,13 @@ def _photometric_stage(
     result: Calibration,
     ahead: EventsAhead | None,
     progress: Progress | None,
+    meanwhile: Callable[[Calibration], None] | None,
 ) -> Calibration:
     """Return the photometric stage's result, or the sharpness stage's result with a warning that says why."""
     try:
         linear = linear_unknowns(search.settings)
-        found, summary, space = refine(recording, search, linear, ahead=ahead, progress=progress)
+        call = None if meanwhile is None else partial(meanwhile, result)
+        found, summary, space = refine(recording, search, linear, ahead=ahead, progress=progress, meanwhile=call)
     except AmiwarpError as error:
         return replace(result, warnings=(*result.warnings, f"the photometric stage failed: {error}"))
     if found.held:

@@ -55,9 +55,14 @@ class Cost:
     def space(self, space: ParameterSpace) -> None:
         self._space, self._solved, self._changes, self.columns = space, None, [], {}
 
-    def warm_up(self, v: NDArray[np.float64]) -> None:
-        """Solve the first brightness map at the search vector ``v``, and scale the weights by its residuals."""
+    def warm_up(self, v: NDArray[np.float64], meanwhile: Callable[[], None] | None = None) -> None:
+        """Solve the first brightness map at the search vector ``v``, and scale the weights by its residuals.
+
+        ``meanwhile`` is called while a GPU solves.
+        """
         self.residuals(v, rounds=3)
+        if meanwhile is not None:
+            meanwhile()
         # a coarse map needs its damping
         if self.brightness.tiles.density > 1.0 and self.brightness.relax_damping():
             self.residuals(v, rounds=3)

@@ -11,8 +11,9 @@ import numpy as np
 from amiwarp.calib.parameters import MOTION
 from amiwarp.calib.photometric.gauss_newton import LEAST_CURVATURE, UNDETERMINED_PX
 from amiwarp.calib.result import Calibration
+from amiwarp.calib.selection.groundwork import TILT
 from amiwarp.calib.selection.smaller_models import motion_per_angle
-from amiwarp.calib.selection.trial import LARGEST_MOTION_PX, SIGNIFICANT_STD, TILT, Trial, in_pixels, largest_tilt
+from amiwarp.calib.selection.trial import LARGEST_MOTION_PX, SIGNIFICANT_STD, Trial, in_pixels, largest_tilt
 from amiwarp.calib.summaries import FreedParameter
 
 if TYPE_CHECKING:

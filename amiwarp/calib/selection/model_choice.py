@@ -7,24 +7,25 @@ sharpest on half of the turns and measured on the other half.
 
 from __future__ import annotations
 
+import contextlib
+import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.calib.result import Calibration
 from amiwarp.calib.selection import free_parameters
-from amiwarp.calib.selection.smaller_models import ellipse_error, fit, linear_motions
-from amiwarp.calib.selection.trial import (
+from amiwarp.calib.selection.groundwork import (
     CIRCLES,
-    CONVERSION_FACTOR,
     TILT,
-    Trial,
+    Groundwork,
     accepted_photometric,
-    in_pixels,
-    make_trial,
+    lay_groundwork,
     sharpness_answer,
 )
+from amiwarp.calib.selection.smaller_models import fit, linear_motions
+from amiwarp.calib.selection.trial import CONVERSION_FACTOR, Trial, in_pixels, largest_tilt, make_trial
 from amiwarp.calib.sharpness.held_out import gradient
 from amiwarp.calib.sharpness.objective import padding
 from amiwarp.calib.sharpness.search import Settings
@@ -65,25 +66,31 @@ def calibrate_auto(
     if budget_px is not None and not budget_px > 0.0:
         raise AmiwarpError(f"budget_px = {budget_px}; give an error above 0, for example 0.03")
     settings = replace(settings, model="exact")
-    first = calibrate_model(recording, settings, device=device, progress=progress)
+    ready: list[Groundwork] = []
+
+    def prepare(sharpest: Calibration) -> None:
+        names = tuple(n for n in _tested_names(recording, sharpest, settings) if n not in TILT)
+        with contextlib.suppress(AmiwarpError):  # it is raised again after the photometric stage
+            ready.append(lay_groundwork(recording, sharpest, settings, names))
+
+    first = calibrate_model(recording, settings, device=device, progress=progress, meanwhile=prepare)
     if not first.parameters["apex"]:
         return first  # without a prism all models are the same
     recording = _as_corrected(recording, first)
     trial, parameters = _free_parameters(
-        recording, first, settings, device=device, progress=progress, budget_px=budget_px
+        recording, first, settings, ready, device=device, progress=progress, budget_px=budget_px
     )
-    fitted = fit_models(trial)
-    pick = next(k for k, f in enumerate(fitted) if f.candidate.chosen)
-    chosen = express(trial, fitted[pick], settings, device)
+    candidates = compare_models(trial)
+    chosen = express(trial, next(c.model for c in candidates if c.chosen), settings, device)
     whole = time.perf_counter() - began
-    disagreements = [f.candidate for f in fitted if not _agree(trial, f.candidate)]
+    disagreements = [c for c in candidates if not _agree(trial, c)]
     choice = ModelChoice(
         budget_px=trial.budget_px,
         timing_px=trial.timing_px,
         agreed=not disagreements,
         exact=dict(trial.exact.parameters),
         exact_uncertainty=dict(trial.exact.uncertainty),
-        rungs=tuple(f.candidate for f in fitted),
+        rungs=candidates,
         parameters=parameters,
         seconds=whole - first.seconds,
     )
@@ -104,6 +111,7 @@ def _free_parameters(
     recording: Recording,
     first: Calibration,
     settings: Settings,
+    ready: list[Groundwork],
     *,
     device: Any,
     progress: Progress | None,
@@ -111,10 +119,10 @@ def _free_parameters(
 ) -> tuple[Trial, tuple[FreedParameter, ...]]:
     """Free the parameters that the recording determines, and calibrate the exact model again with them free.
 
-    Return the trial of the final exact answer, and the decision for each parameter.
+    ``ready`` may hold the groundwork. Return the trial of the final exact answer, and the decision for each parameter.
     """
-    names = free_parameters.candidate_names(recording, first) if settings.free is None else ()
-    trial = make_trial(recording, first, settings, names, device=device, budget_px=budget_px)
+    names = _tested_names(recording, first, settings)
+    trial = trial_for(recording, first, settings, names, ready, device=device, budget_px=budget_px)
     parameters = free_parameters.judge_parameters(trial, names)
     while more := free_parameters.freed_names(parameters):
         again = free_parameters.freed_settings(first, settings, more)
@@ -126,8 +134,40 @@ def _free_parameters(
         if free_parameters.freed_names(parameters) == more:
             warnings = tuple(dict.fromkeys((*first.warnings, *exact.warnings)))
             exact = replace(exact, stages=(*first.stages, *exact.stages), warnings=warnings)
-            return make_trial(recording, exact, settings, (), device=device, budget_px=budget_px), parameters
+            return trial_for(recording, exact, settings, (), [], device=device, budget_px=budget_px), parameters
     return trial, parameters
+
+
+def trial_for(
+    recording: Recording,
+    exact: Calibration,
+    settings: Settings,
+    names: tuple[str, ...],
+    ready: list[Groundwork],
+    *,
+    device: Any,
+    budget_px: float | None,
+) -> Trial:
+    """Return the trial of ``exact``, which tests the parameters ``names``.
+
+    It leaves the tilt out if the photometric stage rules out one that exceeds the budget. ``ready`` may hold the
+    groundwork.
+    """
+    untilted = tuple(n for n in names if n not in TILT)
+    tilt = largest_tilt(exact)
+    if tilt < math.inf:
+        ground = next((g for g in ready if g.serves(exact, untilted)), None)
+        ground = ground or lay_groundwork(recording, exact, settings, untilted)
+        trial = make_trial(ground, exact, device=device, budget_px=budget_px)
+        if tilt <= trial.budget_px or names == untilted:
+            return trial
+    ground = lay_groundwork(recording, exact, settings, names)
+    return make_trial(ground, exact, device=device, budget_px=budget_px)
+
+
+def _tested_names(recording: Recording, exact: Calibration, settings: Settings) -> tuple[str, ...]:
+    """Return the names of the parameters that might be freed."""
+    return free_parameters.candidate_names(recording, exact) if settings.free is None else ()
 
 
 def _whole_image_warning(trial: Trial, chosen: Calibration) -> tuple[str, ...]:
@@ -143,38 +183,23 @@ def _whole_image_warning(trial: Trial, chosen: Calibration) -> tuple[str, ...]:
     )
 
 
-@dataclass(frozen=True)
-class FittedCandidate:
-    """Candidate model with the parameter values of its best fit to the calibrated exact model."""
-
-    candidate: ModelCandidate
-    """Summary of the candidate model and the evidence for and against it."""
-    values: Mapping[str, float]
-    """Parameter values by name, in the parameters' units (rad, us, 1/min, px)."""
-
-
-def fit_models(trial: Trial) -> tuple[FittedCandidate, ...]:
-    """Fit every model, and choose the smallest that keeps the budget and is not clearly worse on held-out turns.
+def compare_models(trial: Trial) -> tuple[ModelCandidate, ...]:
+    """Compare all models, and choose the smallest that keeps the budget and is not clearly worse on held-out turns.
 
     Models are measured on held-out turns only if that may change the choice, or if no photometric stage has confirmed
     the exact model, and measuring shows whether the recording contradicts it.
     """
-    fits = dict(zip(CIRCLES, fit(trial.circles, trial.path[0], trial.sample), strict=True))
     confirmed = accepted_photometric(trial.exact) is not None
-    fitted: list[FittedCandidate] = []
+    candidates: list[ModelCandidate] = []
     for name in MODELS:
-        values, predicted, held_out = dict(trial.exact.parameters), 0.0, None
-        found = any(f.candidate.chosen for f in fitted)
-        if name in fits:
-            values, predicted = fits[name]
-            if not found and (predicted <= trial.budget_px or not confirmed):
-                held_out = _refined(trial, name)
-        elif name == "ellipse":
-            predicted = ellipse_error(trial.path)
-        elif any(f.candidate.sharpness is not None for f in fitted):
+        predicted, held_out = trial.predicted[name], None
+        found = any(c.chosen for c in candidates)
+        if name in CIRCLES and not found and (predicted <= trial.budget_px or not confirmed):
+            held_out = _refined(trial, name)
+        elif name == "exact" and any(c.sharpness is not None for c in candidates):
             held_out = trial.reference
-        fitted.append(FittedCandidate(_candidate(trial, name, predicted, held_out, found=found), values))
-    return tuple(fitted)
+        candidates.append(_candidate(trial, name, predicted, held_out, found=found))
+    return tuple(candidates)
 
 
 def _refined(trial: Trial, name: str) -> Vector:
@@ -239,15 +264,17 @@ def _agree(trial: Trial, candidate: ModelCandidate) -> bool:
     return high >= trial.budget_px / CONVERSION_FACTOR
 
 
-def express(trial: Trial, fitted: FittedCandidate, settings: Settings, device: Any) -> Calibration:
-    """Express the exact model's calibration in the parameters of a smaller model, with uncertainty.
+def express(trial: Trial, name: str, settings: Settings, device: Any) -> Calibration:
+    """Express the exact model's calibration in the parameters of the model ``name``, with uncertainty.
 
-    The deflection replaces the apex. The sharpness is measured like that of the exact model.
+    A circle is fitted to the exact model at the sample. The deflection replaces the apex. The sharpness is measured
+    like that of the exact model.
     """
-    exact, name, values = trial.exact, fitted.candidate.model, fitted.values
+    exact, sample = trial.exact, trial.sample
     if name in ("exact", "ellipse"):
         return replace(exact, model_name=name)
     space = trial.space_of(name, exact)
+    ((values, _),) = fit(linear_motions([space], sample), sample.compensated(exact.model), sample)
     gain = values["deflection"] / exact.parameters["apex"]
     known = {
         "deflection" if n == "apex" else n: x * (gain if n == "apex" else 1.0) for n, x in exact.uncertainty.items()

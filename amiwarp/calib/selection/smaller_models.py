@@ -78,6 +78,10 @@ class Places:
         """
         return compensate_by_each(models, self.xy, self.theta + ahead)
 
+    def path(self, model: Model) -> NDArray[np.float64]:
+        """Return the events' compensated coordinates at :data:`TURN` [px], shape (TURN_ANGLES, n, 2)."""
+        return self.by_each([model] * len(TURN), TURN)
+
     def distance(self, model: Model, other: Model, *, remove_lag: bool = False) -> float:
         """Return the rms distance of two models at the events [px].
 
@@ -114,12 +118,11 @@ def scales(path: NDArray[np.float64], sample: Places, exact: Calibration, speed:
     }  # fmt: skip
 
 
-def timing_blur(path: NDArray[np.float64], encoder: Encoder, speed: float) -> float:
-    """Return the blur [px rms] by encoder noise, clock resolution and latency jitter at a prism speed [rad/us].
+def timing_blur(path: NDArray[np.float64], noise: float, speed: float) -> float:
+    """Return the blur [px rms] by encoder noise [rad], clock resolution and latency jitter at a prism speed [rad/us].
 
     ``path`` holds the compensated coordinates of n events at :data:`TURN` [px], shape (TURN_ANGLES, n, 2).
     """
-    noise = encoder_noise(encoder)
     return motion_per_angle(path) * math.hypot(noise, speed * math.hypot(CLOCK_US, LATENCY_JITTER_US))
 
 
