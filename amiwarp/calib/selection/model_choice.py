@@ -69,6 +69,8 @@ def calibrate_auto(
     ready: list[Groundwork] = []
 
     def prepare(sharpest: Calibration) -> None:
+        if not sharpest.parameters["apex"]:
+            return  # without a prism there is nothing to choose
         names = tuple(n for n in _tested_names(recording, sharpest, settings) if n not in TILT)
         with contextlib.suppress(AmiwarpError):  # it is raised again after the photometric stage
             ready.append(lay_groundwork(recording, sharpest, settings, names))
