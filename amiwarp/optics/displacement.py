@@ -119,17 +119,14 @@ def compensate_by_each(models: Sequence[HasParams], xy: NDArray[Any], theta: NDA
     points = [pixels, wp.array(angles.ravel(), dtype=float, device="cpu", copy=False)]
     out = wp.empty_like(pixels)
     launches: dict[type, RecordedLaunch] = {}
-    given = []  # the launches need their arrays
     for k, model in enumerate(models):
-        if k == 0 or model is not models[k - 1]:
-            given.append([model.params("cpu"), model_camera(model, "cpu")])
+        arguments = [model.params("cpu"), model_camera(model, "cpu")]
         compensate = launches.get(type(model))
         if compensate is None:
-            compensate = RecordedLaunch(kernels.compensate_points, [*given[-1], *points], [out], device="cpu")
+            compensate = RecordedLaunch(kernels.compensate_points, [*arguments, *points], [out], device="cpu")
             launches[type(model)] = compensate
-        else:
-            for index, value in enumerate(given[-1]):
-                compensate.set(index, value)
+        for index, value in enumerate(arguments):
+            compensate.set(index, value)
         compensate(k * n, n)
     return out.numpy().reshape(len(models), n, 2).astype(np.float64)
 

@@ -18,6 +18,7 @@ from amiwarp.calib.selection.smaller_models import (
     Places,
     candidate_space,
     encoder_noise,
+    fit,
     independent_directions,
     linear_motions,
     scales,
@@ -93,6 +94,13 @@ class Groundwork:
             model, exact, (), rad_per_us=self.rad_per_us, duration_us=self.duration_us, pixels=self.space.pixels
         )
 
+    def fitted(self, model: str, exact: Calibration) -> tuple[ParameterSpace, dict[str, float]]:
+        """Return the space of a smaller model about ``exact``, and its parameters that fit ``exact`` best."""
+        space = self.space_of(model, exact)
+        target = self.sample.compensated(exact.model)
+        ((values, _),) = fit(linear_motions([space], self.sample), target, self.sample)
+        return space, values
+
     def motion_range(self, name: str) -> float:
         """Return how far a parameter moves events in its tested range [px rms], beyond what size and phase can do."""
         return _motion_range(self.space, self.directions, name)
@@ -157,6 +165,6 @@ def _with_search_range(space: ParameterSpace) -> ParameterSpace:
 
 
 def _motion_range(space: ParameterSpace, directions: Vector, name: str) -> float:
-    """Return the value of :meth:`Trial.motion_range`; infinite for parameters without a range."""
+    """Return the value of :meth:`Groundwork.motion_range`; infinite for parameters without a range."""
     k = space.names.index(name)
     return SEARCH_RANGE[name] * space.pixels[name] / abs(float(directions[k, k])) if name in SEARCH_RANGE else math.inf

@@ -22,9 +22,7 @@ from amiwarp.calib.selection.groundwork import (
     Groundwork,
     accepted_photometric,
     lay_groundwork,
-    sharpness_answer,
 )
-from amiwarp.calib.selection.smaller_models import fit, linear_motions
 from amiwarp.calib.selection.trial import CONVERSION_FACTOR, Trial, in_pixels, largest_tilt, make_trial
 from amiwarp.calib.sharpness.held_out import gradient
 from amiwarp.calib.sharpness.objective import padding
@@ -121,7 +119,8 @@ def _free_parameters(
 ) -> tuple[Trial, tuple[FreedParameter, ...]]:
     """Free the parameters that the recording determines, and calibrate the exact model again with them free.
 
-    ``ready`` may hold the groundwork. Return the trial of the final exact answer, and the decision for each parameter.
+    ``ready`` may hold groundwork that was laid before. Return the trial of the final exact answer, and the decision for
+    each parameter.
     """
     names = _tested_names(recording, first, settings)
     trial = trial_for(recording, first, settings, names, ready, device=device, budget_px=budget_px)
@@ -152,8 +151,8 @@ def trial_for(
 ) -> Trial:
     """Return the trial of ``exact``, which tests the parameters ``names``.
 
-    It leaves the tilt out if the photometric stage rules out one that exceeds the budget. ``ready`` may hold the
-    groundwork.
+    It does not test the tilt if the photometric stage has shown that a tilt moves events by less than the budget.
+    ``ready`` may hold groundwork that was laid before.
     """
     untilted = tuple(n for n in names if n not in TILT)
     tilt = largest_tilt(exact)
@@ -206,9 +205,7 @@ def compare_models(trial: Trial) -> tuple[ModelCandidate, ...]:
 
 def _refined(trial: Trial, name: str) -> Vector:
     """Return the held-out sharpness of a smaller model, with the parameters that are sharpest on the training turns."""
-    answer = sharpness_answer(trial.exact)
-    space = trial.space_of(name, answer)
-    ((values, _),) = fit(linear_motions([space], trial.sample), trial.sample.compensated(answer.model), trial.sample)
+    space, values = trial.fitted(name, trial.answer)
     v = space.to_vector(values)
     step = trial.quadratic.restricted_to([0, 1]).step_to_maximum(gradient(trial.train, space, v))
     return trial.test.each(space, space.to_values(v + step))
@@ -272,11 +269,10 @@ def express(trial: Trial, name: str, settings: Settings, device: Any) -> Calibra
     A circle is fitted to the exact model at the sample. The deflection replaces the apex. The sharpness is measured
     like that of the exact model.
     """
-    exact, sample = trial.exact, trial.sample
+    exact = trial.exact
     if name in ("exact", "ellipse"):
         return replace(exact, model_name=name)
-    space = trial.space_of(name, exact)
-    ((values, _),) = fit(linear_motions([space], sample), sample.compensated(exact.model), sample)
+    space, values = trial.fitted(name, exact)
     gain = values["deflection"] / exact.parameters["apex"]
     known = {
         "deflection" if n == "apex" else n: x * (gain if n == "apex" else 1.0) for n, x in exact.uncertainty.items()

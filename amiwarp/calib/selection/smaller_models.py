@@ -219,8 +219,8 @@ def fit(
     """
     best = []
     for m in motions:
-        left, *slopes = _finite(np.stack([m.at - target, *m.slopes]))
-        design = np.array(slopes)
+        fields = _finite(np.stack([m.at - target, *m.slopes]))
+        left, design = fields[0], fields[1:]
         best.append(m.space.to_values(m.v - np.linalg.solve(design @ design.T, design @ left)))
     found = sample.by_each([m.space.build(values) for m, values in zip(motions, best, strict=True)])
     return [(values, rms(at - target)) for values, at in zip(best, found, strict=True)]

@@ -38,8 +38,8 @@ CONTRAST = 0.54
 """Contrast threshold [log intensity] of the simulated sensor. With it the map of the earth gives ten million events in
 two seconds."""
 REPEATS = {"compensation": 5, "calibration": 15}
-"""Number of repeated measurements of each setting, by chart. On a GPU's host, times of a calibration differ by half:
-the median of 7 by a tenth, too much to tell the default and the exact model apart."""
+"""Number of repeated measurements of each setting, by chart. On the host of a GPU, the time of a calibration may vary
+by half between repeats."""
 
 
 @dataclass(frozen=True)
