@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -116,6 +117,7 @@ def measure(
 ) -> list[Timed]:
     """Measure all tasks in rounds, so that a temporary slowdown of the machine affects all of them.
 
+    Each timed round after the first has another order, because a run may depend on the one before it.
     ``warm_up`` adds an untimed first round, in which kernels are compiled. No new round begins after ``limit_s`` [s].
     ``rest_s`` [s] is a pause before each run, in which threads of the previous run may still be busy. ``again`` decides
     from tasks that were timed once which of them to repeat. Memory that earlier work freed is released first; with
@@ -126,12 +128,15 @@ def measure(
     results: list[Any] = [None] * len(tasks)
     repeated: Sequence[bool] = [True] * len(tasks)
     rounds, began = repeats + int(warm_up), time.perf_counter()
+    order, rng = list(enumerate(tasks)), random.Random(0)
     for turn in range(rounds):
         if turn > int(warm_up) and time.perf_counter() - began > limit_s:
             break
         if turn == int(warm_up) + 1 and again is not None:
             repeated = again(_timed(tasks, times, results))
-        for k, task in enumerate(tasks):
+        if turn > int(warm_up):
+            rng.shuffle(order)
+        for done, (k, task) in enumerate(order):
             if not repeated[k]:
                 continue
             if release:
@@ -143,7 +148,7 @@ def measure(
             results[k] = task.keep(result) if turn == int(warm_up) else results[k]
             if turn >= int(warm_up):
                 times[k].append(took)
-            progress(what, (turn * len(tasks) + k + 1) / (rounds * len(tasks)))
+            progress(what, (turn * len(tasks) + done + 1) / (rounds * len(tasks)))
     return _timed(tasks, times, results)
 
 
