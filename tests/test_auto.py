@@ -2,8 +2,10 @@
 
 import json
 import math
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from conftest import COARSE
 from scipy.optimize import minimize
 
 from amiwarp.calib import Calibration, Settings
+from amiwarp.calib.selection import groundwork
 from amiwarp.calib.selection import model_choice as auto
 from amiwarp.calib.selection.groundwork import TILT, Groundwork
 from amiwarp.calib.selection.model_choice import calibrate_auto, compare_models, trial_for
@@ -188,8 +191,14 @@ def test_the_groundwork_of_the_sharpness_answer_serves_the_final_one(
 ) -> None:
     """It is laid once, during the photometric stage; laid again for the final answer, it gives the same choice."""
     laid: list[Groundwork] = []
-    lay = auto.lay_groundwork
-    monkeypatch.setattr(auto, "lay_groundwork", lambda *given: laid.append(lay(*given)) or laid[-1])
+    parts = groundwork.lay_in_parts
+
+    def recorded(*given: Any) -> Generator[None, None, Groundwork]:
+        laid.append((yield from parts(*given)))
+        return laid[-1]
+
+    for module in (auto, groundwork):
+        monkeypatch.setattr(module, "lay_in_parts", recorded)
     again = calibrate_auto(wide, BOTH)
     assert len(laid) == 1
     assert laid[0].answer.photometric is None

@@ -12,7 +12,7 @@ import warp as wp
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
-from amiwarp.optics.displacement import wrap_angle
+from amiwarp.optics.displacement import compensate_by_each, wrap_angle
 from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import Fisheye, RadialTangential
@@ -542,3 +542,15 @@ def test_kernel_values_are_the_fields_of_the_struct(model: ExactModel | CircleMo
         expected |= {"deflection": side * model.deflection, "index": model.index}
     for name, value in expected.items():
         assert float(row[name][0]) == pytest.approx(value, rel=1e-5), name
+
+
+def test_several_models_in_one_call_equal_one_call_each() -> None:
+    """Successive places of one model share a launch."""
+    cam, wedge = camera(), prism()
+    a, b = ExactModel(cam, wedge, phase=0.2), ExactModel(cam, wedge, phase=0.9)
+    c = RadialCircleModel.from_prism(cam, wedge)
+    rng = np.random.default_rng(0)
+    xy, theta = rng.uniform(0.0, 48.0, (50, 2)), rng.uniform(-3.0, 3.0, (6, 50))
+    models = [a, a, b, c, c, a]
+    expected = [compensate_by_each([model], xy, angle)[0] for model, angle in zip(models, theta, strict=True)]
+    np.testing.assert_array_equal(compensate_by_each(models, xy, theta), expected)

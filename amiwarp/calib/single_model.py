@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.calib import checks
@@ -27,7 +26,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from amiwarp.calib.photometric.events_ahead import EventsAhead
     from amiwarp.events.recording import Recording
@@ -44,13 +43,13 @@ def calibrate_model(
     *,
     device: Any = "cpu",
     progress: Progress | None = None,
-    meanwhile: Callable[[Calibration], None] | None = None,
+    meanwhile: Callable[[Calibration], Iterator[None]] | None = None,
 ) -> Calibration:
     """Return the calibration of ``settings.model``, by sharpness and then photometrically.
 
     If no brightness map explains the events, or a slow rotation of the camera explains much of what is left, the
-    camera's rotation is freed too. ``meanwhile`` is called with the answer of the sharpness stage while a GPU works on
-    the photometric stage.
+    camera's rotation is freed too. ``meanwhile`` is called with the answer of the sharpness stage and returns an
+    iterator, whose first steps are taken while a GPU works on the photometric stage.
     Raises :class:`AmiwarpError` as :func:`amiwarp.calibrate` does.
     """
     began = time.perf_counter()
@@ -77,7 +76,7 @@ def _calibration_or_error(
     settings: Settings,
     device: Any,
     progress: Progress | None,
-    meanwhile: Callable[[Calibration], None] | None = None,
+    meanwhile: Callable[[Calibration], Iterator[None]] | None = None,
 ) -> Calibration | AmiwarpError:
     try:
         return _calibrate_once(recording, settings, device, progress, meanwhile)
@@ -232,7 +231,7 @@ def _calibrate_once(
     settings: Settings,
     device: Any,
     progress: Progress | None,
-    meanwhile: Callable[[Calibration], None] | None = None,
+    meanwhile: Callable[[Calibration], Iterator[None]] | None = None,
 ) -> Calibration:
     """Return the calibration by the stages of the settings, with the free parameters that they name."""
     began = time.perf_counter()
@@ -249,7 +248,7 @@ def _run_stages(
     searches: list[Search],
     ahead: EventsAhead | None,
     progress: Progress | None,
-    meanwhile: Callable[[Calibration], None] | None,
+    meanwhile: Callable[[Calibration], Iterator[None]] | None,
 ) -> Calibration:
     """Return the calibration by the sharpest of the searches, and by the photometric stage if the settings name it.
 
@@ -291,13 +290,13 @@ def _photometric_stage(
     result: Calibration,
     ahead: EventsAhead | None,
     progress: Progress | None,
-    meanwhile: Callable[[Calibration], None] | None,
+    meanwhile: Callable[[Calibration], Iterator[None]] | None,
 ) -> Calibration:
     """Return the photometric stage's result, or the sharpness stage's result with a warning that says why."""
     try:
         linear = linear_unknowns(search.settings)
-        call = None if meanwhile is None else partial(meanwhile, result)
-        found, summary, space = refine(recording, search, linear, ahead=ahead, progress=progress, meanwhile=call)
+        parts = None if meanwhile is None else meanwhile(result)
+        found, summary, space = refine(recording, search, linear, ahead=ahead, progress=progress, meanwhile=parts)
     except AmiwarpError as error:
         return replace(result, warnings=(*result.warnings, f"the photometric stage failed: {error}"))
     if found.held:

@@ -11,7 +11,7 @@ from amiwarp.calib.photometric.causes import place_arguments
 from amiwarp.calib.photometric.gauss_newton import Slopes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     import warp as wp
     from numpy.typing import NDArray
@@ -55,19 +55,20 @@ class Cost:
     def space(self, space: ParameterSpace) -> None:
         self._space, self._solved, self._changes, self.columns = space, None, [], {}
 
-    def warm_up(self, v: NDArray[np.float64], meanwhile: Callable[[], None] | None = None) -> None:
+    def warm_up(self, v: NDArray[np.float64], meanwhile: Iterator[None] | None = None) -> None:
         """Solve the first brightness map at the search vector ``v``, and scale the weights by its residuals.
 
-        ``meanwhile`` is called while a GPU solves.
+        Two steps of ``meanwhile`` are taken while a GPU solves.
         """
+        meanwhile = meanwhile or iter(())
         self.residuals(v, rounds=3)
-        if meanwhile is not None:
-            meanwhile()
+        next(meanwhile, None)
         # a coarse map needs its damping
         if self.brightness.tiles.density > 1.0 and self.brightness.relax_damping():
             self.residuals(v, rounds=3)
         self.scale = max(0.1, 1.5 * self.brightness.residuals.median())
         self.residuals(v)
+        next(meanwhile, None)
 
     def renew(self, v: NDArray[np.float64]) -> None:
         """Discard the brightness map and solve a new one at ``v``: a map is biased to the parameters of its fit."""

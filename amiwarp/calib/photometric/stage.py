@@ -33,7 +33,7 @@ from amiwarp.calib.summaries import PhotometricSummary, StageSummary
 from amiwarp.validation import real, whole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     import numpy as np
     from numpy.typing import NDArray
@@ -124,13 +124,13 @@ def refine(
     *,
     ahead: EventsAhead | None = None,
     progress: Progress | None = None,
-    meanwhile: Callable[[], None] | None = None,
+    meanwhile: Iterator[None] | None = None,
 ) -> tuple[PhotometricSummary, StageSummary, ParameterSpace]:
     """Run the photometric stage, which starts at the result of the sharpness stage.
 
     ``linear`` names the free ones of ``off_ratio`` and ``leak``. ``ahead``: events already on the device, of
-    :func:`upload_ahead`. ``meanwhile`` is called once, while a GPU solves the first map. Return the result, the
-    summary of the search, and the space of the result, whose camera and prism are corrected. Raises
+    :func:`upload_ahead`. The first steps of ``meanwhile`` are taken while a GPU solves the first maps. Return the
+    result, the summary of the search, and the space of the result, whose camera and prism are corrected. Raises
     :class:`AmiwarpError` for too few pairs.
     """
 
@@ -138,13 +138,13 @@ def refine(
         if progress is not None:
             progress(*stage_share(search.settings, "photometric", share))
 
-    def equations(sensor: SensorTiming, meanwhile: Callable[[], None] | None = None) -> _Equations:
+    def equations(sensor: SensorTiming) -> _Equations:
         settings = replace(search.settings.photometric, sensor=sensor)
         collected = collect_pairs(recording, search, settings, ahead)
         return _equations(recording, search, linear, settings, collected, report, meanwhile)
 
     given = search.settings.photometric.sensor
-    found = equations(given, meanwhile)
+    found = equations(given)
     answer = found.answers.search(found.start)
     rpm, sensor, time_constant = search.calibration_events.encoder.rpm, given, 0.0
     rad_per_us, direction = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm)
@@ -197,7 +197,7 @@ def _equations(
     settings: PhotometricSettings,
     collected: tuple[PairSet, Tiles],
     report: Callable[[float], None],
-    meanwhile: Callable[[], None] | None,
+    meanwhile: Iterator[None] | None,
 ) -> _Equations:
     """Return the equations of ``collected`` pairs. Raises :class:`AmiwarpError` for too few pairs."""
     pairs, tiles = collected
@@ -208,7 +208,7 @@ def _equations(
     whole_turn = abs(search.calibration_events.encoder.rpm) * duration_us >= 60e6
     excess = off_excess(pairs, with_leak="leak" in linear) if whole_turn else 0.0
 
-    def cost_on(tiles: Tiles, space: ParameterSpace = space, meanwhile: Callable[[], None] | None = None) -> Cost:
+    def cost_on(tiles: Tiles, space: ParameterSpace = space) -> Cost:
         brightness = BrightnessMap(
             pairs, tiles, off_excess=None if "off_ratio" in linear else excess, with_leak="leak" in linear,
             middle_us=space.middle_us,
@@ -218,7 +218,7 @@ def _equations(
         return cost
 
     v = space.to_vector({**space.start, **search.best})
-    cost = cost_on(tiles, meanwhile=meanwhile)
+    cost = cost_on(tiles)
     mean, coverage = cost.start_mean(), cost.brightness.coverage(cost.scale)
     few = not fine_map_is_determined(coverage, len(pairs))
     noisy = mean() > LARGEST_FINE_COST

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -28,6 +28,8 @@ from amiwarp.calib.thinning import thin
 from amiwarp.events.events import MemoryEvents
 
 if TYPE_CHECKING:
+    from collections.abc import Generator
+
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import ParameterSpace
@@ -108,6 +110,18 @@ class Groundwork:
 
 def lay_groundwork(recording: Recording, exact: Calibration, settings: Settings, names: tuple[str, ...]) -> Groundwork:
     """Return the groundwork for the choice among models. ``names`` are the parameters that might be freed."""
+    parts = lay_in_parts(recording, exact, settings, names)
+    while True:
+        try:
+            next(parts)
+        except StopIteration as end:
+            return cast("Groundwork", end.value)
+
+
+def lay_in_parts(
+    recording: Recording, exact: Calibration, settings: Settings, names: tuple[str, ...]
+) -> Generator[None, None, Groundwork]:
+    """Return a generator that lays the groundwork of :func:`lay_groundwork` in two parts of equal length."""
     window = rotation_window(recording, settings)
     source, most = window.events, settings.events
     if isinstance(source, MemoryEvents):
@@ -131,8 +145,10 @@ def lay_groundwork(recording: Recording, exact: Calibration, settings: Settings,
         candidate_space(name, answer, (), rad_per_us=speed, duration_us=duration, pixels=space.pixels)
         for name in CIRCLES
     ]
-    motion, *smaller = linear_motions([space, *circles], sample)
+    (motion,) = linear_motions([space], sample)
+    yield
     rows = independent_directions(motion)
+    smaller = linear_motions(circles, sample)
     return Groundwork(
         answer=answer, encoder=encoder, encoder_noise=encoder_noise(encoder), events=events, most_events=most,
         sample=sample, rad_per_us=speed, duration_us=duration, space=space, circles=tuple(smaller), start=motion.v,

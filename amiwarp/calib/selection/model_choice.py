@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from amiwarp.calib.selection.groundwork import (
     Groundwork,
     accepted_photometric,
     lay_groundwork,
+    lay_in_parts,
 )
 from amiwarp.calib.selection.trial import CONVERSION_FACTOR, Trial, in_pixels, largest_tilt, make_trial
 from amiwarp.calib.sharpness.held_out import gradient
@@ -66,12 +67,12 @@ def calibrate_auto(
     settings = replace(settings, model="exact")
     ready: list[Groundwork] = []
 
-    def prepare(sharpest: Calibration) -> None:
+    def prepare(sharpest: Calibration) -> Iterator[None]:
         if not sharpest.parameters["apex"]:
             return  # without a prism there is nothing to choose
         names = tuple(n for n in _tested_names(recording, sharpest, settings) if n not in TILT)
         with contextlib.suppress(AmiwarpError):  # it is raised again after the photometric stage
-            ready.append(lay_groundwork(recording, sharpest, settings, names))
+            ready.append((yield from lay_in_parts(recording, sharpest, settings, names)))
 
     first = calibrate_model(recording, settings, device=device, progress=progress, meanwhile=prepare)
     if not first.parameters["apex"]:
