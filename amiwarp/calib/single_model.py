@@ -49,7 +49,7 @@ def calibrate_model(
 
     If no brightness map explains the events, or a slow rotation of the camera explains much of what is left, the
     camera's rotation is freed too. ``meanwhile`` is called with the answer of the sharpness stage and returns an
-    iterator, whose first steps are taken while a GPU works on the photometric stage.
+    iterator. Some of its steps are taken while a GPU works on the photometric stage, if any.
     Raises :class:`AmiwarpError` as :func:`amiwarp.calibrate` does.
     """
     began = time.perf_counter()

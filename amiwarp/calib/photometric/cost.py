@@ -35,10 +35,14 @@ class Cost:
     Each evaluation starts from the previous brightness map.
     """
 
-    def __init__(self, space: ParameterSpace, brightness: BrightnessMap, steps: int) -> None:
+    def __init__(
+        self, space: ParameterSpace, brightness: BrightnessMap, steps: int, meanwhile: Iterator[None] | None = None
+    ) -> None:
         self._space, self.brightness, self.steps = space, brightness, steps
         self.scale = FIRST_SCALE
         self.evaluations = 0
+        self.meanwhile = iter(()) if meanwhile is None else meanwhile
+        """Other work, whose steps are taken where the host would wait for a GPU."""
         self._solved: NDArray[np.float64] | None = None
         self._changes: list[Any] = []
         """Derivatives of the brightness map by each parameter [1/px], from which the next solution starts."""
@@ -55,20 +59,15 @@ class Cost:
     def space(self, space: ParameterSpace) -> None:
         self._space, self._solved, self._changes, self.columns = space, None, [], {}
 
-    def warm_up(self, v: NDArray[np.float64], meanwhile: Iterator[None] | None = None) -> None:
-        """Solve the first brightness map at the search vector ``v``, and scale the weights by its residuals.
-
-        Two steps of ``meanwhile`` are taken while a GPU solves.
-        """
-        meanwhile = meanwhile or iter(())
+    def warm_up(self, v: NDArray[np.float64]) -> None:
+        """Solve the first brightness map at the search vector ``v``, and scale the weights by its residuals."""
         self.residuals(v, rounds=3)
-        next(meanwhile, None)
+        next(self.meanwhile, None)
         # a coarse map needs its damping
         if self.brightness.tiles.density > 1.0 and self.brightness.relax_damping():
             self.residuals(v, rounds=3)
         self.scale = max(0.1, 1.5 * self.brightness.residuals.median())
         self.residuals(v)
-        next(meanwhile, None)
 
     def renew(self, v: NDArray[np.float64]) -> None:
         """Discard the brightness map and solve a new one at ``v``: a map is biased to the parameters of its fit."""

@@ -142,6 +142,7 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
         if name not in cost.columns or cost.columns[name][0] is not column:
             cost.columns[name] = column, b.unexplained(column, steps=MAP_STEPS)
     left = [cost.columns[name][1] for name in columns]
+    next(cost.meanwhile, None)
     width, height = (-(-side // SQUARE_PX) for side in (camera.width, camera.height))
     sums, squares = b.residuals.products_by_square([*left, b.residuals.values], SQUARE_PX, width, height)
     xy = np.stack([squares % width, squares // width], axis=1).astype(np.float64)

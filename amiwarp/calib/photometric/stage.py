@@ -129,7 +129,7 @@ def refine(
     """Run the photometric stage, which starts at the result of the sharpness stage.
 
     ``linear`` names the free ones of ``off_ratio`` and ``leak``. ``ahead``: events already on the device, of
-    :func:`upload_ahead`. The first steps of ``meanwhile`` are taken while a GPU solves the first maps. Return the
+    :func:`upload_ahead`. Steps of ``meanwhile`` are taken while a GPU works. Return the
     result, the summary of the search, and the space of the result, whose camera and prism are corrected. Raises
     :class:`AmiwarpError` for too few pairs.
     """
@@ -213,8 +213,8 @@ def _equations(
             pairs, tiles, off_excess=None if "off_ratio" in linear else excess, with_leak="leak" in linear,
             middle_us=space.middle_us,
         )  # fmt: skip
-        cost = Cost(space, brightness, settings.steps)
-        cost.warm_up(space.to_vector({**space.start, **search.best}), meanwhile)
+        cost = Cost(space, brightness, settings.steps, meanwhile)
+        cost.warm_up(space.to_vector({**space.start, **search.best}))
         return cost
 
     v = space.to_vector({**space.start, **search.best})

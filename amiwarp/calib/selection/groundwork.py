@@ -121,7 +121,7 @@ def lay_groundwork(recording: Recording, exact: Calibration, settings: Settings,
 def lay_in_parts(
     recording: Recording, exact: Calibration, settings: Settings, names: tuple[str, ...]
 ) -> Generator[None, None, Groundwork]:
-    """Return a generator that lays the groundwork of :func:`lay_groundwork` in two parts of equal length."""
+    """Return a generator that lays the groundwork of :func:`lay_groundwork` in three parts of similar length."""
     window = rotation_window(recording, settings)
     source, most = window.events, settings.events
     if isinstance(source, MemoryEvents):
@@ -145,9 +145,10 @@ def lay_in_parts(
         candidate_space(name, answer, (), rad_per_us=speed, duration_us=duration, pixels=space.pixels)
         for name in CIRCLES
     ]
-    (motion,) = linear_motions([space], sample)
     yield
+    (motion,) = linear_motions([space], sample)
     rows = independent_directions(motion)
+    yield
     smaller = linear_motions(circles, sample)
     return Groundwork(
         answer=answer, encoder=encoder, encoder_noise=encoder_noise(encoder), events=events, most_events=most,
