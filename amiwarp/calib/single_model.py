@@ -49,7 +49,7 @@ def calibrate_model(
 
     If no brightness map explains the events, or a slow rotation of the camera explains much of what is left, the
     camera's rotation is freed too. ``meanwhile`` is called with the answer of the sharpness stage and returns an
-    iterator. Some of its steps are taken while a GPU works on the photometric stage, if any.
+    iterator. Its steps are taken while a GPU works on the photometric stage, those that are left after the stage.
     Raises :class:`AmiwarpError` as :func:`amiwarp.calibrate` does.
     """
     began = time.perf_counter()
@@ -295,8 +295,10 @@ def _photometric_stage(
     """Return the photometric stage's result, or the sharpness stage's result with a warning that says why."""
     try:
         linear = linear_unknowns(search.settings)
-        parts = None if meanwhile is None else meanwhile(result)
-        found, summary, space = refine(recording, search, linear, ahead=ahead, progress=progress, meanwhile=parts)
+        steps = iter(()) if meanwhile is None else meanwhile(result)
+        found, summary, space = refine(recording, search, linear, ahead=ahead, progress=progress, meanwhile=steps)
+        for _ in steps:
+            pass
     except AmiwarpError as error:
         return replace(result, warnings=(*result.warnings, f"the photometric stage failed: {error}"))
     if found.held:

@@ -111,8 +111,8 @@ def compensate_by_each(models: Sequence[HasParams], xy: NDArray[Any], theta: NDA
     """Return the same pixels compensated by each of several models, on the CPU [px], shape (models, n, 2).
 
     ``xy`` holds the pixels, shape (n, 2). ``theta`` holds the prism angles, wrapped to a turn [rad], shape (n,), or
-    (models, n) if each model has its own. One call takes a fraction of the time of a call for each model, and a model
-    that follows itself takes hardly more time than once.
+    (models, n) if each model has its own. One call takes a fraction of the time of a call for each model. Successive
+    places of one model share a launch.
     """
     n = len(xy)
     pixels = wp.array(np.tile(xy.astype(np.float32), (len(models), 1)), dtype=wp.vec2, device="cpu", copy=False)

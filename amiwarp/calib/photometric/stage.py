@@ -129,9 +129,9 @@ def refine(
     """Run the photometric stage, which starts at the result of the sharpness stage.
 
     ``linear`` names the free ones of ``off_ratio`` and ``leak``. ``ahead``: events already on the device, of
-    :func:`upload_ahead`. Steps of ``meanwhile`` are taken while a GPU works. Return the
-    result, the summary of the search, and the space of the result, whose camera and prism are corrected. Raises
-    :class:`AmiwarpError` for too few pairs.
+    :func:`upload_ahead`. Some steps of ``meanwhile`` are taken while a GPU works. Return the result, the summary of the
+    search, and the space of the result, whose camera and prism are corrected. Raises :class:`AmiwarpError` for too few
+    pairs.
     """
 
     def report(share: float) -> None:

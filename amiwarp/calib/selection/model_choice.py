@@ -8,7 +8,6 @@ sharpest on half of the turns and measured on the other half.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 import time
 from collections.abc import Iterator, Mapping
@@ -67,7 +66,6 @@ def calibrate_auto(
         raise AmiwarpError(f"budget_px = {budget_px}; give an error above 0, for example 0.03")
     settings = replace(settings, model="exact")
     ready: list[Groundwork] = []
-    begun: list[Iterator[None]] = []
 
     def prepare(sharpest: Calibration) -> Iterator[None]:
         if not sharpest.parameters["apex"]:
@@ -76,13 +74,7 @@ def calibrate_auto(
         with contextlib.suppress(AmiwarpError):  # it is raised again after the photometric stage
             ready.append((yield from lay_in_parts(recording, sharpest, settings, names)))
 
-    def begin(sharpest: Calibration) -> Iterator[None]:
-        begun.append(prepare(sharpest))
-        return begun[-1]
-
-    first = calibrate_model(recording, settings, device=device, progress=progress, meanwhile=begin)
-    for _ in itertools.chain(*begun):
-        pass  # the parts that are still to be laid
+    first = calibrate_model(recording, settings, device=device, progress=progress, meanwhile=prepare)
     if not first.parameters["apex"]:
         return first  # without a prism all models are the same
     recording = _as_corrected(recording, first)
