@@ -5,7 +5,8 @@ from __future__ import annotations
 import ctypes
 import gc
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
 
 def release_memory() -> None:
@@ -18,3 +19,17 @@ def release_memory() -> None:
     if sys.platform.startswith("linux"):
         with suppress(AttributeError):  # musl has no malloc_trim
             ctypes.CDLL(None).malloc_trim(0)
+
+
+@contextmanager
+def only_new_garbage() -> Iterator[None]:
+    """Make the garbage collector ignore the objects that exist now, inside a ``with`` block.
+
+    Modules create several 100,000 objects, and to visit them all may take as long as a calibration on a GPU.
+    """
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()

@@ -38,12 +38,14 @@ from amiwarp.studies.chart import Charts, calibration, compensation
 from amiwarp.studies.chart.rows import (
     Row,
     Task,
+    Timed,
     beaten_by,
     fastest_within,
     front,
     measure,
     most_accurate_within,
     near_front,
+    slowness,
     told_apart,
 )
 from amiwarp.studies.chart.truth import KnownRecording, exact_image, exact_places, rms
@@ -245,6 +247,19 @@ def test_what_cannot_reach_the_front_is_not_repeated() -> None:
     assert "".join(ran[:3]) == "abc"
     assert sorted(ran[3:5]) == sorted(ran[5:]) == ["a", "c"]
     assert [len(t.times) for t in timed] == [3, 1, 3]
+
+
+def test_slow_rounds_do_not_change_the_measured_times() -> None:
+    usual, slow = np.array([1.0, 2.0, 5.0]), np.array([1.0, 1.4, 0.9, 1.0, 3.0])
+    times = [*(usual[:, None] * slow).tolist(), [4.0]]  # the last task was not repeated
+    times[0][3] = 1.5  # one run was slow by itself
+    assert slowness(times) == pytest.approx(slow)
+    found = [Timed(Task(lambda: None, 1), tuple(t), slowness(times)[: len(t)], None) for t in times]
+    fields = {"chart": "calibration", "job": "job", "label": "a", "family": "", "mark": "", "settings": {}}
+    rows = [replace(t, task=replace(t.task, fields=fields)).row(0.0) for t in found]
+    assert [r.seconds for r in rows] == pytest.approx([1.0, 2.0, 5.0, 4.0])
+    assert [r.spread for r in rows] == pytest.approx([2.1, 2.1, 2.1, 0.0])
+    assert [r.repeats for r in rows] == [5, 5, 5, 1]
 
 
 def test_tasks_take_turns_in_changing_order() -> None:

@@ -9,7 +9,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from amiwarp.memory import release_memory
+import numpy as np
+
+from amiwarp.memory import only_new_garbage, release_memory
 from amiwarp.progress import Progress
 
 EQUAL_TIME_SHARE = 0.05
@@ -44,9 +46,9 @@ class Row:
     events: int
     """Number of events of the recording, whichever share of them the setting uses."""
     seconds: float
-    """Median time of the repeated runs [s]."""
+    """Median time of the repeated runs, each divided by how slow the machine was in its round [s]."""
     spread: float
-    """Difference of longest and shortest repeat, relative to the median."""
+    """Difference of longest and shortest repeat, relative to ``seconds``."""
     repeats: int
     """Number of repeated runs."""
     error_px: float
@@ -92,17 +94,20 @@ class Timed:
     """The compensation or calibration that was timed."""
     times: tuple[float, ...]
     """Times of the repeated runs [s]."""
+    slowness: tuple[float, ...]
+    """How slow the machine was in the round of each run; 1 is usual."""
     result: Any
     """Part of the first timed run's result that was kept."""
 
     def row(self, error_px: float, **more: Any) -> Row:
         """Return the row of the measured setting, with its error and further fields."""
-        median = statistics.median(self.times)
+        median = statistics.median(t / slow for t, slow in zip(self.times, self.slowness, strict=True))
         spread = (max(self.times) - min(self.times)) / median
         return Row(**self.task.fields, events=self.task.events, seconds=median, spread=spread,
                    repeats=len(self.times), error_px=error_px, **more)  # fmt: skip
 
 
+@only_new_garbage()
 def measure(
     tasks: Sequence[Task],
     repeats: int,
@@ -115,7 +120,7 @@ def measure(
     release: bool = False,
     again: Callable[[Sequence[Timed]], Sequence[bool]] | None = None,
 ) -> list[Timed]:
-    """Measure all tasks in rounds, so that a temporary slowdown of the machine affects all of them.
+    """Measure all tasks in rounds, so that a temporary slowdown of the machine affects all of them and can be removed.
 
     Each timed round after the first has another order, because a run may depend on the one before it.
     ``warm_up`` adds an untimed first round, in which kernels are compiled. No new round begins after ``limit_s`` [s].
@@ -154,7 +159,23 @@ def measure(
 
 def _timed(tasks: Sequence[Task], times: list[list[float]], results: list[Any]) -> list[Timed]:
     """Return the tasks together with their times and results."""
-    return [Timed(task, tuple(each), result) for task, each, result in zip(tasks, times, results, strict=True)]
+    slow = slowness(times)
+    return [
+        Timed(task, tuple(each), slow[: len(each)], result)
+        for task, each, result in zip(tasks, times, results, strict=True)
+    ]
+
+
+def slowness(times: Sequence[Sequence[float]]) -> tuple[float, ...]:
+    """Return how slow the machine was in each round; 1 is usual.
+
+    ``times``: run times of each task [s]. Tasks that were not repeated in every round do not count. The slowness of a
+    round is the median over tasks of the run time relative to the task's median.
+    """
+    rounds = max(map(len, times))
+    whole = np.array([each for each in times if len(each) == rounds])
+    relative = whole / np.median(whole, axis=1, keepdims=True)
+    return tuple(np.median(relative, axis=0).tolist())
 
 
 def front(rows: Sequence[Row]) -> list[Row]:
