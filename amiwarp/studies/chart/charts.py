@@ -39,7 +39,7 @@ CONTRAST = 0.54
 two seconds."""
 REPEATS = {"compensation": 5, "calibration": 45}
 """Number of repeated measurements of each setting, by chart. On the host of a GPU, the time of a calibration may vary
-by half between repeats: the ratio of two medians of 45 is then accurate to about 2.5 %."""
+by half between repeats: the ratio of two medians of 45 is then accurate to 1 to 3 %."""
 
 
 @dataclass(frozen=True)
