@@ -132,14 +132,15 @@ def measure(
     times: list[list[float]] = [[] for _ in tasks]
     results: list[Any] = [None] * len(tasks)
     repeated: Sequence[bool] = [True] * len(tasks)
-    rounds, began = repeats + int(warm_up), time.perf_counter()
+    first = int(warm_up)  # the first timed round
+    rounds, began = repeats + first, time.perf_counter()
     order, rng = list(enumerate(tasks)), random.Random(0)
     for turn in range(rounds):
-        if turn > int(warm_up) and time.perf_counter() - began > limit_s:
-            break
-        if turn == int(warm_up) + 1 and again is not None:
-            repeated = again(_timed(tasks, times, results))
-        if turn > int(warm_up):
+        if turn > first:
+            if time.perf_counter() - began > limit_s:
+                break
+            if turn == first + 1 and again is not None:
+                repeated = again(_timed(tasks, times, results))
             rng.shuffle(order)
         for done, (k, task) in enumerate(order):
             if not repeated[k]:
@@ -150,8 +151,9 @@ def measure(
             start = time.perf_counter()
             result = task.run()
             took = time.perf_counter() - start
-            results[k] = task.keep(result) if turn == int(warm_up) else results[k]
-            if turn >= int(warm_up):
+            if turn == first:
+                results[k] = task.keep(result)
+            if turn >= first:
                 times[k].append(took)
             progress(what, (turn * len(tasks) + done + 1) / (rounds * len(tasks)))
     return _timed(tasks, times, results)
