@@ -130,6 +130,7 @@ import resource, sys
 import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
+from amiwarp.events.truth import MAPS, FrameTruth
 from amiwarp.io import RecordingWriter
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
 rng, n = np.random.default_rng(0), 1 << 19
@@ -140,6 +141,13 @@ try:
     with RecordingWriter(sys.argv[1], width=320, height=240) as writer:
         if sys.argv[3] == "fill":
             writer.fill([lambda: (events, flags, {})], count=n, t_first=0, done=lambda *_: None)
+        elif sys.argv[3] == "truth":
+            for k in range(20):
+                maps = {m: rng.integers(0, 250, (240, 320, *row)).astype(kind) for m, (kind, row) in MAPS.items()}
+                writer.append_frame(FrameTruth(k, **maps, rotation=np.eye(3), position=np.zeros(3), joints={}))
+        elif sys.argv[3] == "images":
+            for k in range(20):
+                writer.append_image(k, rng.integers(0, 65535, (240, 320)).astype(np.uint16))
         else:
             writer.append(events)
 except AmiwarpError as error:
@@ -147,7 +155,7 @@ except AmiwarpError as error:
 """
 
 
-@pytest.mark.parametrize("way", ["append", "fill"])
+@pytest.mark.parametrize("way", ["append", "fill", "truth", "images"])
 @pytest.mark.parametrize("limit", [2000, 1_100_000, 1_400_000])
 def test_a_full_disk_leaves_nothing(tmp_path, way, limit):
     path = tmp_path / "a.h5"
@@ -157,6 +165,54 @@ def test_a_full_disk_leaves_nothing(tmp_path, way, limit):
     assert done.stdout.startswith(f"{path}: ")
     assert "File too large" in done.stdout
     assert list(tmp_path.iterdir()) == []
+
+
+FAILING = """
+import errno, os, sys
+import numpy as np
+from amiwarp.io.chunk_file import ChunkFile
+from amiwarp.io.native_layout import make_dataset
+written = os.pwritev
+calls = 0
+def failing(*arguments):
+    global calls
+    calls += 1
+    if calls >= failed:
+        raise OSError(errno.ENOSPC, "No space left on device")
+    return written(*arguments)
+os.pwritev = failing
+numbers = np.random.default_rng(0).integers(0, 1 << 60, (40, 1000))
+for failed in range(1, 10_000):
+    calls = 0
+    try:
+        file = ChunkFile(sys.argv[1])
+        try:
+            data = make_dataset(file.hdf5, "data", np.int64, (1000,), 1)
+            for k in range(len(numbers)):
+                data.resize(k + 1, axis=0)
+                data[k] = numbers[k]
+                file.hdf5.create_group(f"group {k}").attrs["number"] = k
+            data.id.refresh()  # reads everything again
+            assert (data[()] == numbers).all()
+        finally:
+            file.close()
+    except OSError as error:
+        assert error.errno == errno.ENOSPC, error
+        os.unlink(sys.argv[1])
+        continue
+    break
+print(failed)
+"""
+
+
+def test_no_write_that_fails_crashes_hdf5(tmp_path: Path) -> None:
+    """Each write in turn is the first that fails. HDF5 goes on with what it could not write, until it is closed."""
+    words = [sys.executable, "-X", "dev", "-c", FAILING, tmp_path / "a.h5"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert int(done.stdout) > 50
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert file["data"].shape == (40, 1000)
 
 
 def test_an_interrupt_waits_until_the_file_is_created(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

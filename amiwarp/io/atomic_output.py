@@ -31,10 +31,6 @@ UNFINISHED = re.compile(r"\..+\.(?P<host>\w+)-(?P<pid>\d+)-[0-9a-f]{8}\.part")
 """Pattern of the names of unfinished files, with the machine and the process that writes them."""
 
 
-SPARE_BYTES = 1 << 20
-"""Disk space that is kept for closing an HDF5 file [bytes]. The data are written before; the structure remains."""
-
-
 @dataclass
 class _Permissions:
     """Files that the running command may replace."""
@@ -210,18 +206,6 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
         yield made
     finally:
         _remove(made)
-
-
-@contextlib.contextmanager
-def spare_space(folder: Path) -> Iterator[None]:
-    """Occupy disk space, and free it at the end. HDF5 crashes if the disk is full when a file is closed."""
-    spare = _unfinished_name(folder / "spare")
-    _unfinished.add(spare)
-    try:
-        spare.write_bytes(bytes(SPARE_BYTES))
-        yield
-    finally:
-        _remove(spare)
 
 
 def _unfinished_name(target: Path) -> Path:

@@ -2,6 +2,9 @@
 
 HDF5 uses one thread at a time, and h5py holds Python's lock while HDF5 writes. Here HDF5 only finds the place of a
 chunk in the file; the thread that encoded the chunk writes it there.
+
+HDF5 crashes the process, at the latest when the process ends, if it cannot write a file that it closes. So HDF5 never
+learns of a full disk: :class:`ChunkFile` notes the error and raises it outside HDF5.
 """
 
 from __future__ import annotations
@@ -43,10 +46,13 @@ def chunks_of(name: str, start: int, column: NDArray[Any], parts: Iterable[Seque
 
 
 class ChunkFile:
-    """HDF5 file that is being written. Threads write chunks of its datasets at places that they get in turn."""
+    """HDF5 file that is being written. Threads write chunks of its datasets at places that they get in turn.
 
-    def __init__(self, path: Path) -> None:
-        """Create the file. Raises OSError if it exists."""
+    Data that HDF5 could not write wait in memory. Call :meth:`check` regularly, so that they stay few.
+    """
+
+    def __init__(self, path: Path, libver: tuple[str, str] | None = ("v110", "v110")) -> None:
+        """Create the file. ``libver`` are h5py's bounds of the format. Raises OSError if the file exists."""
         import h5py
 
         self._columns: dict[str, ChunkedColumn] = {}
@@ -58,7 +64,7 @@ class ChunkFile:
                 self.output = _Output(path)
                 undo.callback(self.output.close)
                 # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
-                self.hdf5 = h5py.File(self.output, "w", libver=("v110", "v110"))
+                self.hdf5 = h5py.File(self.output, "w", libver=libver)
                 """The file as h5py gives it."""
                 undo.callback(self.hdf5.close)
             undo.pop_all()
@@ -109,13 +115,20 @@ class ChunkFile:
         for at, parts in placed:
             if at is not None:
                 self.output.write_at(parts, at)
+        self.check()
+
+    def check(self) -> None:
+        """Raise the error of the first write of HDF5 that failed, such as OSError for a full disk."""
+        if self.output.failure is not None:
+            raise self.output.failure
 
     def close(self) -> None:
-        """Close the file, after all threads have written their chunks."""
+        """Close the file, after all threads have written their chunks. Raises an error as :meth:`check` does."""
         try:
             self.hdf5.close()
         finally:
             self.output.close()
+        self.check()
 
 
 @contextlib.contextmanager
@@ -166,7 +179,10 @@ class ChunkedColumn:
 
 
 class _Output(io.RawIOBase):
-    """File that HDF5 writes through, which can find the place of data instead of writing them."""
+    """File that HDF5 writes through, which can find the place of data instead of writing them.
+
+    HDF5's writes never fail. If one cannot be done, its data and those of all later ones stay in memory.
+    """
 
     def __init__(self, path: Path) -> None:
         self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
@@ -175,6 +191,10 @@ class _Output(io.RawIOBase):
         self._stand_in = memoryview(self._token)
         self._sought: int | None = None
         self._found: int | None = None
+        self.failure: BaseException | None = None
+        """Error of the first write that failed."""
+        self._unwritten: list[tuple[int, bytes]] = []
+        """Data that could not be written, with their places [bytes]."""
 
     def place_of(self, size: int, write: Callable[[Any], Any]) -> int | None:
         """Return the place [bytes] at which ``write(data)`` writes ``size`` bytes in one piece, without writing them.
@@ -207,15 +227,34 @@ class _Output(io.RawIOBase):
         if size == self._sought and memoryview(data)[: len(self._token)] == self._token[:size]:
             self._found = self._position
         else:
-            self.write_at([data], self._position)
+            self._write_or_keep(data)
         self._position += size
         return size
 
+    def _write_or_keep(self, data: Any) -> None:
+        """Write data at the position, or keep them in memory if that or an earlier write failed."""
+        if self.failure is None:
+            try:
+                self.write_at([data], self._position)
+                return
+            except BaseException as error:  # an interrupt too must not reach HDF5
+                self.failure = error
+        self._unwritten.append((self._position, bytes(data)))
+
     def readinto(self, buffer: Any) -> int:
-        return os.preadv(self._handle, [buffer], self._position)
+        count = os.preadv(self._handle, [buffer], self._position)
+        view = memoryview(buffer).cast("B")
+        for at, data in self._unwritten:
+            first, last = max(at - self._position, 0), min(at - self._position + len(data), len(view))
+            if first < last:
+                view[first:last] = data[first + self._position - at : last + self._position - at]
+                count = max(count, last)
+        return count
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        self._position = offset + (os.fstat(self._handle).st_size if whence == os.SEEK_END else 0)
+        if whence == os.SEEK_END:
+            offset += max(os.fstat(self._handle).st_size, *(at + len(data) for at, data in self._unwritten), 0)
+        self._position = offset
         return self._position
 
     def tell(self) -> int:
@@ -223,7 +262,10 @@ class _Output(io.RawIOBase):
 
     def truncate(self, size: int | None = None) -> int:
         size = self._position if size is None else size
-        os.ftruncate(self._handle, size)
+        try:
+            os.ftruncate(self._handle, size)
+        except OSError as error:
+            self.failure = self.failure or error
         return size
 
     def close(self) -> None:

@@ -5,6 +5,7 @@ DSEC's files do not hold the sensor size. It is added as attributes, which DSEC'
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.events.events import Events, regroup
-from amiwarp.io.atomic_output import spare_space
+from amiwarp.io.chunk_file import ChunkFile
 from amiwarp.io.chunks import CHUNK, Codec, append_chunk, encode
 from amiwarp.io.native_layout import make_dataset, ms_entries
 from amiwarp.io.output_formats import Outline
@@ -25,9 +26,8 @@ COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.uint32, "p": np.uint8}
 
 def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
     """Write all events, one chunk of each dataset at a time."""
-    import h5py
-
-    with h5py.File(part, "x") as file, spare_space(part.parent):
+    with contextlib.closing(ChunkFile(part, libver=None)) as chunks:
+        file = chunks.hdf5
         file.attrs["width"], file.attrs["height"] = about.width, about.height
         file["t_offset"] = np.int64(about.t_first)
         create = partial(make_dataset, file, codec=about.codec)
@@ -42,6 +42,7 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
             for name, dtype in COLUMNS.items():
                 _append(datasets[name], written, columns[name].astype(dtype), about.codec)
             written += len(events)
+            chunks.check()
         stored = create("ms_to_idx", np.uint64)
         found = np.concatenate(index).astype(np.uint64)
         for start in range(0, ms, CHUNK):
@@ -49,5 +50,5 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
 
 
 def _append(dataset: Any, start: int, values: NDArray[Any], codec: Codec) -> None:
-    """Append a chunk, without HDF5's buffers, which it cannot discard if the disk is full."""
+    """Append a chunk without HDF5's buffers."""
     append_chunk(dataset, start, encode(values, codec), len(values))

@@ -24,7 +24,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.events.truth import EventTruth, WorldLabels
-from amiwarp.io.atomic_output import NewFile, spare_space
+from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.chunk_file import ChunkFile, EncodedChunk, chunks_of
 from amiwarp.io.chunks import CHUNK, Codec, encode_parts, in_order
 from amiwarp.io.input_files import errors_name
@@ -117,11 +117,9 @@ class RecordingWriter(RecordAppender):
         self._truth_parameters, self._truth_labels = truth_parameters, truth_labels
         self._metadata = dict(metadata or {})
         self._file: Any = None
-        self._chunks: Any = None
         self._datasets: dict[str, Any] = {}
         self._turns = itertools.count()
         self._new: NewFile | None = None
-        self._spare = contextlib.ExitStack()
         self._pending: list[Columns] = []
         self._written = self._pending_count = 0
         self._columns: dict[str, np.dtype[Any]] | None = None
@@ -136,7 +134,6 @@ class RecordingWriter(RecordAppender):
         self._new = NewFile(self.path, overwrite=self._overwrite)
         try:
             with errors_name(self.path, lambda: "making the file"):
-                self._spare.enter_context(spare_space(self._new.part.parent))
                 self._chunks = ChunkFile(self._new.part)
                 self._file = self._chunks.hdf5
                 self._open_records(self._file, self._size, self._codec)
@@ -155,7 +152,6 @@ class RecordingWriter(RecordAppender):
         try:
             with errors_name(self.path, lambda: f"finishing after {len(self)} events"):
                 self._finish()
-                self._spare.close()
                 self._close()
                 self._new.commit()
         except BaseException:
@@ -388,7 +384,6 @@ class RecordingWriter(RecordAppender):
             self._chunks.close()
 
     def _discard(self) -> None:
-        self._spare.close()
         # The file is removed even if it cannot be closed.
         with contextlib.suppress(Exception):
             self._close()

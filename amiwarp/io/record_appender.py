@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,7 @@ class RecordAppender:
     """Base of :class:`amiwarp.RecordingWriter`: appends ground truth, IMU samples and frames."""
 
     path: Path
+    _chunks: Any = None
     _truth: TruthWriter | None = None
     _sensors: SensorWriter | None = None
 
@@ -32,7 +35,7 @@ class RecordAppender:
         frame : FrameTruth
             Ground truth of all pixels, at a later time than the frame before.
         """
-        with errors_name(self.path, lambda: f"truth of the instant {frame.t_us} us"):
+        with self._appending(lambda: f"truth of the instant {frame.t_us} us"):
             self._open_truth().append_frame(frame)
 
     def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
@@ -45,7 +48,7 @@ class RecordAppender:
         mask : numpy.ndarray
             Whether the scene at each pixel without the prism is known, shape ``(height, width)``.
         """
-        with errors_name(self.path, lambda: f"mask at {t_us} us"):
+        with self._appending(lambda: f"mask at {t_us} us"):
             self._open_truth().append_known(t_us, mask)
 
     def append_poses(self, poses: Poses) -> None:
@@ -56,7 +59,7 @@ class RecordAppender:
         poses : Poses
             Poses at later times than those before.
         """
-        with errors_name(self.path, lambda: "true poses"):
+        with self._appending(lambda: "true poses"):
             self._open_truth().append_poses(poses)
 
     def append_imu(self, samples: ImuSamples) -> None:
@@ -67,7 +70,7 @@ class RecordAppender:
         samples : ImuSamples
             Samples, not earlier than those before.
         """
-        with errors_name(self.path, lambda: "IMU samples"):
+        with self._appending(lambda: "IMU samples"):
             self._open_sensors().append_imu(samples)
 
     def append_image(self, t_us: int, image: NDArray[Any]) -> None:
@@ -80,8 +83,16 @@ class RecordAppender:
         image : numpy.ndarray
             Grey levels, uint8 or uint16, shape ``(height, width)``, as those of the frames before.
         """
-        with errors_name(self.path, lambda: f"frame at {t_us} us"):
+        with self._appending(lambda: f"frame at {t_us} us"):
             self._open_sensors().append_image(t_us, image)
+
+    @contextlib.contextmanager
+    def _appending(self, place: Callable[[], str]) -> Iterator[None]:
+        """Name the file and the place in errors, and raise the error of a full disk."""
+        with errors_name(self.path, place):
+            yield
+            if self._chunks is not None:
+                self._chunks.check()
 
     def _open_records(self, file: Any, size: tuple[int, int], codec: Codec) -> None:
         """Set up the writers of an open file. ``size``: width and height of the sensor [px]."""
