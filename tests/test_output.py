@@ -1,5 +1,7 @@
 """No command overwrites a file that it reads, under any name, or any other existing file without --force."""
 
+import errno
+import fcntl
 import json
 import math
 import os
@@ -29,7 +31,7 @@ from amiwarp.imaging.choices import Layers
 from amiwarp.imaging.export import IweFiles
 from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
 from amiwarp.io import atomic_output as output
-from amiwarp.io.atomic_output import HOST, NewFile, check_output, own_folder, remove_abandoned, write_text
+from amiwarp.io.atomic_output import NewFile, check_output, own_folder, remove_abandoned, write_text
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -387,6 +389,25 @@ def test_a_replaced_file_keeps_who_may_read_it(tmp_path: Path) -> None:
     assert (path.read_text(), stat.S_IMODE(path.stat().st_mode)) == ("new", 0o640)
 
 
+WRITER = """
+import os, sys
+from amiwarp.io.atomic_output import NewFile, scratch_folder
+os.getpid = lambda: int(sys.argv[1])  # a number in another namespace, or on another machine
+new = NewFile("a.txt")
+new.part.write_text("half")
+with scratch_folder(new.part.parent) as scratch:
+    (scratch / "b.txt").write_text("half")
+    if len(sys.argv) > 2 and os.fork():
+        os._exit(0)  # leaves the descriptor of the lock to the child
+    print(flush=True)
+    sys.stdin.read()
+    if len(sys.argv) == 2:
+        new.part.write_text("whole")
+        new.commit()
+        (scratch / "b.txt").read_text()
+"""
+
+
 @pytest.fixture
 def dead_pid() -> int:
     process = subprocess.Popen([sys.executable, "-c", ""])
@@ -394,14 +415,82 @@ def dead_pid() -> int:
     return process.pid
 
 
-def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path, dead_pid: int) -> None:
-    keep = {f".a.h5.{HOST}-{os.getppid()}-00c0ffee.part", f".a.h5.elsewhere-{dead_pid}-00c0ffee.part",
-            ".part", "a.part", ".a.h5.part", f".a.h5.{HOST}-{dead_pid}-nothex00.part"}  # fmt: skip
-    for name in (*keep, f".a.h5.{HOST}-{dead_pid}-00c0ffee.part"):
-        (tmp_path / name).write_bytes(b"")
+def start_writer(folder: Path, *words: object) -> subprocess.Popen[str]:
+    """Start a process that has an unfinished file and a scratch folder, and goes on at the end of its input."""
+    line = [sys.executable, "-c", WRITER, *map(str, words)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    process = subprocess.Popen(line, cwd=folder, env=environment(), text=True, **pipes)  # type: ignore[call-overload]
+    assert process.stdout.readline() == "\n"
+    return process
+
+
+def clean(folder: Path) -> set[str]:
+    """Write a file as the next run would, and return the names of all files but this one."""
     remove_abandoned.cache_clear()
-    write_text(tmp_path / "new.txt", "")
-    assert set(os.listdir(tmp_path)) == keep | {"new.txt"}
+    write_text(folder / "new.txt", "", overwrite=True)
+    return set(os.listdir(folder)) - {"new.txt"}
+
+
+def test_what_another_process_writes_is_kept_whatever_its_number(tmp_path: Path, dead_pid: int) -> None:
+    """In a container, or on another machine with the same name, the number of a process means nothing."""
+    with start_writer(tmp_path, dead_pid) as writer:
+        before = set(os.listdir(tmp_path))
+        assert clean(tmp_path) == before
+        assert len(before) == 3
+        writer.communicate("")
+    assert writer.returncode == 0
+    assert clean(tmp_path) == {"a.txt"}
+    assert (tmp_path / "a.txt").read_text() == "whole"
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="needs unshare")
+def test_what_a_process_in_a_container_writes_is_kept(tmp_path: Path) -> None:
+    line = ["unshare", "--user", "--map-root-user", "--pid", "--fork", "--mount-proc", sys.executable, "-c"]
+    if subprocess.run([*line, ""], check=False, capture_output=True).returncode:
+        pytest.skip("may not make a namespace")
+    script = WRITER.replace("os.getpid = lambda: int(sys.argv[1])", "assert os.getpid() == 1")
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([*line, script, "0"], cwd=tmp_path, env=environment(), text=True, **pipes) as writer:
+        assert writer.stdout.readline() == "\n"
+        before = set(os.listdir(tmp_path))
+        assert clean(tmp_path) == before
+        assert len(before) == 3
+        writer.communicate("")
+    assert clean(tmp_path) == {"a.txt"}
+
+
+@pytest.mark.parametrize("fork", [False, True])
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path, dead_pid: int, fork: bool) -> None:
+    """If the run has forked, when both processes have ended."""
+    with start_writer(tmp_path, os.getppid(), *["fork"] * fork) as writer:
+        if fork:
+            writer.wait()
+            assert len(clean(tmp_path)) == 3
+            writer.stdin.close()
+            writer.stdout.read()  # until the child has ended
+        else:
+            writer.kill()
+    assert clean(tmp_path) == set()
+
+
+def test_what_may_still_be_written_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of another system or without a lock file, and all files if the file system has no locks."""
+    with start_writer(tmp_path, 1) as writer:
+        writer.kill()
+    left = set(os.listdir(tmp_path))
+    system = output._system()
+    keep = {f".a.h5.{system}-00c0ffee-00c0ffee.part", ".a.h5.0123456789ab-00c0ffee-00c0ffee.part",
+            ".0123456789ab-00c0ffee.part", ".part", "a.part", ".a.h5.part"}  # fmt: skip
+    for name in keep:
+        (tmp_path / name).write_bytes(b"")
+
+    def unknown(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(fcntl, "flock", unknown)
+        assert clean(tmp_path) == keep | left
+    assert clean(tmp_path) == keep
 
 
 def test_sigkill_leaves_nothing_after_the_next_run(tmp_path: Path) -> None:
@@ -411,8 +500,7 @@ def test_sigkill_leaves_nothing_after_the_next_run(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", script, tmp_path / "a.txt"], env=environment(), check=False)
     assert done.returncode == -9
-    (left,) = os.listdir(tmp_path)
-    assert left.endswith(".part")
+    assert [name.endswith(".part") for name in os.listdir(tmp_path)] == [True, True]
     remove_abandoned.cache_clear()
     write_text(tmp_path / "a.txt", "whole")
     assert os.listdir(tmp_path) == ["a.txt"]
@@ -500,7 +588,7 @@ def test_a_stack_of_images_takes_its_room_on_the_disk_first(tmp_path: Path) -> N
     source = MemoryEvents(events(), *SIZE)
     with IweFiles([tmp_path / "a.npy"], source, window_us=10_000, layers=Layers.MERGED, device="cpu") as files:
         files.add(compensated(events()))
-        (part,) = tmp_path.iterdir()
+        (part,) = tmp_path.glob(".a.npy.*.part")
         found = part.stat()
         assert found.st_blocks * 512 >= found.st_size > 20 * 4 * SIZE[0] * SIZE[1]
 

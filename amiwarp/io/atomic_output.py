@@ -1,6 +1,9 @@
 """Writing of files: each appears under its name complete or not at all.
 
 No input is overwritten, and other files only on request. All writers of the package use this module.
+
+A process that writes into a folder holds a lock on an empty file there. The names of its unfinished files contain the
+name of that file. If the lock is free, the process has ended. Process ids would mean nothing in another container.
 """
 
 from __future__ import annotations
@@ -12,23 +15,22 @@ import os
 import re
 import secrets
 import shutil
-import socket
 import stat
+import threading
+from collections import defaultdict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from types import TracebackType
+from typing import IO
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.input_files import inputs_in_use, inputs_noted, same_file
 from amiwarp.io.regular_file import KINDS
 
-HOST = re.sub(r"[^A-Za-z0-9]", "_", socket.gethostname())[:32]
-"""Name of this machine, which is part of the names of unfinished files: process ids are valid on one machine only."""
-
-UNFINISHED = re.compile(r"\..+\.(?P<host>\w+)-(?P<pid>\d+)-[0-9a-f]{8}\.part")
-"""Pattern of the names of unfinished files, with the machine and the process that writes them."""
+UNFINISHED = re.compile(r"\.(?:.+\.)?(?P<owner>(?P<system>[0-9a-f]{12})-[0-9a-f]{8})(?:-[0-9a-f]{8})?\.part")
+"""Pattern of the names of unfinished files and of lock files, with the running system and the lock of their owner."""
 
 
 @dataclass
@@ -41,9 +43,22 @@ class _Permissions:
     """Folders in which existing files may be replaced."""
 
 
+@dataclass
+class _Lock:
+    """Lock of this process in a folder, with the unfinished files and scratch folders that it protects there."""
+
+    owner: str
+    """Part of the names of these files."""
+    file: IO[bytes]
+    """The open lock file."""
+    files: set[Path] = field(default_factory=set)
+    """Paths of the unfinished files and scratch folders."""
+
+
 _permissions = _Permissions()
-_unfinished: set[Path] = set()
-"""Unfinished files and scratch folders of this process."""
+_locks: dict[Path, _Lock] = {}
+"""Locks of this process, by folder."""
+_locks_guard = threading.RLock()
 
 
 @contextlib.contextmanager
@@ -123,9 +138,11 @@ class NewFile:
         self._overwrite = overwrite
         target = check_output(self.path, overwrite=overwrite)
         remove_abandoned(target.parent)
-        self.part = _unfinished_name(target)
-        """Path of the unfinished file, to which the caller writes."""
-        _unfinished.add(self.part)
+        try:
+            self.part = _unfinished_name(target)
+            """Path of the unfinished file, to which the caller writes."""
+        except OSError as error:
+            raise AmiwarpError(f"{path}: cannot be written: {_reason(error)}; choose another place") from error
 
     def __enter__(self) -> NewFile:
         return self
@@ -144,7 +161,7 @@ class NewFile:
     def commit(self) -> None:
         """Rename the unfinished file to its final name."""
         put_in_place(self.part, self.path, overwrite=self._overwrite)
-        _unfinished.discard(self.part)
+        _forget(self.part)
 
     def discard(self) -> None:
         """Remove the file if it is unfinished."""
@@ -200,7 +217,6 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
     """Create a folder for temporary files. It is removed at the end, or by the next run if the process is killed."""
     remove_abandoned(folder.resolve())
     made = _unfinished_name(folder.resolve() / "scratch")
-    _unfinished.add(made)
     try:
         made.mkdir()
         yield made
@@ -209,8 +225,78 @@ def scratch_folder(folder: Path) -> Iterator[Path]:
 
 
 def _unfinished_name(target: Path) -> Path:
-    """Return a new name for the unfinished version of a file."""
-    return target.with_name(f".{target.name[:40]}.{HOST}-{os.getpid()}-{secrets.token_hex(4)}.part")
+    """Return a new name for the unfinished version of a file. No other process removes it while this one lives."""
+    with _locks_guard:
+        lock = _locks.get(target.parent) or _locks.setdefault(target.parent, _take_lock(target.parent))
+        part = target.with_name(f".{target.name[:40]}.{lock.owner}-{secrets.token_hex(4)}.part")
+        lock.files.add(part)
+    return part
+
+
+def _take_lock(folder: Path) -> _Lock:
+    """Create a lock file and lock it, if the file system has locks."""
+    while True:
+        owner = f"{_system()}-{secrets.token_hex(4)}"
+        path = _lock_path(folder, owner)
+        file = open(path, "x+b")  # noqa: SIM115
+        if _lock(file) is not False and path.exists():
+            return _Lock(owner, file)
+        file.close()  # another process took it for abandoned before it was locked, and removes it
+
+
+def _lock(file: IO[bytes]) -> bool | None:
+    """Lock a file until it is closed; return False if another process holds the lock, and None without locks."""
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):
+        return None
+    return True
+
+
+def _lock_path(folder: Path, owner: str) -> Path:
+    return folder / f".{owner}.part"
+
+
+@cache
+def _system() -> str:
+    """Return 12 digits for the running system. Locks on a network drive may be unknown to other systems."""
+    with contextlib.suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_text().replace("-", "")[:12]
+    import uuid
+
+    return f"{uuid.getnode():012x}"
+
+
+def _forget(part: Path) -> None:
+    """Take a file that was removed or renamed from the unfinished files; release the lock after the last."""
+    with _locks_guard:
+        lock = _locks.get(part.parent)
+        if lock is None:
+            return
+        lock.files.discard(part)
+        if not lock.files:
+            lock.file.close()
+            with contextlib.suppress(OSError):
+                _lock_path(part.parent, lock.owner).unlink()
+            del _locks[part.parent]
+
+
+def _start_fork() -> None:
+    """Leave the unfinished files to the process that this one was forked from. Its locks last until both have ended."""
+    global _locks_guard
+    _inherited.extend(_locks.values())
+    _locks.clear()
+    _locks_guard = threading.RLock()
+
+
+_inherited: list[_Lock] = []
+"""Locks of the process that this one was forked from. They stay open."""
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_start_fork)
 
 
 def write_text(path: Path, text: str, *, overwrite: bool = False) -> None:
@@ -229,31 +315,34 @@ def make_folder(path: Path) -> None:
 
 @cache
 def remove_abandoned(folder: Path) -> None:
-    """Remove unfinished files in ``folder`` of killed processes of this machine. Done once per process."""
+    """Remove unfinished files in ``folder`` of processes that were killed since this system started.
+
+    Done once per process. Files are kept if it is not certain that their process has ended: those of other systems, and
+    those without a lock file, or on file systems without locks.
+    """
+    found: dict[str, list[Path]] = defaultdict(list)
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
-            found = UNFINISHED.fullmatch(entry.name)
-            if found and found["host"] == HOST and not _is_alive(int(found["pid"])):
-                _remove(folder / entry.name)
-
-
-def _is_alive(pid: int) -> bool:
-    if os.name != "posix":  # on Windows, os.kill would end the process
-        return True
-    try:
-        os.kill(pid, 0)
-    except OSError as error:
-        return error.errno != errno.ESRCH
-    return True
+            match = UNFINISHED.fullmatch(entry.name)
+            if match and match["system"] == _system():
+                found[match["owner"]].append(folder / entry.name)
+    for owner, paths in found.items():
+        path = _lock_path(folder, owner)
+        with contextlib.suppress(OSError), open(path, "r+b") as file:
+            if _lock(file):
+                parts = [part for part in paths if part != path]
+                for part in parts:
+                    _remove(part)
+                if not any(os.path.lexists(part) for part in parts):
+                    path.unlink()
 
 
 @atexit.register
 def _discard_unfinished() -> None:
-    """Remove the unfinished files of this process, but not files of the process that it was forked from."""
-    for part in list(_unfinished):
-        if f"-{os.getpid()}-" in part.name:
+    """Remove the unfinished files of this process."""
+    for lock in list(_locks.values()):
+        for part in list(lock.files):
             _remove(part)
-    _unfinished.clear()
 
 
 def _remove(unfinished: Path) -> None:
@@ -263,7 +352,8 @@ def _remove(unfinished: Path) -> None:
             shutil.rmtree(unfinished)
         else:
             unfinished.unlink(missing_ok=True)
-    _unfinished.discard(unfinished)
+    if not os.path.lexists(unfinished):
+        _forget(unfinished)
 
 
 def _reason(error: BaseException) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import convert, open_recording
-from amiwarp.io.atomic_output import HOST, make_folder, put_in_place
+from amiwarp.io.atomic_output import make_folder, put_in_place
 from amiwarp.kernels.cpu_threads import limited_cpu_threads
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.scene import Scene
@@ -100,8 +101,8 @@ def make(job: Job) -> Made | Failed:
     """Make a recording. Raises :class:`AmiwarpError` if the folder of the data set is not visible to this worker."""
     if not job.scratch.is_dir():
         raise AmiwarpError(
-            f"the worker on {HOST} does not see {job.scratch.parent}; put the data set and its sources on a disk that "
-            "all workers share under the same path"
+            f"the worker on {socket.gethostname()} does not see {job.scratch.parent}; put the data set and its sources "
+            "on a disk that all workers share under the same path"
         )
     try:
         with limited_cpu_threads(job.threads):
