@@ -176,7 +176,7 @@ def put_in_place(part: Path, path: Path, *, overwrite: bool = False) -> None:
     target = check_output(path, overwrite=overwrite)
     try:
         if not _may_replace(target, overwrite):
-            _link(part, target)
+            link_new(part, target)
             return
         if os.path.lexists(target):
             shutil.copymode(target, part)
@@ -187,8 +187,8 @@ def put_in_place(part: Path, path: Path, *, overwrite: bool = False) -> None:
         raise AmiwarpError(f"{path}: cannot be written: {_reason(error)}; choose another place") from error
 
 
-def _link(part: Path, target: Path) -> None:
-    """Rename a file, but do not replace a file that another program has just created, as os.replace would."""
+def link_new(part: Path, target: Path) -> None:
+    """Rename a file, but do not replace an existing file, as os.replace would. Raises FileExistsError."""
     try:
         os.link(part, target)
     except FileExistsError:

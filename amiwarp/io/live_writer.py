@@ -3,6 +3,7 @@
 HDF5's single-writer mode orders all writes so that the file is consistent after each. The last chunk is usually not
 full. Every flush writes it again at another place, so that the version which a reader or a crashed file refers to
 stays intact. HDF5 fails badly on a full disk, so the space to finish the file is reserved before events are accepted.
+The file gets its name after that mode has begun: HDF5 cannot open a file whose creation was cut off.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from amiwarp.events.checks import as_times, check_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.events.recording import MetadataValue
-from amiwarp.io.atomic_output import allocate, check_output, put_in_place
+from amiwarp.io.atomic_output import NewFile, allocate, check_output, link_new, put_in_place
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
 from amiwarp.io.copying import save_recording
 from amiwarp.io.input_files import errors_name
@@ -112,33 +113,37 @@ class LiveWriter:
         import h5py
 
         check_output(self.path, overwrite=self._overwrite)
-        try:
-            file = open(self.part, "xb")
-        except FileExistsError as error:
-            what = "is being written, or was left by an interrupted recording; it can be opened like any recording"
-            raise AmiwarpError(f"{self.part}: {what}; rename or delete this file") from error
-        except OSError as error:
-            raise self._not_created(error) from error
+        if os.path.lexists(self.part):
+            raise self._part_exists()
+        new = NewFile(self.part)
         try:
             try:
-                with file:
+                with open(new.part, "xb") as file:
                     allocate(file.fileno(), 0, self._to_finish())
             except OSError as error:
-                raise self._not_created(error) from error
+                what = f"cannot be created: {error.strerror}; choose another place"
+                raise AmiwarpError(f"{self.path}: {what}") from error
             with errors_name(self.path, lambda: "making the file"):
-                self._file = h5py.File(self.part, "w", libver=("v110", "v110"))
-                self._reserve()
+                self._file = h5py.File(new.part, "w", libver=("v110", "v110"))
+                self._allocate()
                 self._create_datasets()
                 self._file.swmr_mode = True
+                self._file.flush()
+                try:
+                    link_new(new.part, self.part)
+                except FileExistsError as error:
+                    raise self._part_exists() from error
         except BaseException:
             self._close()
-            self.part.unlink(missing_ok=True)
             raise
+        finally:
+            new.discard()
         self._flushed_at = time.monotonic()
         return self
 
-    def _not_created(self, error: OSError) -> AmiwarpError:
-        return AmiwarpError(f"{self.path}: cannot be created: {error.strerror}; choose another place")
+    def _part_exists(self) -> AmiwarpError:
+        what = "is being written, or was left by an interrupted recording; it can be opened like any recording"
+        return AmiwarpError(f"{self.part}: {what}; rename or delete this file")
 
     def _create_datasets(self) -> None:
         """Create all datasets, because none can be added in single-writer mode."""
@@ -277,16 +282,19 @@ class LiveWriter:
 
         If the disk is full, finish the file and raise :class:`AmiwarpError`.
         """
-        end = self._file.id.get_filesize() + self._to_finish() + extra
-        if end <= self._reserved:
-            return
         try:
-            allocate(self._file.id.get_vfd_handle(), self._reserved, end - self._reserved)
+            self._allocate(extra)
         except OSError as error:
             self._finish(tidy=False)
             what = f"{error.strerror} after {len(self)} events, which the file holds"
             raise AmiwarpError(f"{self.path}: {what}; make room, or write to another disk") from error
-        self._reserved = end
+
+    def _allocate(self, extra: int = 0) -> None:
+        """Reserve disk space to finish the file, and ``extra`` bytes. Raises OSError if the disk is full."""
+        end = self._file.id.get_filesize() + self._to_finish() + extra
+        if end > self._reserved:
+            allocate(self._file.id.get_vfd_handle(), self._reserved, end - self._reserved)
+            self._reserved = end
 
     def _write(self) -> None:
         """Write the pending events of the current chunk. Start a new chunk if the chunk is full."""
