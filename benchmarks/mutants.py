@@ -1,0 +1,336 @@
+"""Mutation test: do the tests notice small defects in the code?
+
+    python -m benchmarks.mutants [--count 200] [--seed 1] [--only AREA …] [--jobs 2] [--map FOLDER] [--out FILE.json]
+
+Cosmic Ray (``pip install '.[mutants]'``) finds the places in the modules of ``benchmarks/mutants.toml`` where a small
+change is possible. A seeded sample of these places, spread over the modules by their number of places, is changed, one
+at a time, in copies of the repository. A mutant is killed if a test fails among those that run the changed function.
+Kernels are compiled and decoders run in another process, so it is not known which tests run them: all tests of the area
+are used. The exit status is 1 if a mutant survives that ``mutants.toml`` does not explain.
+
+Not changed are annotations, texts of errors and blocks for type checkers. All tests must pass without a change first;
+that run also records which test runs which line. ``--map`` keeps this record for the next run of the same code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import difflib
+import itertools
+import json
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import coverage
+from cosmic_ray import plugins
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import MutationVisitor
+from cosmic_ray.operators.operator import Operator
+from parso.python.tree import Name, PythonNode
+
+ROOT = Path(__file__).parents[1]
+CONFIG = ROOT / "benchmarks" / "mutants.toml"
+
+TESTS_S = 120.0
+"""Total duration of the tests that are run on one mutant, the fastest first [s]."""
+
+PATIENCE, START_S = 8.0, 240.0
+"""A mutant hangs after this multiple of its tests' duration and this time [s], in which kernels are compiled."""
+
+ARITHMETIC, BITS, ORDER = (
+    "(Add|Sub|Mul|Div|FloorDiv|Mod)",
+    "(RShift|LShift|BitOr|BitAnd|BitXor)",
+    "(Eq|NotEq|Lt|LtE|Gt|GtE)",
+)
+OPERATORS = re.compile(
+    f"core/(ReplaceBinaryOperator_({ARITHMETIC}_{ARITHMETIC}|{BITS}_{BITS}|Pow_Mul)"
+    f"|ReplaceComparisonOperator_({ORDER}_{ORDER}|Is_IsNot|IsNot_Is)|ReplaceUnaryOperator_Delete_(Not|USub|Invert)"
+    "|(?!Replace(Binary|Comparison|Unary)|Variable).*)"
+)
+"""Cosmic Ray's operators without those that make nonsense, such as a shift by a float."""
+
+
+class DropCall(Operator):
+    """Leave out a call whose result is not used."""
+
+    def mutation_positions(self, node: Any) -> Iterator[Any]:
+        """Yield the position of a statement that is a call."""
+        call = node.children[0] if node.type == "simple_stmt" else node
+        if call is not node and call.type == "atom_expr" and call.children[-1].get_code().startswith("("):
+            yield call.start_pos, call.end_pos
+
+    def mutate(self, node: PythonNode, index: int) -> PythonNode:
+        """Put ``pass`` in its place."""
+        node.children[0] = Name("pass", node.start_pos, node.get_first_leaf().prefix)
+        return node
+
+    @classmethod
+    def examples(cls) -> tuple[()]:
+        """Give none."""
+        return ()
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change of one place of a module: ``before`` is replaced by ``after`` at ``line``."""
+
+    area: str
+    module: str
+    line: int
+    before: str
+    after: str
+    operator: str
+    code: str
+
+
+Place = tuple[str, str, int, list[tuple[str, int]]]
+"""Area, module, line, and each possible change by operator and occurrence."""
+
+
+def places_of(area: str, module: str) -> list[Place]:
+    """Return all places of a module that can be changed."""
+    source = (ROOT / module).read_text()
+    nodes, skipped = list(ast_nodes(get_ast(source))), list(_skipped(ast.parse(source)))
+    found: dict[Any, list[tuple[str, int]]] = {}
+    for name, operator in _operators().items():
+        positions = (position for node in nodes for position in operator.mutation_positions(node))
+        for occurrence, (start, end) in enumerate(positions):
+            if not any(first <= start < last for first, last in skipped):
+                found.setdefault((start, end), []).append((name, occurrence))
+    return [(area, module, start[0], changes) for (start, _), changes in sorted(found.items())]
+
+
+def _operators() -> dict[str, Any]:
+    classes = {name: plugins.get_operator(name) for name in plugins.operator_names() if OPERATORS.fullmatch(name)}
+    return {"amiwarp/DropCall": DropCall()} | {name: operator() for name, operator in classes.items()}
+
+
+def _skipped(tree: ast.AST) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
+    """Yield the extents of annotations, raised errors, unions of types, type-checking blocks and some decorators."""
+    for node in ast.walk(tree):
+        parts: list[Any] = [getattr(node, "annotation", None), getattr(node, "returns", None)]
+        if isinstance(node, ast.Raise):
+            parts.append(node.exc)
+        if isinstance(node, ast.Expr) and ast.unparse(node).startswith("wp.set_module_options"):
+            parts.append(node)
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            parts.append(node)
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.BinOp) and isinstance(node.value.left, ast.Name):
+            parts.append(node.value if isinstance(node.value.op, ast.BitOr) else None)
+        for part in filter(None, parts):
+            yield (part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset)
+        for decorator in getattr(node, "decorator_list", ()):
+            if re.match(r"wp\.|overload|dataclass", ast.unparse(decorator)):
+                yield (decorator.lineno, 0), (decorator.end_lineno, decorator.end_col_offset)
+
+
+def sample(areas: list[dict[str, Any]], count: int, seed: int) -> list[Mutant]:
+    """Return ``count`` mutants of different places. Each module gets its share, and each place one change."""
+    rng = random.Random(seed)
+    places: list[Place] = []
+    for area in areas:
+        for module in sorted({str(p.relative_to(ROOT)) for glob in area["modules"] for p in ROOT.glob(glob)}):
+            found = places_of(area["name"], module)
+            places += rng.sample(found, len(found))
+    step = len(places) / count
+    start = rng.uniform(0, step)
+    print(f"{count} of {len(places)} places", flush=True)
+    return [
+        next(filter(None, (_mutant(place, rng) for place in places[int(start + k * step) :]))) for k in range(count)
+    ]
+
+
+def _mutant(place: Place, rng: random.Random) -> Mutant | None:
+    """Apply one of the possible changes of a place, or return None if none is valid Python."""
+    area, module, line, changes = place
+    source = (ROOT / module).read_text()
+    for name, occurrence in rng.sample(changes, len(changes)):
+        code = MutationVisitor.mutate_code(source, _operators()[name], occurrence)
+        try:
+            ast.parse(code)
+        except SyntaxError:
+            continue
+        changed = [k for k in difflib.ndiff(source.splitlines(), code.splitlines()) if k[0] in "+-"]
+        before, after = (" ".join(k[2:].strip() for k in changed if k[0] == sign) for sign in "-+")
+        return Mutant(area, module, line, before, after, name.split("/")[1], code)
+    return None
+
+
+class Map:
+    """Which tests run which lines, and how long they take."""
+
+    def __init__(self, folder: Path) -> None:
+        """Read a record that :func:`record` made."""
+        self.seconds: dict[str, float] = json.loads((folder / "durations.json").read_text())
+        self._data = coverage.CoverageData(str(folder / "lines"))
+        self._data.read()
+
+    def tests(self, mutant: Mutant, files: list[str]) -> list[str]:
+        """Return the tests of a mutant: first those of its line, then those of its function, the fastest first.
+
+        If it is unknown which tests run the function, return all tests of the area.
+        """
+        own = [test for test in self.seconds if Path(test.partition("::")[0]).stem.removeprefix("test_") in files]
+        lines: dict[int, list[str]] = {}
+        for name in self._data.measured_files():
+            if name.endswith(mutant.module):
+                lines = self._data.contexts_by_lineno(name)
+        first, last = _function(ast.parse((ROOT / mutant.module).read_text()), mutant.line)
+        near = {test for line in range(first, last + 1) for test in lines.get(line, ()) if test in self.seconds}
+        here = set(lines.get(mutant.line, ()))
+        ordered = sorted(near or own, key=lambda test: (test not in here, self.seconds[test]))
+        totals = itertools.accumulate(self.seconds[test] for test in ordered)
+        return [test for test, total in zip(ordered, totals, strict=True) if total < TESTS_S]
+
+
+def _function(tree: ast.AST, line: int) -> tuple[int, int]:
+    """Return the first and the last line of the outermost function around a line, or of the whole module."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef):
+            first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
+            if first <= line <= (node.end_lineno or first):
+                return node.lineno + 1, node.end_lineno or first
+    return 1, 1_000_000
+
+
+def record(folder: Path, copy: Path, files: list[str]) -> None:
+    """Run the tests without a change, and record the lines that each one runs."""
+    folder.mkdir(parents=True, exist_ok=True)
+    options = folder / "coverage.ini"
+    options.write_text(
+        "[run]\nsource_pkgs = amiwarp\nomit = */kernels/*,*/viewer/*,*/plotting/*\nconcurrency = thread\n"
+        f"relative_files = true\ndata_file = {folder / 'lines'}\n"
+    )
+    environment = {"MUTANTS_DURATIONS": str(folder / "durations.json")}
+    command = [
+        "-m",
+        "coverage",
+        "run",
+        f"--rcfile={options}",
+        "-m",
+        "pytest",
+        *(f"tests/test_{name}.py" for name in files),
+    ]
+    code, output = _run(copy, command, None, environment)
+    if code:
+        raise SystemExit(f"{output[-3000:]}\nthe tests do not pass without a change")
+
+
+def _run(copy: Path, command: list[str], limit_s: float | None, environment: dict[str, str]) -> tuple[int, str]:
+    """Run Python in a copy of the repository. Return its exit status and its output."""
+    environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"} | environment
+    command = [sys.executable, *command, "-q", "-x", "-p", "no:cacheprovider", "-p", "benchmarks.mutants_plugin"]
+    with subprocess.Popen(
+        command, cwd=copy, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+        start_new_session=True,
+    ) as child:  # fmt: skip
+        try:
+            output, _ = child.communicate(timeout=limit_s)
+        except subprocess.TimeoutExpired:
+            os.killpg(child.pid, 9)
+            return -9, "timeout"
+    return child.returncode, output
+
+
+def judge(mutant: Mutant, tests: list[str], seconds: float, copy: Path) -> tuple[str, str]:
+    """Run the tests on a mutant. Return ``killed`` or ``survived``, and what killed it."""
+    if not tests:
+        return "survived", "no test runs it"
+    path = copy / mutant.module
+    original = path.read_text()
+    path.write_text(mutant.code)
+    try:
+        code, output = _run(copy, ["-m", "pytest", *tests], PATIENCE * seconds + START_S, {})
+        if code == 4 and "not found:" in output:  # the change renames parametrised tests
+            files = sorted({test.partition("::")[0] for test in tests})
+            code, output = _run(copy, ["-m", "pytest", *files], PATIENCE * seconds + 4 * START_S, {})
+    finally:
+        path.write_text(original)
+    if code == 0:
+        return "survived", f"{len(tests)} tests"
+    reasons = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR", "E  ", "timeout"))]
+    return "killed", (reasons[-1] if reasons else output.strip()[-200:])[:300]
+
+
+def explained(mutant: Mutant, equivalents: list[dict[str, Any]]) -> str:
+    """Return the reason why a mutant changes nothing that a test can see, or an empty text."""
+    for known in equivalents:
+        if known["module"] == mutant.module and known["before"] == mutant.before and mutant.after in known["after"]:
+            return str(known["reason"])
+    return ""
+
+
+def main() -> None:
+    """Read the command line, judge the sample and print the survivors and the score."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=200, help="number of mutants")
+    parser.add_argument("--seed", type=int, default=1, help="another seed gives another sample")
+    parser.add_argument("--only", nargs="+", metavar="AREA", help="names of areas")
+    parser.add_argument("--jobs", type=int, default=2, help="mutants at the same time")
+    parser.add_argument("--map", type=Path, metavar="FOLDER", help="folder that keeps which test runs which line")
+    parser.add_argument("--out", type=Path, help="file of all mutants and their outcomes")
+    given = parser.parse_args()
+    config = tomllib.loads(CONFIG.read_text())
+    areas = [area for area in config["area"] if given.only is None or area["name"] in given.only]
+    mutants = sample(areas, given.count, given.seed)
+    rows: list[dict[str, Any]] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        copies: SimpleQueue[Path] = SimpleQueue()
+        for k in range(given.jobs):
+            unneeded = shutil.ignore_patterns(".*", "__pycache__", "_build", "results")
+            copies.put(Path(shutil.copytree(ROOT, Path(scratch) / str(k), ignore=unneeded)))
+        folder = given.map or Path(scratch) / "map"
+        if not (folder / "durations.json").exists():
+            record(folder, Path(scratch) / "0", list(dict.fromkeys(name for area in areas for name in area["tests"])))
+        tests_of, files = Map(folder), {area["name"]: area["tests"] for area in areas}
+
+        def one(mutant: Mutant) -> None:
+            tests = tests_of.tests(mutant, files[mutant.area])
+            copy = copies.get()
+            try:
+                outcome, cause = judge(mutant, tests, sum(tests_of.seconds[test] for test in tests), copy)
+            finally:
+                copies.put(copy)
+            if outcome == "survived" and (reason := explained(mutant, config.get("equivalent", []))):
+                outcome, cause = "equivalent", reason
+            row = {key: value for key, value in asdict(mutant).items() if key != "code"}
+            rows.append(row | {"outcome": outcome, "cause": cause})
+            print(
+                f"{outcome:10} {mutant.module}:{mutant.line} {mutant.before}  ->  {mutant.after}  [{cause}]", flush=True
+            )
+
+        with ThreadPoolExecutor(given.jobs) as pool:
+            list(pool.map(one, mutants))
+    rows.sort(key=lambda row: (row["module"], row["line"]))
+    totals = Counter(row["outcome"] for row in rows)
+    score = totals["killed"] / (len(rows) - totals["equivalent"])
+    print(f"{dict(totals)}: {100 * score:.1f} % of those that are not equivalent are killed")
+    if given.out:
+        by_area = {name: dict(Counter(row["outcome"] for row in rows if row["area"] == name)) for name in files}
+        result = {
+            "seed": given.seed,
+            "score": round(score, 3),
+            "outcomes": dict(totals),
+            "areas": by_area,
+            "mutants": rows,
+        }
+        given.out.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    sys.exit(totals["survived"] > 0)
+
+
+if __name__ == "__main__":
+    main()
