@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import difflib
 import itertools
 import json
@@ -23,6 +24,7 @@ import os
 import random
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -45,8 +47,8 @@ from parso.python.tree import Name, PythonNode
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "benchmarks" / "mutants.toml"
 
-TESTS_S = 120.0
-"""Total duration of the tests that are run on one mutant, the fastest first [s]."""
+TESTS_S = 60.0
+"""Total duration of the tests of the area, and of other tests, that are run on one mutant [s]."""
 
 PATIENCE, START_S = 8.0, 240.0
 """A mutant hangs after this multiple of its tests' duration and this time [s], in which kernels are compiled."""
@@ -62,6 +64,12 @@ OPERATORS = re.compile(
     "|(?!Replace(Binary|Comparison|Unary)|Variable).*)"
 )
 """Cosmic Ray's operators without those that make nonsense, such as a shift by a float."""
+
+
+PYTEST = ["-q", "-x", "-p", "no:cacheprovider", "-p", "benchmarks.mutants_plugin"]
+
+CLOCK = itertools.count(10**9)
+"""Times of change of the mutated files [s]."""
 
 
 class DropCall(Operator):
@@ -94,6 +102,8 @@ class Mutant:
     before: str
     after: str
     operator: str
+    function: str
+    """Qualified name of the function, if its body alone is changed and it is not part of a kernel."""
     code: str
 
 
@@ -129,8 +139,8 @@ def _skipped(tree: ast.AST) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]
             parts.append(node)
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             parts.append(node)
-        if isinstance(node, ast.Assign) and isinstance(node.value, ast.BinOp) and isinstance(node.value.left, ast.Name):
-            parts.append(node.value if isinstance(node.value.op, ast.BitOr) else None)
+        if isinstance(node, ast.Assign) and re.fullmatch(r"[A-Z]\w+( \| [A-Z]\w+)+", ast.unparse(node.value)):
+            parts.append(node.value)
         for part in filter(None, parts):
             yield (part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset)
         for decorator in getattr(node, "decorator_list", ()):
@@ -166,7 +176,8 @@ def _mutant(place: Place, rng: random.Random) -> Mutant | None:
             continue
         changed = [k for k in difflib.ndiff(source.splitlines(), code.splitlines()) if k[0] in "+-"]
         before, after = (" ".join(k[2:].strip() for k in changed if k[0] == sign) for sign in "-+")
-        return Mutant(area, module, line, before, after, name.split("/")[1], code)
+        function = "" if "/kernels/" in module else _function(ast.parse(source), line)[2]
+        return Mutant(area, module, line, before, after, name.split("/")[1], function, code)
     return None
 
 
@@ -179,32 +190,44 @@ class Map:
         self._data = coverage.CoverageData(str(folder / "lines"))
         self._data.read()
 
-    def tests(self, mutant: Mutant, files: list[str]) -> list[str]:
-        """Return the tests of a mutant: first those of its line, then those of its function, the fastest first.
+    def tests(self, mutant: Mutant, files: list[str]) -> list[list[str]]:
+        """Return the tests of a mutant: those of its area that run its function, then others that do.
 
-        If it is unknown which tests run the function, return all tests of the area.
+        Those of its line come first, then the fastest. If it is unknown which tests run it, all of the area are taken.
         """
-        own = [test for test in self.seconds if Path(test.partition("::")[0]).stem.removeprefix("test_") in files]
+        own = {test for test in self.seconds if Path(test.partition("::")[0]).stem.removeprefix("test_") in files}
         lines: dict[int, list[str]] = {}
         for name in self._data.measured_files():
             if name.endswith(mutant.module):
                 lines = self._data.contexts_by_lineno(name)
-        first, last = _function(ast.parse((ROOT / mutant.module).read_text()), mutant.line)
-        near = {test for line in range(first, last + 1) for test in lines.get(line, ()) if test in self.seconds}
+        first, last, _ = _function(ast.parse((ROOT / mutant.module).read_text()), mutant.line)
+        near = {test for line in range(first, last + 1) for test in lines.get(line, ()) if test in self.seconds} or own
         here = set(lines.get(mutant.line, ()))
-        ordered = sorted(near or own, key=lambda test: (test not in here, self.seconds[test]))
+        return [self._affordable(tests, here) for tests in (near & own, near - own)]
+
+    def _affordable(self, tests: set[str], here: set[str]) -> list[str]:
+        ordered = sorted(tests, key=lambda test: (test not in here, self.seconds[test]))
         totals = itertools.accumulate(self.seconds[test] for test in ordered)
         return [test for test, total in zip(ordered, totals, strict=True) if total < TESTS_S]
 
 
-def _function(tree: ast.AST, line: int) -> tuple[int, int]:
-    """Return the first and the last line of the outermost function around a line, or of the whole module."""
-    for node in ast.walk(tree):
+def _function(tree: ast.AST, line: int, prefix: str = "") -> tuple[int, int, str]:
+    """Return the first and the last line and the name of the outermost function whose body contains a line.
+
+    For other lines, return those of the whole module and no name.
+    """
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.ClassDef) and node.lineno <= line <= (node.end_lineno or 0):
+            return _function(node, line, f"{prefix}{node.name}.")
         if isinstance(node, ast.FunctionDef):
             first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
-            if first <= line <= (node.end_lineno or first):
-                return node.lineno + 1, node.end_lineno or first
-    return 1, 1_000_000
+            if first <= line <= (node.end_lineno or 0):
+                return (
+                    node.body[0].lineno,
+                    node.end_lineno or 0,
+                    prefix + node.name if line >= node.body[0].lineno else "",
+                )
+    return 1, 1_000_000, ""
 
 
 def record(folder: Path, copy: Path, files: list[str]) -> None:
@@ -232,8 +255,8 @@ def record(folder: Path, copy: Path, files: list[str]) -> None:
 
 def _run(copy: Path, command: list[str], limit_s: float | None, environment: dict[str, str]) -> tuple[int, str]:
     """Run Python in a copy of the repository. Return its exit status and its output."""
-    environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"} | environment
-    command = [sys.executable, *command, "-q", "-x", "-p", "no:cacheprovider", "-p", "benchmarks.mutants_plugin"]
+    command = [sys.executable, *command, *PYTEST]
+    environment = os.environ | {"PYTHONPATH": str(copy)} | environment
     with subprocess.Popen(
         command, cwd=copy, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
         start_new_session=True,
@@ -241,29 +264,72 @@ def _run(copy: Path, command: list[str], limit_s: float | None, environment: dic
         try:
             output, _ = child.communicate(timeout=limit_s)
         except subprocess.TimeoutExpired:
-            os.killpg(child.pid, 9)
+            os.killpg(child.pid, signal.SIGKILL)
             return -9, "timeout"
     return child.returncode, output
 
 
-def judge(mutant: Mutant, tests: list[str], seconds: float, copy: Path) -> tuple[str, str]:
-    """Run the tests on a mutant. Return ``killed`` or ``survived``, and what killed it."""
-    if not tests:
-        return "survived", "no test runs it"
-    path = copy / mutant.module
-    original = path.read_text()
-    path.write_text(mutant.code)
-    try:
-        code, output = _run(copy, ["-m", "pytest", *tests], PATIENCE * seconds + START_S, {})
+class Worker:
+    """A copy of the repository, and a process that has collected the tests there."""
+
+    def __init__(self, copy: Path, files: list[str]) -> None:
+        """Start the process; :meth:`judge` waits for it."""
+        self.copy = copy
+        here, there = os.pipe(), os.pipe()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "pytest", *files, *PYTEST, "--capture=no"], cwd=copy, stdout=subprocess.DEVNULL,
+            env=os.environ | {"PYTHONPATH": str(copy), "MUTANTS_PIPES": f"{here[0]} {there[1]}"},
+            pass_fds=(here[0], there[1]),
+        )  # fmt: skip
+        os.close(here[0])
+        os.close(there[1])
+        self._requests, self._replies = os.fdopen(here[1], "w"), os.fdopen(there[0])
+        self._ready = False
+
+    def close(self) -> None:
+        """Let the process end."""
+        self._requests.close()
+        self._process.wait()
+
+    def judge(self, mutant: Mutant, tests: list[list[str]], seconds: dict[str, float]) -> tuple[str, str]:
+        """Run the tests on a mutant. Return ``killed`` or ``survived``, and what killed it."""
+        path = self.copy / mutant.module
+        if not self._ready and self._replies.readline() != "ready\n":
+            raise SystemExit("the tests cannot be collected")
+        self._ready = True
+        original, changed = path.read_text(), path.stat().st_mtime
+        path.write_text(mutant.code)  # also if the function is replaced: other processes import the file
+        os.utime(path, (next(CLOCK),) * 2)  # compiled code is recognised by the second of the change
+        try:
+            for some in filter(None, tests):
+                limit_s = PATIENCE * sum(seconds[test] for test in some) + START_S
+                cause = self._replaced(mutant, some, limit_s) if mutant.function else None
+                if cause is None:
+                    cause = self._imported(mutant, some, limit_s)
+                if cause:
+                    return "killed", cause[:300]
+        finally:
+            path.write_text(original)
+            os.utime(path, (changed, changed))
+        return "survived", f"{sum(map(len, tests))} tests"
+
+    def _replaced(self, mutant: Mutant, tests: list[str], limit_s: float) -> str | None:
+        """Run the tests with the changed function. Return what failed, or None if it cannot be changed."""
+        path = str(self.copy / mutant.module)
+        request = {"path": path, "function": mutant.function, "code": mutant.code, "tests": tests, "limit_s": limit_s}
+        self._requests.write(json.dumps(request) + "\n")
+        self._requests.flush()
+        cause: str | None = json.loads(self._replies.readline())
+        return cause
+
+    def _imported(self, mutant: Mutant, tests: list[str], limit_s: float) -> str:
+        """Run the tests in a new process. Return what failed."""
+        code, output = _run(self.copy, ["-m", "pytest", *tests], limit_s, {})
         if code == 4 and "not found:" in output:  # the change renames parametrised tests
             files = sorted({test.partition("::")[0] for test in tests})
-            code, output = _run(copy, ["-m", "pytest", *files], PATIENCE * seconds + 4 * START_S, {})
-    finally:
-        path.write_text(original)
-    if code == 0:
-        return "survived", f"{len(tests)} tests"
-    reasons = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR", "E  ", "timeout"))]
-    return "killed", (reasons[-1] if reasons else output.strip()[-200:])[:300]
+            code, output = _run(self.copy, ["-m", "pytest", *files], 4 * limit_s, {})
+        reasons = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR", "E  ", "timeout"))]
+        return "" if code == 0 else reasons[-1] if reasons else output.strip()[-200:]
 
 
 def explained(mutant: Mutant, equivalents: list[dict[str, Any]]) -> str:
@@ -288,39 +354,42 @@ def main() -> None:
     areas = [area for area in config["area"] if given.only is None or area["name"] in given.only]
     mutants = sample(areas, given.count, given.seed)
     rows: list[dict[str, Any]] = []
-    with tempfile.TemporaryDirectory() as scratch:
-        copies: SimpleQueue[Path] = SimpleQueue()
-        for k in range(given.jobs):
-            unneeded = shutil.ignore_patterns(".*", "__pycache__", "_build", "results")
-            copies.put(Path(shutil.copytree(ROOT, Path(scratch) / str(k), ignore=unneeded)))
+    names = list(dict.fromkeys(name for area in areas for name in area["tests"]))
+    files_of = {area["name"]: area["tests"] for area in areas}
+    with tempfile.TemporaryDirectory() as scratch, contextlib.ExitStack() as opened:
+        unneeded = shutil.ignore_patterns(".*", "_build", "results")
+        copies = [Path(shutil.copytree(ROOT, Path(scratch) / str(k), ignore=unneeded)) for k in range(given.jobs)]
         folder = given.map or Path(scratch) / "map"
         if not (folder / "durations.json").exists():
-            record(folder, Path(scratch) / "0", list(dict.fromkeys(name for area in areas for name in area["tests"])))
-        tests_of, files = Map(folder), {area["name"]: area["tests"] for area in areas}
+            record(folder, copies[0], names)
+        known = Map(folder)
+        files = sorted({test.partition("::")[0] for test in known.seconds})
+        workers: SimpleQueue[Worker] = SimpleQueue()
+        for copy in copies:
+            workers.put(opened.enter_context(contextlib.closing(Worker(copy, files))))
 
         def one(mutant: Mutant) -> None:
-            tests = tests_of.tests(mutant, files[mutant.area])
-            copy = copies.get()
+            worker = workers.get()
             try:
-                outcome, cause = judge(mutant, tests, sum(tests_of.seconds[test] for test in tests), copy)
+                outcome, cause = worker.judge(mutant, known.tests(mutant, files_of[mutant.area]), known.seconds)
             finally:
-                copies.put(copy)
+                workers.put(worker)
             if outcome == "survived" and (reason := explained(mutant, config.get("equivalent", []))):
                 outcome, cause = "equivalent", reason
-            row = {key: value for key, value in asdict(mutant).items() if key != "code"}
+            row = {key: value for key, value in asdict(mutant).items() if key not in ("function", "code")}
             rows.append(row | {"outcome": outcome, "cause": cause})
             print(
                 f"{outcome:10} {mutant.module}:{mutant.line} {mutant.before}  ->  {mutant.after}  [{cause}]", flush=True
             )
 
         with ThreadPoolExecutor(given.jobs) as pool:
-            list(pool.map(one, mutants))
+            list(pool.map(one, sorted(mutants, key=lambda mutant: not mutant.function)))  # the slow ones last
     rows.sort(key=lambda row: (row["module"], row["line"]))
     totals = Counter(row["outcome"] for row in rows)
     score = totals["killed"] / (len(rows) - totals["equivalent"])
     print(f"{dict(totals)}: {100 * score:.1f} % of those that are not equivalent are killed")
     if given.out:
-        by_area = {name: dict(Counter(row["outcome"] for row in rows if row["area"] == name)) for name in files}
+        by_area = {name: dict(Counter(row["outcome"] for row in rows if row["area"] == name)) for name in files_of}
         result = {
             "seed": given.seed,
             "score": round(score, 3),
