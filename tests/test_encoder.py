@@ -135,6 +135,7 @@ def test_a_gap_at_the_end_is_not_extrapolated_over():
         (lambda: Encoder.from_angles([0, 1, 2], [0.0, 0.1]), "one length"),
         (lambda: Encoder.from_angles([0.0, np.inf], [0.0, 0.1]), "not finite"),
         (lambda: Encoder.from_counts([0, 1], [0, 1], counts_per_turn=0), "counts_per_turn"),
+        (lambda: Encoder.from_counts([0, 1], [0, 1], counts_per_turn=2**40 + 1), "counts_per_turn"),
         (lambda: Encoder.from_counts([0, 1], [0, 1], counts_per_turn=10, direction=2), "direction"),
         (lambda: Encoder.from_counts([0, 9], [0, 1], counts_per_turn=10, index_t_us=[10]), "pulse at 10 us"),
         (lambda: Encoder.from_counts([0, 9], [0, 1], counts_per_turn=10, index_t_us=[]), "no index pulse"),
@@ -187,6 +188,57 @@ def test_a_stream_that_stood_still_is_guessed_to_stand():
     assert stream.over(199_000, 250_000).angle_at(250_000) == pytest.approx(7.5)
 
 
+def test_a_stream_knows_the_angles_up_to_both_sides_of_a_gap():
+    """The ends of a gap are samples; one microsecond into the gap, or outside all samples, the angle is an estimate."""
+    stream, offset = EncoderStream(clock_offset_us=250.0), 250
+    t = np.concatenate([np.arange(0, 50_000, 1000), np.arange(49_000, 100_000, 1000) + 20_001])
+    stream.append(t[:70], SPEED * t[:70])
+    stream.append(t[70:], SPEED * t[70:])
+    assert (stream.first, stream.last) == (-1000 - offset, int(t[-1]) - offset)
+    known = np.array([0, 24_000, 49_000, 69_001, t[-1]]) - offset
+    estimated = np.array([-1, 49_001, 60_000, 69_000, t[-1] + 1]) - offset
+    asked = np.sort(np.concatenate([known, estimated]))
+    np.testing.assert_array_equal(asked[stream.guessed(asked)], estimated)
+    for one in asked:
+        assert stream.guessed(np.array([one]))[0] == (one in estimated)
+        assert stream.knows(int(one), int(one)) == (one in known)
+    assert stream.knows(0 - offset, 49_000 - offset)
+    assert stream.knows(69_001 - offset, int(t[-1]) - offset)
+    assert not stream.knows(49_000 - offset, 69_001 - offset)
+
+
+def test_an_interval_of_20_ms_is_no_gap():
+    stream = EncoderStream()
+    stream.append([0, 20_000], [0.0, 1.0])
+    stream.append([40_000], [2.0])
+    assert stream.knows(0, 40_000)
+
+
+def test_after_a_restart_the_earlier_samples_go_on_at_their_speed():
+    stream = EncoderStream()
+    stream.restart()  # before the first sample there is nothing to end
+    t, angle = stream.append(np.arange(0, 60_000, 1000), SPEED * np.arange(0, 60_000, 1000))
+    assert t.size == 60
+    stream.restart()
+    t, angle = stream.append([69_000, 70_000], [0.25, 0.25 + SPEED * 1000])
+    assert t.tolist() == [68_999, 69_000, 70_000]
+    np.testing.assert_allclose(angle, [SPEED * 68_999, 0.25, 0.25 + SPEED * 1000], rtol=0, atol=1e-9)
+    assert stream.knows(0, 59_000)
+    assert not stream.knows(59_000, 60_000)
+    assert stream.guessed(np.array([59_000, 59_001, 68_999, 69_000])).tolist() == [False, True, True, False]
+    np.testing.assert_allclose(stream.over(0, 70_000).angle_at([64_000]), SPEED * 64_000, rtol=0, atol=1e-9)
+    assert stream.rpm == pytest.approx(3000.0, abs=1e-6)
+    later, _ = stream.append([71_000], [0.25 + SPEED * 2000])  # only the first samples after a restart
+    assert later.tolist() == [71_000]
+
+
+def test_a_restart_within_a_microsecond_adds_no_sample():
+    stream = EncoderStream()
+    stream.append([0, 1000], [0.0, 0.1])
+    stream.restart()
+    assert stream.append([1001, 2000], [5.0, 5.1])[0].tolist() == [1001, 2000]
+
+
 def test_a_stream_refuses_what_is_no_angle():
     stream = EncoderStream()
     with pytest.raises(AmiwarpError, match="finite"):
@@ -197,6 +249,11 @@ def test_a_stream_refuses_what_is_no_angle():
         stream.over(0, 1)
     with pytest.raises(AmiwarpError, match="16 samples or more"):
         EncoderStream(capacity=3)
+
+
+def test_the_largest_number_of_counts_is_taken():
+    encoder = Encoder.from_counts([0, 1000], [0, 2**38], counts_per_turn=2**40)
+    np.testing.assert_allclose(np.diff(encoder.angle), TWO_PI / 4, rtol=0, atol=1e-9)
 
 
 def test_arrays_given_are_not_changed():

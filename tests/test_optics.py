@@ -11,6 +11,7 @@ import warp as wp
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
 from amiwarp.optics.displacement import compensate_by_each, wrap_angle
 from amiwarp.optics.ellipse_model import EllipseModel
@@ -554,3 +555,42 @@ def test_several_models_in_one_call_equal_one_call_each() -> None:
     models = [a, a, b, c, c, a]
     expected = [compensate_by_each([model], xy, angle)[0] for model, angle in zip(models, theta, strict=True)]
     np.testing.assert_array_equal(compensate_by_each(models, xy, theta), expected)
+
+
+# -- rotation of the camera
+
+
+def test_a_rotation_is_the_integral_of_its_velocity() -> None:
+    """About any reference time; the velocity is linear in time."""
+    rotation = CameraRotation((0.4, -0.6, 0.9), (2.0, 1.0, -3.0), middle_us=50_000)
+    tau = np.linspace(-0.04, 0.07, 1101)
+    velocity = np.asarray(rotation.angular_velocity) + np.outer(tau, rotation.angular_acceleration)
+    steps = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(tau)[:, None]
+    travelled = rotation.rotation(tau) - rotation.rotation(tau[:1])
+    np.testing.assert_allclose(travelled[1:], np.cumsum(steps, axis=0), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(rotation.rotation(np.zeros(1)), np.zeros((1, 3)))
+    later = rotation.about(80_000)
+    assert later.middle_us == 80_000
+    expected = rotation.rotation(tau + 0.03) - rotation.rotation(np.array([0.03]))
+    np.testing.assert_allclose(later.rotation(tau), expected, rtol=0, atol=1e-12)
+
+
+def test_a_rotation_moves_if_it_turns_or_accelerates() -> None:
+    assert CameraRotation().moves is False
+    assert CameraRotation(angular_velocity=(0.0, 1e-6, 0.0)).moves is True
+    assert CameraRotation(angular_acceleration=(0.0, 0.0, 1e-6)).moves is True
+
+
+def test_the_reach_of_a_pan_is_that_of_the_border() -> None:
+    """A pan by an angle moves the centre by fx·tan of it, the edge by more, and corners also up or down."""
+    camera = Camera.from_fov(201, 101, math.radians(60.0))
+    pan = CameraRotation(angular_velocity=(0.0, 0.5, 0.0))
+    angle, edge = 0.5 * 0.1, math.atan(100 / camera.fx)
+    reach = pan.reach(camera, 0.1)
+    assert reach[0] == pytest.approx(camera.fx * (math.tan(edge + angle) - math.tan(edge)), abs=1e-2)
+    corner = 50.0 * (math.cos(edge) / math.cos(edge + angle) - 1.0)
+    assert reach[1] == pytest.approx(corner, abs=1e-2)
+    np.testing.assert_array_equal(CameraRotation().reach(camera, 0.1), np.zeros(2))
+    assert CameraRotation(angular_acceleration=(0.0, 100.0, 0.0)).reach(camera, 0.1)[0] > reach[0]
+    flipped = CameraRotation(angular_velocity=(0.0, math.pi, 0.0))
+    np.testing.assert_array_equal(flipped.reach(camera, 1.0), [201.0, 101.0])

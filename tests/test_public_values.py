@@ -24,7 +24,7 @@ from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
 from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import Fisheye, RadialTangential
-from amiwarp.optics.prism import Prism, UnsizedPrism
+from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
@@ -255,3 +255,10 @@ def test_a_recording_at_the_limit_of_time_opens_again(first: int, tmp_path: Any)
 def test_encoders_beyond_the_limits(t: list[int], angle: list[float], message: str) -> None:
     with pytest.raises(AmiwarpError, match=message):
         Encoder(np.array(t, np.int64), np.array(angle))
+
+
+def test_an_unsized_prism_has_a_valid_index() -> None:
+    for index in (1.0, 4.0, math.nan):
+        with pytest.raises(AmiwarpError, match="prism index"):
+            UnsizedPrism(index=index)
+    assert UnsizedPrism(index=1.6, flat_side="camera").with_apex(0.03) == Prism(0.03, 1.6, FlatSide.CAMERA)
