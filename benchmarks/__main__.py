@@ -234,6 +234,5 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    wp.config.log_level = wp.LOG_ERROR
     wp.init()
     sys.exit(main())

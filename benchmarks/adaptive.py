@@ -403,7 +403,6 @@ def main() -> int:
     parser.add_argument("--figure", type=Path, help="chart to write (PNG)")
     parser.add_argument("--again", type=Path, metavar="FILE.json", help="only draw the results of an earlier run")
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     if args.again:
         draw(args.figure, json.loads(args.again.read_text()))
         return 0

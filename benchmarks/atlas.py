@@ -17,8 +17,6 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-import warp as wp
-
 from amiwarp.studies.stability.axes import AXES
 from amiwarp.studies.stability.cells import Cell, run_cell
 from amiwarp.studies.stability.run import QUICK_METHODS, chosen, quick_axes, run
@@ -26,9 +24,8 @@ from amiwarp.studies.stability.run import QUICK_METHODS, chosen, quick_axes, run
 _started = multiprocessing.get_context("spawn").Value("i", 0)
 
 
-def quiet(counter: object) -> None:
-    """Silence Warp, and pin each process to its own core, because work is spread over processes, not threads."""
-    wp.config.log_level = wp.LOG_ERROR
+def pin(counter: object) -> None:
+    """Pin each process to its own core, because work is spread over processes, not threads."""
     with counter.get_lock():  # type: ignore[attr-defined]
         number = counter.value  # type: ignore[attr-defined]
         counter.value += 1  # type: ignore[attr-defined]
@@ -61,7 +58,7 @@ def main() -> int:
             said = int(20 * share)
             print(f"{time.perf_counter() - began:6.0f} s  {what}", flush=True)
 
-    start = {"initializer": quiet, "initargs": (_started,), "mp_context": multiprocessing.get_context("spawn")}
+    start = {"initializer": pin, "initargs": (_started,), "mp_context": multiprocessing.get_context("spawn")}
     with ProcessPoolExecutor(1, **start) as one:  # one process compiles the kernels for all
         one.submit(run_cell, Cell(axes[0].conditions()[0], 0), methods, args.device).result()
     print(f"{time.perf_counter() - began:6.0f} s  compiled", flush=True)

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.selection.model_choice import calibrate_auto
@@ -204,7 +203,6 @@ def main() -> int:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     print(HEADING + "\n" + "|---" * HEADING.count(" | ") + "|---|")
     rows = []
     for row in runs[args.what](args):

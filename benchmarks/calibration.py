@@ -383,7 +383,6 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--limit-s", type=float, default=math.inf, help="start no new row after this time [s]")
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     began, rows, complete = time.perf_counter(), [], True
     for row in RUNS[args.what](args):
         rows.append(row)

@@ -11,8 +11,6 @@ import sys
 import time
 from pathlib import Path
 
-import warp as wp
-
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import own_folder
 from amiwarp.studies.chart import Charts, make, simulated
@@ -33,7 +31,6 @@ def main() -> int:
     budget.add_argument("--budget-ms", type=float)
     parser.add_argument("--quick", action="store_true")
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     try:
         charts = _redrawn(args.data, args.out) if args.data else _measured(args)
         _print(charts)

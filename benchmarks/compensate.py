@@ -320,7 +320,6 @@ def arguments() -> argparse.Namespace:
 
 def main() -> None:
     a = arguments()
-    wp.config.quiet = True
     if a.row:
         print(json.dumps(row(a.row, a.models[0], a.device, a.repeats, a.columns)))
         return

@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.events.device_events import DeviceEvents
@@ -210,5 +209,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    wp.config.log_level = wp.LOG_ERROR
     sys.exit(main())

@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.events.encoder import Encoder
@@ -198,7 +197,6 @@ def main() -> int:
     parser.add_argument("--events", type=int, default=100_000_000)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     found: dict[str, Any] = {"machine": machine(args.device), "device": args.device}
     found["update_whole"], found["update_region"] = update(args.device, None), update(args.device, REGION)
     found["images"] = images(args.device)

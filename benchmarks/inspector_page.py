@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from amiwarp.studies.machine_info import machine
 from amiwarp.viewer.inspector import Inspector
@@ -83,7 +82,6 @@ def main() -> int:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     recording, found = recorded(made(1_000_000, 0.2)), {"machine": machine(args.device), "device": args.device}
 
     def inspector() -> Inspector:

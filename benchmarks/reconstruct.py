@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
@@ -300,7 +299,6 @@ def main() -> None:
     parser.add_argument("--real-figure", type=Path)
     parser.add_argument("--device", default="cpu")
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     if args.real is not None:
         grid(real(args.real, args.device), args.real_figure)
     shown: dict[str, dict[str, NDArray[np.float32]]] = {}

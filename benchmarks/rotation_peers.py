@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -122,7 +121,6 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--out", type=Path, help="JSON file to write")
     a = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     rows = []
     for n in (20_000, 200_000, 1_000_000):
         given = scene(n)

@@ -95,7 +95,6 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=1.0)
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
-    wp.config.quiet = True
     wp.init()
     device = wp.get_device(arguments.device)
     scene = Scene.from_picture(arguments.picture or blocks_picture())

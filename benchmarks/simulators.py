@@ -23,7 +23,6 @@ from typing import Any
 
 import eventcv
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.optics.camera import Camera
@@ -100,7 +99,6 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480))
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     camera, none = Camera.from_fov(*args.size, math.radians(60.0)), Prism(0.0)
     world, path = named_world("room", "handheld", duration_s=args.seconds)
     ideal = SensorModel.ideal(CONTRAST)

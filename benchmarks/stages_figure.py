@@ -12,7 +12,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
@@ -57,7 +56,6 @@ def main() -> None:
     parser.add_argument("results", type=Path)
     parser.add_argument("out", type=Path)
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     x = np.linspace(-0.8, 0.8, 33)
     sharp, rest = costs(x)
     figure = Figure(figsize=(11.0, 3.6), dpi=110, layout="constrained")

@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from amiwarp.calib.result import Calibration
 from amiwarp.compensation.recordings import compensate_events
@@ -261,7 +260,6 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", default=["rate", "latency", "hour"])
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     if args.picture is None:
         from pyvista.examples import mapfile
 

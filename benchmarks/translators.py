@@ -254,7 +254,6 @@ def main() -> None:
     parser.add_argument("--trajectories", nargs="+", default=list(FPS), choices=list(FPS))
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     print(" " * 46 + " ".join(name[:6].rjust(6) for name in COLUMNS))
     began = time.process_time()
     rows = [row for w in arguments.worlds for t in arguments.trajectories for row in rows_of(w, t)]

@@ -145,7 +145,6 @@ def main() -> int:
     tool = shutil.which(args.nvdisasm)
     if tool is None:
         parser.error("nvdisasm is not installed; it is part of CUDA and of the package nvidia-cuda-nvdisasm")
-    wp.config.log_level = wp.LOG_ERROR
     with tempfile.TemporaryDirectory() as name:
         rows = list(sorted_votes(args.arch, tool, Path(name)))
     for row in rows:

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 from matplotlib import colormaps
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw, ImageFont
@@ -153,7 +152,6 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     for name in args.worlds:
         first, *others = draw(simulate(name, args.frames, args.motion_px, args.device), args.frames)
         path = args.out / f"world_{name}.gif"

@@ -107,7 +107,6 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="simulate a tenth of the time")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     on_cpu = wp.get_device(args.device).is_cpu
     seconds = (0.1 if on_cpu else 1.0) * (0.1 if args.quick else 1.0)
     rows = [measure("room, still, as a picture at infinity", as_picture("room"), seconds, args.device)]

@@ -79,7 +79,6 @@ def main() -> None:
     parser.add_argument("--trajectories", nargs="+", default=list(TRAJECTORIES), choices=list(TRAJECTORIES))
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    wp.config.log_level = wp.LOG_ERROR
     rows = []
     for trajectory in args.trajectories:
         for name in args.worlds:

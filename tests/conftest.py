@@ -22,7 +22,6 @@ from amiwarp.simulation.simulator import simulate
 
 # Makes benchmarks importable. At the end of the path, so that tests use the installed package, not the checkout.
 sys.path.append(str(Path(__file__).parents[1]))
-wp.config.log_level = wp.LOG_ERROR
 wp.init()
 
 LONGEST_FIRST = (

@@ -562,6 +562,52 @@ def test_stdout_of_a_process_is_json_alone(place: Path) -> None:
     assert done.stderr == ""
 
 
+ONE_IMAGE = """
+import numpy as np
+import warp as wp
+{before}
+import amiwarp
+
+def image():
+    x, t = np.arange(8, dtype=np.uint16), np.arange(8)
+    amiwarp.iwe(amiwarp.Events(x, x, t, x.astype(np.uint8) % 2), 8, 8)
+
+if __name__ == "__main__":
+    import multiprocessing
+    image()
+    worker = multiprocessing.get_context("spawn").Process(target=image)
+    worker.start()
+    worker.join()
+    print("level", wp.config.log_level)
+"""
+
+
+@pytest.mark.parametrize(
+    ("before", "verbose", "level", "loads"),
+    [("", "", 30, False), ("", "1", 20, True), ("wp.config.log_level = wp.LOG_DEBUG", "", 10, True),
+     ("wp.config.log_level = wp.LOG_ERROR", "", 40, False)],
+    ids=["default", "verbose", "own level, lower", "own level, higher"],
+)  # fmt: skip
+def test_warp_is_quiet_in_python_unless_wanted(
+    tmp_path: Path, before: str, verbose: str, level: int, loads: bool
+) -> None:
+    """Warp's lines appear, of both processes, or nothing but results does, also while kernels are compiled."""
+    (tmp_path / "program.py").write_text(ONE_IMAGE.format(before=before))
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "AMIWARP_VERBOSE": verbose}
+    if not before and not verbose:
+        environment["WARP_CACHE_PATH"] = str(tmp_path / "cache")
+    done = subprocess.run(
+        [sys.executable, "program.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    lines = done.stdout.splitlines()
+    assert lines[-1] == f"level {level}"
+    if loads:
+        assert sum(line.startswith("Warp 1.") for line in lines) == 2
+        assert sum(line.startswith("Module amiwarp.kernels.iwe ") for line in lines) >= 2
+    else:
+        assert lines == lines[-1:]
+
+
 @pytest.mark.parametrize(
     ("text", "unit", "value"),
     [("90deg", "rad", np.pi / 2), ("1.5 rad", "rad", 1.5), ("-0.25ms", "us", -250.0), ("30", "us", 30.0),

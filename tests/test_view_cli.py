@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import warp as wp
 from calibration_sample import exact_calibration
 from PIL import Image
 from typer.testing import CliRunner
@@ -196,7 +195,6 @@ def test_a_notebook_shows_the_page_below_its_cell(files: Path, monkeypatch: pyte
     vars(shown).update(IFrame=lambda url, width, height: url, display=pages.append)
     monkeypatch.setitem(sys.modules, "IPython", types.ModuleType("IPython"))
     monkeypatch.setitem(sys.modules, "IPython.display", shown)
-    monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)
 
     async def cell() -> bytes:
         shown = amiwarp.view(open_recording(files / "recording.h5"))
@@ -209,4 +207,3 @@ def test_a_notebook_shows_the_page_below_its_cell(files: Path, monkeypatch: pyte
         return bytes(page)
 
     assert b"<html" in asyncio.run(cell()).lower()
-    assert wp.config.log_level == wp.LOG_ERROR  # Warp would print into the cell

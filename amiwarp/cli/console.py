@@ -20,7 +20,7 @@ from amiwarp.progress import Progress
 
 
 def choose_device(name: str | None) -> str:
-    """Initialise Warp without its banner and return the device to run on.
+    """Initialise Warp and return the device to run on.
 
     Raises :class:`AmiwarpError` if the named device is not available.
     """

@@ -1,4 +1,4 @@
-"""Start of Warp without its banner."""
+"""Start of Warp without the warning of a missing GPU driver."""
 
 import contextlib
 import os
@@ -13,8 +13,7 @@ NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
 
 def start_quietly() -> list[str]:
-    """Initialise Warp without its banner, and return the names of its devices."""
-    wp.config.log_level = wp.LOG_ERROR
+    """Initialise Warp and return the names of its devices."""
     with _without(NO_DRIVER):
         wp.init()
     return [device.alias for device in wp.get_devices()]

@@ -101,7 +101,7 @@ def gpu_count(devices: Iterable[str]) -> int:
 
 
 def _prepare(gpus: tuple[str, ...], local: bool, dask_worker: Any) -> None:
-    """Prepare a worker: choose its GPU and silence Warp. A local worker also leaves Ctrl-C to its parent process."""
+    """Prepare a worker: choose its GPU and start Warp. A local worker also leaves Ctrl-C to its parent process."""
     if gpus:  # before CUDA starts in this process
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus[int(dask_worker.name) % len(gpus)]
     if local:

@@ -4,11 +4,9 @@ from typing import Any
 
 
 def reset(gallery_conf: dict[str, Any], fname: str) -> None:
-    """Set the style of all figures, and keep the start message of Warp out of the outputs."""
+    """Set the style of all figures."""
     import matplotlib
-    import warp
 
     matplotlib.rcParams.update(
         {"figure.figsize": (8.0, 3.6), "figure.constrained_layout.use": True, "font.size": 9.5, "image.cmap": "gray"}
     )
-    warp.config.log_level = warp.LOG_ERROR
