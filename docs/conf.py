@@ -24,6 +24,7 @@ extensions = [
     "api_pages",
     "command_pages",
     "offline",
+    "page_commands",
     "paper_results",
     "repository_pages",
     "results_table",

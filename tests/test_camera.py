@@ -13,7 +13,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.camera import CameraParams, solve_ray
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.device_camera import camera_params, fold_radius
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
+from amiwarp.optics.prism import Prism
 
 # as in the package's kernels; otherwise a GPU would fuse multiplications and additions in this module only
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -249,3 +251,27 @@ def test_impossible_lenses_are_refused(lens: Any, value: Any) -> None:
 def test_impossible_field_of_view_is_refused(fov: float) -> None:
     with pytest.raises(AmiwarpError, match="field of view"):
         Camera.from_fov(640, 480, fov)
+
+
+@pytest.mark.parametrize("apex_deg", [1.0, 2.0])
+def test_lens_calibrations_through_a_standing_prism_average_to_the_camera(apex_deg: float) -> None:
+    """OpenCV calibrates the lens from a board seen through the prism at four angles a quarter turn apart."""
+    cv2 = pytest.importorskip("cv2")
+    camera = Camera.from_fov(640, 480, math.radians(60))
+    model = ExactModel(camera, Prism(math.radians(apex_deg)))
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    board = np.float32([[i - 4.5, j - 3.0, 0] for j in range(7) for i in range(10)]) * 0.03  # m
+    rng = np.random.default_rng(0)
+    found = []
+    for theta in np.arange(4) * np.pi / 2:
+        seen: list[np.ndarray] = []
+        while len(seen) < 25:
+            pose = rng.uniform(-0.6, 0.6, 3), rng.uniform([-0.2, -0.15, 0.3], [0.2, 0.15, 0.7])
+            xy = cv2.projectPoints(board, *pose, matrix, None)[0][:, 0].astype(float)
+            if ((xy > 5) & (xy < [634, 474])).all():
+                seen.append(model.deflect_points(xy, np.full(len(xy), theta)).astype(np.float32)[:, None])
+        _, fitted, *_ = cv2.calibrateCamera([board] * len(seen), seen, (640, 480), None, None)
+        found.append(fitted[[0, 1, 0, 1], [0, 1, 2, 2]])
+    true = [camera.fx, camera.fy, camera.cx, camera.cy]
+    assert np.abs(found[0] - true).max() > 5  # px, at one angle
+    np.testing.assert_allclose(np.mean(found, axis=0), true, rtol=0, atol=0.6)  # px

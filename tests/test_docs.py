@@ -1,4 +1,4 @@
-"""The documentation's links have a target, headings included, and its index names every page."""
+"""The documentation's links have a target, headings included; its index names every page; files and names exist."""
 
 import re
 from pathlib import Path
@@ -67,3 +67,49 @@ def test_what_the_site_makes_is_not_checked_as_a_source() -> None:
     assert DOCS / "_build" in MADE
     assert DOCS / "changelog.md" in MADE
     assert all("_build" not in page.parts and page.name != "changelog.md" for page in SOURCES)
+
+
+CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
+PLACE = re.compile(r"(?:amiwarp|benchmarks|docs|examples|tests)/[\w./-]*|[\w./-]+\.pyi?")
+PLACEHOLDERS = ("NAME.py", "NAME_writer.py")
+
+
+def missing_files(text: str, *bases: str) -> list[str]:
+    """Return the paths in code spans that do not exist below the repository or below one of its folders ``bases``."""
+    places = [place for span in CODE.findall(text) for place in span.split() if PLACE.fullmatch(place)]
+    return [
+        place for place in places
+        if not place.endswith(PLACEHOLDERS) and not any((ROOT / base / place).exists() for base in ("", *bases))
+        and not any((ROOT / place).is_relative_to(made) for made in MADE)
+    ]  # fmt: skip
+
+
+def unknown_names(text: str, source: str) -> list[str]:
+    """Return the identifiers in code spans that do not occur in ``source``; of dotted ones, the last part counts."""
+    spans = [span.removesuffix("()") for span in CODE.findall(text)]
+    names = [span for span in spans if re.fullmatch(r"[A-Za-z_][\w.]*", span) and not PLACE.fullmatch(span)]
+    known = set(re.findall(r"\w+", source))
+    return [name for name in names if name.rpartition(".")[2] not in known]
+
+
+def source_text() -> str:
+    """Return the text of the package, its tests and its settings."""
+    files = [ROOT / "pyproject.toml", *(ROOT / "amiwarp").rglob("*.py*"), *(ROOT / "tests").rglob("*.py")]
+    own = [file for file in files if file.suffix in (".py", ".pyi", ".toml") and file != Path(__file__)]
+    return "\n".join(file.read_text() for file in own)
+
+
+@pytest.mark.parametrize("page", PAGES[1:], ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_files_that_a_page_names_exist(page: Path) -> None:
+    """The first page is the changelog, which may name what is gone."""
+    assert missing_files(page.read_text(), "amiwarp") == []
+
+
+def test_names_in_contributing_occur_in_the_source() -> None:
+    assert unknown_names((ROOT / "CONTRIBUTING.md").read_text(), source_text()) == []
+
+
+def test_files_and_names_that_do_not_exist_are_seen() -> None:
+    text = "`calib/solve.py` only; `amiwarp/io/NAME.py`, `tests/none/`, `amiwarp/io/`; `pytest tests/test_docs.py`"
+    assert missing_files(text, "amiwarp") == ["calib/solve.py", "tests/none/"]
+    assert unknown_names("`MODEL_STRUCTS`, `Sharp.score`, `known()`, `a b`", "score known") == ["MODEL_STRUCTS"]

@@ -1,4 +1,4 @@
-"""The extensions that make pages of the site: references, tables of measurements, links, check for remote files."""
+"""The extensions of the site: references, tables of measurements, links, remote files, and the commands on pages."""
 
 import json
 from pathlib import Path
@@ -153,3 +153,94 @@ def test_a_report_of_evaluations_becomes_a_page(extension: Any, tmp_path: Path) 
     assert "All" not in text
     assert "The calibration refused 1 of 2 recordings of room." in text
     assert page.content({}, tmp_path).startswith("No report")
+
+
+SMALL_PAGE = """# A page
+
+```sh
+printf 'apex %s deg in 3.1 s\\n' 1.0029
+printf 'note: one, two\\n'
+```
+
+```output deg±0.001 s±any
+apex APEX deg in 9 s
+note: one, two
+```
+
+- In a list:
+
+  ```python
+  number = 3
+  print(number, open("made.txt").read().strip())
+  ```
+
+  ```output
+  NUMBER WORD
+  ```
+
+```sh
+# not tested: fails
+false
+```
+
+<!-- given: echo given > made.txt -->
+"""
+
+
+@pytest.mark.parametrize(
+    ("apex", "number", "word", "found"),
+    [
+        ("1.0025", "3", "given", []),
+        ("1.0050", "3", "given", [(8, "'apex 1.0050 deg in'", "'apex 1.0029 deg in'")]),
+        ("1.0029", "4", "given", [(20, "'4 given'", "'3 given'")]),
+        ("1.0029", "3", "wrong", [(20, "'3 wrong'", "'3 given'")]),
+    ],
+)
+def test_a_wrong_number_on_a_page_is_seen(
+    extension: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, apex: str, number: str, word: str, found: list[Any]
+) -> None:
+    pages = extension("page_commands")
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text(SMALL_PAGE.replace("APEX", apex).replace("NUMBER", number).replace("WORD", word))
+    texts = [(line, f"the page shows {shown}, printed was {printed}") for line, shown, printed in found]
+    assert pages.run_pages([page]) == {page: texts}
+
+
+def test_what_fails_on_a_page_or_is_in_the_way_is_seen(
+    extension: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pages = extension("page_commands")
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+    folder = tmp_path / "docs" / "how-to"
+    folder.mkdir(parents=True)
+    texts = ["```sh\necho hello > same.txt\n```\n", "```sh\ntouch same.txt other.txt\n```\n", "```sh\nexit 3\n```\n"]
+    files = [folder / f"{k}.md" for k in range(3)]
+    for file, text in zip(files, texts, strict=True):
+        file.write_text(text)
+    assert pages.run_pages(files) == {
+        files[0]: [],
+        files[1]: [(1, "writes same.txt, which docs/how-to/0.md writes, too")],
+        files[2]: [(1, "exit code 3: ")],
+    }
+
+
+def test_spreads_of_numbers_on_pages(extension: Any) -> None:
+    difference = extension("page_commands").difference
+    assert difference("a 10 px b", "x a 11 px b y", "px±10%") is None
+    assert difference("a 10 px b", "x a 12 px b y", "px±10%") is not None
+    assert difference("a 10 px b", "a 10 px c", "px±any") is not None  # words are exact
+    assert difference("1,234 events.", "1,235 events.", "events±1") is None
+    assert difference("-0.5 deg", "0.5 deg", "deg±0.9") is not None
+    assert difference("a.h5: 3 x 4", "a.h6: 3 x 4", "x±any") is not None  # not a number of its own
+    assert difference("one\n...\nfour", "zero one two three four", "") is None
+    assert difference("four\n...\none", "zero one two three four", "") is not None
+
+
+def test_few_commands_on_pages_are_not_run(extension: Any) -> None:
+    """Every page with commands is run, and blocks that are left out say why."""
+    pages = extension("page_commands")
+    found = [block for page in pages.pages_of() for block in pages.blocks(page.read_text()) if block.kind != "given"]
+    left_out = [block for block in found if block.text.startswith(pages.NOT_RUN)]
+    assert len(left_out) < 0.4 * len(found)
+    assert all(block.text.splitlines()[0].removeprefix(pages.NOT_RUN).strip() for block in left_out)

@@ -33,7 +33,7 @@ def run(
 ) -> None:
     """Simulate a recording, calibrate it without an initial guess, compensate it and reconstruct the picture.
 
-    Takes less than a minute.
+    Takes about 15 s on two idle CPU cores, longer the first time, when kernels are compiled, and on a busy machine.
     """
     began = time.perf_counter()
     device = choose_device(common.device)
