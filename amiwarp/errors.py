@@ -1,5 +1,7 @@
 """Exception for bad input, whose message says what was given, what was expected and what to do."""
 
+import re
+
 
 class AmiwarpError(ValueError):
     """Error for bad input: a file, field or value that cannot be used. The message is one line.
@@ -14,8 +16,24 @@ class AmiwarpError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        """Store the message in printable form, because it may quote a damaged or malicious file."""
-        super().__init__(printable(message))
+        """Store the message in printable form and shortened, because it may quote a damaged or malicious file."""
+        super().__init__(shortened(printable(message)))
+
+
+LONGEST_WORD, WORD_HEAD, WORD_TAIL = 160, 100, 40
+"""Longest word of a message, and the characters kept at the beginning and end of a longer one."""
+LONGEST_MESSAGE, MESSAGE_HEAD, MESSAGE_TAIL = 800, 500, 250
+"""The same of a whole message."""
+
+
+def shortened(message: str) -> str:
+    """Return a message without the middle of overlong words (paths, names in files), then of the whole."""
+    words = re.sub(rf"\S{{{LONGEST_WORD + 1},}}", lambda found: _ends(found[0], WORD_HEAD, WORD_TAIL), message)
+    return words if len(words) <= LONGEST_MESSAGE else _ends(words, MESSAGE_HEAD, MESSAGE_TAIL)
+
+
+def _ends(text: str, head: int, tail: int) -> str:
+    return f"{text[:head]}...{text[-tail:]}"
 
 
 def printable(text: str) -> str:

@@ -115,6 +115,8 @@ def array(value: object, what: str, kinds: str = "iuf") -> NDArray[Any]:
     ``kinds`` are the accepted kinds of types, as in NumPy's ``dtype.kind``. Add ``b`` to accept truth values. Arrays of
     other libraries in host memory are shared too.
     """
+    if isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value):
+        raise AmiwarpError(f"{what} has masked values; leave those rows out of all arrays, as in values[~mask]")
     if on_gpu(value):
         raise AmiwarpError(f"{what} is on a GPU; copy it to the host, or give events as amiwarp.DeviceEvents")
     try:

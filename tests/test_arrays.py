@@ -84,6 +84,12 @@ def as_columns(library: str, device: str, events: Events) -> dict[str, Any]:
     return {name: foreign(library, device, getattr(events, name)) for name in NAMES}
 
 
+def falling(device: str) -> DeviceEvents:
+    """Return two events on a device, of which the second is earlier than the first."""
+    columns = zip(([1, 1], [1, 1], [5, 4], [0, 1]), (wp.uint16, wp.uint16, wp.int64, wp.uint8), strict=True)
+    return DeviceEvents(*(wp.array(values, dtype=dtype, device=device) for values, dtype in columns))
+
+
 def on_device(events: Events, device: str) -> DeviceEvents:
     return DeviceEvents.from_arrays(events.x, events.y, events.t, events.p, device=device)
 
@@ -157,7 +163,7 @@ def test_events_from_numpy_move_to_a_device(device: str) -> None:
 COPIED = {
     "x": [np.arange(4, dtype=np.int32), np.array([0.0, np.nan, 1.5, -2.0])],
     "y": [np.arange(4, dtype=np.int64)],
-    "t": [np.array([-3, 0, 5, 7], np.int32), np.array([0.5, 1.5, 2.5, 1e15])],
+    "t": [np.array([-3, 0, 5, 7], np.int32), np.array([0.0, 1.0, 2.0, 1e15])],
     "p": [np.array([-1, 1, 0, 1], np.int8), np.array([0.0, 2.0, -1.0, 1.0])],
 }
 
@@ -200,7 +206,7 @@ def test_values_that_do_not_fit_are_refused_on_the_device(
         ({"x": [[1, 2], [3, 4]]}, "expected one length"),
         ({"x": [-1, 2]}, "expected pixels in 0 .. 65535"),
         ({"x": [np.inf, 2.0], "y": [1.0, 2.0]}, "infinite coordinate|too large for float32"),
-        ({"x": [1.0, 2.0]}, "use from_arrays|expected both uint16 or both float32"),
+        ({"x": [1.0, 2.0]}, "both uint16.* or both float32"),
         ({"t": [0.0, np.nan]}, "not finite"),
         ({"t": [0, 2**62]}, "expected microseconds"),
         ({"p": [0.0, np.nan]}, "p holds NaN"),
@@ -230,7 +236,7 @@ def test_device_arrays_of_other_types_are_refused() -> None:
     with pytest.raises(AmiwarpError, match="x has values of type vec2f"):
         import_array(wp.zeros(3, dtype=wp.vec2), "events' x")
     x, t, p = wp.zeros(3, dtype=wp.uint16), wp.zeros(3, dtype=wp.int64), wp.zeros(3, dtype=wp.uint8)
-    with pytest.raises(AmiwarpError, match="use from_arrays, which converts"):
+    with pytest.raises(AmiwarpError, match=r"int32.*expected x and y both uint16"):
         DeviceEvents(x, x, wp.zeros(3, dtype=wp.int32), p)
     with pytest.raises(AmiwarpError, match="gaps"):
         DeviceEvents(wp.zeros(6, dtype=wp.uint16)[::2], x, t, p)
@@ -635,11 +641,112 @@ def test_packets_on_a_device_can_be_taken_on_the_host(device: str) -> None:
 def test_unsorted_packets_on_a_device_are_refused(device: str) -> None:
     compensator = Compensator(MODEL, EncoderStream(), device=device)
     with pytest.raises(AmiwarpError, match="not sorted"):
-        compensator.put(DeviceEvents.from_arrays([1, 1], [1, 1], [5, 4], [0, 1], device=device), 0)
+        compensator.put(falling(device), 0)
     compensator.put(DeviceEvents.from_arrays([1], [1], [5], [0], device=device), 0)
     with pytest.raises(AmiwarpError, match="start before 5 us"):
         compensator.put(DeviceEvents.from_arrays([1], [1], [4], [0], device=device), 0)
     assert compensator.waiting == 1
+
+
+# -- times, order, masks and gaps
+
+
+TIMES = np.array([0, 1000, 2000])
+FLAT = {"x": [1, 2, 3], "y": [1, 2, 3], "p": [1, 0, 1]}
+
+
+@pytest.mark.parametrize("kind", [Events, DeviceEvents])
+@pytest.mark.parametrize("library", ["numpy", "torch"])
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1.0005])
+def test_floating_times_with_fractions_are_refused(kind: Any, library: str, scale: float) -> None:
+    """Times in seconds or milliseconds, which would become zeros or duplicates."""
+    with pytest.raises(AmiwarpError, match=r"times hold .*whole microseconds.*t_unit='s'"):
+        kind.from_arrays(**FLAT, t=foreign(library, "cpu", 1.0 + (TIMES + 300) * scale))
+
+
+@pytest.mark.parametrize("kind", [Events, DeviceEvents])
+def test_times_in_seconds_are_rounded_to_microseconds(kind: Any) -> None:
+    for first in (0.0, 1_700_000_000.0):  # since the start, and since 1970
+        events = kind.from_arrays(**FLAT, t=first + TIMES / 1e6, t_unit="s")
+        events = events if kind is Events else events.to_host()
+        np.testing.assert_array_equal(events.t, int(first * 1e6) + TIMES)
+    assert kind.from_arrays(**FLAT, t=[0, 1, 2], t_unit="s").t.dtype in (np.int64, wp.int64)
+    with pytest.raises(AmiwarpError, match="t_unit is 'ms'; choose among us, s"):
+        kind.from_arrays(**FLAT, t=TIMES / 1e3, t_unit="ms")
+
+
+@pytest.mark.parametrize("kind", [Events, DeviceEvents])
+@pytest.mark.parametrize(
+    ("t", "unit"),
+    [(TIMES.astype(np.float32) + 2**25, "us"), ((100 + TIMES / 1e6).astype(np.float32), "s"), (TIMES + 1e18, "us")],
+)
+def test_floating_times_that_lost_their_microseconds_are_refused(kind: Any, t: np.ndarray, unit: str) -> None:
+    with pytest.raises(AmiwarpError, match="does not resolve 1 us"):
+        kind.from_arrays(**FLAT, t=t, t_unit=unit)
+
+
+@pytest.mark.parametrize(
+    ("t", "unit", "message"),
+    [
+        (TIMES / 1e6, "us", "t_unit='s'"),
+        (np.array([0.0, np.nan, 1.0]), "s", "not finite"),
+        (np.array([0.0, 100.0], np.float32), "s", "does not resolve 1 us"),
+        (np.array([0, 2**64 - 5], np.uint64), "us", "beyond 2"),
+    ],
+)
+def test_times_are_checked_on_the_device_as_on_the_host(t: np.ndarray, unit: str, message: str, device: str) -> None:
+    with pytest.raises(AmiwarpError, match=message):
+        converted("t", wp.array(t, dtype=wp.dtype_from_numpy(t.dtype), device=device), unit)
+
+
+def test_seconds_are_converted_on_the_device(device: str) -> None:
+    given = wp.array(1e9 + TIMES / 1e6, dtype=wp.float64, device=device)
+    np.testing.assert_array_equal(converted("t", given, "s").numpy(), 10**15 + TIMES)
+
+
+@pytest.mark.parametrize("kind", [Events, DeviceEvents])
+def test_falling_times_are_refused(kind: Any) -> None:
+    with pytest.raises(AmiwarpError, match=r"event 1 \(x=2, y=2, t=1000 us\) is earlier than the one before"):
+        kind.from_arrays(**FLAT, t=TIMES[::-1])
+
+
+def test_falling_times_are_refused_where_events_are_computed(device: str) -> None:
+    on_host = falling("cpu").to_host()
+    for events in (on_host, falling(device)):
+        with pytest.raises(AmiwarpError, match=r"event 1 .* is earlier than the one before"):
+            amiwarp.iwe(events, WIDTH, HEIGHT)
+        with pytest.raises(AmiwarpError, match=r"event 1 .* is earlier than the one before"):
+            amiwarp.compensate_events(events, MODEL, ENCODER)
+
+
+@pytest.mark.parametrize("kind", [Events, DeviceEvents])
+@pytest.mark.parametrize("name", NAMES)
+def test_masked_values_are_refused(kind: Any, name: str) -> None:
+    columns = {**FLAT, "t": TIMES}
+    masked = np.ma.masked_array(columns[name], [False, True, False])
+    with pytest.raises(AmiwarpError, match=r"masked values; .*values\[~mask\]"):
+        kind.from_arrays(**{**columns, name: masked})
+    kind.from_arrays(**{**columns, name: np.ma.masked_array(columns[name])})  # no value is masked
+
+
+def test_numpy_events_copy_arrays_with_gaps() -> None:
+    packed = np.zeros(3, [("x", "u2"), ("y", "u2"), ("t", "i8"), ("p", "u1")])
+    packed["x"], packed["y"], packed["t"], packed["p"] = FLAT["x"], FLAT["y"], TIMES, FLAT["p"]
+    wide = {name: np.repeat(packed[name], 2) for name in NAMES}
+    unaligned = np.frombuffer(b"\0" + np.array(FLAT["x"], np.uint16).tobytes(), np.uint16, offset=1)
+    for columns in (
+        {name: packed[name] for name in NAMES},
+        {name: values[::2] for name, values in wide.items()},
+        {**FLAT, "t": TIMES, "x": unaligned},
+    ):
+        events = Events.from_arrays(**columns)
+        assert_equal(events, Events.from_arrays(**FLAT, t=TIMES))
+        for name in NAMES:
+            found = getattr(events, name)
+            assert found.flags.c_contiguous
+            assert found.flags.aligned
+            if not isinstance(columns[name], list) and name != "t":
+                assert not np.shares_memory(found, columns[name])
 
 
 # -- streams of CUDA

@@ -1,7 +1,9 @@
 """Printed text: control characters from files and names are escaped, and every message is one line."""
 
+import contextlib
 import json
 import os
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -13,9 +15,10 @@ from hypothesis import strategies as st
 
 from amiwarp.cli.console import report, table
 from amiwarp.cli.options import Common
-from amiwarp.errors import printable
+from amiwarp.errors import AmiwarpError, printable
 from amiwarp.events.events import Events
-from amiwarp.io import RecordingWriter
+from amiwarp.io import RecordingWriter, open_recording
+from tests.io_samples_extra import arrays, write_ros2
 
 NASTY = "a\x1b]0;owned\x07\x1b[31m\nb\u202egnp\u2028c.h5"
 """File name that sets the terminal's title and colour, breaks the line and reverses the direction of text."""
@@ -86,3 +89,25 @@ def test_any_text_becomes_a_printable_line(text: str) -> None:
     assert printable(shown) == shown
     if text.isprintable():
         assert shown == text
+
+
+def test_long_names_in_an_error_are_shortened() -> None:
+    said = str(AmiwarpError(f"a.bag: no events in {'n' * 1000}/end; give another"))
+    assert said.startswith("a.bag: no events in nnn")
+    assert said.endswith("nnn/end; give another")
+    assert len(said) < 250
+    long = str(AmiwarpError("start " + "word " * 10_000 + "; do this"))
+    assert long.startswith("start word")
+    assert long.endswith("; do this")
+    assert len(long) <= 800
+    path = "/folder/" + "d" * 100 + "/file.h5: no such file"
+    assert str(AmiwarpError(path)) == path
+
+
+def test_a_type_of_a_bag_does_not_fill_the_error(tmp_path: Path) -> None:
+    bag = write_ros2(tmp_path / "bag", {"/events": arrays(Events.from_arrays([1], [1], [5], [1]), ros1=False)})
+    with contextlib.closing(sqlite3.connect(bag)) as database, database:
+        database.execute("UPDATE topics SET type = ?", (f"pkg/msg/{'T' * 1000}",))
+    with pytest.raises(AmiwarpError, match="bag") as caught:
+        open_recording(bag)
+    assert len(str(caught.value)) < 600

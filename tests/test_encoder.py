@@ -1,5 +1,7 @@
 """The encoder: angle at a time, unwrapping, index pulses, gaps, coverage, and logs in text files."""
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -322,3 +324,17 @@ def test_the_speed_is_that_between_two_times() -> None:
     assert rpm_between(encoder, 0, 900_000) == 0.0
     assert rpm_between(encoder, -(10**9), 10**9) == pytest.approx(encoder.rpm, rel=2e-3)
     assert rpm_between(encoder, 5, 5) == rpm_between(encoder, 10**8, 10**9) == encoder.rpm
+
+
+def test_times_in_seconds_are_refused() -> None:
+    encoder = Encoder.constant_speed(720.0, 0, 1_000_000)
+    for wrong in (np.array([0.25, 0.5]), math.nan):
+        with pytest.raises(AmiwarpError, match="microseconds"):
+            encoder.angle_at(wrong)
+        with pytest.raises(AmiwarpError, match="microseconds"):
+            encoder.speed_at(wrong)
+        with pytest.raises(AmiwarpError, match="microseconds"):
+            encoder.with_index(wrong)
+    with pytest.raises(AmiwarpError, match=r"np.rint\(t \* 1e6\)"):
+        Encoder.from_angles([0.0, 0.5, 1.0], [0.0, 0.1, 0.2])
+    np.testing.assert_array_equal(encoder.angle_at(np.array([2e5])), encoder.angle_at([200_000]))

@@ -18,7 +18,7 @@ from amiwarp.compensation.piece_buffers import PIECE, GpuPieces
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import check_sensor
 from amiwarp.events.device_encoder import encoder_params
-from amiwarp.events.device_events import DeviceEvents, device_for, limits, wait
+from amiwarp.events.device_events import DeviceEvents, check_order, device_for, limits, wait
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.io.chunks import compile_checksums
@@ -121,7 +121,7 @@ def compensate_events(
     Parameters
     ----------
     events : Events or DeviceEvents
-        Events with the whole pixel coordinates of a sensor (uint16).
+        Events with the whole pixel coordinates of a sensor (uint16), sorted by time.
     model : Model
         Optical model of the prism.
     encoder : Encoder
@@ -138,8 +138,8 @@ def compensate_events(
     Raises
     ------
     AmiwarpError
-        If the encoder does not cover the events, their coordinates are not whole pixels, or they are on another device
-        than ``device``.
+        If the encoder does not cover the events, their coordinates are not whole pixels, their times decrease, or they
+        are on another device than ``device``.
 
     Examples
     --------
@@ -151,6 +151,7 @@ def compensate_events(
     (2, 2)
     """
     device = device_for(events, device)
+    check_order(events)
     if isinstance(events, DeviceEvents):
         return _compensate_on_device(events, model, encoder)
     first, last = (int(events.t.min()), int(events.t.max())) if len(events) else encoder.coverage

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import array as as_numbers
+from amiwarp.validation import one_of
 
 if TYPE_CHECKING:
     from amiwarp.events.device_events import DeviceEvents
@@ -21,6 +22,14 @@ TIME_LIMIT = 2**62
 
 The difference and the sum of any two times then fit int64.
 """
+
+TIME_UNITS = {"us": 1.0, "s": 1e6}
+"""Microseconds in each unit of times that arrays may have."""
+
+FRACTION_OF_US = "times are whole microseconds; for seconds, give t_unit='s' (events) or np.rint(t * 1e6)"
+"""Message for floating times with a fraction."""
+COARSE_TIMES = "does not resolve 1 us there; give float64 or int64 from the start"
+"""Message for floating times that were rounded before."""
 
 SENSOR_DTYPE = np.dtype(np.uint16)
 """Data type of pixel coordinates from a sensor. Compensated events have float32 coordinates instead."""
@@ -57,16 +66,51 @@ def as_polarity(values: ArrayLike) -> NDArray[np.uint8]:
     return (array > 0).astype(np.uint8)
 
 
-def as_times(values: ArrayLike) -> NDArray[np.int64]:
-    """Return times of any numeric type as int64 [us], rounded.
+def as_times(values: ArrayLike, what: str = "times", unit: str = "us") -> NDArray[np.int64]:
+    """Return times given in Python, of any numeric type and in one of :data:`TIME_UNITS`, as int64 [us].
+
+    Times in seconds are rounded. Floating times in microseconds must be whole: others are likely in seconds. Raises
+    :class:`AmiwarpError`, also for a time that is not finite, beyond :data:`TIME_LIMIT`, or too late for its type.
+    """
+    array = as_numbers(values, what)
+    scale = TIME_UNITS[one_of(unit, TIME_UNITS, "t_unit")]
+    if scale == 1.0 and array.dtype.kind != "f":
+        return rounded_times(array, what)
+    limit = largest_exact_time(array.dtype)
+    with np.errstate(over="ignore"):
+        scaled = array.astype(np.float64) * scale
+    times = rounded_times(scaled, what)
+    if scale == 1.0 and not np.array_equal(times, scaled):
+        at = int(np.argmax(times != scaled))
+        raise AmiwarpError(f"{what} hold {scaled.flat[at]:.9g} (number {at}): {FRACTION_OF_US}")
+    if times.size and max(-int(times.min()), int(times.max())) > limit:
+        raise AmiwarpError(f"{what} reach {np.abs(times).max()} us, and {array.dtype} {COARSE_TIMES}")
+    return times
+
+
+def largest_exact_time(dtype: np.dtype[Any]) -> float:
+    """Return the largest time whose neighbours in a type are at most 1 us away [us]."""
+    return 2.0 / float(np.finfo(dtype).eps) if dtype.kind == "f" else TIME_LIMIT
+
+
+def rounded_times(values: ArrayLike, what: str = "times") -> NDArray[np.int64]:
+    """Return times of a file, of any numeric type, as int64 [us], rounded.
 
     Raises :class:`AmiwarpError` for a time that is not finite or beyond :data:`TIME_LIMIT`.
     """
-    array = as_numbers(values, "times")
+    array = as_numbers(values, what)
     if array.size and not (array.min() > -TIME_LIMIT and array.max() < TIME_LIMIT):
-        given = f"times span {array.min()} .. {array.max()} us: not finite or beyond int64"
+        given = f"{what} span {array.min()} .. {array.max()} us: not finite or beyond int64"
         raise AmiwarpError(f"{given}; expected microseconds within {TIME_LIMIT} us of 0")
     return np.asarray(np.rint(array) if array.dtype.kind == "f" else array, np.int64)
+
+
+def check_order(events: Events, *, where: str, first_index: int = 0) -> None:
+    """Raise :class:`AmiwarpError` if an event is earlier than the one before."""
+    falls = events.t[1:] < events.t[:-1]
+    if falls.any():
+        falls = np.concatenate([[False], falls])
+        _fail(events, where, first_index, falls, "is earlier than the one before; sort by time")
 
 
 def check_sensor(events: Events | DeviceEvents) -> None:
@@ -93,8 +137,7 @@ def check_events(
         return
     check_coordinates(events, width, height, where=where, first_index=first_index, allow_nan=allow_nan)
     fail = partial(_fail, events, where, first_index)
-    if bool((events.t[1:] < events.t[:-1]).any()):
-        fail(np.concatenate([[False], events.t[1:] < events.t[:-1]]), "is earlier than the one before; sort by time")
+    check_order(events, where=where, first_index=first_index)
     if after_t is not None and events.t[0] < after_t:
         fail(np.ones(1, np.bool_), f"is earlier than the one before ({after_t} us); sort by time")
     if not (events.t[0] > -TIME_LIMIT and events.t[-1] < TIME_LIMIT):  # the times are sorted here

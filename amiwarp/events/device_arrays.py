@@ -2,35 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import as_coordinate, as_polarity, as_times
+from amiwarp.events.checks import (
+    COARSE_TIMES,
+    FRACTION_OF_US,
+    TIME_UNITS,
+    as_coordinate,
+    as_polarity,
+    as_times,
+    largest_exact_time,
+)
 from amiwarp.kernels import event_arrays as kernels
-from amiwarp.validation import on_gpu
+from amiwarp.validation import on_gpu, one_of
 
-HOST: dict[str, Callable[[str, Any], Any]] = {
-    "x": as_coordinate,
-    "y": as_coordinate,
-    "t": lambda _, values: as_times(values),
-    "p": lambda _, values: as_polarity(values),
+HOST: dict[str, Callable[[str, Any, str], Any]] = {
+    "x": lambda name, values, _: as_coordinate(name, values),
+    "y": lambda name, values, _: as_coordinate(name, values),
+    "t": lambda _, values, unit: as_times(values, unit=unit),
+    "p": lambda _, values, __: as_polarity(values),
 }
-"""Conversion of each column of events in host memory, from its name and its values."""
+"""Conversion of each column of events in host memory, from its name, its values and the unit of times."""
 
 
-def event_column(name: str, values: Any, device: Any) -> Any:
+def event_column(name: str, values: Any, device: Any, t_unit: str) -> Any:
     """Return the column ``x``, ``y``, ``t`` or ``p`` of events as a contiguous Warp array of the type that it needs.
 
-    ``device``: where to put it; None for where the values are.
+    ``device``: where to put it; None for where the values are. ``t_unit``: unit of times, in ``TIME_UNITS``.
     """
     if on_gpu(values):
-        found = converted(name, import_array(values, f"events' {name}"))
+        found = converted(name, import_array(values, f"events' {name}"), t_unit)
     else:
-        host = np.ascontiguousarray(HOST[name](name, values))
+        host = np.require(HOST[name](name, values, t_unit), requirements=["C", "A"])
         found = wp.array(host, dtype=wp.dtype_from_numpy(host.dtype), device="cpu", copy=False)
     return found if device is None else found.to(device)
 
@@ -52,13 +60,11 @@ def import_array(values: Any, what: str) -> Any:
     return found
 
 
-def converted(name: str, values: Any) -> Any:
+def converted(name: str, values: Any, t_unit: str = "us") -> Any:
     """Return a column in the type that events need, as a checked copy if it has another type."""
     integers = wp.types.type_is_int(values.dtype)
     if name == "t":
-        if integers:
-            return cast(values, wp.int64)
-        return _checked(kernels.round_times, values, wp.float64, wp.int64, "t is not finite or beyond 2**62 us of 0")
+        return _times(values, TIME_UNITS[one_of(t_unit, TIME_UNITS, "t_unit")], integers)
     if name == "p":
         if values.dtype is wp.uint8:
             return values  # the caller checks that it is 0 or 1
@@ -77,6 +83,22 @@ def positive(values: Any) -> Any:
     return _checked(kernels.mark_positive, values, wp.float64, wp.uint8, "p holds NaN")
 
 
+def _times(values: Any, scale: float, integers: bool) -> Any:
+    """Return times as int64 [us], checked as by :func:`amiwarp.events.checks.as_times`."""
+    if scale == 1.0 and integers:
+        if values.dtype is wp.uint64:
+            return _checked(kernels.narrow_times, values, wp.uint64, wp.int64, "t is beyond 2**62 us of 0")
+        return cast(values, wp.int64)
+    dtype = np.dtype(wp.dtype_to_numpy(values.dtype))
+    what = {
+        3: "t is not finite or beyond 2**62 us of 0",
+        2: f"t holds fractions: {FRACTION_OF_US}",
+        1: f"t reaches beyond {largest_exact_time(dtype):g} us, and {dtype} {COARSE_TIMES}",
+    }
+    inputs = [scale, largest_exact_time(dtype)]
+    return _checked(kernels.round_times, values, wp.float64, wp.int64, what, inputs)
+
+
 def cast(values: Any, dtype: Any) -> Any:
     """Return the values in another type, without a copy if they have it."""
     if values.dtype is dtype:
@@ -87,12 +109,19 @@ def cast(values: Any, dtype: Any) -> Any:
     return out
 
 
-def _checked(kernel: Any, values: Any, wide: Any, dtype: Any, what: str) -> Any:
-    """Return a converted copy. Raises :class:`AmiwarpError` if the kernel finds a bad value."""
+def _checked(
+    kernel: Any, values: Any, wide: Any, dtype: Any, what: str | dict[int, str], inputs: Sequence[float] = ()
+) -> Any:
+    """Return a converted copy. Raises :class:`AmiwarpError` if the kernel finds a bad value.
+
+    ``what``: what is wrong, by the kernel's number of the fault if it finds several. ``inputs``: more inputs of the
+    kernel.
+    """
     if values.ndim != 1:  # the caller names the shapes
         return wp.empty(values.shape, dtype=dtype, device=values.device)
     out, bad = wp.empty(values.shape, dtype=dtype, device=values.device), wp.zeros(1, dtype=int, device=values.device)
-    wp.launch(kernel, len(values), inputs=[cast(values, wide)], outputs=[out, bad], device=values.device)
-    if bad.numpy()[0]:
-        raise AmiwarpError(f"events' {what}")
+    wp.launch(kernel, len(values), inputs=[cast(values, wide), *inputs], outputs=[out, bad], device=values.device)
+    fault = int(bad.numpy()[0])
+    if fault:
+        raise AmiwarpError(f"events' {what if isinstance(what, str) else what[fault]}")
     return out

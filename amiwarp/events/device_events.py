@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events import checks
 from amiwarp.events.checks import TIME_LIMIT
 from amiwarp.events.device_arrays import event_column, positive
 from amiwarp.events.events import Events
@@ -65,12 +66,15 @@ class DeviceEvents:
             raise AmiwarpError(f"event arrays are on devices {devices}; put them on one device")
         types = {name: array.dtype.__name__ for name, array in arrays.items()}
         if (types["t"], types["p"]) != ("int64", "uint8") or (types["x"], types["y"]) not in COORDINATES:
-            raise AmiwarpError(f"event arrays have types {types}; use from_arrays, which converts them")
+            wanted = "x and y both uint16 (whole pixels) or both float32, t int64, p uint8"
+            raise AmiwarpError(f"event arrays have types {types}; expected {wanted}")
         if any(array.size and not array.is_contiguous for array in arrays.values()):
-            raise AmiwarpError("event arrays have gaps between their values; use from_arrays, which copies them")
+            raise AmiwarpError("event arrays have gaps between their values; DeviceEvents.from_arrays copies them")
 
     @classmethod
-    def from_arrays(cls, x: Any, y: Any, t: Any, p: Any, *, device: Any = None) -> DeviceEvents:
+    def from_arrays(
+        cls, x: Any, y: Any, t: Any, p: Any, *, t_unit: Literal["us", "s"] = "us", device: Any = None
+    ) -> DeviceEvents:
         """Create events from arrays of NumPy, Warp, PyTorch, CuPy, JAX or any other library with DLPack.
 
         Arrays with the types of :class:`DeviceEvents`, and truth values as ``p``, are used without a copy if they have
@@ -83,9 +87,11 @@ class DeviceEvents:
             Pixel coordinates [px], shape (n,). Integers become uint16. Floating values become float32 and mark
             compensated events; NaN marks a compensated event without a position.
         t : array
-            Times [us], shape (n,), rounded to int64.
+            Times [us], shape (n,), in ascending order. Floating times must be whole.
         p : array
             Polarities, shape (n,): ON if above 0 or true, else OFF.
+        t_unit : {"us", "s"}, default "us"
+            Unit of ``t``. Times in seconds are rounded to microseconds.
         device : str or warp.Device, optional
             Device to put the events on. By default, they stay where the arrays are.
 
@@ -97,11 +103,10 @@ class DeviceEvents:
         Raises
         ------
         AmiwarpError
-            If the arrays differ in length or device, a coordinate does not fit its type, a time is not finite or beyond
-            2**62 us, or a polarity is NaN.
+            If the arrays differ in length or device; or for values that :meth:`Events.from_arrays` refuses.
         """
         given = {"x": x, "y": y, "t": t, "p": p}
-        events = cls(*(event_column(name, values, device) for name, values in given.items()))
+        events = cls(*(event_column(name, values, device, t_unit) for name, values in given.items()))
         if not len(events):
             return events
         first, last, right, bottom, polarity, _ = limits(events)
@@ -109,6 +114,7 @@ class DeviceEvents:
             raise AmiwarpError(f"times span {first} .. {last} us; expected microseconds within {TIME_LIMIT} us of 0")
         if max(right, bottom) >= int(kernels.BEYOND):
             raise AmiwarpError("events' x or y holds an infinite coordinate; drop that event")
+        check_order(events)
         return cls(events.x, events.y, events.t, positive(events.p)) if polarity > 1 else events
 
     @classmethod
@@ -205,6 +211,14 @@ def limits(events: DeviceEvents) -> list[int]:
         wp.launch(kernels.find_limits, threads, inputs=inputs, outputs=[found], device=events.device)
         events._limits.extend(found.numpy().tolist())
     return events._limits
+
+
+def check_order(events: Events | DeviceEvents) -> None:
+    """Raise :class:`AmiwarpError` if an event is earlier than the one before."""
+    if isinstance(events, Events):
+        checks.check_order(events, where="events")
+    elif len(events) and limits(events)[5]:
+        checks.check_order(events.to_host(), where="events")  # it names the event
 
 
 def time_span(events: Events | DeviceEvents) -> tuple[int, int]:

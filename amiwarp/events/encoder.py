@@ -288,7 +288,7 @@ class Encoder:
         Raises
         ------
         AmiwarpError
-            If a time is outside :attr:`coverage`.
+            If a time is outside :attr:`coverage`, or not a whole number.
         """
         elapsed, sampled, angle = self._near(t)
         result = np.interp(elapsed, sampled, angle)
@@ -314,7 +314,7 @@ class Encoder:
         Raises
         ------
         AmiwarpError
-            If a time is outside :attr:`coverage`.
+            If a time is outside :attr:`coverage`, or not a whole number.
         """
         elapsed, sampled, angle = self._near(t)
         piece = np.clip(np.searchsorted(sampled, elapsed, side="right") - 1, 0, sampled.size - 2)
@@ -378,7 +378,7 @@ class Encoder:
         All times are relative to the first of these samples. Only samples near ``t`` are used, so the cost does not
         depend on the recording's length.
         """
-        times = np.asarray(t, np.int64)
+        times = t if isinstance(t, np.ndarray) and t.dtype == np.int64 else as_times(t)
         low, high = (int(times.min()), int(times.max())) if times.size else self.coverage
         if not self.covers(low, high):
             first, last = self.coverage

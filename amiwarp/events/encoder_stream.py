@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import as_times
 from amiwarp.events.encoder import TWO_PI, Encoder
+from amiwarp.validation import array
 
 RESTART_US = 1
 """Time between the extrapolated sample that ends the samples before a restart and the first sample after it [us]."""
@@ -104,7 +105,7 @@ class EncoderStream:
         AmiwarpError
             If the shapes differ or an angle is not finite.
         """
-        t, angles = as_times(t_us), np.asarray(angle, np.float64)
+        t, angles = as_times(t_us), array(angle, "encoder angle").astype(np.float64)
         if not t.size and not angles.size:
             return t, angles
         if t.shape != angles.shape or t.ndim != 1:

@@ -9,13 +9,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import SENSOR_DTYPE, as_coordinate, as_polarity, as_times, check_events
+from amiwarp.events.checks import SENSOR_DTYPE, as_coordinate, as_polarity, as_times, check_events, check_order
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import instance, whole
 
@@ -62,12 +62,14 @@ class Events:
             )
 
     @classmethod
-    def from_arrays(cls, x: ArrayLike, y: ArrayLike, t: ArrayLike, p: ArrayLike) -> Events:
+    def from_arrays(
+        cls, x: ArrayLike, y: ArrayLike, t: ArrayLike, p: ArrayLike, *, t_unit: Literal["us", "s"] = "us"
+    ) -> Events:
         """Create events from arrays of any numeric type, of any library, in host memory.
 
         Arrays of NumPy, Warp, PyTorch, JAX and others with DLPack are used without a copy if they have the types of
-        :class:`Events`, or truth values as ``p``. Arrays of other types are copied. For arrays on a GPU, use
-        :class:`amiwarp.DeviceEvents`.
+        :class:`Events`, or truth values as ``p``, and no gaps between their values. Others are copied. For arrays on a
+        GPU, use :class:`amiwarp.DeviceEvents`.
 
         Parameters
         ----------
@@ -75,9 +77,11 @@ class Events:
             Pixel coordinates [px], shape (n,). Integers become uint16. Floating values become float32 and mark
             compensated events; NaN marks a compensated event without a position.
         t : array_like
-            Times [us], shape (n,), rounded to int64.
+            Times [us], shape (n,), in ascending order. Floating times must be whole.
         p : array_like
             Polarities, shape (n,): ON if above 0 or true, else OFF. Both 0/1 and -1/1 are understood.
+        t_unit : {"us", "s"}, default "us"
+            Unit of ``t``. Times in seconds are rounded to microseconds.
 
         Returns
         -------
@@ -87,9 +91,19 @@ class Events:
         Raises
         ------
         AmiwarpError
-            If a coordinate does not fit its type, a time is not finite or beyond 2**62 us, or a polarity is NaN.
+            If a coordinate does not fit its type; if a time has a fraction of a microsecond, is not finite, beyond
+            2**62 us, earlier than the one before, or floating and too late for its type to resolve 1 us; if a polarity
+            is NaN; or if an array has masked values.
+
+        Examples
+        --------
+        >>> amiwarp.Events.from_arrays(x=[10, 11], y=[5, 5], t=[0.5, 0.6], p=[1, 0], t_unit="s").t.tolist()
+        [500000, 600000]
         """
-        return cls(as_coordinate("x", x), as_coordinate("y", y), as_times(t), as_polarity(p))
+        columns = as_coordinate("x", x), as_coordinate("y", y), as_times(t, unit=t_unit), as_polarity(p)
+        events = cls(*(np.require(column, requirements=["C", "A"]) for column in columns))
+        check_order(events, where="events")
+        return events
 
     @classmethod
     def empty(cls) -> Events:

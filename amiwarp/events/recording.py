@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import as_times
 from amiwarp.events.events import EventSource
 from amiwarp.events.sensors import ImageStore, ImuSamples
 from amiwarp.events.truth import EventTruth, EventValues, FrameStore, KnownStore, PoseStore, WorldLabels
+from amiwarp.validation import array
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
@@ -96,7 +99,9 @@ class Truth:
             Whether each pixel is known at its time, shape ``(n,)``. Pixels outside the image, NaN and times before the
             first mask are unknown. Everything is known if no masks are stored.
         """
-        times, pixels = np.asarray(t_us), np.asarray(xy, np.float64)
+        times, pixels = as_times(t_us), array(xy, "xy").astype(np.float64)
+        if times.ndim != 1 or pixels.shape != (len(times), 2):
+            raise AmiwarpError(f"t_us has shape {times.shape}, xy {pixels.shape}; expected (n,) and (n, 2)")
         if self.known is None:
             return np.ones(len(times), np.bool_)
         row = np.searchsorted(self.known.t, times, side="right") - 1

@@ -11,7 +11,7 @@ import warp as wp
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_arrays import cast
-from amiwarp.events.device_events import DeviceEvents, device_for, wait
+from amiwarp.events.device_events import DeviceEvents, check_order, device_for, wait
 from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.device_events import UploadedEvents, upload_events
 from amiwarp.imaging.device_image import Image
@@ -194,7 +194,7 @@ def iwe(
     Parameters
     ----------
     events : Events or DeviceEvents
-        Events to vote.
+        Events to vote, sorted by time.
     width, height : int
         Sensor size [px].
     model : Model, optional
@@ -222,8 +222,8 @@ def iwe(
     Raises
     ------
     AmiwarpError
-        If only one of ``model`` and ``encoder`` is given, the encoder does not cover the events, or the events are on
-        another device than ``device``.
+        If only one of ``model`` and ``encoder`` is given, the encoder does not cover the events, their times decrease,
+        or they are on another device than ``device``.
 
     Examples
     --------
@@ -235,6 +235,7 @@ def iwe(
     if (model is None) != (encoder is None):
         raise AmiwarpError("only one of model and encoder is given; give both a model and an encoder, or neither")
     device = device_for(events, device)
+    check_order(events)
     votes = Votes(CanvasShape(width, height, pad, 1.0, per_polarity, vote), device)
     for start in range(0, len(events), PIECE):
         piece = events[start : start + PIECE]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import as_times
+from amiwarp.events.checks import rounded_times
 from amiwarp.events.events import DEFAULT_BLOCK, Events, regroup
 from amiwarp.io.input_files import errors_name, register_reader
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
@@ -280,7 +280,7 @@ class FileEvents:
             x, y, t, p = x[inside], y[inside], t[inside], p[inside]
         if not t.size:
             return Events.empty()
-        times = as_times(t)
+        times = rounded_times(t)
         floor = counts.t_last if counts.count else int(times[0])
         ordered = np.maximum(np.maximum.accumulate(times), floor)
         counts.late += int(np.count_nonzero(ordered != times))

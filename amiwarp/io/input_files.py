@@ -8,7 +8,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from amiwarp.errors import AmiwarpError, printable
+from amiwarp.errors import WORD_HEAD, AmiwarpError, printable
 
 _sources: weakref.WeakKeyDictionary[object, tuple[Path, ...]] = weakref.WeakKeyDictionary()
 """Files that each open event source reads."""
@@ -60,7 +60,7 @@ def errors_name(path: Path, place: Callable[[], str]) -> Iterator[None]:
     try:
         yield
     except AmiwarpError as error:
-        if printable(str(path)) in str(error):
+        if printable(str(path))[:WORD_HEAD] in str(error):
             raise
         raise AmiwarpError(f"{path}: {place()}: {error}") from error
     except (KeyboardInterrupt, SystemExit, GeneratorExit):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import as_coordinate, as_polarity, as_times, check_events
+from amiwarp.events.checks import as_coordinate, as_polarity, check_events, rounded_times
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import DEFAULT_BLOCK, Events, regroup
 from amiwarp.events.recording import MetadataValue, Recording
@@ -51,7 +51,7 @@ class NativeEvents:
             raise AmiwarpError(f"{path}: datasets of events differ in length: {lengths}; the file is damaged")
         self._count = min(lengths.values())
         offset = file.columns.get("t_offset")
-        self._offset = 0 if offset is None else as_times(offset.read(0, 1)).item()
+        self._offset = 0 if offset is None else rounded_times(offset.read(0, 1)).item()
         # The index of an unfinished file may be incomplete. Bisection is used instead.
         self._ms_to_idx = None if file.unfinished else file.columns.get("ms_to_idx")
         self._size = self._find_size()
@@ -103,7 +103,7 @@ class NativeEvents:
             x, y, p = (self._read(name, start, stop) for name in ("x", "y", "p"))
             t = self._read("t", start, stop)
             # check_events finds times beyond the limit among sorted int64, also if adding the offset overflows.
-            t = self._since_zero(t if t.dtype == np.int64 else as_times(t))
+            t = self._since_zero(t if t.dtype == np.int64 else rounded_times(t))
             events = Events(as_coordinate("x", x), as_coordinate("y", y), t, as_polarity(p))
             nan = "inside" in self._columns
             check_events(events, *self._size, where=str(self.path), first_index=start, allow_nan=nan)
@@ -170,7 +170,7 @@ class NativeEvents:
             yield from pieces
 
     def _times(self, start: int, stop: int) -> NDArray[np.int64]:
-        return self._since_zero(as_times(self._read("t", start, stop)))
+        return self._since_zero(rounded_times(self._read("t", start, stop)))
 
     def _since_zero(self, t: NDArray[np.int64]) -> NDArray[np.int64]:
         """Add the file's offset to times, in the same array if it can be written."""
@@ -259,9 +259,9 @@ def _column(file: Hdf5File, name: str) -> Column:
 def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
     columns = {name: _column(file, f"encoder/{name}") for name in ("t", "angle")}
     t, angle = (column.read(0, len(column)) for column in columns.values())
-    t, angle = as_times(t), angle.astype(np.float64)
+    t, angle = rounded_times(t), angle.astype(np.float64)
     pulses = file.columns.get("encoder/index_t")
-    index_t = None if pulses is None else as_times(pulses.read(0, len(pulses)))
+    index_t = None if pulses is None else rounded_times(pulses.read(0, len(pulses)))
     if file.unfinished:
         count = min(t.size, angle.size)
         t, angle = t[:count], angle[:count]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import as_times
+from amiwarp.events.checks import rounded_times
 from amiwarp.events.sensors import ImuSamples
 from amiwarp.io.hdf5 import Column, Hdf5File
 from amiwarp.io.input_files import errors_name
@@ -22,7 +22,7 @@ def read_imu(path: Path, file: Hdf5File) -> ImuSamples | None:
     with errors_name(path, lambda: "imu"):
         count = len(file.columns["imu/t"])
         values = [_rows(file, f"imu/{name}", count, (3,)) for name in ("angular_velocity", "acceleration")]
-        t = as_times(file.columns["imu/t"].read(0, count))
+        t = rounded_times(file.columns["imu/t"].read(0, count))
         return ImuSamples(t, *(column.read(0, count).astype(np.float64, copy=False) for column in values))
 
 
@@ -54,7 +54,7 @@ class StoredImages:
         self._image = _rows(file, "frames/image", len(times), None)
         if self._image.dtype not in (np.uint8, np.uint16) or not all(self._image.row):
             raise AmiwarpError(f"frames are {self._image.dtype} of shape {self._image.row}; expected uint8 or uint16")
-        self.t = as_times(times.read(0, len(times)))
+        self.t = rounded_times(times.read(0, len(times)))
         """Times of the frames [us], shape ``(k,)``."""
         if (self.t[1:] < self.t[:-1]).any():
             raise AmiwarpError("frames/t decreases; the file is damaged")

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import as_times
+from amiwarp.events.checks import rounded_times
 from amiwarp.events.recording import MetadataValue
 from amiwarp.events.sensors import ImuSamples
 from amiwarp.io.file_scan import head_limit
@@ -45,7 +45,7 @@ def imu_of(path: Path, columns: Packets) -> ImuSamples:
         if not found:
             return ImuSamples(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
         t, *values = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        times = as_times(t)
+        times = rounded_times(t)
         order = np.argsort(times, kind="stable")
         rows = np.stack(values, axis=1).astype(np.float64)[order]
         return ImuSamples(times[order], rows[:, :3].copy(), rows[:, 3:].copy())
@@ -69,7 +69,7 @@ class StreamedImages:
             kinds = set(zip(width.tolist(), height.tolist(), depth.tolist(), strict=True))
             if len(kinds) != 1 or (np.diff(t) < 0).any():
                 raise AmiwarpError("frames differ in size or bits, or their times decrease")
-        self.t = as_times(t)
+        self.t = rounded_times(t)
         """Times of the frames [us], shape ``(k,)``."""
         self._size, self._dtype = (int(width[0]), int(height[0])), np.dtype(f"u{int(depth[0])}")
         self._lock = threading.Lock()

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import as_times
+from amiwarp.events.checks import rounded_times
 from amiwarp.events.recording import Truth
 from amiwarp.events.truth import MAPS, EventValues, FrameTruth, Poses, WorldLabels, rotation_of
 from amiwarp.io.camera_attributes import attribute
@@ -164,7 +164,7 @@ class _StoredFrames:
 
 def _rising_times(path: Path, file: Hdf5File, name: str) -> NDArray[np.int64]:
     """Return the times of a dataset [us]. Raises :class:`AmiwarpError` if they do not rise."""
-    times = as_times(file.columns[name].read(0, len(file.columns[name])))
+    times = rounded_times(file.columns[name].read(0, len(file.columns[name])))
     if (np.diff(times) <= 0).any():
         raise AmiwarpError(f"{path}: {name} does not increase; the file is damaged")
     return times
@@ -215,4 +215,4 @@ class _StoredPoses:
                 for what, (names, column) in self._tables.items()
             }  # fmt: skip
             camera = self._camera.read(start, stop).astype(np.float64)
-            return Poses(as_times(self._t.read(start, stop)), camera, **tables)
+            return Poses(rounded_times(self._t.read(start, stop)), camera, **tables)

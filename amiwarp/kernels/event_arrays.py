@@ -69,12 +69,37 @@ def narrow_floats(values: wp.array(dtype=wp.float64), out: wp.array(dtype=float)
 
 
 @wp.kernel
-def round_times(values: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.int64), bad: wp.array(dtype=int)):
-    """Round times [us], half to even as NumPy does, and set ``bad`` if one is not finite or beyond the limit."""
+def round_times(
+    values: wp.array(dtype=wp.float64),
+    scale: wp.float64,
+    latest: wp.float64,
+    out: wp.array(dtype=wp.int64),
+    bad: wp.array(dtype=int),
+):
+    """Scale times to microseconds and round them, half to even as NumPy does.
+
+    ``bad`` becomes 3 if a time is not finite or beyond the limit, else 2 if times of scale 1 are not whole, else 1 if
+    one is beyond ``latest`` [us].
+    """
     i = wp.tid()
-    if wp.abs(values[i]) < TIME_LIMIT:
-        out[i] = wp.int64(wp.rint(values[i]))
+    time = values[i] * scale
+    rounded = wp.rint(time)
+    if not wp.abs(time) < TIME_LIMIT:
+        wp.atomic_max(bad, 0, 3)
     else:
+        out[i] = wp.int64(rounded)
+        if scale == wp.float64(1.0) and rounded != time:
+            wp.atomic_max(bad, 0, 2)
+        elif wp.abs(time) > latest:
+            wp.atomic_max(bad, 0, 1)
+
+
+@wp.kernel
+def narrow_times(values: wp.array(dtype=wp.uint64), out: wp.array(dtype=wp.int64), bad: wp.array(dtype=int)):
+    """Convert unsigned times [us], and set ``bad`` if int64 does not hold one."""
+    i = wp.tid()
+    out[i] = wp.int64(values[i])
+    if out[i] < wp.int64(0):
         bad[0] = 1
 
 
