@@ -2,6 +2,7 @@
 
 import errno
 import fcntl
+import importlib
 import json
 import math
 import os
@@ -12,17 +13,20 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
 from calibration_sample import exact_calibration
 from PIL import Image
+from typer.models import ArgumentInfo
 from typer.testing import CliRunner, Result
 
 from amiwarp.calib import Calibration
-from amiwarp.cli.app import app
+from amiwarp.cli.app import SUMMARIES, app
+from amiwarp.cli.options import NO_FILE, OUTPUT, OUTPUT_FOLDER
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
@@ -32,6 +36,7 @@ from amiwarp.imaging.export import IweFiles
 from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
 from amiwarp.io import atomic_output as output
 from amiwarp.io.atomic_output import NewFile, check_output, own_folder, remove_abandoned, write_text
+from amiwarp.io.json_files import read_json
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -75,6 +80,13 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     text.mkdir()
     (text / "events.txt").write_text("".join(f"{k * 1e-4:.6f} {k % 64} {k % 48} {k % 2}\n" for k in range(100)))
     (text / "calib.txt").write_text("50 50 32 24 0 0 0 0 0\n")
+    (folder / "speed.txt").write_text("0 600\n1 720\n")
+    (folder / "tr.tum").write_text("0 0 0 1.5 0 0 0 1\n1 0 0 1.5 0 0 0 1\n")
+    (folder / "tile.obj").write_text("v 0 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n")
+    (folder / "world.toml").write_text(
+        'format = "amiwarp-world"\nversion = 1\nsky = {panorama = "pic.png"}\ncamera = {trajectory = "tr.tum"}\n'
+        'bodies = [{name = "tile", mesh = "tile.obj"}]\n'
+    )
     return folder
 
 
@@ -98,24 +110,66 @@ OVER_INPUTS = (
     ("compensate a.h5 {} --calibration cal.json", "a.h5"),
     ("compensate a.h5 {} --calibration cal.json", "cal.json"),
     ("compensate a.h5 out.h5 --calibration cal.json --iwe {}", "cal.json"),
+    ("compensate a.h5 {} --calibration cal.json --preset tr.tum", "tr.tum"),
     ("reconstruct a.h5 {} --calibration cal.json", "a.h5"),
     ("reconstruct a.h5 out.png --calibration cal.json --mask {}", "cal.json"),
     ("simulate {} --picture pic.png --duration 0.01", "pic.png"),
     ("simulate {} --picture pic.png --camera cam.json --duration 0.01", "cam.json"),
+    ("simulate {} --picture pic.png --speed speed.txt --duration 0.01", "speed.txt"),
+    ("simulate out.h5 --world room --camera cam.json --duration 0.01 --preview {}", "cam.json"),
+    ("simulate {} --world room --trajectory tr.tum --size 64x48 --duration 0.01", "tr.tum"),
+    *(
+        ("simulate {} --world world.toml --size 64x48 --duration 0.01", read)
+        for read in ("world.toml", "tile.obj", "pic.png", "tr.tum")
+    ),
     ("translate v.npy {} --fps 100", "v.npy"),
     ("translate pictures {} --fps 100", "pictures/0.png"),
     ("translate pictures {} --fps 100 --camera cam.json", "cam.json"),
+    ("translate pictures {} --fps 100 --speed speed.txt", "speed.txt"),
+    ("translate pictures {} --fps 100 --events a.h5", "a.h5"),
     ("convert a.h5 {}", "a.h5"),
     ("convert a.h5 {} --encoder enc.csv", "enc.csv"),
     ("convert a.h5 {} --camera cam.json", "cam.json"),
     ("convert text/events.txt {}", "text/calib.txt"),
     ("record a.h5 {} --fast", "a.h5"),
+    ("record a.h5 {} --fast --camera cam.json", "cam.json"),
     ("live a.h5 --fast --calibration cal.json --out {}", "cal.json"),
     ("live a.h5 --fast --calibration cal.json --out {}", "a.h5"),
     ("live a.h5 --fast --calibration cal.json --record {}", "a.h5"),
     ("view a.h5 --screenshot {}", "a.h5"),
     ("view a.h5 --calibration cal.json --screenshot {}", "cal.json"),
+    ("view a.h5 --camera cam.json --screenshot {}", "cam.json"),
 )
+
+
+def path_options(name: str) -> Iterator[tuple[str, bool]]:
+    """Yield the options and arguments of a command that are paths, and whether the command writes to them."""
+    function = importlib.import_module(f"amiwarp.cli.{name}").run
+    for key, kind in get_type_hints(function, include_extras=True).items():
+        group = get_type_hints(kind, include_extras=True) if is_dataclass(kind) else {key: kind}
+        for one, hint in group.items():
+            marks = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, str)]
+            if "Path" in str(getattr(hint, "__origin__", hint)) and NO_FILE not in marks:
+                argument = any(isinstance(mark, ArgumentInfo) for mark in hint.__metadata__)
+                yield "" if argument else f"--{one.replace('_', '-')}", bool({OUTPUT, OUTPUT_FOLDER} & set(marks))
+
+
+def options_of(line: str) -> set[tuple[str, str]]:
+    """Return the command of a line with each of its options, and with "" for its arguments."""
+    command, *words = line.split()
+    return {(command, word) for word in words if word.startswith("--")} | {(command, "")}
+
+
+def test_every_input_of_every_command_is_in_the_tables() -> None:
+    """A new command or option that reads a file gets its lines in both tables."""
+    over = {pair for line, _ in OVER_INPUTS for pair in options_of(line)}
+    endless = {pair for line in ENDLESS for pair in options_of(line)}
+    for command in SUMMARIES:
+        options = list(path_options(command))
+        read = {(command, option) for option, writes in options if not writes}
+        assert read <= endless
+        if command not in ("chart", "dataset", "demo", "design", "emulate", "evaluate", "info", "truth"):
+            assert read <= over  # these commands write to a folder, or nothing
 
 
 def same_name(path: Path) -> Path:
@@ -280,36 +334,52 @@ def impatient() -> Iterator[None]:
     signal.signal(signal.SIGALRM, before)
 
 
-@pytest.mark.usefixtures("impatient")
-@pytest.mark.parametrize(
-    "line",
-    [
-        "info {}",
-        "convert {} out.h5",
-        "convert a.h5 out.h5 --encoder {}",
-        "convert a.h5 out.h5 --camera {}.json",
-        "convert a.h5 out.h5 --camera {}.txt",
-        "calibrate {} out.json",
-        "calibrate a.h5 out.json --preset {}",
-        "compensate {} out.h5 --calibration cal.json",
-        "compensate a.h5 out.h5 --calibration {}",
-        "compensate a.h5 out.h5 --calibration cal.json --preset {}",
-        "reconstruct {} out.png --calibration cal.json",
-        "reconstruct a.h5 out.png --calibration {}",
-        "simulate out.h5 --picture {}",
-        "simulate out.h5 --picture pic.png --speed {}",
-        "translate {} out.h5 --fps 100",
-        "translate {}.npy out.h5 --fps 100",
-        "record {} out.h5 --fast",
-        "live {} --calibration cal.json --out out.h5",
-        "live a.h5 --calibration {} --out out.h5",
-        "view {} --screenshot out.png",
-        "view a.h5 --calibration {} --screenshot out.png",
-        "demo --out out --picture {}",
-        "design --out out --picture {}",
-        "chart {} --out out --quick",
-    ],
+ENDLESS = (
+    "info {}",
+    "convert {} out.h5",
+    "convert a.h5 out.h5 --encoder {}",
+    "convert a.h5 out.h5 --camera {}.json",
+    "convert a.h5 out.h5 --camera {}.txt",
+    "calibrate {} out.json",
+    "calibrate a.h5 out.json --preset {}",
+    "compensate {} out.h5 --calibration cal.json",
+    "compensate a.h5 out.h5 --calibration {}",
+    "compensate a.h5 out.h5 --calibration cal.json --preset {}",
+    "reconstruct {} out.png --calibration cal.json",
+    "reconstruct a.h5 out.png --calibration {}",
+    "simulate out.h5 --picture {}",
+    "simulate out.h5 --picture pic.png --speed {}",
+    "translate {} out.h5 --fps 100",
+    "translate {}.npy out.h5 --fps 100",
+    "record {} out.h5 --fast",
+    "live {} --calibration cal.json --out out.h5",
+    "live a.h5 --calibration {} --out out.h5",
+    "view {} --screenshot out.png",
+    "view a.h5 --calibration {} --screenshot out.png",
+    "demo --out out --picture {}",
+    "design --out out --picture {}",
+    "chart {} --out out --quick",
+    "chart a.h5 --out out --quick --picture {}",
+    "compensate a.h5 out.h5 --preset {} --calibration cal.json",
+    "dataset {}.toml out",
+    "design --out out --camera {}.json --apex-deg 1 --rpm 720",
+    "emulate --link link --camera unix:camera --recording {}",
+    "evaluate --out out --recording {}",
+    "record a.h5 out.h5 --fast --camera {}.json",
+    "simulate out.h5 --world {}.toml",
+    "simulate out.h5 --world room --trajectory {}.tum",
+    "simulate out.h5 --picture pic.png --camera {}.json",
+    "translate pictures out.h5 --fps 100 --events {}",
+    "translate pictures out.h5 --fps 100 --speed {}",
+    "translate pictures out.h5 --fps 100 --camera {}.txt",
+    "calibrate a.h5 out.json --camera {}.json",
+    "truth {} out --flow dsec",
+    "view a.h5 --camera {}.json --screenshot out.png",
 )
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("line", ENDLESS)
 def test_inputs_that_never_end_are_refused(place: Path, line: str) -> None:
     name = next(word for word in line.split() if "{}" in word).format("pipe")
     os.mkfifo(place / name)
@@ -534,6 +604,28 @@ def test_api_calls_guard_what_they_read(place: Path) -> None:
     assert snapshot(place) == before
     calibration.save("cal.json", overwrite=True)
     assert snapshot(place) == before
+
+
+def test_files_in_a_folder_that_is_read_are_inputs(tmp_path: Path) -> None:
+    np.save(tmp_path / "dataset_events_t.npy", np.linspace(0.0, 1.0, 50))
+    np.save(tmp_path / "dataset_events_xy.npy", np.zeros((50, 2), np.uint16))
+    np.save(tmp_path / "dataset_events_p.npy", np.zeros(50, np.uint8))
+    recording = open_recording(tmp_path)
+    with pytest.raises(AmiwarpError, match="is read in this run"):
+        write_text(tmp_path / "dataset_events_p.npy", "", overwrite=True)
+    assert len(recording.events) == 50
+
+
+def test_a_command_may_replace_what_it_has_written_and_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    with output.run((), (), overwrite=True):
+        write_text(path, "{}")
+        assert read_json(path, "test") == {}
+        write_text(path, '{"second": 2}')
+    with output.run((), (), overwrite=True):
+        assert read_json(path, "test") == {"second": 2}
+        with pytest.raises(AmiwarpError, match="is read in this run"):
+            write_text(path, "{}")
 
 
 def writers(path: Path) -> Iterator[Any]:

@@ -15,10 +15,15 @@ from io_samples import SIZE, make_events, write_text
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import Format, open_recording, read_encoder_csv
+from amiwarp.io.json_files import read_toml
+from amiwarp.io.json_lines import read_lines
 from amiwarp.io.regular_file import check_regular
 from amiwarp.io.text import read_calib
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.sequences import open_pictures
+from amiwarp.simulation.worlds.trajectory import Trajectory
+from amiwarp.studies.chart.charts import Charts
+from amiwarp.studies.stability.report import load as load_cells
 
 
 def fifo(path: Path) -> Path:
@@ -63,6 +68,8 @@ READERS: list[Callable[[Path], object]] = [
     open_recording,
     read_encoder_csv,
     lambda path: read_calib(path, *SIZE),
+    Trajectory.from_file,
+    lambda path: read_toml(path, "a world"),
     read_picture,
     *(lambda path, chosen=chosen: open_recording(path, format=chosen) for chosen in Format),
 ]
@@ -80,6 +87,15 @@ def test_only_regular_files_are_opened(tmp_path, place, message):
 def test_films_are_regular_files(tmp_path, place):
     with pytest.raises(AmiwarpError, match=r"is a (named pipe|socket|character device)"):
         open_pictures(place(tmp_path / "film.mp4"), fps=25.0)
+
+
+@pytest.mark.parametrize(
+    "read", [Charts.load, lambda path: list(read_lines(path)), lambda path: load_cells(path.parent)]
+)
+def test_results_that_a_run_continues_are_regular_files(tmp_path, read):
+    fifo(tmp_path / "a.json")
+    with pytest.raises(AmiwarpError, match=r"a\.json: (.*: )?is a named pipe"):
+        read(tmp_path / "a.json")
 
 
 def test_files_next_to_an_input_are_regular(tmp_path):

@@ -197,3 +197,119 @@ def test_no_modules_import_each_other() -> None:
 def test_a_cycle_would_be_seen() -> None:
     with pytest.raises(graphlib.CycleError):
         graphlib.TopologicalSorter({"a": {"b"}, "b": {"a"}}).prepare()
+
+
+OPENERS = {"open", "np.load", "h5py.File", "trimesh.load", "trimesh.load_mesh", "pyvista.read", "sqlite3.connect"}
+"""Functions that open a file, of Python and of the libraries that the package uses."""
+OPENING_NAMES = {
+    "open", "read_text", "read_bytes", "memmap", "open_memmap", "fromfile", "loadtxt", "genfromtxt", "loadmat",
+    "read_csv", "read_table", "ZipFile", "TarFile", "GzipFile", "FileIO", "imread", "imopen", "VideoCapture",
+    "Decoder", "copyfile", "copy2",
+}  # fmt: skip
+"""Last parts of the names of others, whatever their module is called."""
+OPEN_NO_FILE = {
+    "read_text",  # of input_files
+    "dv.io.camera.open", "webbrowser.open", "archive.open", "playback.open", "stream.open", "inspector.open",
+    "self.open", "tabs.open",
+}  # fmt: skip
+"""Functions with such names that read no file."""
+OPENED_OTHERWISE = {
+    "amiwarp.io.input_files: open(path, 'rb')": "the way that all take",
+    # Functions of the reading process. ReadingProcess.send has checked and noted the path.
+    "amiwarp.io.aedat: aedat.Decoder(path)": "reading process",
+    "amiwarp.io.aedat_sensors: aedat.Decoder(path)": "reading process",
+    "amiwarp.io.event_stream: es.Decoder(path, 0)": "reading process",
+    "amiwarp.io.prophesee: evt.Decoder(path, WIDEST, 'evt3')": "reading process",
+    "amiwarp.io.hdf5_row_server: h5py.File(path, 'r')": "reading process",
+    "amiwarp.io.hdf5_sensors: h5py.File(path, 'r')": "reading process",
+    "amiwarp.io.hdf5_server: h5py.File(path, 'r', rdcc_nbytes=CACHE_BYTES)": "reading process",
+    "amiwarp.io.hdf5_server: h5py.File(h5py.h5f.open(os.fsencode(path), how, fapl=access))": "reading process",
+    "amiwarp.io.hdf5_server: h5py.h5f.open(os.fsencode(path), how, fapl=access)": "reading process",
+    "amiwarp.io.hdf5_server: open(path, 'rb')": "reading process",
+    "amiwarp.io.rosbag: open(path, 'rb')": "reading process",
+    "amiwarp.io.rosbag: bag.open()": "reading process",
+    # Files of the system and of the package.
+    "amiwarp.io.atomic_output: Path('/proc/sys/kernel/random/boot_id').read_text()": "system",
+    "amiwarp.io.reading_server: open('/proc/self/statm')": "system",
+    "amiwarp.io.reading_server: open(f'/proc/self/fdinfo/{number}')": "system",
+    "amiwarp.studies.machine_info: info.read_text()": "system",
+    "amiwarp.live.stream.source_opening: open(0, 'rb', buffering=0, closefd=False)": "standard input",
+    "amiwarp.viewer.page_files: path.read_text(encoding='utf-8')": "file of the package",
+    "amiwarp.viewer.page_files: (FOLDER / 'page.html').read_text(encoding='utf-8')": "file of the package",
+    # Unfinished files of this process, or of a child of it.
+    "amiwarp.imaging.export: open(part, 'r+b')": "own file",
+    "amiwarp.io.atomic_output: open(path, 'r+b')": "lock file",
+    "amiwarp.io.live_writer: open(self.part, 'r+b')": "own file",
+    "amiwarp.io.npz_writer: (folder / name).open('rb')": "own file",
+    "amiwarp.plotting.clouds: np.load(picture)": "own file",
+    "amiwarp.plotting.clouds: np.load(points)": "own file",
+    "amiwarp.viewer.downloads: path.read_bytes()": "own file",
+    # What is no file.
+    "amiwarp.io.encoder_csv: np.loadtxt(lines, delimiter=',', ndmin=2, comments=None)": "lines",
+    "amiwarp.io.text: np.loadtxt(kept, ndmin=2, comments=None, encoding='ascii')": "lines",
+    "amiwarp.plotting.figures: Image.open(buffer)": "bytes",
+    "amiwarp.simulation.worlds.mesh_files: Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)": "bytes",
+    "amiwarp.simulation.worlds.mesh_files: trimesh.load(file, file_type=kind, resolver=files, force='scene', "
+    "process=False)": "open file",
+    "amiwarp.studies.evaluate.results: Image.open(io.BytesIO(base64.b64decode(text)))": "bytes",
+}
+"""Calls that open a file for reading in another way, and what they open."""
+
+
+def opened_otherwise(source: str) -> Iterator[str]:
+    """Yield the calls that open a file for reading, other than ``open_input(path)`` and ``f(input_path(path))``."""
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call):
+            continue
+        name = ast.unparse(node.func)
+        last = name.rpartition(".")[2]
+        if name in OPEN_NO_FILE or (name not in OPENERS and last not in OPENING_NAMES):
+            continue
+        modes = [*node.args[:2], *(word.value for word in node.keywords if word.arg == "mode")]
+        texts = [set(str(mode.value)) for mode in modes if isinstance(mode, ast.Constant)]
+        if any(text <= set("rwxabt+") and text & set("wxa") for text in texts):
+            continue
+        if name == "os.open" and ("O_CREAT" in ast.unparse(node) or "O_WRONLY" in ast.unparse(node)):
+            continue
+        inner = (call.func for call in ast.walk(node) if isinstance(call, ast.Call))
+        if not any(isinstance(func, ast.Name) and func.id == "input_path" for func in inner):
+            yield ast.unparse(node)
+
+
+def test_inputs_are_opened_in_one_way() -> None:
+    """So each is checked to be a regular file, and no command can write over it."""
+    found = {f"{name_of(path)}: {call}" for path in MODULES for call in opened_otherwise(path.read_text())}
+    assert found == set(OPENED_OTHERWISE)
+
+
+def test_paths_reach_the_reading_process_as_paths() -> None:
+    """ReadingProcess.send checks and notes them. As text they would pass by."""
+    texts = [
+        name_of(path)
+        for path in MODULES
+        if path.name != "reading_process.py"
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "os.path.abspath"
+    ]
+    assert texts == []
+
+
+@pytest.mark.parametrize(
+    "code",
+    ["open(path)", "open(path, 'rb')", "open(path, mode='r')", "path.open()", "(a / b).open('rb')", "path.read_text()",
+     "path.read_bytes()", "os.open(path, os.O_RDONLY)", "np.load(path, mmap_mode='r')", "np.loadtxt(path)",
+     "h5py.File(path)", "h5py.File(path, 'r')", "av.open(str(path))", "Image.open(path)", "zipfile.ZipFile(path)",
+     "trimesh.load(path)", "evt.Decoder(path)", "open(path, 'r+b')", "path.open(mode)", "ZipFile(path)",
+     "shutil.copyfile(path, part)"],
+)  # fmt: skip
+def test_another_way_would_be_seen(code: str) -> None:
+    assert list(opened_otherwise(f"def read(path):\n    return {code}")) != []
+
+
+@pytest.mark.parametrize(
+    "code",
+    ["open(path, 'w')", "path.open('xb')", "h5py.File(path, 'w')", "zipfile.ZipFile(part, 'x')",
+     "os.open(path, os.O_RDWR | os.O_CREAT)", "np.load(input_path(path))", "av.open(str(input_path(path)))"],
+)  # fmt: skip
+def test_other_calls_are_no_inputs(code: str) -> None:
+    assert list(opened_otherwise(code)) == []

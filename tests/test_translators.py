@@ -33,7 +33,7 @@ from amiwarp.simulation.simulator import Simulation
 from amiwarp.translation.camera_motion import find_motion
 from amiwarp.translation.datasets import SACCADE_US, SACCADES_PX, DataSet, open_mvsec, saccades
 from amiwarp.translation.event_pictures import READ_US, EventPictures
-from amiwarp.translation.inputs import open_input
+from amiwarp.translation.inputs import translator_input
 from amiwarp.translation.interpolation import Interpolation, MotionPictures, PicturePair
 from amiwarp.translation.translator import translate, translation
 
@@ -290,7 +290,7 @@ def seen_at(recording: Recording, motion: CameraMotion, t_us: float) -> NDArray[
 
 def correlation_of_known(recording: Recording, dataset: DataSet | None, motion: CameraMotion, device: str) -> float:
     """Correlation of a picture in the middle of the recording with the truth, where it is known."""
-    given = open_input(recording, dataset=dataset, device=device)
+    given = translator_input(recording, dataset=dataset, device=device)
     pictures = {t: np.log(light + DARK) for t, light in given.frames.read()}
     masks = given.frames.take_known()  # type: ignore[attr-defined]
     assert [t for t, _ in masks] == sorted({t for t, _ in masks})

@@ -11,6 +11,7 @@ import typer
 
 from amiwarp.cli.inputs import numbers, read_camera
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.input_files import read_text
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
@@ -111,8 +112,8 @@ def parse_size(text: str) -> tuple[int, int]:
 
 def _read_speed(path: Path) -> list[tuple[float, ...]]:
     try:
-        rows = [line for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
-    except (OSError, UnicodeDecodeError) as error:
+        rows = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+    except UnicodeDecodeError as error:
         raise AmiwarpError(f"{path}: cannot be read: {error}") from error
     return [numbers(row, 2, f"{path}: line {k}") for k, row in enumerate(rows, 1)]
 

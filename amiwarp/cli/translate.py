@@ -64,7 +64,7 @@ def run(
     camera has the size of the source unless --size or --camera gives another one.
     """
     from amiwarp.translation.datasets import DataSet
-    from amiwarp.translation.inputs import open_input
+    from amiwarp.translation.inputs import translator_input
     from amiwarp.translation.interpolation import Interpolation
     from amiwarp.translation.translator import translation
     from amiwarp.validation import choice
@@ -73,7 +73,7 @@ def run(
     name = None if dataset is None else choice(DataSet, dataset, "--dataset")
     way = choice(Interpolation, interpolation, "--interpolation")
     with progress("reading") as advance:
-        given = open_input(
+        given = translator_input(
             source, events=events, dataset=name, interpolation=way, fps=fps, device=device, progress=advance
         )
     chosen = rig.size is None and rig.fov_deg is None and rig.camera is None

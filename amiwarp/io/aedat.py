@@ -6,7 +6,6 @@ packet sizes are checked first.
 
 from __future__ import annotations
 
-import os
 import struct
 from collections.abc import Iterator
 from functools import partial
@@ -19,10 +18,9 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
-from amiwarp.io.input_files import errors_name
+from amiwarp.io.input_files import errors_name, open_input
 from amiwarp.io.reading_process import packets, run
 from amiwarp.io.reading_server import Reply, noting_progress
-from amiwarp.io.regular_file import check_regular
 from amiwarp.io.sensor_streams import read_sensors
 
 COUNTED = {"frame": "frames", "imus": "imu_samples"}
@@ -38,12 +36,11 @@ MAGIC = b"#!AER-DAT4.0\r\n"
 
 def open_aedat4(path: Path) -> Recording:
     """Open the first event stream of an AEDAT 4 file."""
-    check_regular(path)
     with errors_name(path, lambda: "reading the header"):
-        with path.open("rb") as file:
+        with open_input(path) as file:
             _check_frame(path, file)
-        width, height, number = run("amiwarp.io.aedat:read_head", os.path.abspath(path))
-    source = partial(packets, "amiwarp.io.aedat:read_packets", os.path.abspath(path), number, False)
+        width, height, number = run("amiwarp.io.aedat:read_head", path.absolute())
+    source = partial(packets, "amiwarp.io.aedat:read_packets", path.absolute(), number, False)
     events = FileEvents(path, source, size=(width, height))
     imu, frames, notes = read_sensors(path, events.records, "aedat_sensors")
     metadata = {"format": "aedat4", **events.metadata, **notes}
@@ -109,9 +106,9 @@ def read_head(path: str) -> Reply:
 
 def trigger_packets(path: Path) -> Iterator[Packet]:
     """Yield the edges at the external input, of channel 0."""
-    with path.open("rb") as file:
+    with open_input(path) as file:
         _check_frame(path, file)
-    return packets("amiwarp.io.aedat:read_packets", os.path.abspath(path), -1, True, {})
+    return packets("amiwarp.io.aedat:read_packets", path.absolute(), -1, True, {})
 
 
 def read_packets(notes: dict[str, int], path: str, number: int, triggers: bool) -> Iterator[Packet]:

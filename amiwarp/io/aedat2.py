@@ -24,8 +24,7 @@ from amiwarp.events.sensors import ImuSamples
 from amiwarp.io.aedat2_imu import RANGES, read_imu, read_ranges
 from amiwarp.io.counters import last_word, unwrapped
 from amiwarp.io.file_scan import FileEvents, Packet, head_limit
-from amiwarp.io.input_files import errors_name
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, open_input
 from amiwarp.io.sensor_streams import only_counted
 
 MAGIC = b"#!AER-DAT2.0"
@@ -53,7 +52,6 @@ CHIPS = {
 
 def open_aedat2(path: Path) -> Recording:
     """Open the events of an AEDAT 2.0 file."""
-    check_regular(path)
     with errors_name(path, lambda: "reading the header"):
         chip, offset = _read_header(path)
     read, last = partial(_packets, path, chip, offset), partial(_last_time, path, offset)
@@ -91,7 +89,7 @@ def trigger_packets(path: Path) -> Iterator[Packet]:
 
 def _read_header(path: Path) -> tuple[Chip, int]:
     """Return the camera, and the position of the first record."""
-    with path.open("rb") as file:
+    with open_input(path) as file:
         name, start = "", 0
         while (line := file.readline(HEADER_BYTES)).startswith(b"#") and line.endswith(b"\n"):
             start += len(line)
@@ -111,7 +109,7 @@ def _records(path: Path, offset: int, notes: dict[str, int]) -> Iterator[tuple[N
     """Yield addresses and unwrapped times [us]."""
     last: int | None = None
     notes["total"] = path.stat().st_size
-    with path.open("rb") as file:
+    with open_input(path) as file:
         file.seek(offset)
         while data := file.read(8 * DEFAULT_BLOCK):
             notes["read"] = file.tell()

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.events.sensors import ImuSamples
+from amiwarp.io.input_files import open_input
 from amiwarp.io.sensor_streams import GRAVITY, imu_of
 
 STEPS_PER_G = {2: 16384.0, 4: 8192.0, 8: 4096.0, 16: 2048.0}
@@ -35,7 +36,7 @@ Records = Iterator[tuple[NDArray[Any], NDArray[np.int64]]]
 
 def read_ranges(path: Path, offset: int) -> tuple[int, int] | None:
     """Return the ranges of accelerometer [g] and gyroscope [deg/s] in the header's settings, or None if not there."""
-    with path.open("rb") as file:
+    with open_input(path) as file:
         header = file.read(offset)
     camera = re.search(rb"#\s*AEChip:\s*(\S+)", header)
     short = camera[1].rpartition(b".")[2] if camera else b""

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
-from amiwarp.io.input_files import errors_name
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, open_input
 from amiwarp.io.sensor_streams import only_counted
 
 MAGIC = b"#!AER-DAT3.1"
@@ -51,7 +50,6 @@ SIZES = {"DVS128": (128, 128), "DAVIS128": (128, 128), "DAVIS208": (208, 192), "
 
 def open_aedat3(path: Path) -> Recording:
     """Open the events of an AEDAT 3.1 file."""
-    check_regular(path)
     with errors_name(path, lambda: "reading the header"):
         size, offset = _read_header(path)
     events = FileEvents(path, partial(_packets, path, offset), size=size)
@@ -61,7 +59,7 @@ def open_aedat3(path: Path) -> Recording:
 
 def _read_header(path: Path) -> tuple[tuple[int, int] | None, int]:
     """Return the sensor size [px], or None if the source is unknown, and the position of the first packet."""
-    with path.open("rb") as file:
+    with open_input(path) as file:
         size = None
         for _ in range(MOST_LINES):
             line = file.readline(LONGEST_LINE)
@@ -81,7 +79,7 @@ def _contents(path: Path, offset: int, notes: dict[str, int]) -> Iterator[tuple[
     """Yield type, source, valid events as rows of 32-bit words, and time overflow [us] of the packets."""
     total = path.stat().st_size
     notes["total"] = total
-    with path.open("rb") as file:
+    with open_input(path) as file:
         file.seek(offset)
         while head := file.read(PACKET_HEADER.size):
             at = file.tell() - len(head)

@@ -26,7 +26,7 @@ from types import TracebackType
 from typing import IO
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import inputs_in_use, inputs_noted, same_file
+from amiwarp.io.input_files import inputs_in_use, inputs_noted, note_output, same_file
 from amiwarp.io.regular_file import KINDS
 
 UNFINISHED = re.compile(r"\.(?:.+\.)?(?P<owner>(?P<system>[0-9a-f]{12})-[0-9a-f]{8})(?:-[0-9a-f]{8})?\.part")
@@ -175,16 +175,17 @@ def put_in_place(part: Path, path: Path, *, overwrite: bool = False) -> None:
     """
     target = check_output(path, overwrite=overwrite)
     try:
-        if not _may_replace(target, overwrite):
+        if _may_replace(target, overwrite):
+            if os.path.lexists(target):
+                shutil.copymode(target, part)
+            os.replace(part, target)
+        else:
             link_new(part, target)
-            return
-        if os.path.lexists(target):
-            shutil.copymode(target, part)
-        os.replace(part, target)
     except FileExistsError as error:
         raise AmiwarpError(f"{path}: was created by another program meanwhile; give another name") from error
     except OSError as error:
         raise AmiwarpError(f"{path}: cannot be written: {_reason(error)}; choose another place") from error
+    note_output(target)
 
 
 def link_new(part: Path, target: Path) -> None:

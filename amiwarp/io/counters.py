@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.io.input_files import open_input
+
 
 def nearest(value: int, bits: int, estimate: int) -> int:
     """Return the value of a counter of ``bits`` bits with the number of wraps that brings it nearest to an estimate."""
@@ -36,7 +38,7 @@ def last_word(path: Path, offset: int, dtype: str, estimate: int) -> int | None:
     count = (path.stat().st_size - offset) // 8
     if not count:
         return None
-    with path.open("rb") as file:
+    with open_input(path) as file:
         file.seek(offset + 8 * (count - 1))
         words = np.frombuffer(file.read(8), dtype)
     return nearest(int(words[0 if dtype == "<u4" else 1]), 32, estimate)

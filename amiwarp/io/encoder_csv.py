@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.unwrapping import UnwrapError
-from amiwarp.io.input_files import errors_name
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, read_text
 
 
 def read_encoder_csv(
@@ -32,7 +31,6 @@ def read_encoder_csv(
     ``direction`` -1 negates the angle. Raises :class:`AmiwarpError` with the file and line for anything else.
     """
     path = Path(path)
-    check_regular(path)
     with errors_name(path, lambda: "reading the encoder"):
         names, table, lines = _read_table(path)
         columns = {name: table[:, at] for at, name in enumerate(names)}
@@ -86,7 +84,7 @@ def _encoder(
 
 def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], list[int]]:
     """Return column names, values of shape ``(rows, columns)`` and the line number of each row."""
-    text = path.read_text(encoding="utf-8-sig")
+    text = read_text(path, encoding="utf-8-sig")
     rows = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
     if not rows:
         raise AmiwarpError(f"{path}: is empty; expected a header t_us,angle_deg or t_us,count")

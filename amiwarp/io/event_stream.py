@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -13,15 +12,13 @@ from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.reading_process import packets, run
 from amiwarp.io.reading_server import Reply, noting_progress
-from amiwarp.io.regular_file import check_regular
 
 
 def open_es(path: Path) -> Recording:
     """Open an Event Stream file. Its rows are counted from the bottom, so they are flipped."""
-    check_regular(path)
     with errors_name(path, lambda: "reading the header"):
-        width, height = run("amiwarp.io.event_stream:read_head", os.path.abspath(path))
-    source = partial(packets, "amiwarp.io.event_stream:read_packets", os.path.abspath(path), height)
+        width, height = run("amiwarp.io.event_stream:read_head", path.absolute())
+    source = partial(packets, "amiwarp.io.event_stream:read_packets", path.absolute(), height)
     events = FileEvents(path, source, size=(width, height))
     return Recording(events=events, metadata={"format": "es", **events.metadata}, name=path.stem)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_kinds import name_kind
-from amiwarp.io.input_files import errors_name
+from amiwarp.io.input_files import errors_name, open_input
 from amiwarp.io.nmnist import looks_like_bin
 from amiwarp.io.regular_file import check_regular
 from amiwarp.validation import choice
@@ -74,8 +74,7 @@ def detect_format(path: Path) -> Format:
     folder = _folder_format(path)
     if folder is not None:
         return folder
-    check_regular(path)
-    with errors_name(path, lambda: "opening"), path.open("rb") as file:
+    with errors_name(path, lambda: "opening"), open_input(path) as file:
         head = file.read(4096)
         file_bytes = os.fstat(file.fileno()).st_size
     if not head:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.chunks import CHUNK, StoredColumn
+from amiwarp.io.input_files import input_path
 from amiwarp.io.reading_process import ReadingProcess, borrow, give_back
 
 PIECE = 1 << 20
@@ -41,10 +42,10 @@ class Hdf5File:
     def __init__(self, path: Path, topic: str | None = None) -> None:
         """Open a file. ``topic`` chooses among several cameras."""
         self._topic = topic
-        self._absolute = os.path.abspath(path)
+        self._absolute = path.absolute()
         self._lock = threading.Lock()
         self._process: list[ReadingProcess] = []  # at most one; the finalizer has the same list
-        handle = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+        handle = os.open(input_path(path), os.O_RDONLY | getattr(os, "O_BINARY", 0))
         self.close = weakref.finalize(self, _close, handle, self._process)
         found = os.fstat(handle)
         self._identity = [found.st_dev, found.st_ino]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,7 @@ READ = "amiwarp.io.hdf5_row_server:read_rows"
 
 def open_rows(path: Path, layout: str, group: str) -> Recording:
     """Open the events of a group, which :func:`amiwarp.io.hdf5_layouts.find_layout` has found."""
-    source = os.path.abspath(path)
+    source = path.absolute()
     about = run("amiwarp.io.hdf5_row_server:read_head", source, group)
     events = FileEvents(path, partial(packets, READ, source, f"{group}/events"), size=_size(about["size"]))
     imu, frames, notes = read_sensors(path, about["counts"], "hdf5_sensors", group)
@@ -32,4 +31,4 @@ def _size(given: list[int] | None) -> tuple[int, int] | None:
 
 def trigger_packets(path: Path) -> Iterator[Packet]:
     """Yield the edges of the external triggers in Prophesee's file."""
-    return packets(READ, os.path.abspath(path), "EXT_TRIGGER/events", {})
+    return packets(READ, path.absolute(), "EXT_TRIGGER/events", {})

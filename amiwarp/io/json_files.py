@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, input_path, open_input, read_text
 from amiwarp.validation import real, shown, whole
 
 Made = TypeVar("Made")
@@ -51,8 +50,7 @@ def read_json(path: str | os.PathLike[str], what: str, *, most_bytes: int = MOST
     """
     path = Path(path)
     with errors_name(path, lambda: f"cannot be read as {what}"):
-        check_regular(path)
-        with path.open("rb") as file:
+        with open_input(path) as file:
             text = file.read(most_bytes + 1)
         if len(text) > most_bytes:
             raise AmiwarpError(f"{path}: is larger than {most_bytes >> 20} MiB, so it is not {what}; give another file")
@@ -69,10 +67,9 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     file cannot be read, is larger or is not TOML.
     """
     with errors_name(path, lambda: f"cannot be read as {what}"):
-        check_regular(path)
-        if path.stat().st_size > MOST_BYTES:
+        if input_path(path).stat().st_size > MOST_BYTES:
             raise AmiwarpError(f"is larger than {MOST_BYTES >> 20} MiB; give another file")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(read_text(path))
 
 
 def parse_json(text: bytes) -> Any:

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from amiwarp.io.atomic_output import check_output
-from amiwarp.io.input_files import errors_name
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, open_input
 
 
 def create_journal(path: Path) -> None:
@@ -34,8 +33,7 @@ def read_lines(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the objects of a journal; nothing if it does not exist. Damaged lines are left out."""
     if not path.exists():
         return
-    check_regular(path)
-    with errors_name(path, lambda: "cannot be read as a journal"), path.open("rb") as file:
+    with errors_name(path, lambda: "cannot be read as a journal"), open_input(path, noted=False) as file:
         for line in file:
             try:
                 data = json.loads(line)

@@ -26,7 +26,6 @@ from amiwarp.io.hdf5 import Column, Hdf5File
 from amiwarp.io.hdf5_rows import open_rows
 from amiwarp.io.input_files import errors_name, register_reader
 from amiwarp.io.native_layout import FORMAT, FORMAT_VERSION
-from amiwarp.io.regular_file import check_regular
 from amiwarp.io.sensor_reader import read_frames, read_imu
 from amiwarp.io.truth_reader import read_truth
 from amiwarp.optics.camera import check_size
@@ -199,7 +198,6 @@ def open_native(path: Path, topic: str | None = None) -> Recording:
 
     Raises :class:`AmiwarpError` for other files.
     """
-    check_regular(path)
     with errors_name(path, lambda: "opening HDF5"):
         file = Hdf5File(path, topic)
         try:

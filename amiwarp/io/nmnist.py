@@ -18,8 +18,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
-from amiwarp.io.input_files import errors_name
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, open_input
 
 EVENT_BYTES = 5
 MARK_ROW = 240
@@ -32,8 +31,7 @@ FRAMES = ((34, 34), (240, 180), (304, 240))
 
 def open_bin(path: Path) -> Recording:
     """Open a file of 5-byte events."""
-    check_regular(path)
-    with errors_name(path, lambda: "opening"), path.open("rb") as file:
+    with errors_name(path, lambda: "opening"), open_input(path) as file:
         if not looks_like_bin(file.read(4096), path.stat().st_size):
             raise AmiwarpError("does not hold events of 5 bytes in the order of time; give another file")
     events = FileEvents(path, partial(_packets, path), size=None, sensors=FRAMES)
@@ -62,7 +60,7 @@ def _columns(data: NDArray[np.uint8]) -> Packet:
 def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
     marks = 0
     notes["total"] = path.stat().st_size
-    with path.open("rb") as file:
+    with open_input(path) as file:
         while data := file.read(EVENT_BYTES * DEFAULT_BLOCK):
             notes["read"] = file.tell()
             x, y, t, p = _columns(np.frombuffer(data, np.uint8))

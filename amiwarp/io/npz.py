@@ -25,8 +25,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet, microseconds, whole_pixels
-from amiwarp.io.input_files import errors_name
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, input_path, open_input
 
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods that NumPy writes. Others are refused, because they may take any amount of memory."""
@@ -37,8 +36,7 @@ def open_npz(path: Path) -> Recording:
 
     Arrays are read in pieces, and read again for each use if they are too large to keep in memory.
     """
-    check_regular(path)
-    with errors_name(path, lambda: "reading width and height"), zipfile.ZipFile(path) as archive:
+    with errors_name(path, lambda: "reading width and height"), zipfile.ZipFile(input_path(path)) as archive:
         size = None
         if {"width.npy", "height.npy"} <= set(archive.namelist()):
             size = (_number(archive, "width"), _number(archive, "height"))
@@ -89,7 +87,7 @@ def _number(archive: zipfile.ZipFile, name: str) -> int:
 
 def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
     with contextlib.ExitStack() as opened:
-        archive = opened.enter_context(zipfile.ZipFile(path))
+        archive = opened.enter_context(zipfile.ZipFile(input_path(path)))
         names = {name.removesuffix(".npy") for name in archive.namelist()}
         missing = [name for name in "xytp" if name not in names]
         if not missing:
@@ -172,8 +170,7 @@ def _evimo_packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
         arrays = {}
         for name, kinds in zip(EVIMO, ("f", "iu", "iub"), strict=True):
             part = path / f"dataset_events_{name}.npy"
-            check_regular(part)
-            stream = opened.enter_context(part.open("rb"))
+            stream = opened.enter_context(open_input(part))
             arrays[name] = _header(stream, part.name, part.stat().st_size, kinds)
         counts = {name: shape[0] if shape else 0 for name, (_, shape, _) in arrays.items()}
         sizes = {name: math.prod(shape[1:]) for name, (_, shape, _) in arrays.items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -17,10 +16,9 @@ from amiwarp.events.recording import Recording
 from amiwarp.io.counters import last_word, nearest, unwrapped
 from amiwarp.io.evt_words import TIME_HIGH, Evt2Decoder, swap_halves, words_of
 from amiwarp.io.file_scan import FileEvents, Packet
-from amiwarp.io.input_files import errors_name
+from amiwarp.io.input_files import errors_name, open_input
 from amiwarp.io.reading_process import packets
 from amiwarp.io.reading_server import noting_progress
-from amiwarp.io.regular_file import check_regular
 
 EVT21_BLOCK = 1 << 16
 """Number of EVT 2.1 words that are decoded at once, with up to 32 events each."""
@@ -41,8 +39,7 @@ GENERATIONS = {
 
 def _read_header(path: Path) -> tuple[dict[str, str], int]:
     """Return the ``% key value`` lines with lower-case keys, and the offset of the first byte after them."""
-    check_regular(path)
-    with errors_name(path, lambda: "reading the header"), path.open("rb") as file:
+    with errors_name(path, lambda: "reading the header"), open_input(path) as file:
         fields: dict[str, str] = {}
         offset = 0
         while (line := file.readline(4096)).startswith(b"%") and line.endswith(b"\n"):
@@ -67,7 +64,7 @@ def open_evt(path: Path) -> Recording:
     if word == 8:
         version, source = "2.1", partial(_evt21_packets, path, offset, swapped, False)
     else:
-        source = partial(packets, "amiwarp.io.prophesee:read_evt_packets", os.path.abspath(path), False)
+        source = partial(packets, "amiwarp.io.prophesee:read_evt_packets", path.absolute(), False)
     last = None if word == 2 else partial(_last_evt_time, path, offset, word, swapped)
     events = FileEvents(path, source, size=_evt_size(fields), last_time=last)
     truncated = (path.stat().st_size - offset) % word
@@ -109,14 +106,14 @@ def trigger_packets(path: Path) -> Iterator[Packet]:
     fields, offset = _read_header(path)
     if fields.get("evt", fields.get("format", "")).startswith(("2.1", "EVT21")):
         return _evt21_packets(path, offset, _is_swapped(path, offset, fields.get("format", "")), True, {})
-    return packets("amiwarp.io.prophesee:read_evt_packets", os.path.abspath(path), True, {})
+    return packets("amiwarp.io.prophesee:read_evt_packets", path.absolute(), True, {})
 
 
 def _evt21_packets(path: Path, offset: int, swapped: bool, triggers: bool, notes: dict[str, int]) -> Iterator[Packet]:
     """Yield the events, or the triggers, of EVT 2.1, which faery does not read."""
     decoder = Evt2Decoder(vectors=True)
     notes["total"] = path.stat().st_size
-    with path.open("rb") as file:
+    with open_input(path) as file:
         file.seek(offset)
         while data := file.read(8 * EVT21_BLOCK):
             notes["read"] = file.tell()
@@ -129,7 +126,7 @@ def _evt21_packets(path: Path, offset: int, swapped: bool, triggers: bool, notes
 def _last_evt_time(path: Path, offset: int, word: int, swapped: bool, estimate: int) -> int | None:
     """Return the time of the last event of a file of EVT 2.0 or 2.1 [us]. Times of EVT 3.0 wrap after 17 s."""
     count = (path.stat().st_size - offset) // word
-    with path.open("rb") as file:
+    with open_input(path) as file:
         file.seek(offset + max(count - EVT21_BLOCK, 0) * word)
         words = words_of(file.read(word * EVT21_BLOCK), "2" if word == 4 else "2.1")
     t = Evt2Decoder(vectors=word == 8).decode(swap_halves(words) if swapped else words)[0][2]
@@ -140,7 +137,7 @@ def _is_swapped(path: Path, offset: int, layout: str) -> bool:
     """Return whether a file of EVT 2.1 has swapped halves, according to its header's ``layout`` or its first words."""
     if "endianness=" in layout:
         return "endianness=legacy" in layout
-    with path.open("rb") as file:
+    with open_input(path) as file:
         file.seek(offset)
         return _halves_are_swapped(words_of(file.read(8 * EVT21_BLOCK), "2.1"))
 
@@ -164,7 +161,7 @@ def open_dat(path: Path) -> Recording:
     Its 32-bit times, which wrap after 71 min, are unwrapped.
     """
     fields, offset = _read_header(path)
-    with errors_name(path, lambda: "reading the header"), path.open("rb") as file:
+    with errors_name(path, lambda: "reading the header"), open_input(path) as file:
         file.seek(offset)
         kind = file.read(2)
     # 0x00: 2D events; 0x0c: CD events. Both have 8 bytes.
@@ -186,7 +183,7 @@ def _dat_packets(path: Path, offset: int, version: str, notes: dict[str, int]) -
     # Bits of the second word, according to Prophesee's documentation of the format.
     bits, y_shift, p_shift = ((9, 8), 9, 17) if version == "1" else ((14, 14), 14, 28)
     last: int | None = None
-    with path.open("rb") as file:
+    with open_input(path) as file:
         file.seek(offset)
         notes["total"] = path.stat().st_size
         while data := file.read(8 * DEFAULT_BLOCK):

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.input_files import input_folder, input_path
 
 CPU_SECONDS = 30
 """Limit of the processor time of one request [s]. Unlike elapsed time, it does not depend on the machine's load."""
@@ -90,10 +91,14 @@ class ReadingProcess:
         self._preparing = True
 
     def send(self, function: str, *arguments: Any) -> None:
-        """Send a call to the process; :meth:`receive` returns its result."""
+        """Send a call to the process; :meth:`receive` returns its result.
+
+        A path among the arguments is an input: it is checked and noted here, and sent as an absolute path.
+        """
         if self._preparing:
             self._preparing = False
             self.receive()
+        arguments = tuple(_absolute(value) if isinstance(value, Path) else value for value in arguments)
         limits = {"cpu_s": CPU_SECONDS, "memory_bytes": MEMORY_BYTES}
         request = json.dumps({"function": function, "arguments": arguments, **limits}).encode()
         try:
@@ -133,6 +138,10 @@ class ReadingProcess:
             return AmiwarpError(f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged")
         remedy = f"check that '{sys.executable}' is Python and that enough memory is free"
         return AmiwarpError(f"the reading process ended with code {code}; {remedy}")
+
+
+def _absolute(path: Path) -> str:
+    return os.path.abspath(input_folder(path) if path.is_dir() else input_path(path))
 
 
 def _end(child: subprocess.Popen[bytes], owner: int) -> None:

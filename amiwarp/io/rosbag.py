@@ -36,7 +36,7 @@ OTHER = {
 
 def open_rosbag(path: Path, topic: str | None = None) -> Recording:
     """Open the events of a topic of a bag: a file, or the folder of a ROS 2 bag."""
-    source = os.path.abspath(path)
+    source = path.absolute()
     with errors_name(path, lambda: "opening the bag"):
         about = run("amiwarp.io.rosbag:read_head", source, topic)
     read = partial(packets, "amiwarp.io.rosbag:read_packets", source, about["topic"], False)
@@ -49,7 +49,7 @@ def open_rosbag(path: Path, topic: str | None = None) -> Recording:
 
 def trigger_packets(path: Path, topic: str | None = None) -> Iterator[Packet]:
     """Yield the trigger edges of the packets of a topic."""
-    source = os.path.abspath(path)
+    source = path.absolute()
     about = run("amiwarp.io.rosbag:read_head", source, topic)
     return packets("amiwarp.io.rosbag:read_packets", source, about["topic"], True, {})
 

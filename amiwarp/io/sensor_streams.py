@@ -7,7 +7,6 @@ They are read after the events, and only if the file is read completely: of the 
 from __future__ import annotations
 
 import contextlib
-import os
 import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
 from functools import partial
@@ -125,7 +124,7 @@ def read_sensors(
         return None, None, notes
 
     def start(function: str) -> Packets:
-        return packets(f"amiwarp.io.{module}:{function}", os.path.abspath(path), *arguments, {})
+        return packets(f"amiwarp.io.{module}:{function}", path.absolute(), *arguments, {})
 
     imu = frames = None
     if counts.get("imu_samples"):

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
-from amiwarp.io.input_files import errors_name, note_input
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, open_input
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import RadialTangential
 
@@ -33,8 +32,7 @@ LONGEST_LINE = 1000
 
 def open_text(path: Path) -> Recording:
     """Open a text recording, with the camera of ``calib.txt`` in the same folder if that file exists."""
-    check_regular(path)
-    with errors_name(path, lambda: "line 1"), path.open("rb") as file:
+    with errors_name(path, lambda: "line 1"), open_input(path) as file:
         size, _ = _read_size(path, file)
     events = FileEvents(path, partial(_packets, path), size=size, last_time=partial(_last_time, path))
     calib = path.with_name("calib.txt")
@@ -44,10 +42,8 @@ def open_text(path: Path) -> Recording:
 
 def read_calib(path: Path, width: int, height: int) -> Camera:
     """Return the camera of a ``calib.txt``. Raises :class:`AmiwarpError` unless it holds nine finite numbers."""
-    note_input(path)
-    check_regular(path)
     with errors_name(path, lambda: "reading the calibration"):
-        with path.open("rb") as file:
+        with open_input(path) as file:
             words = file.read(10_000).decode("utf-8").split()
         numbers = [float(word) for word in words]
         if len(numbers) != 9 or not np.isfinite(numbers).all():
@@ -73,7 +69,7 @@ def _read_size(path: Path, file: BinaryIO) -> tuple[tuple[int, int] | None, int]
 
 def _last_time(path: Path, estimate: int) -> int | None:
     """Return the time of the last line [us], or None if it holds none."""
-    with path.open("rb") as file:
+    with open_input(path) as file:
         file.seek(max(path.stat().st_size - 2 * LONGEST_LINE, 0))
         lines = [line for line in file.read().split(b"\n")[1:] if line.strip() and not line.lstrip().startswith(b"#")]
     with contextlib.suppress(ValueError, IndexError, OverflowError):
@@ -82,7 +78,7 @@ def _last_time(path: Path, estimate: int) -> int | None:
 
 
 def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
-    with path.open("rb") as file:
+    with open_input(path) as file:
         _, line_number = _read_size(path, file)
         rest = b""
         notes["total"] = path.stat().st_size

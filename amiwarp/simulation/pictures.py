@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import input_path
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear red, green and blue in the luminance (ITU-R BT.709)."""
@@ -43,17 +43,18 @@ def read_picture(path: str | Path) -> NDArray[np.float32]:
     """
     from PIL import Image
 
-    check_regular(Path(path))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about Pillow's own, larger limits, and about damage that it tolerates
-            with Image.open(path, formats=PICTURE_FORMATS) as image:
+            with Image.open(input_path(path), formats=PICTURE_FORMATS) as image:
                 if image.width * image.height > MOST_PIXELS:
                     raise ValueError(
                         f"{image.width}x{image.height} is over {MOST_PIXELS} pixels; make the picture smaller"
                     )
                 wide = image.mode.startswith(("I", "F"))
                 pixels = np.asarray(image if wide else image.convert("RGB"))
+    except AmiwarpError:
+        raise
     except Exception as error:  # Pillow raises errors of many types for damaged files
         what = " ".join(str(error).split()) or type(error).__name__
         raise AmiwarpError(f"{path} cannot be read as a picture ({what}); give a JPEG, PNG, TIFF ...") from error

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import TIME_LIMIT
-from amiwarp.io.input_files import errors_name, register_reader
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, input_path, open_input, register_reader
 from amiwarp.simulation.pictures import MOST_PIXELS, linear_luminance, read_picture, srgb_to_linear
 from amiwarp.validation import real, shown
 
@@ -193,7 +192,7 @@ class VideoFile:
         first: Fraction | None = None
         last = -1
         try:
-            with av.open(str(self.path)) as container:
+            with av.open(str(input_path(self.path))) as container:
                 for i, frame in enumerate(container.decode(video=0)):
                     stamp = Fraction(i) / Fraction(self.fps) if frame.pts is None else frame.pts * frame.time_base
                     first = stamp if first is None else first
@@ -235,7 +234,6 @@ def open_pictures(path: str | Path, *, fps: float | None = None) -> Pictures:
         folder = _open_folder(path, fps)
         register_reader(folder, path / TIMES, *folder.files)
         return folder
-    check_regular(path)
     opened = _open_stack(path, fps) if path.suffix == ".npy" else _open_video(path, fps)
     register_reader(opened, path)
     return opened
@@ -272,9 +270,8 @@ def _natural(file: Path) -> list[tuple[int, int, str]]:
 
 def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
     """Read the file names and times in ``times.csv``."""
-    check_regular(table)
     with errors_name(table, lambda: "is not a table with the columns file, t_us"):
-        with table.open("rb") as file:
+        with open_input(table) as file:
             text = file.read(MOST_TABLE_BYTES + 1)
         if len(text) > MOST_TABLE_BYTES:
             raise AmiwarpError(f"it is larger than {MOST_TABLE_BYTES >> 20} MiB")
@@ -296,7 +293,7 @@ def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
 
 def _open_stack(path: Path, fps: float | None) -> PictureStack:
     try:
-        pictures = np.load(path, mmap_mode="r", allow_pickle=False)
+        pictures = np.load(input_path(path), mmap_mode="r", allow_pickle=False)
     except Exception as error:  # NumPy parses the header as Python: errors of many types
         what = " ".join(str(error).split())
         raise AmiwarpError(f"{path} cannot be read as an array ({what}); give a stack saved by numpy.save") from error
@@ -311,7 +308,7 @@ def _open_video(path: Path, fps: float | None) -> VideoFile:
     import av
 
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(input_path(path))) as container:
             if not container.streams.video:
                 raise AmiwarpError(f"{path} contains no video stream; give a video")
             stream = container.streams.video[0]

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, input_path
 from amiwarp.optics.camera import Camera
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import linear_luminance
@@ -93,7 +92,7 @@ class MvsecPictures:
         """Yield time [us] and linear luminance, shape (height, width)."""
         import h5py
 
-        with errors_name(self.path, lambda: MVSEC_PICTURES), h5py.File(self.path) as file:
+        with errors_name(self.path, lambda: MVSEC_PICTURES), h5py.File(input_path(self.path)) as file:
             for k, t in enumerate(self.times_us.tolist()):
                 pixels = np.asarray(file[MVSEC_PICTURES][k])
                 yield t, linear_luminance(pixels.astype(np.float32) / 255.0, name=f"{self.path}: picture {k}")
@@ -103,9 +102,8 @@ def open_mvsec(path: Path) -> MvsecPictures:
     """Open the pictures of a recording of MVSEC. Raises :class:`AmiwarpError` if it has none."""
     import h5py
 
-    check_regular(path)
     with errors_name(path, lambda: "is not a file of MVSEC with pictures"):
-        with h5py.File(path) as file:
+        with h5py.File(input_path(path)) as file:
             pictures: Any = file.get(MVSEC_PICTURES)
             times: Any = file.get(f"{MVSEC_PICTURES}_ts")
             if pictures is None or times is None:

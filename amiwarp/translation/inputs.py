@@ -62,7 +62,7 @@ class TranslatorInput:
     """How the pictures were made, for the metadata of the recording."""
 
 
-def open_input(
+def translator_input(
     source: str | Path | Pictures | Recording,
     *,
     events: str | Path | Recording | None = None,

@@ -13,7 +13,7 @@ from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.sequences import Pictures
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.translation.datasets import DataSet
-from amiwarp.translation.inputs import TranslatorInput, open_input, with_camera
+from amiwarp.translation.inputs import TranslatorInput, translator_input, with_camera
 from amiwarp.translation.interpolation import Interpolation
 from amiwarp.validation import choice
 
@@ -43,7 +43,7 @@ def translation(
     progress: Progress | None = None,
 ) -> Simulation:
     """Set up the simulation of what is translated, with the settings of :func:`translate`."""
-    given = source if isinstance(source, TranslatorInput) else open_input(
+    given = source if isinstance(source, TranslatorInput) else translator_input(
         source, events=events, dataset=None if dataset is None else choice(DataSet, dataset, "dataset"),
         interpolation=choice(Interpolation, interpolation, "interpolation"), fps=fps, device=device, progress=progress,
     )  # fmt: skip

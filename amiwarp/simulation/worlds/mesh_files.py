@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name, note_input
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import errors_name, open_input
 from amiwarp.simulation.pictures import LUMINANCE, MOST_PIXELS, PICTURE_FORMATS, linear_luminance, srgb_to_linear
 from amiwarp.simulation.worlds.scene import Material, Mesh
 from amiwarp.validation import one_of, real
@@ -73,8 +72,6 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
         raise AmiwarpError(f"{path}: has an unknown mesh format {path.suffix!r}; give one of {', '.join(FORMATS)}")
     up = one_of(up or ("y" if kind in Y_UP else "z"), ("y", "z"), "axis that points up")
     turn = real(scale, "mesh scale", 1e-9, 1e9) * (TO_Z_UP if up == "y" else np.eye(3))
-    check_regular(path)
-    note_input(path)
     scene = _open(path, kind)
     parts = []
     with errors_name(path, lambda: "cannot be read as a mesh"):
@@ -95,7 +92,7 @@ def _open(path: Path, kind: str) -> Any:
     except ImportError as error:
         raise AmiwarpError(f"{path}: mesh files need trimesh; install it by: pip install 'amiwarp[worlds]'") from error
     files = _named_files(path)
-    with errors_name(path, lambda: "cannot be read as a mesh"), path.open("rb") as file:
+    with errors_name(path, lambda: "cannot be read as a mesh"), open_input(path) as file:
         try:
             scene = trimesh.load(file, file_type=kind, resolver=files, force="scene", process=False)
         except Exception:
@@ -121,15 +118,14 @@ def _named_files(path: Path) -> Any:
             file = path.parent / name.replace("\\", "/")
             file = file if file.exists() else path.parent / urllib.parse.unquote(name)
             try:
-                check_regular(file)
-                data = file.read_bytes()
+                with open_input(file) as opened:
+                    data = opened.read()
                 if file.suffix.lower() in PICTURES:
                     _check_picture(data)
             except Exception as error:
                 what = "is missing" if isinstance(error, AmiwarpError) else f"cannot be read ({error})"
                 self.missing = self.missing or f"{name!r}, which {what}"
                 raise
-            note_input(file)
             return data
 
     return NamedFiles(str(path))

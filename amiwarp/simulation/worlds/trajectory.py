@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.input_files import read_text
 from amiwarp.validation import array, real
 
 if TYPE_CHECKING:
@@ -218,9 +218,8 @@ class Trajectory:
             If the file does not exist, or is not a table of poses.
         """
         path = Path(path)
-        check_regular(path)
         rows = []
-        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        for number, line in enumerate(read_text(path, errors="replace").splitlines(), 1):
             words = line.split("#")[0].replace(",", " ").split()
             if not words or (number == 1 and words[0].lower() in ("t", "time", "timestamp", "t_s")):
                 continue

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name, note_input
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import at_field, build, fields_of, read_json, read_toml
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.worlds.mesh_files import LoadedMesh, load_mesh
@@ -125,7 +125,6 @@ def _read(path: Path) -> dict[str, Any]:
         data = read_toml(path, "a world")
     else:
         raise AmiwarpError(f"{path}: has the suffix {path.suffix!r}; a world file ends in .toml or .json")
-    note_input(path)
     return data
 
 
@@ -170,7 +169,6 @@ class _Reader:
 
     def _picture(self, name: str) -> Any:
         """Return the linear luminance of a picture file."""
-        note_input(self._folder / name)
         return read_picture(self._folder / name)
 
     def _bodies(self, data: Any, where: str) -> list[Body]:
@@ -221,7 +219,6 @@ class _Reader:
     def _trajectory(self, data: Any, where: str) -> Trajectory:
         """Return a trajectory from the name of a CSV or TUM file, or from a list of key poses."""
         if isinstance(data, str):
-            note_input(self._folder / data)
             return at_field(where, lambda: Trajectory.from_file(self._folder / data))
         poses = [
             build(PoseEntry, entry, place) for place, entry in _entries(data, where, "the name of a file or a list")

@@ -16,6 +16,7 @@ from amiwarp.calib.presets import Preset
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.device_events import TURNS
 from amiwarp.io.atomic_output import check_output, make_folder, write_text
+from amiwarp.io.input_files import read_text
 from amiwarp.progress import Progress, part, silent
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.studies.chart import calibration, compensation
@@ -62,7 +63,7 @@ class Charts:
         """Read ``chart.json``. Raises :class:`AmiwarpError` if it is damaged or another file."""
         names = [f.name for f in fields(Row)]
         try:
-            held = json.loads(data.read_text())
+            held = json.loads(read_text(data, noted=False))
             rows = {k: tuple(Row(**{n: r[n] for n in names}) for r in held[k]["rows"]) for k in REPEATS}
             about = {name: held[name] for name in ABOUT}
         except (OSError, ValueError, TypeError, LookupError) as error:

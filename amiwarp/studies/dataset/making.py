@@ -117,7 +117,7 @@ def _make(job: Job) -> Made:
     item, device = job.item, "cuda:0" if job.device == ANY_GPU else job.device
     part, path = job.scratch / f"{item.key}.h5", job.out / item.file
     written = write_recording(item, part, device)
-    digest = content_digest(part)
+    digest = content_digest(part, noted=False)
     make_folder(path.parent)
     put_in_place(part, path, overwrite=True)
     state = path.stat()

@@ -74,7 +74,7 @@ class Journal:
             return None
         changed = path.stat().st_mtime_ns
         if changed != made.mtime_ns:
-            if content_digest(path) != made.sha256:
+            if content_digest(path, noted=False) != made.sha256:
                 return None
             made = replace(made, mtime_ns=changed)
             self._touched.append(made)

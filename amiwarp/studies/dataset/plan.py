@@ -231,7 +231,7 @@ def _cost(item: Item, scratch: Path, device: str, duration_s: float | None) -> _
     path = scratch / f"{item.key}.h5"
     began = time.perf_counter()
     written = write_recording(item, path, device, duration_s)
-    content_digest(path)
+    content_digest(path, noted=False)
     cost = _Cost(written.events, path.stat().st_size, time.perf_counter() - began)
     path.unlink()
     return cost

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name, note_input
+from amiwarp.io.input_files import errors_name, open_input
 from amiwarp.io.json_files import read_json, read_toml
-from amiwarp.io.regular_file import check_regular
 from amiwarp.simulation.worlds.named.catalogue import WORLDS
 from amiwarp.studies.dataset.specification import SourceEntry, SourceGroup, Specification
 from amiwarp.validation import one_of
@@ -84,7 +83,6 @@ def _of_group(folder: Path, group: SourceGroup, where: str) -> Iterator[Source]:
     digest: Callable[[Path], str] = _world_digest if entry.kind == "world_files" else content_digest
     for name in names:
         path = folder / name
-        note_input(path)
         yield Source(entry, Path(name).as_posix(), path, digest(path), _labels(group, path, table))
 
 
@@ -107,8 +105,7 @@ def _read_labels(path: Path) -> tuple[Path, dict[Path, dict[str, Any]]]:
     A column of numbers becomes numbers; any other column is text.
     """
     with errors_name(path, lambda: "is no table of labels"):
-        check_regular(path)
-        with path.open("rb") as file:
+        with open_input(path) as file:
             text = file.read(MOST_TABLE_BYTES + 1)
         if len(text) > MOST_TABLE_BYTES:
             raise AmiwarpError(f"is larger than {MOST_TABLE_BYTES >> 20} MiB; divide it among several sources")
@@ -134,16 +131,18 @@ def _column(values: list[str]) -> list[Any]:
     return list(values)
 
 
-def content_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, or of the names and contents of the files in a folder."""
+def content_digest(path: Path, *, noted: bool = True) -> str:
+    """Return the SHA-256 of a file, or of the names and contents of the files in a folder.
+
+    ``noted`` is False for a recording of the data set, which may be replaced.
+    """
     with errors_name(path, lambda: "cannot be read"):
         if path.is_dir():
             total = hashlib.sha256()
             for file in sorted(p for p in path.iterdir() if p.is_file()):
                 total.update(f"{file.name}\0{content_digest(file)}\n".encode())
             return total.hexdigest()
-        check_regular(path)
-        with path.open("rb") as opened:
+        with open_input(path, noted=noted) as opened:
             return hashlib.file_digest(opened, "sha256").hexdigest()
 
 

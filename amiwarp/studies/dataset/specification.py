@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name, note_input
+from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import LARGEST_INTEGER, at_field, build, fields_of, read_toml
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -142,7 +142,6 @@ def load_specification(path: str | Path) -> Specification:
     """Read and check a specification. Raises :class:`AmiwarpError`, which names the field, the value and the remedy."""
     path = Path(path)
     data = read_toml(path, "a specification of a data set")
-    note_input(path)
     with errors_name(path, lambda: "is no specification of a data set"):
         plain = [f.name for f in fields(_Plain)]
         needed = ("format", "version", "duration_s", "prisms", "speeds_rpm", "sources")

@@ -13,6 +13,7 @@ from typing import Any
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
+from amiwarp.io.input_files import read_text
 from amiwarp.kernels.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.kernels.launch import load_all, load_kernels
 from amiwarp.studies.cpu_kernels import EXACT_KERNELS
@@ -126,7 +127,7 @@ class Store:
         if not path.exists():
             return None
         try:
-            data = json.loads(path.read_text())
+            data = json.loads(read_text(path, noted=False))
             if data["version"] != self._version(name, settings):
                 return None
             return CellResult(name, condition, data["values"], data["error"], float(data["processor_s"]))

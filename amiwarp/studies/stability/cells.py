@@ -26,6 +26,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.metrics import model_error
 from amiwarp.io.atomic_output import write_text
+from amiwarp.io.input_files import read_text
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.model_error import predicted_error
 from amiwarp.studies.machine_info import machine
@@ -260,7 +261,7 @@ class Store:
         if not path.exists():
             return Stored(cell)
         try:
-            data = json.loads(path.read_text())
+            data = json.loads(read_text(path, noted=False))
             results = {name: Result.from_json(r) for name, r in data["results"].items()}
             return Stored(cell, data["events"], results)
         except (ValueError, KeyError, TypeError) as error:

@@ -14,6 +14,7 @@ from scipy.stats import binomtest
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
+from amiwarp.io.input_files import read_text
 from amiwarp.studies.stability.axes import Axis
 from amiwarp.studies.stability.cells import Cell, Method, Outcome, Store, Stored, identity
 from amiwarp.studies.stability.conditions import Condition, sensible
@@ -301,7 +302,7 @@ def load(folder: Path) -> list[Stored]:
 def _cell(path: Path) -> Cell | None:
     """Return the cell of a file; None if it belongs to another version."""
     try:
-        data = json.loads(path.read_text())
+        data = json.loads(read_text(path, noted=False))
         cell = Cell(Condition(**data["condition"]), int(data["seed"]))
     except TypeError:
         return None  # the file was written by a version with other fields
