@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from glob import glob
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,6 +31,7 @@ from amiwarp.io.json_lines import append_line, create_journal, read_lines
 from amiwarp.kernels import quiet_start
 from amiwarp.studies import cluster
 from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker
+from amiwarp.studies.dataset import items, sources, specification
 from amiwarp.studies.dataset.items import list_items
 from amiwarp.studies.dataset.making import simulation_of
 from amiwarp.studies.dataset.manifest import JOURNAL, MANIFEST, TABLE
@@ -426,6 +428,52 @@ def test_journal_leaves_out_what_was_cut_off(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-3])
     append_line(path, {"k": 3})
     assert list(read_lines(path)) == [{"k": 0}, {"k": 1}, {"k": 3}]
+
+
+def test_large_specifications_are_refused_or_read_in_linear_time(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = place / "spec.toml"
+    path.write_text("seeds = 5000000\n" + BASE + PICTURES)
+    with pytest.raises(AmiwarpError, match=r"field seeds = 5000000 is not a whole number in 1 \.\. 1000000"):
+        load_specification(path)
+    path.write_text("seeds = 1000000\n" + BASE + PICTURES)
+    made: list[object] = []
+    monkeypatch.setattr(items, "Item", lambda *values: made.append(values))
+    with pytest.raises(AmiwarpError, match=r"spec\.toml: describes 12,000,000 recordings; divide it among"):
+        list_items(load_specification(path))
+    assert not made
+    compared = 0
+
+    class Seed(int):
+        def __eq__(self, other: object) -> bool:
+            nonlocal compared
+            compared += 1
+            return int(self) == other
+
+        __hash__ = int.__hash__
+
+    specification._check_distinct(tuple(map(Seed, range(60_000))), "seeds")
+    assert compared < 60_000
+    for dotted in ("a." * 200_000 + "a = 1", "[" + ' "a" .' * 40 + "a]", "x = {" + "a." * 33 + "a = 1}", r'"\"".' * 99):
+        path.write_text(BASE + PICTURES + dotted + "\n")
+        with pytest.raises(AmiwarpError, match=r"spec\.toml: .*line \d+ has a key of more than 32 parts; use"):
+            load_specification(path)
+    path.write_bytes(b"#" * (1 << 20) + b"\n")
+    with pytest.raises(AmiwarpError, match=r"spec\.toml: .*is larger than 1 MiB"):
+        load_specification(path)
+
+
+def test_a_pattern_visits_a_limited_number_of_entries(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (place / "pictures" / "again").symlink_to(place)  # a loop
+    (place / "pictures" / "self").symlink_to("self")
+    for pattern in ("pictures/*/*.png", "**/[0-3].png", f"{place}/*/d*/0.png", "./pictures/disc/0.png", "pict*/../s*"):
+        expected = {f for f in glob(pattern, root_dir=place, recursive=True) if "again" not in Path(f).parts}
+        assert sources._matches(place, pattern) == sorted(expected) != []
+    monkeypatch.setattr(sources, "MOST_VISITED", 100)
+    for k in range(100):
+        (place / "pictures" / f"{k}.txt").touch()
+    (place / "spec.toml").write_text(BASE + '[[sources]]\npictures = "/**/*.png"\n')
+    with pytest.raises(AmiwarpError, match=r"sources\[0\]: pattern '/\*\*/\*\.png' leads through more than 100 files"):
+        make(place)
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(5.4, "5 s"), (119.0, "119 s"), (150.0, "2.5 min"), (3e5, "3.5 days")])

@@ -7,6 +7,7 @@ import difflib
 import json
 import math
 import os
+import re
 import tomllib
 import types
 from collections.abc import Callable, Mapping
@@ -14,13 +15,22 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name, input_path, open_input, read_text
+from amiwarp.io.input_files import errors_name, open_input
 from amiwarp.validation import real, shown, whole
 
 Made = TypeVar("Made")
 
 MOST_BYTES = 64 << 20
 """Largest JSON file that is read [bytes]. A calibration with all points of its search takes about 1 MB."""
+MOST_TOML_BYTES = 1 << 20
+"""Largest TOML file that is read [bytes]. Such files are written by hand, and Python parses 1 MiB in seconds."""
+MOST_PARTS = 32
+"""Largest number of parts of a dotted key in TOML, as in ``a.b.c``. Their parser takes time by the square of it."""
+_TOO_DOTTED = re.compile(
+    r"""(?<![A-Za-z0-9_\\-])(?:(?:[A-Za-z0-9_-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+)"""
+    rf"{{{MOST_PARTS}}}"
+)
+"""Pattern of dotted keys with more parts. Its quantifiers are possessive, so that the time is that of the length."""
 LARGEST_INTEGER = 2**62
 """Largest accepted magnitude of a whole number, equal to :data:`amiwarp.events.checks.TIME_LIMIT`."""
 
@@ -61,15 +71,21 @@ def read_json(path: str | os.PathLike[str], what: str, *, most_bytes: int = MOST
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """Return the fields of a TOML file of at most :data:`MOST_BYTES`.
+    """Return the fields of a TOML file of at most :data:`MOST_TOML_BYTES`.
 
     ``what`` says what the file should contain, for messages, such as "a world". Raises :class:`AmiwarpError` if the
-    file cannot be read, is larger or is not TOML.
+    file cannot be read, is larger, has a key of more than :data:`MOST_PARTS` parts, or is not TOML.
     """
     with errors_name(path, lambda: f"cannot be read as {what}"):
-        if input_path(path).stat().st_size > MOST_BYTES:
-            raise AmiwarpError(f"is larger than {MOST_BYTES >> 20} MiB; give another file")
-        return tomllib.loads(read_text(path))
+        with open_input(path) as file:
+            data = file.read(MOST_TOML_BYTES + 1)
+        if len(data) > MOST_TOML_BYTES:
+            raise AmiwarpError(f"is larger than {MOST_TOML_BYTES >> 20} MiB; give another file")
+        text = data.decode("utf-8")
+        if dotted := _TOO_DOTTED.search(text):
+            line = text.count("\n", 0, dotted.start()) + 1
+            raise AmiwarpError(f"line {line} has a key of more than {MOST_PARTS} parts; use fewer dots")
+        return tomllib.loads(text)
 
 
 def parse_json(text: bytes) -> Any:

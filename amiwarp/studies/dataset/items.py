@@ -5,16 +5,18 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.simulation.worlds.open_world import POSE_FILES
 from amiwarp.studies.dataset.sources import Source, content_digest, find_sources
-from amiwarp.studies.dataset.specification import LARGEST_SEED, Specification
+from amiwarp.studies.dataset.specification import LARGEST_SEED, MOST_RECORDINGS, Specification
 
 
 @dataclass(frozen=True)
@@ -65,20 +67,43 @@ def _digest(data: Any) -> str:
 
 
 def list_items(specification: Specification) -> list[Item]:
-    """Return all recordings of a specification, in its order. Raises :class:`AmiwarpError` for sources not found."""
-    return [item for source in find_sources(specification) for item in _of_source(specification, source)]
+    """Return all recordings of a specification, in its order.
+
+    Raises :class:`AmiwarpError` for sources not found, and for more than :data:`MOST_RECORDINGS` recordings.
+    """
+    found = [(source, _axes(specification, source)) for source in find_sources(specification)]
+    count = sum(math.prod(map(len, axes)) for _, axes in found)
+    if count > MOST_RECORDINGS:
+        raise AmiwarpError(
+            f"{specification.path}: describes {count:,} recordings; divide it among specifications of at most "
+            f"{MOST_RECORDINGS:,} recordings each"
+        )
+    return [item for source, axes in found for item in _of_source(specification, source, axes)]
 
 
-def _of_source(specification: Specification, source: Source) -> Iterator[Item]:
+def _of_source(specification: Specification, source: Source, axes: Sequence[Sequence[Any]]) -> Iterator[Item]:
     """Yield the recordings of one source."""
-    for recipe in _recipes(specification, source):
+    split: dict[str, str] = {}
+    for recipe in _recipes(specification, source, axes):
         # Equal files, and the worlds of one seed, are the same source and lie in the same split.
         same = source.digest or f"{source.name} {recipe['seed']}"
-        split = _split(specification, same)
-        yield Item(recipe, specification.folder, split, source.labels, source.entry.licence)
+        if same not in split:
+            split[same] = _split(specification, same)
+        yield Item(recipe, specification.folder, split[same], source.labels, source.entry.licence)
 
 
-def _recipes(specification: Specification, source: Source) -> Iterator[dict[str, Any]]:
+def _axes(specification: Specification, source: Source) -> tuple[Sequence[Any], ...]:
+    """Return what one source is combined with: trajectories, prisms, speeds, sensors and seeds."""
+    if source.entry.kind == "recordings":
+        return ()
+    return (
+        _trajectories(specification, source), [asdict(prism) for prism in specification.prisms],
+        specification.speeds_rpm, [{"name": name, **asdict(sensor)} for name, sensor in specification.sensors.items()],
+        specification.seeds,
+    )  # fmt: skip
+
+
+def _recipes(specification: Specification, source: Source, axes: Sequence[Sequence[Any]]) -> Iterator[dict[str, Any]]:
     """Yield what determines each recording of one source."""
     entry = source.entry
     base: dict[str, Any] = {"source": {"kind": entry.kind, "name": source.name, "sha256": source.digest}}
@@ -92,12 +117,7 @@ def _recipes(specification: Specification, source: Source) -> Iterator[dict[str,
         base |= {"duration_s": entry.duration_s or specification.duration_s}
     if entry.kind in ("worlds", "world_files"):
         base |= {"truth_hz": specification.truth_hz}
-    prisms = [asdict(prism) for prism in specification.prisms]
-    sensors = [{"name": name, **asdict(sensor)} for name, sensor in specification.sensors.items()]
-    axes = itertools.product(
-        _trajectories(specification, source), prisms, specification.speeds_rpm, sensors, specification.seeds
-    )
-    for trajectory, prism, rpm, sensor, seed in axes:
+    for trajectory, prism, rpm, sensor, seed in itertools.product(*axes):
         yield base | trajectory | {"prism": prism, "rpm": rpm, "sensor": sensor, "seed": seed}
 
 

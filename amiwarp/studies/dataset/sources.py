@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import fnmatch
 import glob
 import hashlib
 import io
+import itertools
+import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,8 +21,10 @@ from amiwarp.io.input_files import errors_name, open_input
 from amiwarp.io.json_files import read_json, read_toml
 from amiwarp.simulation.worlds.named.catalogue import WORLDS
 from amiwarp.studies.dataset.specification import SourceEntry, SourceGroup, Specification
-from amiwarp.validation import one_of
+from amiwarp.validation import one_of, shown
 
+MOST_VISITED = 2_000_000
+"""Largest number of files and folders that one pattern leads through."""
 MOST_TABLE_BYTES = 256 << 20
 """Largest table of labels that is read [bytes]."""
 
@@ -76,14 +82,73 @@ def _of_group(folder: Path, group: SourceGroup, where: str) -> Iterator[Source]:
             yield Source(entry, name, None, "", dict(group.labels))
         return
     pattern = getattr(entry, entry.kind)
-    names = sorted(glob.glob(pattern, root_dir=folder, recursive=True))
+    names = _matches(folder, pattern)
     if not names:
-        raise AmiwarpError(f"field {where}.{entry.kind} is {pattern!r}, which matches no file in {folder}; change it")
+        raise AmiwarpError(
+            f"field {where}.{entry.kind} is {shown(pattern)}, which matches no file in {folder}; change it"
+        )
     table = None if entry.label_table is None else _read_labels(folder / entry.label_table)
     digest: Callable[[Path], str] = _world_digest if entry.kind == "world_files" else content_digest
     for name in names:
         path = folder / name
         yield Source(entry, Path(name).as_posix(), path, digest(path), _labels(group, path, table))
+
+
+def _matches(folder: Path, pattern: str) -> list[str]:
+    """Return the paths that match a pattern as in the module glob, sorted and relative to ``folder``.
+
+    Raises :class:`AmiwarpError` after :data:`MOST_VISITED` entries of folders.
+    """
+    visited = itertools.count(1)
+
+    def entries(name: str) -> Iterator[os.DirEntry[str]]:
+        with contextlib.suppress(OSError, ValueError), os.scandir(folder / name) as listed:
+            for entry in listed:  # without entries: no folder, or an unreadable one
+                if next(visited) > MOST_VISITED:
+                    raise _TooMany
+                yield entry
+
+    def below(name: str) -> Iterator[str]:
+        waiting: list[tuple[str, frozenset[tuple[int, int]]]] = [(name, frozenset())]
+        while waiting:
+            here, above = waiting.pop()
+            with contextlib.suppress(OSError, ValueError):
+                state = os.stat(folder / here)
+                if (same := (state.st_dev, state.st_ino)) not in above:  # a link to a folder above it has no end
+                    yield here
+                    deeper = [e.name for e in entries(here) if not e.name.startswith(".") and _is_folder(e)]
+                    waiting += [(os.path.join(here, inner), above | {same}) for inner in deeper]
+
+    def step(name: str, segment: str) -> Iterator[str]:
+        if segment == "**":
+            yield from below(name)
+        elif glob.has_magic(segment):
+            names = (e.name for e in entries(name) if segment.startswith(".") or not e.name.startswith("."))
+            yield from (os.path.join(name, found) for found in fnmatch.filter(names, segment))
+        elif os.path.lexists(folder / name / segment):
+            yield os.path.join(name, segment)
+
+    names = ["/" if pattern.startswith("/") else ""]
+    segments = [segment for segment in pattern.split("/") if segment]
+    try:
+        for segment in (*segments, "*") if pattern.endswith("**") else segments:
+            names = list(dict.fromkeys(found for name in names for found in step(name, segment)))
+    except _TooMany:
+        raise AmiwarpError(
+            f"pattern {shown(pattern)} leads through more than {MOST_VISITED:,} files and folders; name the folders"
+        ) from None
+    return sorted(name for name in names if name)
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    """Return whether an entry is a folder or a link to one."""
+    with contextlib.suppress(OSError):  # a link to itself
+        return entry.is_dir()
+    return False
+
+
+class _TooMany(Exception):
+    """The limit of :func:`_matches`."""
 
 
 def _labels(group: SourceGroup, path: Path, table: tuple[Path, dict[Path, dict[str, Any]]] | None) -> dict[str, Any]:

@@ -26,8 +26,10 @@ KINDS = ("pictures", "videos", "recordings", "translated", "world_files", "world
 """Fields of a source that name its files or worlds; each source has exactly one of them."""
 LARGEST_SEED = 2**31 - 1
 """Largest seed of a recording."""
-MOST_SEEDS = 1_000_000
-"""Largest number of seeds."""
+MOST_RECORDINGS = 1_000_000
+"""Largest number of recordings, and of seeds."""
+MOST_SPLITS = 100
+"""Largest number of splits."""
 
 Entry = TypeVar("Entry")
 
@@ -187,6 +189,8 @@ def _check(values: _Plain) -> None:
         at_field(f"speeds_rpm[{k}]", lambda rpm=rpm: PrismMotion(rpm))  # type: ignore[misc]
     if values.truth_hz is not None:
         real(values.truth_hz, "field truth_hz", 1e-3, 1e6, " Hz")
+    if len(values.splits) > MOST_SPLITS:
+        raise AmiwarpError(f"field splits has {len(values.splits):,} names; give at most {MOST_SPLITS}")
     for name, share in values.splits.items():
         if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
             raise AmiwarpError(f"field splits has the name {shown(name)}; use letters, digits, '-' and '_'")
@@ -200,9 +204,10 @@ def _check_distinct(values: tuple[Any, ...], name: str) -> None:
     """Raise :class:`AmiwarpError` for an empty list and for equal entries, whose recordings would be the same."""
     if not values:
         raise AmiwarpError(f"field {name} is empty; give at least one entry")
+    first: dict[Any, int] = {}
     for k, value in enumerate(values):
-        if value in values[:k]:
-            raise AmiwarpError(f"field {name}[{k}] repeats {name}[{values.index(value)}]; remove it")
+        if first.setdefault(value, k) != k:
+            raise AmiwarpError(f"field {name}[{k}] repeats {name}[{first[value]}]; remove it")
 
 
 def _seeds(value: Any) -> tuple[int, ...]:
@@ -211,7 +216,7 @@ def _seeds(value: Any) -> tuple[int, ...]:
         seeds = tuple(whole(seed, f"field seeds[{k}]", 0, LARGEST_SEED) for k, seed in enumerate(value))
         _check_distinct(seeds, "seeds")
         return seeds
-    return tuple(range(whole(value, "field seeds", 1, MOST_SEEDS, "; give their number, or a list of them")))
+    return tuple(range(whole(value, "field seeds", 1, MOST_RECORDINGS, "; give their number, or a list of them")))
 
 
 _MAKERS: dict[str, Callable[[], SensorModel]] = {"default": SensorModel, "ideal": SensorModel.ideal}
