@@ -18,7 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from amiwarp.studies.stability.axes import AXES
-from amiwarp.studies.stability.cells import Cell, run_cell
+from amiwarp.studies.stability.cells import Cell, Store, run_cell
 from amiwarp.studies.stability.run import QUICK_METHODS, chosen, quick_axes, run
 
 _started = multiprocessing.get_context("spawn").Value("i", 0)
@@ -63,7 +63,7 @@ def main() -> int:
         one.submit(run_cell, Cell(axes[0].conditions()[0], 0), methods, args.device).result()
     print(f"{time.perf_counter() - began:6.0f} s  compiled", flush=True)
     with ProcessPoolExecutor(args.workers, **start) as pool:
-        run(axes, args.seeds, methods, cells, pool, device=args.device, progress=show_progress,
+        run(axes, args.seeds, methods, Store(cells), pool, device=args.device, progress=show_progress,
             until=lambda: time.perf_counter() - began > args.limit_s)  # fmt: skip
     with tarfile.open(args.out / "cells.tar", "w") as tar:
         tar.add(cells, arcname="cells")

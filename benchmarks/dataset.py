@@ -30,7 +30,7 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
-from amiwarp.io.json_lines import read_lines
+from amiwarp.io.sealed_json import read_journal
 from amiwarp.kernels.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.kernels.quiet_start import start_quietly
 from amiwarp.simulation.engine import Engine
@@ -118,7 +118,7 @@ def measure(specification: Path, out: Path, device: str, workers: int) -> tuple[
     steady_s = finished[-1] - finished[warm]
     found = json.loads((out / manifest.MANIFEST).read_text())
     # the median leaves out each worker's first recording, which imports and compiles
-    times = [line["processor_s"] for line in read_lines(out / manifest.JOURNAL)]
+    times = [line["processor_s"] for line in read_journal(out / manifest.JOURNAL, dict, [])]
     per_s = (len(finished) - 1 - warm) / steady_s
     row = {
         "device": device, "gpus": gpus, "workers": workers, "items": done.made, "failed": len(done.failed),

@@ -27,7 +27,7 @@ from typer.testing import CliRunner, Result
 import amiwarp
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.json_lines import append_line, create_journal, read_lines
+from amiwarp.io.sealed_json import append_line, create_journal, read_journal
 from amiwarp.kernels import quiet_start
 from amiwarp.studies import cluster
 from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker
@@ -247,7 +247,7 @@ def test_a_killed_run_is_continued(place: Path) -> None:
             time.sleep(0.005)
         process.kill()
     assert process.returncode == -signal.SIGKILL
-    kept = len(list(read_lines(journal)))
+    kept = len(list(read_journal(journal, dict, [])))
     assert 3 <= kept < 120
     append_line(journal, {"key": "cut off"})
     journal.write_bytes(journal.read_bytes()[:-4])
@@ -421,13 +421,44 @@ def test_a_wrong_call_is_named(place: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_journal_leaves_out_what_was_cut_off(tmp_path: Path) -> None:
     path = tmp_path / "journal"
-    assert list(read_lines(path)) == []
+    damaged: list[str] = []
+    assert list(read_journal(path, dict, damaged)) == []
     create_journal(path)
     for k in range(3):
         append_line(path, {"k": k})
     path.write_bytes(path.read_bytes()[:-3])
     append_line(path, {"k": 3})
-    assert list(read_lines(path)) == [{"k": 0}, {"k": 1}, {"k": 3}]
+    assert list(read_journal(path, dict, damaged)) == [{"k": 0}, {"k": 1}, {"k": 3}]
+    assert len(damaged) == 1
+    assert damaged[0].startswith(f"{path}: line 3: is not JSON: ")
+
+
+def test_an_invented_journal_is_not_trusted(place: Path) -> None:
+    """A line counts if its checksum, its values and the hash of its file are right. Others are made again, and said."""
+    make(place)
+    before, journal = checksums(place), place / "out" / JOURNAL
+    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    for line in lines:
+        line.pop("checksum", None)
+    journal.write_text("".join(json.dumps({**line, "sha256": "0" * 64}) + "\n" for line in lines[:3]))
+    for line in lines[3:5]:
+        append_line(journal, {**line, "sha256": "1" * 64})  # anybody can compute the checksum of a line
+    append_line(journal, {**lines[5], "file": "../secret.h5", "key": "0" * 16})
+    append_line(journal, {**lines[5], "events": 10**300})
+    append_line(journal, {**lines[5], "colour": "red"})
+    for line in (lines[6], lines[6], lines[7]):
+        append_line(journal, line)
+    journal.write_bytes(journal.read_bytes() + b"\xff" * 200_000 + b"[" * 100_000 + b"\n")
+    done = make(place)
+    assert (done.made, done.kept, done.failed) == (10, 2, {})
+    assert len(done.damaged) == 3
+    assert "line 1: field checksum is missing; 7 lines are damaged" in done.damaged[0]
+    assert "does not have the checksum of journal.jsonl" in done.damaged[1]
+    assert {item["file"]: item["sha256"] for item in manifest(place)["items"]} == checksums(place) == before
+    journal.unlink()
+    os.mkfifo(journal)
+    with pytest.raises(AmiwarpError, match=r"journal\.jsonl: is a named pipe \(FIFO\); give a regular file"):
+        make(place)
 
 
 def test_large_specifications_are_refused_or_read_in_linear_time(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:

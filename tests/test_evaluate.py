@@ -2,8 +2,12 @@
 
 import json
 import math
+import os
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -15,12 +19,17 @@ from scipy.spatial.distance import cdist
 from scipy.special import ndtr
 
 import amiwarp
+from amiwarp.cli.console import made_again
+from amiwarp.io.sealed_json import sealed
+from amiwarp.progress import silent
+from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.evaluate import apex_speed, corners, fading, texture
 from amiwarp.studies.evaluate.cells import Job, Store, plan, run_job
 from amiwarp.studies.evaluate.conditions import DISCS, IDEAL, Condition, RecordedStreams, Stream, Streams
 from amiwarp.studies.evaluate.disc_target import DiscTarget, robust_spread
+from amiwarp.studies.evaluate.drawing import CHANCE
 from amiwarp.studies.evaluate.measures.density import density_variance, event_counts
-from amiwarp.studies.evaluate.measures.edge_match import Counts, best_f, binary_entropy, match
+from amiwarp.studies.evaluate.measures.edge_match import THRESHOLDS, Counts, best_f, binary_entropy, match
 from amiwarp.studies.evaluate.measures.true_edges import geometric_edges
 from amiwarp.studies.evaluate.registry import EVALUATIONS, load
 from amiwarp.studies.evaluate.report import refused, section, write
@@ -32,9 +41,11 @@ from amiwarp.studies.evaluate.results import (
     Verdict,
     by_case,
     compared,
+    encode_picture,
     grouped,
     where_calibrated,
 )
+from amiwarp.studies.evaluate.run import _run
 
 SMALL = replace(QUICK, width=64, height=48, duration_s=0.1, seeds=1)
 
@@ -337,12 +348,97 @@ def test_cells_are_kept_and_the_report_is_one_file(tmp_path: Path) -> None:
     assert (tmp_path / "tables" / "apex_speed_rate.csv").read_text().startswith("apex,bandwidth,speed [rpm]")
 
 
-def test_a_damaged_cell_is_named(tmp_path: Path) -> None:
-    condition = Condition()
-    path = tmp_path / f"texture_quick_{condition.key}.json"
-    path.write_text("{}")
-    with pytest.raises(amiwarp.AmiwarpError, match="damaged cell"):
-        Store(tmp_path).load("texture", condition, SMALL)
+def stored_edges() -> CellResult:
+    """Return a cell of the edges with one row, of small pictures."""
+    picture = encode_picture(np.zeros((3, 4), np.uint8))
+    counts = [1] * len(THRESHOLDS)
+    names = (Stream.PLAIN.value, CHANCE)
+    values: dict[str, Any] = {
+        "images": [{"stream": name, "found": counts, "entropy": [0.5] * len(counts)} for name in names],
+        "rows": [{"stream": n, "truth": "Canny", "tolerance": 1.5, "matched": counts, "true": 9} for n in names],
+        "sectors": [{"stream": names[0], "angle": 7.5, "recall": 0.5}],
+        "pictures": {"Canny": picture, "geometry": picture},
+    }
+    return CellResult("edges", Condition(), values, "", 1.0)
+
+
+def stored_fading() -> CellResult:
+    """Return a cell of the fading with one part of a turn, two tiles and a film of two frames."""
+    tiles = {"part_ms": 1.0, "columns": 2, "rate": [[1.0, 2.0]], "speed": [[1.0, 2.0]], "camera_speed": [[0.0, 1.0]]}
+    film = [encode_picture(np.zeros((3, 4, 3), np.uint8))] * 2
+    return CellResult("fading", Condition(), {"rows": [], "film": film, "tiles": tiles}, "", 1.0)
+
+
+Change = Callable[[dict[str, Any]], object]
+WRONG_EDGES: dict[str, tuple[Change, str]] = {
+    "huge": (lambda v: v["sectors"][0].update(angle=1e300), r"sectors\[0\]\.angle = 1e\+300 is not a finite number"),
+    "share": (lambda v: v["images"][0]["entropy"].__setitem__(3, 1.5), r"entropy\[3\] = 1\.5 is not .* in 0 \.\. 1"),
+    "count": (lambda v: v["rows"][0].update(true=True), r"rows\[0\]\.true = True is not a whole number"),
+    "stream": (lambda v: v["sectors"][0].update(stream="mine"), r"sectors\[0\]\.stream is 'mine'; choose among S-EV"),
+    "unknown": (lambda v: v.update(colour=1), r"values\.colour is unknown"),
+    "missing": (lambda v: v["rows"][0].pop("truth"), r"values\.rows\[0\]\.truth is missing"),
+    "no list": (lambda v: v.update(rows=1), r"values\.rows is 1; expected a list"),
+    "short": (lambda v: v["rows"][0]["matched"].pop(), "values has lists of other lengths than the 99 thresholds"),
+    "no images": (lambda v: v["images"].pop(0), "has a row of S-EV, but not its images or its chance"),
+    "no chance": (lambda v: v["rows"].pop(1), "has a row of S-EV, but not its images or its chance"),
+    "no picture": (lambda v: v["pictures"].update(Canny="AAAA"), r"values\.pictures cannot be decoded"),
+    "two sizes": (
+        lambda v: v["pictures"].update(Canny=encode_picture(np.zeros((3, 5), np.uint8))), "expected one shape of 2 axes"
+    ),
+    "large picture": (
+        lambda v: v["pictures"].update(Canny=encode_picture(np.zeros((2049, 2048), np.uint8))), "has 2048x2049 px"
+    ),
+}  # fmt: skip
+WRONG_FADING: dict[str, tuple[Change, str]] = {
+    "ragged": (lambda v: v["tiles"]["speed"][0].pop(), r"values\.tiles has rows of unequal lengths"),
+    "no columns": (lambda v: v["tiles"].update(columns=0), r"tiles\.columns = 0 is not a whole number in 1"),
+    "grey film": (lambda v: v.update(film=[encode_picture(np.zeros((3, 4), np.uint8))]), "one shape of 3 axes"),
+}
+
+
+@pytest.mark.parametrize(
+    ("cell", "change", "message"),
+    [
+        *((stored_edges(), *case) for case in WRONG_EDGES.values()),
+        *((stored_fading(), *c) for c in WRONG_FADING.values()),
+    ],
+    ids=[*WRONG_EDGES, *WRONG_FADING],
+)
+def test_a_cell_of_wrong_values_is_run_again(tmp_path: Path, cell: CellResult, change: Change, message: str) -> None:
+    store = Store(tmp_path)
+    store.save(cell, SMALL)
+    known = store.load(cell.evaluation, cell.condition, SMALL)
+    assert known == cell
+    section(cell.evaluation, [known])
+    (path,) = tmp_path.iterdir()
+    data = json.loads(path.read_text())
+    del data["checksum"]
+    change(data["values"])
+    path.write_text(json.dumps(sealed(data)))  # anybody can compute the checksum
+    assert store.load(cell.evaluation, cell.condition, SMALL) is None
+    (said,) = store.damaged
+    assert said.startswith(f"{path}: is damaged: field values")
+    assert re.search(message, said), said
+
+
+def test_damaged_cells_are_run_again_and_said(tmp_path: Path) -> None:
+    """A cell that is cut off, not finite or a pipe is run again by the command, which says so in one line."""
+    condition = Condition(DISCS, "still", width=120, height=100, duration_s=60 / 1440, rpm=1440.0, cutoff_hz=0.0)
+    jobs, store = [Job(condition, ("apex_speed",), SMALL)], Store(tmp_path)
+    with single_worker() as workers:
+        first, *_ = _run(jobs, store, workers, silent)
+        (path,) = tmp_path.iterdir()
+        whole = path.read_bytes()
+        for content in (whole[:-20], whole.replace(b'"blur":', b'"blur":1e300,"old":', 1), b"{}", None):
+            path.unlink()
+            os.mkfifo(path) if content is None else path.write_bytes(content)
+            again, new, _ = _run(jobs, store, workers, silent)
+            assert (new, again[0].values) == (1, first[0].values)
+            assert _run(jobs, store, workers, silent)[1] == 0
+    assert len(store.damaged) == 4
+    assert all(said.startswith(f"{path}: ") for said in store.damaged)
+    (line,) = made_again(store.damaged)
+    assert line == f"damaged, and made again: {store.damaged[0]}, and 3 more"
 
 
 def test_a_table_without_values_has_no_chart() -> None:

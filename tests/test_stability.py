@@ -15,7 +15,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import model_error
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.studies.stability import AXES, Condition, Outcome, chosen, identity, make, quick_axes, run, sensible
-from amiwarp.studies.stability.cells import Cell, Store, best_fit
+from amiwarp.studies.stability.cells import Store, best_fit
 from amiwarp.studies.stability.run import conditions
 from amiwarp.studies.stability.scenes import SceneKind, draw
 
@@ -170,17 +170,19 @@ def test_cells_are_kept_and_only_what_misses_is_run(tmp_path: Path) -> None:
     assert [m.name for m in methods] == ["default", "paper", "sharpness"]
     calls: list[tuple[str, float]] = []
     with ThreadPoolExecutor(1) as pool:
-        some = run(small, 1, methods[:1], tmp_path, pool, progress=lambda *a: calls.append(a))
+        some = run(small, 1, methods[:1], Store(tmp_path), pool, progress=lambda *a: calls.append(a))
         assert calls == [("1 of 2 cells", 0.5), ("2 of 2 cells", 1.0)]
-        every = run(small, 1, methods, tmp_path, pool)
-        again = run(small, 1, methods, tmp_path, pool, progress=lambda *a: calls.append(a))
+        every = run(small, 1, methods, Store(tmp_path), pool)
+        again = run(small, 1, methods, Store(tmp_path), pool, progress=lambda *a: calls.append(a))
     assert len(calls) == 2
     name = identity(methods[0])
     for a, b, c in zip(some, every, again, strict=True):
         assert a.results[name] == b.results[name] == c.results[name]
         assert set(b.results) == {identity(m) for m in methods}
         assert all((r.error_px is None) == (r.outcome is Outcome.REFUSAL) for r in b.results.values())
-    damaged = tmp_path / f"{every[0].cell.name}.json"
-    damaged.write_text("{")
-    with pytest.raises(AmiwarpError, match="delete the file"):
-        Store(tmp_path).load(Cell(every[0].cell.condition, 0))
+    store, path = Store(tmp_path), tmp_path / f"{every[0].cell.name}.json"
+    path.write_text("{")
+    assert store.load(every[0].cell).results == {}
+    assert [text.split(": ")[0] for text in store.damaged] == [str(path)]
+    store.save(every[0])
+    assert Store(tmp_path).load(every[0].cell) == every[0]

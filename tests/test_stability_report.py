@@ -3,6 +3,8 @@
 import csv
 import json
 import math
+import os
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +21,7 @@ from typer.testing import CliRunner, Result
 import amiwarp.studies.stability
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.sealed_json import sealed
 from amiwarp.studies.stability import (
     METHODS,
     Atlas,
@@ -109,7 +112,7 @@ def test_spots_count_what_the_cells_hold(atlas: Atlas) -> None:
 def test_summary_names_the_values_that_work(atlas: Atlas) -> None:
     assert (atlas.works(NOISE, "default"), atlas.works(NOISE, "paper")) == ("0 % to 50 %", "0 %")
     assert atlas.works(SCENE, "default") == "dense texture, one edge direction"
-    never = aggregate(cells({"default": lambda h: found(Outcome.SILENT)}), AXES, METHODS, {})
+    never = aggregate(cells({"default": lambda h: found(Outcome.SILENT, 5.0)}), AXES, METHODS, {})
     assert (never.works(NOISE, "default"), never.works(NOISE, "paper")) == ("nowhere", "nowhere")
     gap = aggregate(cells({"default": lambda h: good(0.0 if h in (0.0, 1.0) else 1.0)}), AXES, METHODS, {})
     assert gap.works(NOISE, "default") == "0 %, 80 %"
@@ -181,15 +184,91 @@ def test_cells_are_loaded_and_those_of_other_versions_left_out(tmp_path: Path) -
     some = cells({"default": good}, seeds=2)
     for stored in some:
         Store(tmp_path).save(stored)
-    old = json.loads((tmp_path / f"{some[0].cell.name}.json").read_text())
-    (tmp_path / "old_0.json").write_text(json.dumps({**old, "condition": {"colour": "red"}}))
-    (tmp_path / "renamed_0.json").write_text(json.dumps(old))
-    assert {s.cell.name: s.results for s in load(tmp_path)} == {s.cell.name: s.results for s in some}
-    (tmp_path / "renamed_0.json").write_text("{")
-    with pytest.raises(AmiwarpError, match=r"renamed_0\.json: damaged cell"):
-        load(tmp_path)
+    path = tmp_path / f"{some[0].cell.name}.json"
+    old = json.loads(path.read_text())
+    rewrite(tmp_path / "old_0.json", {**old, "condition": {"colour": "red"}})
+    rewrite(tmp_path / "older_0.json", {**old, "format": 2})
+    rewrite(tmp_path / "renamed_0.json", old)
+    store = Store(tmp_path)
+    assert {s.cell.name: s.results for s in load(store)} == {s.cell.name: s.results for s in some}
+    assert store.damaged == []
     with pytest.raises(AmiwarpError, match=r"no results of single runs \(cells\) of this version"):
-        load(tmp_path / "empty")
+        load(Store(tmp_path / "empty"))
+
+
+def rewrite(path: Path, data: dict[str, Any]) -> None:
+    """Write the fields of a cell with the checksum that they need."""
+    path.write_text(json.dumps(sealed({name: value for name, value in data.items() if name != "checksum"})))
+
+
+def of_result(**values: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    """Return a function that changes values of the only result of a cell."""
+    return lambda data: {**data, "results": {name: {**r, **values} for name, r in data["results"].items()}}
+
+
+WRONG: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
+    "huge": (of_result(error_px=1e300, outcome="silent failure"), r"error_px = 1e\+300 is not a finite number in 0"),
+    "negative": (of_result(seconds=-1.0), r"seconds = -1\.0 is not a finite number"),
+    "outcome": (of_result(outcome="triumph"), r"outcome is 'triumph'; choose among success, refusal, silent failure"),
+    "contradiction": (of_result(error_px=99.0), r"outcome success does not fit error_px = 99\.0"),
+    "field": (of_result(colour="red"), r"colour is unknown; expected outcome, error_px"),
+    "missing": (lambda data: {**data, "results": {"a": {}}}, r"field results\.a\.outcome is missing"),
+    "events": (lambda data: {**data, "events": -1}, r"field events = -1 is not a whole number"),
+    "condition": (
+        lambda data: {**data, "condition": {**data["condition"], "width": "320"}},
+        r"condition\.width = '320' is not a whole number",
+    ),
+    "results": (lambda data: {**data, "results": [1]}, r"field results is \[1\]; expected an object"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_cell_of_wrong_values_is_not_used(tmp_path: Path, case: str) -> None:
+    (stored,) = (s for s in cells({"default": good}, seeds=1) if s.cell.condition == Condition())
+    Store(tmp_path).save(stored)
+    path, (change, message) = tmp_path / f"{stored.cell.name}.json", WRONG[case]
+    data = json.loads(path.read_text())
+    data.pop("checksum")
+    rewrite(path, change(data))
+    store = Store(tmp_path)
+    assert store.load(stored.cell) == Stored(stored.cell)
+    (said,) = store.damaged
+    assert re.search(message, said), said
+    assert said.startswith(f"{path}: is damaged: ")
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "is not JSON"),
+        (b"[" * 100_000, "nests too deeply"),
+        (b'{"seed": NaN}', "holds NaN"),
+        (b"[]", "holds []; expected an object"),
+        (b"{}", "field checksum is missing"),
+        (b" " * (9 << 20), "is larger than 8 MiB"),
+        (None, "is a named pipe"),
+    ],
+)
+def test_a_damaged_cell_is_made_again(tmp_path: Path, content: bytes | None, message: str) -> None:
+    (stored,) = (s for s in cells({"default": good}, seeds=1) if s.cell.condition == Condition())
+    store, path = Store(tmp_path), tmp_path / f"{stored.cell.name}.json"
+    if content is None:
+        os.mkfifo(path)
+    else:
+        path.write_bytes(content)
+    assert store.load_all() == []
+    assert message in store.damaged[0]
+    store.save(stored)
+    whole = path.read_bytes()
+    assert store.load_all() == [stored]
+    path.write_bytes(whole.replace(b'"seconds":', b'"seconds":1', 1))
+    assert store.load_all() == []
+    assert store.damaged[1].endswith("not of this content")
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(AmiwarpError, match="is a folder, where the file of a cell belongs; remove it"):
+        store.load(stored.cell)
 
 
 def test_pages_show_every_share_and_nothing_overlaps(atlas: Atlas, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import rich.progress
@@ -76,6 +76,12 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value if isinstance(value, str | int | float | bool | None) else str(value)
+
+
+def made_again(damaged: Sequence[str]) -> list[str]:
+    """Return a line of text about damaged files of an earlier run that were made again; none without such files."""
+    more = f", and {len(damaged) - 1:,} more" if len(damaged) > 1 else ""
+    return [f"damaged, and made again: {damaged[0]}{more}"] if damaged else []
 
 
 def table(rows: Iterable[tuple[str, ...]], *headings: str) -> Table:

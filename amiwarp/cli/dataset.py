@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from amiwarp.cli import say
-from amiwarp.cli.console import progress, report
+from amiwarp.cli.console import made_again, progress, report
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
 
@@ -104,6 +104,7 @@ def _lines(done: DatasetSummary, out: Path) -> list[str]:
     lines = [f"failed: {file}: {error}" for file, error in list(done.failed.items())[:SHOWN]]
     if len(done.failed) > SHOWN:
         lines.append(f"... and {len(done.failed) - SHOWN:,} more failures, in {out / 'manifest.json'}")
+    lines += made_again(done.damaged)
     if done.not_in_specification:
         lines.append(
             f"{len(done.not_in_specification):,} recordings in {out} are not in the specification, such as "

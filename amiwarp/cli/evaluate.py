@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from amiwarp.cli import say
-from amiwarp.cli.console import choose_device, progress, report
+from amiwarp.cli.console import choose_device, made_again, progress, report
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.studies.cluster import ANY_GPU
 
@@ -85,6 +85,7 @@ def _lines(done: EvaluationSummary) -> list[str]:
     lines = [f"claims: {verdicts or 'none'}"]
     if done.failed:
         lines.append(f"{done.failed:,} cells failed; the report says why")
+    lines += made_again(done.damaged)
     lines += [f"{name}: {path}" for name, path in done.files.items()]
     return [
         *lines,

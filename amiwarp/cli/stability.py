@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.cli import say
-from amiwarp.cli.console import choose_device, progress, report, table
+from amiwarp.cli.console import choose_device, made_again, progress, report, table
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import make_folder, own_folder
@@ -20,7 +20,7 @@ from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.studies.cluster import start_workers
 
 if TYPE_CHECKING:
-    from amiwarp.studies.stability import Atlas, Axis, Method, Stored
+    from amiwarp.studies.stability import Atlas, Axis, Method, Store, Stored
 
 EXAMPLE = "amiwarp stability --quick --out amiwarp-atlas"
 SEEDS, QUICK_SEEDS = 20, 1
@@ -74,7 +74,7 @@ def run(
     Finished cells are saved in OUT/cells: the same command continues a stopped run and skips finished cells.
     """
     device = choose_device(common.device)
-    from amiwarp.studies.stability import aggregate, draw, identity, load
+    from amiwarp.studies.stability import Store, aggregate, draw, identity, load
 
     chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
     cells_in = out / "cells"
@@ -82,12 +82,13 @@ def run(
     earlier = any(cells_in.iterdir())  # existing figures were drawn from the cells in this folder and may be replaced
     began = time.perf_counter()
     new = left = 0
+    store = Store(cells_in)
     if redraw:
-        cells = load(cells_in)
+        cells = load(store)
     else:
         of_each = seeds or (QUICK_SEEDS if quick else SEEDS)
         limit = QUICK_MINUTES if quick and minutes is None else minutes
-        cells, new = _run(chosen_axes, of_each, chosen_methods, cells_in, device, scheduler, limit, common.seed)
+        cells, new = _run(chosen_axes, of_each, chosen_methods, store, device, scheduler, limit, common.seed)
         left = sum(not {identity(m) for m in chosen_methods} <= c.results.keys() for c in cells)
     took = time.perf_counter() - began
     atlas = aggregate(cells, chosen_axes, chosen_methods, _about(cells))
@@ -95,7 +96,9 @@ def run(
         files = atlas.write(out) | draw(atlas, out)
     speed = {"cells": atlas.cells, "new_cells": new, "cells_left": left, "seconds": took, "cells_per_s": new / took}
     data = {"aims": atlas.aims.to_json(), "files": {name: str(path) for name, path in files.items()}, **speed}
-    report(common, data | {"device": device}, lines(atlas, files, new, left, took))
+    damaged = [f"damaged, and left out: {what}" for what in store.damaged] if redraw else made_again(store.damaged)
+    shown = [*damaged, *lines(atlas, files, new, left, took)]
+    report(common, data | {"device": device, "damaged": store.damaged}, shown)
 
 
 def _axes(names: Sequence[str], quick: bool) -> tuple[Axis, ...]:
@@ -121,7 +124,7 @@ def _check_known(what: str, names: Sequence[str], known: Sequence[str]) -> None:
 
 
 def _run(
-    axes: Sequence[Axis], seeds: int, methods: Sequence[Method], folder: Path, device: str, scheduler: str | None,
+    axes: Sequence[Axis], seeds: int, methods: Sequence[Method], store: Store, device: str, scheduler: str | None,
     minutes: float | None, first: int,
 ) -> tuple[list[Stored], int]:  # fmt: skip
     """Run all missing cells (single recordings). Return all cells and the number of new cells."""
@@ -137,10 +140,10 @@ def _run(
 
     try:
         with progress("starting workers") as advance, _executor(scheduler, device) as executor:
-            cells = run(axes, seeds, methods, folder, executor, device=device, first=first, progress=count,
+            cells = run(axes, seeds, methods, store, executor, device=device, first=first, progress=count,
                         until=None if end is None else lambda: time.monotonic() > end)  # fmt: skip
     except KeyboardInterrupt:
-        say(f"amiwarp: finished cells are kept in {folder}; run the same command again to continue")
+        say(f"amiwarp: finished cells are kept in {store.folder}; run the same command again to continue")
         raise
     return cells, new
 

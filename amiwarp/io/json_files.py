@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import enum
 import json
 import math
 import os
 import re
 import tomllib
 import types
+import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.input_files import errors_name, open_input
-from amiwarp.validation import real, shown, whole
+from amiwarp.validation import choice, one_of, real, shown, whole
 
 Made = TypeVar("Made")
 
@@ -35,7 +37,9 @@ LARGEST_INTEGER = 2**62
 """Largest accepted magnitude of a whole number, equal to :data:`amiwarp.events.checks.TIME_LIMIT`."""
 
 
-def read_json(path: str | os.PathLike[str], what: str, *, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
+def read_json(
+    path: str | os.PathLike[str], what: str, *, most_bytes: int = MOST_BYTES, noted: bool = True
+) -> dict[str, Any]:
     """Return the JSON object of a file.
 
     Parameters
@@ -46,6 +50,8 @@ def read_json(path: str | os.PathLike[str], what: str, *, most_bytes: int = MOST
         What the file should contain, for messages, such as "a calibration".
     most_bytes : int, optional
         Largest size of the file [bytes].
+    noted : bool, default True
+        Whether the file is an input, which no command replaces; False for results that the command continues.
 
     Returns
     -------
@@ -60,7 +66,7 @@ def read_json(path: str | os.PathLike[str], what: str, *, most_bytes: int = MOST
     """
     path = Path(path)
     with errors_name(path, lambda: f"cannot be read as {what}"):
-        with open_input(path) as file:
+        with open_input(path, noted=noted) as file:
             text = file.read(most_bytes + 1)
         if len(text) > most_bytes:
             raise AmiwarpError(f"{path}: is larger than {most_bytes >> 20} MiB, so it is not {what}; give another file")
@@ -148,10 +154,10 @@ def at_field(where: str, make: Callable[[], Made]) -> Made:
 def build(kind: type[Made], data: Any, where: str) -> Made:
     """Return a dataclass made from a JSON object, with each field checked against its annotation.
 
-    Fields with a default may be missing. Supported types are str, bool, int, float, None, dataclasses, and lists,
-    tuples and mappings of these. Raises :class:`AmiwarpError`, which names the field.
+    Fields with a default may be missing. For supported types see :func:`value_of`. Raises :class:`AmiwarpError`, which
+    names the field.
     """
-    hints = get_type_hints(kind)
+    hints = get_type_hints(kind, include_extras=True)
     known: tuple[Any, ...] = dataclasses.fields(kind)  # type: ignore[arg-type]
     has_default = {
         f.name: f.default is not dataclasses.MISSING or f.default_factory is not dataclasses.MISSING for f in known
@@ -160,16 +166,31 @@ def build(kind: type[Made], data: Any, where: str) -> Made:
     optional = tuple(name for name, has in has_default.items() if has)
     given = fields_of(data, where, *needed, optional=optional)
     prefix = f"{where}." if where else ""
-    return kind(**{name: _value(hints[name], value, f"{prefix}{name}") for name, value in given.items()})
+    return kind(**{name: value_of(hints[name], value, f"{prefix}{name}") for name, value in given.items()})
 
 
-def _value(kind: Any, value: Any, where: str) -> Any:
-    """Convert a JSON value to its annotated type."""
+def value_of(kind: Any, value: Any, where: str) -> Any:
+    """Return a JSON value converted to its annotated type. Raises :class:`AmiwarpError`, which names the field.
+
+    Supported types are str, bool, int, float, None, literals, enumerations of texts, dataclasses, typed dicts, and
+    lists, tuples and mappings of these. ``Annotated[kind, check]`` calls ``check`` with the value and its name.
+    """
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         return build(kind, value, where)
-    if get_origin(kind) is types.UnionType:
+    if typing.is_typeddict(kind):
+        hints = get_type_hints(kind, include_extras=True)
+        given, prefix = fields_of(value, where, *hints), f"{where}." if where else ""
+        return {name: value_of(hint, given[name], f"{prefix}{name}") for name, hint in hints.items()}
+    if get_origin(kind) is Annotated:
+        plain, check = get_args(kind)
+        return check(value_of(plain, value, where), f"field {where}")
+    if get_origin(kind) in (types.UnionType, typing.Union):
         parts = [part for part in get_args(kind) if part is not types.NoneType]
-        return None if value is None else _value(parts[0], value, where)
+        return None if value is None else value_of(parts[0], value, where)
+    if get_origin(kind) is Literal:
+        return one_of(value, get_args(kind), f"field {where}")
+    if isinstance(kind, type) and issubclass(kind, enum.StrEnum):
+        return choice(kind, value, f"field {where}")
     if kind is float:
         return real(value, f"field {where}")
     if kind is int:
@@ -188,11 +209,11 @@ def _container(kind: Any, value: Any, where: str) -> Any:
     origin, inner = get_origin(kind), get_args(kind)
     if origin in (dict, Mapping):
         given = value if isinstance(value, dict) else fields_of(value, where)
-        return {name: _value(inner[1], entry, f"{where}.{shown(name)[1:-1]}") for name, entry in given.items()}
+        return {name: value_of(inner[1], entry, f"{where}.{shown(name)[1:-1]}") for name, entry in given.items()}
     if not isinstance(value, list):
         raise AmiwarpError(f"field {where} is {shown(value)}; expected a list")
     fixed = origin is tuple and inner[-1] is not ...
     if fixed and len(value) != len(inner):
         raise AmiwarpError(f"field {where} has {len(value)} entries; expected {len(inner)}")
     kinds = inner if fixed else (inner[0],) * len(value)
-    return origin(_value(k, entry, f"{where}[{i}]") for i, (k, entry) in enumerate(zip(kinds, value, strict=True)))
+    return origin(value_of(k, entry, f"{where}[{i}]") for i, (k, entry) in enumerate(zip(kinds, value, strict=True)))

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import os
+import re
 import socket
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import convert, open_recording
 from amiwarp.io.atomic_output import make_folder, put_in_place
+from amiwarp.io.json_files import LARGEST_INTEGER
 from amiwarp.kernels.cpu_threads import limited_cpu_threads
+from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
@@ -26,49 +29,47 @@ from amiwarp.studies.dataset.items import Item
 from amiwarp.studies.dataset.sources import content_digest
 from amiwarp.studies.dataset.specification import CameraEntry, PrismEntry
 from amiwarp.translation.translator import translation
+from amiwarp.validation import real, shown, whole
 
 if TYPE_CHECKING:
     from amiwarp.optics.camera import Camera
+
+
+def _of_pattern(pattern: str, text: str, what: str) -> str:
+    """Return text that a regular expression matches; raise :class:`AmiwarpError` for other text."""
+    if not re.fullmatch(pattern, text):
+        raise AmiwarpError(f"{what} is {shown(text)}; expected text of the form {pattern}")
+    return text
 
 
 @dataclass(frozen=True)
 class Made:
     """A recording that was made, as the journal keeps it."""
 
-    key: str
+    key: Annotated[str, partial(_of_pattern, "[0-9a-f]{16}")]
     """Key of the item."""
-    file: str
+    file: Annotated[str, partial(_of_pattern, "[A-Za-z0-9_-]+/[A-Za-z0-9_-]*-[0-9a-f]{16}[.]h5")]
     """Path, relative to the folder of the data set."""
-    bytes: int
+    bytes: Annotated[int, partial(whole, low=0, high=LARGEST_INTEGER)]
     """Size [bytes]."""
-    mtime_ns: int
-    """Time of the last change of the file [ns]."""
-    sha256: str
+    sha256: Annotated[str, partial(_of_pattern, "[0-9a-f]{64}")]
     """SHA-256 of the file, in hexadecimal."""
-    events: int
+    events: Annotated[int, partial(whole, low=0, high=LARGEST_INTEGER)]
     """Number of events."""
-    duration_s: float
+    duration_s: Annotated[float, partial(real, low=0.0, high=LARGEST_INTEGER * 1e-6)]
     """Duration: as simulated, or from the first event to the last [s]."""
-    width: int
+    width: Annotated[int, partial(whole, low=1, high=LARGEST_SIZE)]
     """Width of the sensor [px]."""
-    height: int
+    height: Annotated[int, partial(whole, low=1, high=LARGEST_SIZE)]
     """Height of the sensor [px]."""
-    seconds: float
+    seconds: Annotated[float, partial(real, low=0.0, high=1e9)]
     """Time that the worker took [s]."""
-    processor_s: float
+    processor_s: Annotated[float, partial(real, low=0.0, high=1e9)]
     """Processor time that its process took [s]."""
-    device: str
+    device: Annotated[str, partial(_of_pattern, "cpu|cuda:[0-9]{1,3}")]
     """Device that it was computed on."""
-    amiwarp: str
+    amiwarp: Annotated[str, partial(_of_pattern, "[A-Za-z0-9.+-]{1,64}")]
     """Version of amiwarp."""
-
-    @classmethod
-    def from_json(cls, data: Mapping[str, Any]) -> Made | None:
-        """Return what a line of the journal holds; None if it has other fields or types."""
-        kinds = {f.name: {"str": str, "int": int, "float": (int, float)}[str(f.type)] for f in fields(cls)}
-        if data.keys() != kinds.keys() or not all(isinstance(data[name], kind) for name, kind in kinds.items()):  # type: ignore[arg-type]
-            return None
-        return cls(**data)
 
 
 @dataclass(frozen=True)
@@ -120,9 +121,8 @@ def _make(job: Job) -> Made:
     digest = content_digest(part, noted=False)
     make_folder(path.parent)
     put_in_place(part, path, overwrite=True)
-    state = path.stat()
     return Made(
-        item.key, item.file, state.st_size, state.st_mtime_ns, digest, written.events, written.duration_s,
+        item.key, item.file, path.stat().st_size, digest, written.events, written.duration_s,
         written.width, written.height, round(time.perf_counter() - began, 6),
         round(time.process_time() - began_processor, 6), device, __version__,
     )  # fmt: skip

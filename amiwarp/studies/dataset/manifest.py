@@ -7,15 +7,16 @@ import json
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import NewFile, write_text
-from amiwarp.io.json_lines import append_line, create_journal, read_lines
+from amiwarp.io.json_files import build
 from amiwarp.io.recorded_dataset import FORMAT, MANIFEST, VERSION
+from amiwarp.io.sealed_json import append_line, create_journal, read_journal
 from amiwarp.studies.dataset.items import Item
 from amiwarp.studies.dataset.making import Failed, Made
 from amiwarp.studies.dataset.sources import content_digest
@@ -46,10 +47,11 @@ class Journal:
 
     def __init__(self, out: Path) -> None:
         self._out, self._path = out, out / JOURNAL
-        found = (Made.from_json(data) for data in read_lines(self._path))
-        self.made = {made.key: made for made in found if made is not None}
+        self.damaged: list[str] = []
+        """What is wrong with damaged lines of the journal, and with damaged recordings."""
+        found = read_journal(self._path, lambda data: build(Made, data, ""), self.damaged)
+        self.made = {made.key: made for made in found}
         """Recordings by the key of their item."""
-        self._touched: list[Made] = []
 
     def create(self) -> None:
         """Create the journal unless it exists. It marks the folder as a data set."""
@@ -60,30 +62,21 @@ class Journal:
         self.made[made.key] = made
         append_line(self._path, asdict(made))
 
-    def intact(self, item: Item) -> Made | None:
-        """Return the recording of an item, or None if its file is missing or damaged.
-
-        A file with the recorded size and time of change is taken as undamaged. If only the time differs, the checksum
-        is computed.
-        """
+    def is_there(self, item: Item) -> bool:
+        """Return whether the recording of an item is in the journal, and its file has the size stated there."""
         made = self.made.get(item.key)
         if made is None or made.file != item.file:
-            return None
+            return False
         path = self._out / made.file
-        if not path.is_file() or path.stat().st_size != made.bytes:
-            return None
-        changed = path.stat().st_mtime_ns
-        if changed != made.mtime_ns:
-            if content_digest(path, noted=False) != made.sha256:
-                return None
-            made = replace(made, mtime_ns=changed)
-            self._touched.append(made)
-        return made
+        return path.is_file() and path.stat().st_size == made.bytes
 
-    def note_touched(self) -> None:
-        """Record the times of undamaged files whose time of change differed, so that they are not read again."""
-        while self._touched:
-            self.add(self._touched.pop())
+    def is_intact(self, item: Item) -> bool:
+        """Return whether the file of a recording that is there has the checksum of the journal."""
+        made = self.made[item.key]
+        if content_digest(self._out / made.file, noted=False) == made.sha256:
+            return True
+        self.damaged.append(f"{self._out / made.file}: does not have the checksum of {JOURNAL}")
+        return False
 
     def others(self, items: Sequence[Item]) -> list[str]:
         """Return the existing recordings that belong to none of the items, for example of an earlier specification."""
@@ -123,14 +116,13 @@ def write_manifest(
 
 def _licences(counts: Mapping[tuple[str, str], int]) -> list[dict[str, Any]]:
     """Return the licences with the number of their sources and recordings."""
-    names = sorted({licence for _, licence in counts})
+    sources, recordings = Counter[str](), Counter[str]()
+    for (_, licence), count in counts.items():
+        sources[licence] += 1
+        recordings[licence] += count
     return [
-        {
-            "licence": name or "not stated",
-            "sources": sum(licence == name for _, licence in counts),
-            "recordings": sum(count for (_, licence), count in counts.items() if licence == name),
-        }
-        for name in names
+        {"licence": name or "not stated", "sources": sources[name], "recordings": recordings[name]}
+        for name in sorted(sources)
     ]
 
 

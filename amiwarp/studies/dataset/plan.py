@@ -17,7 +17,7 @@ from amiwarp.studies.cluster import ANY_GPU
 from amiwarp.studies.dataset.items import Item, list_items
 from amiwarp.studies.dataset.making import simulation_of, write_recording
 from amiwarp.studies.dataset.manifest import Journal, check_folder
-from amiwarp.studies.dataset.run import missing, threads_of_worker, worker_count
+from amiwarp.studies.dataset.run import threads_of_worker, worker_count
 from amiwarp.studies.dataset.sources import content_digest
 from amiwarp.studies.dataset.specification import load_specification
 
@@ -143,7 +143,8 @@ def plan_dataset(
     out = Path(out)
     items = list_items(load_specification(specification))
     check_folder(out)
-    todo = missing(Journal(out), items)
+    journal = Journal(out)
+    todo = sorted((item for item in items if not journal.is_there(item)), key=lambda item: item.key)
     by_kind: defaultdict[str, list[Item]] = defaultdict(list)
     for item in todo:
         by_kind[item.kind].append(item)

@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +22,10 @@ from amiwarp.studies.dataset.manifest import Journal, check_folder, require_pyar
 from amiwarp.studies.dataset.specification import load_specification
 from amiwarp.validation import whole
 
+MOST_READERS = 8
+"""Largest number of threads that read finished recordings."""
+CHECKED = 256
+"""Number of recordings that are given to these threads at a time."""
 MOST_WORKERS = 4096
 """Largest number of local workers."""
 
@@ -64,6 +68,8 @@ class DatasetSummary:
     """Processor time that they spent, added up [s]."""
     workers: int
     """Largest number of workers; 0 if there was nothing to make."""
+    damaged: tuple[str, ...] = ()
+    """What was wrong with the journal, and with each damaged recording. These recordings were made again."""
 
 
 @dataclass
@@ -151,8 +157,7 @@ def make_dataset(
     journal = Journal(out)
     journal.create()
     state = _Run()
-    todo = missing(journal, items)
-    journal.note_touched()
+    todo = missing(journal, items, progress or silent)
     try:
         if todo:
             jobs = _Jobs(out.resolve(), device, threads_of_worker(device, count))
@@ -162,16 +167,24 @@ def make_dataset(
     return _summary(items, journal, state, len(items) - len(todo), time.perf_counter() - began)
 
 
-def missing(journal: Journal, items: Sequence[Item]) -> list[Item]:
+def missing(journal: Journal, items: Sequence[Item], progress: Progress) -> list[Item]:
     """Return the items without an undamaged recording, in an order that depends on their keys alone.
 
-    The order mixes long and short recordings, so that the speed so far predicts the rest.
+    The order mixes long and short recordings, so that the speed so far predicts the rest. The files are read by several
+    threads, to compare their checksums.
     """
-    todo = []
-    for item in items:
-        if journal.intact(item) is None:
-            journal.made.pop(item.key, None)
-            todo.append(item)
+    there = [item for item in items if journal.is_there(item)]
+    intact: set[str] = set()
+    with ThreadPoolExecutor(min(cpu_threads(), MOST_READERS)) as pool:
+        for first in range(0, len(there), CHECKED):
+            block = there[first : first + CHECKED]
+            intact.update(
+                item.key for item, good in zip(block, pool.map(journal.is_intact, block), strict=True) if good
+            )
+            progress("checking finished recordings", (first + len(block)) / len(there))
+    todo = [item for item in items if item.key not in intact]
+    for item in todo:
+        journal.made.pop(item.key, None)
     return sorted(todo, key=lambda item: item.key)
 
 
@@ -301,4 +314,5 @@ def _summary(items: Sequence[Item], journal: Journal, state: _Run, kept: int, se
         worker_seconds=state.worker_seconds,
         processor_seconds=state.processor_seconds,
         workers=state.workers,
+        damaged=tuple(journal.damaged),
     )

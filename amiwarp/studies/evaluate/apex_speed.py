@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 
@@ -14,9 +14,11 @@ from amiwarp.studies.evaluate.conditions import BANDWIDTH, DISCS, IDEAL, LIMITS,
 from amiwarp.studies.evaluate.disc_target import BACKGROUND, DiscTarget, robust_spread
 from amiwarp.studies.evaluate.results import (
     NO_RESULT,
+    Amount,
     CellResult,
     Chart,
     Claim,
+    Count,
     Settings,
     Table,
     Value,
@@ -60,6 +62,29 @@ USUAL_RPM = 720.0
 """Speed above which the paper reports a surge [turns/min]."""
 SURGE = 1.25
 """Smallest increase of the blur above :data:`USUAL_RPM` that counts as a surge."""
+
+
+class _Row(TypedDict):
+    degrees: Amount
+    blur: Amount | None
+    delay: Count
+    edge_blur: Amount | None
+    mev_per_s: Amount
+
+
+class _Light(TypedDict):
+    degrees: Amount
+    light: Literal["bright", "dark"]
+    blur: Amount | None
+    own_delay: Count
+    own_blur: Amount | None
+
+
+class Values(TypedDict):
+    """What :func:`measure` returns."""
+
+    rows: list[_Row]
+    light: list[_Light]
 
 
 def conditions(settings: Settings) -> list[Condition]:

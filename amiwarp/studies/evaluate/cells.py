@@ -12,8 +12,8 @@ from typing import Any
 
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.atomic_output import write_text
-from amiwarp.io.input_files import read_text
+from amiwarp.io.json_files import fields_of, value_of
+from amiwarp.io.sealed_json import CellStore
 from amiwarp.kernels.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.kernels.launch import load_all, load_kernels
 from amiwarp.studies.cpu_kernels import EXACT_KERNELS
@@ -21,8 +21,9 @@ from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition, Re
 from amiwarp.studies.evaluate.measures.libraries import library
 from amiwarp.studies.evaluate.registry import load
 from amiwarp.studies.evaluate.results import CellResult, Settings
+from amiwarp.validation import real
 
-FORMAT = 3
+FORMAT = 4
 """Version of the files of cells, and of the streams and measures that all evaluations share."""
 
 
@@ -92,59 +93,58 @@ def _run(name: str, streams: RecordedStreams, job: Job) -> CellResult:
     """Run one evaluation. An error becomes part of the result, as a refused calibration does."""
     began = time.process_time()
     try:
-        values, error = load(name).measure(streams, job.settings), ""
+        values, error = _as_stored(name, load(name).measure(streams, job.settings)), ""
     except AmiwarpError as refusal:
         values, error = {}, str(refusal)
     return CellResult(name, job.condition, values, error, time.process_time() - began)
 
 
-class Store:
-    """Folder of cells, one file each."""
+def _as_stored(name: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of an evaluation as their cell will give them; numbers that are not finite become None."""
+    plain = json.loads(json.dumps(values), parse_constant=lambda word: None)
+    return value_of(load(name).Values, plain, f"values of {name}")
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
 
-    def _path(self, name: str, condition: Condition | RecordedCondition, settings: Settings) -> Path:
-        size = "quick" if settings.quick else "full"
-        return self.folder / f"{name}_{size}_{condition.key}.json"
+class Store(CellStore):
+    """Folder of the cells of evaluations."""
 
     @staticmethod
-    def _version(name: str, settings: Settings) -> list[Any]:
-        """Return all that a cell depends on next to its condition: versions, settings and the kind of device.
+    def _name(name: str, condition: Condition | RecordedCondition, settings: Settings) -> str:
+        return f"{name}_{'quick' if settings.quick else 'full'}_{condition.key}.json"
+
+    @staticmethod
+    def _version(name: str, condition: Condition | RecordedCondition, settings: Settings) -> list[Any]:
+        """Return all that a cell depends on: its condition, versions, settings and the kind of device.
 
         Seeds are left out, so that a run with more of them keeps its cells; the first one is shown in pictures.
         """
         size = asdict(settings) | {"device": settings.device.partition(":")[0]}
         del size["seeds"]
-        return [FORMAT, __version__, load(name).VERSION, size]
+        return [FORMAT, __version__, load(name).VERSION, size, condition.key]
 
     def load(self, name: str, condition: Condition | RecordedCondition, settings: Settings) -> CellResult | None:
-        """Return a stored cell, or None if it is missing, or of another version, other settings or another device.
+        """Return a stored cell; None if it is missing, damaged, or of another version, other settings or a device."""
 
-        Raises :class:`AmiwarpError` for a damaged file.
-        """
-        path = self._path(name, condition, settings)
-        if not path.exists():
-            return None
-        try:
-            data = json.loads(read_text(path, noted=False))
-            if data["version"] != self._version(name, settings):
+        def make(data: dict[str, Any]) -> CellResult | None:
+            fields_of(data, "", "version", "condition", "values", "error", "processor_s")
+            if data["version"] != self._version(name, condition, settings):
                 return None
-            return CellResult(name, condition, data["values"], data["error"], float(data["processor_s"]))
-        except (ValueError, KeyError, TypeError) as error:
-            raise AmiwarpError(f"{path}: damaged cell: {error}; delete the file to run the cell again") from error
+            error, seconds = value_of(str, data["error"], "error"), real(data["processor_s"], "processor_s", 0.0, 1e9)
+            values = {} if error else value_of(load(name).Values, data["values"], "values")
+            return CellResult(name, condition, values, error, seconds)
+
+        return self.read(self._name(name, condition, settings), make)
 
     def save(self, cell: CellResult, settings: Settings) -> None:
         """Write a cell."""
-        data: dict[str, Any] = {
-            "version": self._version(cell.evaluation, settings),
-            "condition": asdict(cell.condition),
+        condition = {name: str(v) if isinstance(v, Path) else v for name, v in asdict(cell.condition).items()}
+        self.write(self._name(cell.evaluation, cell.condition, settings), {
+            "version": self._version(cell.evaluation, cell.condition, settings),
+            "condition": condition,
             "values": cell.values,
             "error": cell.error,
             "processor_s": cell.processor_s,
-        }
-        path = self._path(cell.evaluation, cell.condition, settings)
-        write_text(path, json.dumps(data, default=str, separators=(",", ":")) + "\n", overwrite=True)
+        })  # fmt: skip
 
 
 def plan(names: Sequence[str], settings: Settings, recordings: Iterable[Path], *, worlds: bool = True) -> list[Job]:

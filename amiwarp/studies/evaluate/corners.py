@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
 from amiwarp.studies.evaluate.measures.tracks import GAP_US, LIMITS_PX, link_corners, quality_curve, true_paths
 from amiwarp.studies.evaluate.results import (
+    Amount,
     CellResult,
     Chart,
     ChartKind,
@@ -59,6 +60,24 @@ SOURCES = {
 """Streams whose positions are those of the events of another stream, by that stream."""
 VALUES = ("number", "lifetime_ms", "error_px", "update_hz")
 """Names of the values of each row."""
+
+
+class _Row(TypedDict):
+    detector: CornerMethod
+    stream: Stream
+    limit: Amount
+    gap: Amount
+    number: Amount | None
+    lifetime_ms: Amount | None
+    error_px: Amount | None
+    update_hz: Amount | None
+
+
+class Values(TypedDict):
+    """What :func:`measure` returns."""
+
+    rows: list[_Row]
+    gaps: list[_Row]
 
 
 def conditions(settings: Settings) -> list[Condition]:

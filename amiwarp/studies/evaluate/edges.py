@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 import numpy as np
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.studies.evaluate.conditions import ENOUGH, Condition, Stream, Streams
@@ -29,14 +30,18 @@ from amiwarp.studies.evaluate.measures.true_edges import (
 )
 from amiwarp.studies.evaluate.results import (
     NO_RESULT,
+    Amount,
     CellResult,
     Chart,
     ChartKind,
     Claim,
+    Count,
     Picture,
     Score,
     Settings,
+    Share,
     Table,
+    check_pictures,
     compared,
     decode_picture,
     encode_picture,
@@ -86,6 +91,51 @@ SECTORS = 6
 """Number of classes of the angle between image motion and the normal of an edge."""
 SLOWEST = 5.0
 """Slowest image motion whose direction counts [px/s]."""
+
+
+class _Summary(TypedDict):
+    stream: Literal["chance", *Stream]  # type: ignore[valid-type]
+    found: list[Count]
+    entropy: list[Share]
+
+
+class _Row(TypedDict):
+    stream: Literal["chance", *Stream]  # type: ignore[valid-type]
+    truth: Literal["Canny", "geometry", "Canny, σ 1 px", "Canny, σ 3 px"]
+    tolerance: Amount
+    matched: list[Count]
+    true: Count
+
+
+class _Sector(TypedDict):
+    stream: Stream
+    angle: Amount
+    recall: Share
+
+
+class _Values(TypedDict):
+    images: list[_Summary]
+    rows: list[_Row]
+    sectors: list[_Sector]
+    pictures: dict[str, str]
+
+
+def _checked(values: _Values, what: str) -> _Values:
+    """Return the values if each row has its images, its chance and a number for each threshold."""
+    check_pictures(list(values["pictures"].values()), 2, f"{what}.pictures")
+    lists = [row[name] for name in ("found", "entropy") for row in values["images"]]
+    if any(len(numbers) != len(THRESHOLDS) for numbers in (*lists, *(row["matched"] for row in values["rows"]))):
+        raise AmiwarpError(f"{what} has lists of other lengths than the {len(THRESHOLDS)} thresholds")
+    images = {row["stream"] for row in values["images"]}
+    judged = {(row["truth"], row["tolerance"]) for row in values["rows"] if row["stream"] == CHANCE}
+    for row in values["rows"]:
+        if row["stream"] not in images or (row["truth"], row["tolerance"]) not in judged:
+            raise AmiwarpError(f"{what} has a row of {row['stream']}, but not its images or its chance")
+    return values
+
+
+Values = Annotated[_Values, _checked]
+"""What :func:`measure` returns."""
 
 
 def conditions(settings: Settings) -> list[Condition]:

@@ -5,24 +5,30 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, TypedDict
 
 import numpy as np
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.optics.prism import Prism
 from amiwarp.studies.evaluate.conditions import INDEX, Condition, Stream, Streams
 from amiwarp.studies.evaluate.results import (
+    Amount,
     CellResult,
     Chart,
     Claim,
+    Count,
     Picture,
     Settings,
     Table,
+    check_pictures,
     decode_picture,
     encode_picture,
     grouped,
     rows_of,
 )
+from amiwarp.validation import whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -55,6 +61,41 @@ TILE_COLUMNS = ("camera", "rpm", "time_ms", "column", "row", "rate", "speed", "c
 """Values of the table of tiles."""
 RED = (213, 94, 0)
 """Colour of the borders of marked tiles in the film."""
+
+
+class _Row(TypedDict):
+    speed: Amount
+    rate: Amount
+    tiles: Count
+
+
+class _Tiles(TypedDict):
+    part_ms: Amount
+    columns: Annotated[int, partial(whole, low=1, high=10_000)]
+    rate: list[list[Amount]]
+    speed: list[list[Amount]]
+    camera_speed: list[list[Amount]]
+
+
+def _checked_film(film: list[str], what: str) -> list[str]:
+    check_pictures(film, 3, what)
+    return film
+
+
+def _checked_tiles(tiles: _Tiles, what: str) -> _Tiles:
+    """Return the tiles if their tables have the same number of values in each row."""
+    lengths = {tuple(map(len, table)) for table in (tiles["rate"], tiles["speed"], tiles["camera_speed"])}
+    if len(lengths) > 1 or any(len(set(rows)) != 1 for rows in lengths):
+        raise AmiwarpError(f"{what} has rows of unequal lengths; expected three tables of one shape")
+    return tiles
+
+
+class Values(TypedDict):
+    """What :func:`measure` returns."""
+
+    rows: list[_Row]
+    film: Annotated[list[str], _checked_film]
+    tiles: Annotated[_Tiles, _checked_tiles] | None
 
 
 def conditions(settings: Settings) -> list[Condition]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 import numpy as np
 from scipy import ndimage
@@ -14,10 +14,12 @@ from amiwarp.studies.evaluate.flow_estimation import flow_by_contrast, flow_by_d
 from amiwarp.studies.evaluate.measures.flow_error import flow_error
 from amiwarp.studies.evaluate.results import (
     NO_RESULT,
+    Amount,
     CellResult,
     Chart,
     Claim,
     Settings,
+    Share,
     Table,
     grouped,
     mean_of,
@@ -58,6 +60,22 @@ DARK = 0.02
 """Luminance that is added before the logarithm, as in the simulated sensor."""
 PAPER_PX = 0.19
 """Increase of the endpoint error by the prism in the paper [px]."""
+
+
+class _Row(TypedDict):
+    stream: Stream
+    method: Literal["DIS", "contrast maximisation"]
+    turns: Amount
+    pixels: Literal["events", "edges"]
+    epe: Amount | None
+    outliers: Share | None
+    share: Share
+
+
+class Values(TypedDict):
+    """What :func:`measure` returns."""
+
+    rows: list[_Row]
 
 
 def conditions(settings: Settings) -> list[Condition]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from amiwarp.studies.evaluate.measures.niqe import BLOCK, niqe
 from amiwarp.studies.evaluate.measures.pictures import displayed, fitted, similarity
 from amiwarp.studies.evaluate.results import (
     NO_RESULT,
+    Amount,
     CellResult,
     Chart,
     Claim,
@@ -23,6 +25,7 @@ from amiwarp.studies.evaluate.results import (
     rows_of,
 )
 from amiwarp.studies.evaluate.stream_pictures import PictureMaker, Reconstructor, Window, reconstructed_streams
+from amiwarp.validation import real
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -55,6 +58,35 @@ PICTURES = 6
 """Number of pictures over time."""
 DARK = 0.02
 """Luminance that is added before the logarithm, as in the simulated sensor."""
+
+
+class _Quality(TypedDict):
+    stream: Stream
+    method: Literal["own"]
+    psnr: Annotated[float, partial(real, low=-1e3, high=1e3)] | None
+    ssim: Annotated[float, partial(real, low=-1.0, high=1.0)]
+
+
+class _Row(_Quality):
+    time_ms: Amount
+    niqe: Amount | None
+    niqe_truth: Amount | None
+
+
+class _OverLength(_Row):
+    turns: Amount
+
+
+class _OverRate(_Quality):
+    rate: Amount
+
+
+class Values(TypedDict):
+    """What :func:`measure` returns."""
+
+    time: list[_Row]
+    length: list[_OverLength]
+    rate: list[_OverRate]
 
 
 def conditions(settings: Settings) -> list[Condition]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.simulation.worlds.world_scene import WorldScene
 from amiwarp.studies.evaluate.blob_detector import blob_keypoints
-from amiwarp.studies.evaluate.conditions import Condition, Streams
+from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
 from amiwarp.studies.evaluate.measures.keypoints import detected_joints
 from amiwarp.studies.evaluate.measures.masks import box_overlap
 from amiwarp.studies.evaluate.measures.pictures import displayed
 from amiwarp.studies.evaluate.results import (
+    Amount,
     CellResult,
     Chart,
     Claim,
     Settings,
+    Share,
     Table,
     Verdict,
     grouped,
@@ -62,6 +64,21 @@ QUICK_PICTURES, FULL_PICTURES = 1, 2
 """Number of pictures at each rate."""
 TORSO = ("left shoulder", "right hip")
 """Joints whose distance is the torso's diameter."""
+
+
+class _Row(TypedDict):
+    stream: Literal["truth", *Stream]  # type: ignore[valid-type]
+    detector: Literal["blob", "true joints"]
+    rate: Amount
+    pdj: Share | None
+    iou: Share | None
+    pdj_over_fraction: tuple[Share | None, Share | None, Share | None, Share | None, Share | None]
+
+
+class Values(TypedDict):
+    """What :func:`measure` returns."""
+
+    rows: list[_Row]
 
 
 def conditions(settings: Settings) -> list[Condition]:

@@ -27,6 +27,9 @@ class Evaluation(Protocol):
     """How that differs from the paper."""
     VERSION: int
     """Version of ``measure``. Raise it when the results change: older cells are then run anew."""
+    Values: Any
+    """Type of what ``measure`` returns: a typed dict, whose fields have their ranges. A cell of other values is not
+    used."""
     NEEDS_TRUTH: bool
     """Whether it needs ground truth. If not, it also runs on recordings."""
 

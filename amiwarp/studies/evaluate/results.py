@@ -7,15 +7,24 @@ import enum
 import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.studies.evaluate.conditions import FOCAL_PX, Condition, RecordedCondition, Stream
+from amiwarp.validation import real, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+Share = Annotated[float, partial(real, low=0.0, high=1.0)]
+"""Type of a share in a cell, 0 to 1."""
+Amount = Annotated[float, partial(real, low=0.0, high=1e6)]
+"""Type of a measured value in a cell that is not negative: pixels, degrees, milliseconds, relative rates and so on."""
+Count = Annotated[int, partial(whole, low=0, high=10**12)]
+"""Type of a number of things in a cell."""
 Value = str | int | float | bool | None
 """Type of a value in a table."""
 
@@ -172,6 +181,8 @@ class Claim:
         return cls(text, paper, ours, verdict, rule)
 
 
+MOST_PIXELS = 1 << 22
+"""Largest number of pixels of a picture in a cell."""
 NO_RESULT = "no result"
 """Text for a comparison without values."""
 
@@ -293,8 +304,21 @@ def encode_picture(picture: NDArray[np.uint8]) -> str:
     return base64.b64encode(buffer.getvalue()).decode()
 
 
-def decode_picture(text: str) -> NDArray[np.uint8]:
-    """Return a picture of :func:`encode_picture`."""
+def decode_picture(text: str, what: str = "the picture") -> NDArray[np.uint8]:
+    """Return a picture of :func:`encode_picture`. Raises :class:`AmiwarpError` for other texts."""
     from PIL import Image
 
-    return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))))
+    try:
+        with Image.open(io.BytesIO(base64.b64decode(text, validate=True)), formats=["PNG"]) as picture:
+            if picture.width * picture.height <= MOST_PIXELS:
+                return np.asarray(picture)
+    except Exception as error:  # PIL raises many kinds
+        raise AmiwarpError(f"{what} cannot be decoded: {error}") from error
+    raise AmiwarpError(f"{what} has {picture.width}x{picture.height} px; expected at most {MOST_PIXELS:,} pixels")
+
+
+def check_pictures(texts: Sequence[str], axes: int, what: str) -> None:
+    """Check that texts are pictures of 8-bit values, all of one shape of ``axes`` axes."""
+    found = {(picture.shape, picture.dtype.str) for picture in map(partial(decode_picture, what=what), texts)}
+    if len(found) > 1 or any(len(shape) != axes or kind != "|u1" for shape, kind in found):
+        raise AmiwarpError(f"{what} has pictures of shapes and types {found}; expected one shape of {axes} axes, 8 bit")

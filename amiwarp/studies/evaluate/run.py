@@ -47,6 +47,8 @@ class EvaluationSummary:
     """Elapsed time [s]."""
     processor_seconds: float
     """Processor time of all workers [s]."""
+    damaged: tuple[str, ...] = ()
+    """What was wrong with each damaged cell, which was run again."""
 
 
 def evaluate(
@@ -100,7 +102,7 @@ def evaluate(
     Raises
     ------
     AmiwarpError
-        If there is no evaluation of a name, a file in the folder is damaged, or a package is missing.
+        If there is no evaluation of a name, a folder has the name of a cell, or a package is missing.
 
     Examples
     --------
@@ -121,8 +123,9 @@ def evaluate(
     count = worker_count(workers, device)
     if scheduler is None:
         jobs = [replace(job, threads=max(1, cpu_threads() // count)) for job in jobs]
+    store = Store(folder / "cells")
     with _workers(scheduler, count, device) as there:
-        results, new, processor_s = _run(jobs, Store(folder / "cells"), there, progress or silent)
+        results, new, processor_s = _run(jobs, store, there, progress or silent)
     names = [name for name in EVALUATIONS if any(r.evaluation == name for r in results)]
     sections = [section(name, [r for r in results if r.evaluation == name]) for name in names]
     with contextlib.ExitStack() as stack:
@@ -132,7 +135,7 @@ def evaluate(
     verdicts = [claim.verdict.value for s in sections for claim in s.claims]
     return EvaluationSummary(
         len(results), new, sum(bool(r.error) for r in results), {v: verdicts.count(v) for v in dict.fromkeys(verdicts)},
-        files, time.perf_counter() - began, processor_s,
+        files, time.perf_counter() - began, processor_s, tuple(store.damaged),
     )  # fmt: skip
 
 

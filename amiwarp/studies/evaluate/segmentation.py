@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -13,10 +13,13 @@ from amiwarp.studies.evaluate.flow import moving_instances
 from amiwarp.studies.evaluate.measures.masks import overlap
 from amiwarp.studies.evaluate.motion_segmentation import SegmentationSettings, moving_events
 from amiwarp.studies.evaluate.results import (
+    Amount,
     CellResult,
     Chart,
     Claim,
+    Count,
     Settings,
+    Share,
     Table,
     by_case,
     compared,
@@ -53,6 +56,25 @@ VARIED = {"gain": (1.25, 2.0), "least_share": (0.08, 0.3), "density": (1.0, 4.0)
 NAMES = {"gain": "least gain", "least_share": "least share of a cluster", "density": "least density of a cluster",
          "radius_px": "radius of the clustering [px]"}  # fmt: skip
 """What the settings are called in the report."""
+
+
+class _Row(TypedDict):
+    stream: Stream
+    events: Count
+    gain: Amount
+    least_share: Share
+    density: Amount
+    radius_px: Amount
+    share: Share | None
+    iou: Share | None
+    precision: Share | None
+    recall: Share | None
+
+
+class Values(TypedDict):
+    """What :func:`measure` returns."""
+
+    rows: list[_Row]
 
 
 def conditions(settings: Settings) -> list[Condition]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
 from amiwarp.studies.evaluate.conditions import ENOUGH, Condition, RecordedStreams, Stream
 from amiwarp.studies.evaluate.measures.density import density_variance, event_counts
 from amiwarp.studies.evaluate.results import (
+    Amount,
     CellResult,
     Chart,
     ChartKind,
@@ -47,6 +48,25 @@ REPEATS = 4
 """Largest number of windows of a recording."""
 PAPER = {"paper, AMI-EV": 0.196, "paper, S-EV": 0.425}
 """Variances in the paper."""
+
+
+class _Row(TypedDict):
+    stream: Stream
+    h: Amount
+    window: Amount
+    variance: Amount | None
+
+
+class _Rate(TypedDict):
+    stream: Stream
+    rate: Amount
+
+
+class Values(TypedDict):
+    """What :func:`measure` returns."""
+
+    rows: list[_Row]
+    rates: list[_Rate]
 
 
 def conditions(settings: Settings) -> list[Condition]:

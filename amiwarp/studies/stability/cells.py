@@ -7,10 +7,9 @@ import hashlib
 import json
 import math
 import time
-from dataclasses import asdict, dataclass, field, replace
-from functools import cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cache, partial
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -25,12 +24,13 @@ from amiwarp.calib.sharpness.search import AUTO, STAGES
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.metrics import model_error
-from amiwarp.io.atomic_output import write_text
-from amiwarp.io.input_files import read_text
+from amiwarp.io.json_files import build, fields_of, value_of
+from amiwarp.io.sealed_json import CellStore
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.model_error import predicted_error
 from amiwarp.studies.machine_info import machine
 from amiwarp.studies.stability.conditions import Condition, SimulatedSample, make
+from amiwarp.validation import instance, real, whole
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
@@ -42,7 +42,11 @@ BEST_FIT = 1.5
 """Multiple of the error of the model's best fit to the truth that a successful calibration may have."""
 JUDGED = 5_000
 """Number of events at which the error of a smaller model is measured: enough for an rms error accurate to 1 %."""
-FORMAT = 2
+LARGEST_PX = 1e3
+"""Largest model error that is stored [px rms]; that of a model without a valid position anywhere is this too."""
+MOST_DEVIATION = 1e9
+"""Largest stored distance of the apex angle from the true one [standard deviations]."""
+FORMAT = 3
 """Version of the file format of a stored cell, which is part of the cell's identity."""
 
 
@@ -112,28 +116,27 @@ class Result:
 
     outcome: Outcome
     """Outcome: success, refusal or silent failure."""
-    error_px: float | None
+    error_px: Annotated[float, partial(real, low=0.0, high=LARGEST_PX)] | None
     """Model error relative to the ground truth [px rms]; None if the method refused the recording."""
-    limit_px: float
+    limit_px: Annotated[float, partial(real, low=0.0, high=LARGEST_PX)]
     """Largest model error with which this calibration counts as a success [px rms]."""
-    seconds: float
+    seconds: Annotated[float, partial(real, low=0.0, high=1e9)]
     """Run time of the calibration [s]."""
     message: str = ""
     """Error message of a refusal, or warnings of the calibration."""
     machine: str = ""
     """Description of the machine that ran the calibration."""
-    deviation: float | None = None
+    deviation: Annotated[float, partial(real, low=0.0, high=MOST_DEVIATION)] | None = None
     """Distance of the apex angle from the true one, in standard deviations that the calibration states; None for a
     circle and for a refused recording."""
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the result as JSON data."""
-        return {**asdict(self), "outcome": self.outcome.value}
-
-    @classmethod
-    def from_json(cls, data: dict[str, Any]) -> Result:
-        """Return the result stored as JSON data."""
-        return cls(**{**data, "outcome": Outcome(data["outcome"])})
+    def __post_init__(self) -> None:
+        """Raise :class:`AmiwarpError` for an outcome that does not follow from the error."""
+        within = self.error_px is not None and self.error_px <= self.limit_px
+        if within != (self.outcome is Outcome.SUCCESS) or (
+            self.outcome is Outcome.REFUSAL and self.error_px is not None
+        ):
+            raise AmiwarpError(f"outcome {self.outcome} does not fit error_px = {self.error_px} and {self.limit_px}")
 
 
 @dataclass(frozen=True)
@@ -194,7 +197,7 @@ def _judge(cell: Cell, method: Method, sample: SimulatedSample, device: str) -> 
     error_px = _error_px(found, sample, truth)
     outcome = Outcome.SUCCESS if error_px <= limit else Outcome.SILENT
     return Result(
-        outcome, float(min(error_px, 1e3)), limit, took, "; ".join(found.warnings),
+        outcome, error_px if error_px < LARGEST_PX else LARGEST_PX, limit, took, "; ".join(found.warnings),
         deviation=_deviation(found, cell.condition) if method.model == "exact" else None,
     )  # fmt: skip
 
@@ -203,7 +206,7 @@ def _deviation(found: Calibration, condition: Condition) -> float | None:
     """Return the distance of the apex angle from the true one [standard deviations]; None if none is stated."""
     exact = found.exact
     std = exact.uncertainty.get("apex", 0.0)
-    return abs(exact.parameters["apex"] - condition.prism.apex) / std if std > 0.0 else None
+    return min(abs(exact.parameters["apex"] - condition.prism.apex) / std, MOST_DEVIATION) if std > 0.0 else None
 
 
 def _error_px(found: Calibration, sample: SimulatedSample, truth: ExactModel) -> float:
@@ -246,29 +249,39 @@ def best_fit(condition: Condition, model: str) -> float:
     return float(minimize(error, [1.0, 0.0], method="Nelder-Mead", options={"maxfev": 80}).fun)
 
 
-class Store:
-    """Folder of stored cells, one file each. A cell is written when it finishes, and is not run again."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+class Store(CellStore):
+    """Folder of stored cells. A cell is written when it finishes, and is not run again."""
 
     def load(self, cell: Cell) -> Stored:
-        """Return the known results of ``cell``; none if its file is missing.
+        """Return the known results of ``cell``; none if its file is missing or damaged."""
+        known = self._load(f"{cell.name}.json")
+        return Stored(cell) if known is None or known.cell != cell else known
 
-        Raises :class:`AmiwarpError` for a damaged file.
-        """
-        path = self.folder / f"{cell.name}.json"
-        if not path.exists():
-            return Stored(cell)
-        try:
-            data = json.loads(read_text(path, noted=False))
-            results = {name: Result.from_json(r) for name, r in data["results"].items()}
-            return Stored(cell, data["events"], results)
-        except (ValueError, KeyError, TypeError) as error:
-            raise AmiwarpError(f"{path}: damaged cell: {error}; delete the file to run the cell again") from error
+    def load_all(self) -> list[Stored]:
+        """Return all cells of the folder; damaged ones and those of other versions are left out."""
+        found = (self._load(path.name) for path in sorted(self.folder.glob("*.json")))
+        return [known for known in found if known is not None]
+
+    def _load(self, name: str) -> Stored | None:
+        """Return the cell of a file; None if it is missing, damaged, of another version or renamed."""
+
+        def make(data: dict[str, Any]) -> Stored | None:
+            fields_of(data, "", "format", "condition", "seed", "events", "results")
+            if data["format"] != FORMAT:
+                return None
+            condition = instance(data["condition"], dict, "field condition")
+            if not condition.keys() <= {f.name for f in fields(Condition)}:
+                return None  # a version with other fields wrote it
+            cell = Cell(build(Condition, condition, "condition"), whole(data["seed"], "field seed", 0, 2**31))
+            events = whole(data["events"], "field events", 0, 10**12)
+            results = value_of(dict[str, Result], data["results"], "results")
+            return Stored(cell, events, results) if f"{cell.name}.json" == name else None
+
+        return self.read(name, make)
 
     def save(self, known: Stored) -> None:
         """Write all known results of a cell."""
-        data = {"condition": asdict(known.cell.condition), "seed": known.cell.seed, "events": known.events,
-                "results": {name: r.to_json() for name, r in sorted(known.results.items())}}  # fmt: skip
-        write_text(self.folder / f"{known.cell.name}.json", json.dumps(data, indent=1) + "\n", overwrite=True)
+        self.write(f"{known.cell.name}.json", {
+            "format": FORMAT, "condition": asdict(known.cell.condition), "seed": known.cell.seed,
+            "events": known.events, "results": {name: asdict(r) for name, r in sorted(known.results.items())},
+        })  # fmt: skip

@@ -14,7 +14,6 @@ from scipy.stats import binomtest
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
-from amiwarp.io.input_files import read_text
 from amiwarp.studies.stability.axes import Axis
 from amiwarp.studies.stability.cells import Cell, Method, Outcome, Store, Stored, identity
 from amiwarp.studies.stability.conditions import Condition, sensible
@@ -286,26 +285,13 @@ def _grid(headings: Sequence[str], rows: Sequence[tuple[str, ...]]) -> str:
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
-def load(folder: Path) -> list[Stored]:
-    """Return all cells (results of single runs) in a folder; cells of other versions are left out.
+def load(store: Store) -> list[Stored]:
+    """Return all cells (results of single runs) of a folder; damaged cells and those of other versions are left out.
 
-    Raises :class:`AmiwarpError` for a folder without cells, and for damaged cells.
+    Raises :class:`AmiwarpError` for a folder without cells.
     """
-    store = Store(folder)
-    out = [store.load(cell) for path in sorted(folder.glob("*.json")) if (cell := _cell(path)) is not None]
+    out = store.load_all()
     if not out:
         what = "holds no results of single runs (cells) of this version"
-        raise AmiwarpError(f"{folder}: {what}; run without --redraw first")
+        raise AmiwarpError(f"{store.folder}: {what}; run without --redraw first")
     return out
-
-
-def _cell(path: Path) -> Cell | None:
-    """Return the cell of a file; None if it belongs to another version."""
-    try:
-        data = json.loads(read_text(path, noted=False))
-        cell = Cell(Condition(**data["condition"]), int(data["seed"]))
-    except TypeError:
-        return None  # the file was written by a version with other fields
-    except (OSError, ValueError, KeyError) as error:
-        raise AmiwarpError(f"{path}: damaged cell: {error}; delete the file to run the cell again") from error
-    return cell if cell.name == path.stem else None

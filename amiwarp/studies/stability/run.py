@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amiwarp.progress import Progress
@@ -41,7 +40,7 @@ def run(
     axes: Sequence[Axis],
     seeds: int,
     methods: Sequence[Method],
-    folder: Path,
+    store: Store,
     executor: Executor,
     *,
     device: str = "cpu",
@@ -51,11 +50,10 @@ def run(
 ) -> list[Stored]:
     """Run all cells (conditions and seeds) of the axes, and return their results.
 
-    Cells in the folder are reused; if a cell lacks a method, only that method is run. Seeds begin at ``first``. The
+    Cells in ``store`` are reused; if a cell lacks a method, only that method is run. Seeds begin at ``first``. The
     seed is the outer loop: an interrupted run covers every condition, with fewer seeds. No new cell starts after
-    ``until`` returns True. Raises :class:`AmiwarpError` for damaged files.
+    ``until`` returns True.
     """
-    store = Store(folder)
     cells = [Cell(c, seed) for seed in range(first, first + seeds) for c in conditions(axes)]
     known = {cell: store.load(cell) for cell in cells}
     todo = [(cell, missing) for cell in cells if (missing := _missing(known[cell], methods))]
