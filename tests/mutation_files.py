@@ -7,15 +7,19 @@ mutants of each named input, or of all inputs.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+import math
 import random
+import re
 import subprocess
 import sys
 import tempfile
 import threading
 import unicodedata
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -31,17 +35,30 @@ from PIL import Image
 from amiwarp.calib import Calibration
 from amiwarp.cli.info import describe
 from amiwarp.cli.inputs import read_camera
+from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import check_events
 from amiwarp.events.events import Events
 from amiwarp.events.sensors import ImuSamples
 from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels
 from amiwarp.io import RecordingWriter, open_recording, read_encoder_csv
+from amiwarp.io.sealed_json import append_line, sealed
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import Fisheye
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.sequences import open_pictures
+from amiwarp.studies import stability
+from amiwarp.studies.dataset.items import list_items
+from amiwarp.studies.dataset.making import Made
+from amiwarp.studies.dataset.manifest import JOURNAL, Journal
+from amiwarp.studies.dataset.specification import load_specification
+from amiwarp.studies.evaluate.cells import Store
+from amiwarp.studies.evaluate.conditions import Condition, Stream
+from amiwarp.studies.evaluate.drawing import CHANCE
+from amiwarp.studies.evaluate.measures.edge_match import THRESHOLDS
+from amiwarp.studies.evaluate.report import section
+from amiwarp.studies.evaluate.results import QUICK, CellResult, encode_picture
 
 MEMORY_KIB = 3 << 19
 """Largest memory that a check may take, 1.5 GiB [KiB]."""
@@ -157,6 +174,153 @@ def write_video(path: Path) -> None:
         container.mux(stream.encode())
 
 
+def stored_edges() -> CellResult:
+    """Return a cell of the edges with one row, of small pictures."""
+    picture = encode_picture(np.zeros((3, 4), np.uint8))
+    counts = [1] * len(THRESHOLDS)
+    names = (Stream.PLAIN.value, CHANCE)
+    values: dict[str, Any] = {
+        "images": [{"stream": name, "found": counts, "entropy": [0.5] * len(counts)} for name in names],
+        "rows": [{"stream": n, "truth": "Canny", "tolerance": 1.5, "matched": counts, "true": 9} for n in names],
+        "sectors": [{"stream": names[0], "angle": 7.5, "recall": 0.5}],
+        "pictures": {"Canny": picture, "geometry": picture},
+    }
+    return CellResult("edges", Condition(), values, "", 1.0)
+
+
+def stored_fading() -> CellResult:
+    """Return a cell of the fading with one part of a turn, two tiles and a film of two frames."""
+    tiles = {"part_ms": 1.0, "columns": 2, "rate": [[1.0, 2.0]], "speed": [[1.0, 2.0]], "camera_speed": [[0.0, 1.0]]}
+    film = [encode_picture(np.zeros((3, 4, 3), np.uint8))] * 2
+    rows = [{"speed": speed, "rate": 1.0, "tiles": 5} for speed in (0.25, 1.0)]
+    return CellResult("fading", Condition(), {"rows": rows, "film": film, "tiles": tiles}, "", 1.0)
+
+
+def stored_texture() -> CellResult:
+    """Return a cell of the texture with two streams."""
+    rows = [{"stream": s.value, "h": 1.0, "window": 0.5, "variance": 0.2} for s in (Stream.PLAIN, Stream.CALIBRATED)]
+    return CellResult("texture", Condition(), {"rows": rows, "rates": [{"stream": "S-EV", "rate": 1.5}]}, "", 1.0)
+
+
+def stored_atlas() -> stability.Stored:
+    """Return a cell of the stability study with a success and a refusal."""
+    names = [stability.identity(method) for method in stability.METHODS[:2]]
+    good = stability.Result(stability.Outcome.SUCCESS, 0.02, 0.1, 1.5, deviation=0.5)
+    refused = stability.Result(stability.Outcome.REFUSAL, None, 0.1, 1.5, "too little light", "two cores")
+    cell = stability.Cell(stability.AXES[0].conditions()[0], 0)
+    return stability.Stored(cell, 1000, dict(zip(names, (good, refused), strict=True)))
+
+
+def store_of(cell: CellResult | stability.Stored, folder: Path) -> tuple[Store | stability.Store, Path]:
+    """Return a store in a folder that holds one cell, and the cell's file."""
+    store: Store | stability.Store
+    if isinstance(cell, CellResult):
+        store = Store(folder)
+        store.save(cell, QUICK)
+    else:
+        store = stability.Store(folder)
+        store.save(cell)
+    (file,) = folder.iterdir()
+    return store, file
+
+
+def write_cell(make: Callable[[], CellResult | stability.Stored], path: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path.write_bytes(store_of(make(), Path(folder))[1].read_bytes())
+
+
+def write_journal(path: Path) -> None:
+    """Write a journal of three recordings."""
+    for k in range(3):
+        key = f"{k:016x}"
+        file = f"train/disc-{key}.h5"
+        append_line(path, asdict(Made(key, file, 9, "0" * 64, 5, 0.1, 64, 48, 1.0, 0.9, "cpu", "0.1.0")))
+
+
+def write_unsealed(write: Callable[[Path], None], path: Path) -> None:
+    """Write a file without its checksums. Its reader adds them, so that damage reaches the values."""
+    write(path)
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    path.write_text("".join(json.dumps({k: v for k, v in data.items() if k != "checksum"}) + "\n" for data in lines))
+
+
+def resealed(line: bytes) -> bytes:
+    """Return an object in JSON without a checksum with one, and anything else as it is."""
+    with contextlib.suppress(ValueError, RecursionError):
+        data = json.loads(line)
+        if isinstance(data, dict) and "checksum" not in data:
+            return json.dumps(sealed(data)).encode()
+    return line
+
+
+def read_cell(make: Callable[[], CellResult | stability.Stored], path: Path) -> None:
+    """Load a cell as a later run does, and make its part of the report, whose values are finite."""
+    cell = make()
+    with tempfile.TemporaryDirectory() as folder:
+        store, file = store_of(cell, Path(folder))
+        file.write_bytes(resealed(path.read_bytes()))
+        if isinstance(store, Store) and isinstance(cell, CellResult):
+            result = store.load(cell.evaluation, cell.condition, QUICK)
+            if result is not None:
+                for table in section(cell.evaluation, [result]).tables:
+                    assert all(math.isfinite(v) for row in table.rows for v in row if isinstance(v, int | float))
+        elif isinstance(store, stability.Store):
+            for known in store.load_all():
+                methods = [m for m in stability.METHODS if stability.identity(m) in known.results]
+                if methods and known.cell == cell.cell:
+                    atlas = stability.aggregate([known], stability.AXES[:1], methods, {})
+                    json.dumps(atlas.aims.to_json(), allow_nan=False)
+    if store.damaged:
+        raise AmiwarpError(store.damaged[0].replace(str(file), str(path)))
+
+
+def read_made(path: Path) -> None:
+    """Read the journal of a data set."""
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / JOURNAL).write_bytes(b"\n".join(map(resealed, path.read_bytes().split(b"\n"))))
+        journal = Journal(Path(folder))
+        json.dumps([asdict(made) for made in journal.made.values()], allow_nan=False)
+        assert all(".." not in made.file for made in journal.made.values())
+    if journal.damaged:
+        raise AmiwarpError(journal.damaged[0].replace(folder, str(path)))
+
+
+SPECIFICATION = """format = "amiwarp-dataset-specification"
+version = 1
+name = "shapes"
+duration_s = 0.05
+prisms = [{apex_deg = 0.5}, {apex_deg = 1.0, index = 1.5168, flat_side = "scene"}]
+speeds_rpm = [720.0, 1440.0]
+sensors = ["davis346", {name = "fast", preset = "gen4", refractory_us = 20.0}]
+seeds = [0, 7]
+splits = {train = 0.8, val = 0.1, test = 0.1}
+split_seed = 0
+truth_hz = 10.0
+[camera]
+size = [64, 48]
+fov_deg = 60.0
+[[sources]]
+pictures = "pictures/*/*.png"
+label_from_folder = "class"
+labels = {background = "grey"}
+licence = "CC-BY-4.0"
+[[sources]]
+worlds = ["room"]
+trajectories = ["still", "handheld"]
+duration_s = 0.02
+"""
+
+
+def read_specification(path: Path) -> None:
+    """Read a specification and list its recordings."""
+    folder = path.parent / "pictures" / "disc"
+    folder.mkdir(parents=True, exist_ok=True)
+    write_picture("png", folder / "0.png")
+    for item in list_items(load_specification(path)):
+        json.dumps([item.recipe, item.labels, item.split, item.licence], allow_nan=False)
+        assert len(item.file) < 200
+
+
 def read_recording(path: Path) -> None:
     """Read a recording in every possible way, check the events, and describe it as ``amiwarp info`` does."""
     recording = open_recording(path)
@@ -213,6 +377,11 @@ PLUGINS: dict[str, dict[str, Any]] = {
     "zstd": {"chunks": (70,), **hdf5plugin.Zstd()},
 }
 
+CELLS: dict[str, Callable[[], CellResult | stability.Stored]] = {
+    "cell_atlas": stored_atlas, "cell_edges": stored_edges, "cell_fading": stored_fading, "cell_texture": stored_texture
+}  # fmt: skip
+"""Cells of the studies."""
+
 KINDS: dict[str, Kind] = {
     **{
         name: (f".{ending}", partial(lambda write, path: write(path, EVENTS), write), read_recording)
@@ -240,6 +409,18 @@ KINDS: dict[str, Kind] = {
     "camera_json": (".json", write_camera, lambda path: read_camera(path, *SIZE)),
     "calibration_json": (".json", write_calibration, lambda path: Calibration.load(path).model),
     **{
+        f"{name}_{part}": (
+            ".json",
+            partial(write_unsealed, partial(write_cell, make)) if part == "values" else partial(write_cell, make),
+            partial(read_cell, make),
+        )
+        for name, make in CELLS.items()
+        for part in ("sealed", "values")
+    },
+    "journal_sealed": (".jsonl", write_journal, read_made),
+    "journal_values": (".jsonl", partial(write_unsealed, write_journal), read_made),
+    "specification": (".toml", lambda path: path.write_text(SPECIFICATION), read_specification),
+    **{
         f"picture_{kind}": (f".{kind}", partial(write_picture, kind), read_picture)
         for kind in ("png", "jpeg", "tiff", "bmp", "webp", "ppm", "gif")
     },
@@ -262,11 +443,12 @@ def sample(name: str) -> bytes:
 def mutated(data: bytes, rng: random.Random) -> bytes:
     """Change a file in one to five places, half of them near its beginning."""
     mutant = bytearray(data)
+    edits = EDITS + (_value,) * len(EDITS) if data.startswith((b"{", b"format =")) else EDITS
     for _ in range(rng.choice([1, 1, 2, 3, 5])):
         if mutant:
             at = rng.randrange(min(len(mutant), 300) if rng.random() < 0.5 else len(mutant))
             length = rng.choice([1, 1, 2, 4, 8, 64, 300])
-            mutant = rng.choice(EDITS)(mutant, at, length, rng)
+            mutant = rng.choice(edits)(mutant, at, length, rng)
     return bytes(mutant)
 
 
@@ -322,6 +504,26 @@ def _swap(data: bytearray, at: int, length: int, rng: random.Random) -> bytearra
 def _random(data: bytearray, at: int, length: int, rng: random.Random) -> bytearray:
     data[at : at + length] = rng.randbytes(len(data[at : at + length]))
     return data
+
+
+def _value(data: bytearray, at: int, length: int, rng: random.Random) -> bytearray:
+    """Replace the next number or text of JSON or TOML by another value, so that it stays such a file."""
+    values = [
+        b"0",
+        b"-1",
+        b"3.5",
+        b"1e6",
+        b"1e300",
+        b"-1e-300",
+        b"1" + b"0" * 30,
+        b"NaN",
+        b"true",
+        b"null",
+        b'""',
+        b"[]",
+    ]
+    found = re.compile(rb'(?<=[:,\[=])[ \n]*(?:-?[0-9][0-9.eE+-]*|"[^"]*")(?=[,\]}\n])').search(data, at)
+    return data if found is None else data[: found.start()] + rng.choice(values) + data[found.end() :]
 
 
 WORDS = (b"-", b"nan", b"1e999", b"\n", b",", b"\0", b"\xff", b"\x1b[2J", b"[", b"{", b'"', b"null")

@@ -12,6 +12,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from mutation_files import stored_edges, stored_fading
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 from scipy.spatial import KDTree
@@ -27,9 +28,8 @@ from amiwarp.studies.evaluate import apex_speed, corners, fading, texture
 from amiwarp.studies.evaluate.cells import Job, Store, plan, run_job
 from amiwarp.studies.evaluate.conditions import DISCS, IDEAL, Condition, RecordedStreams, Stream, Streams
 from amiwarp.studies.evaluate.disc_target import DiscTarget, robust_spread
-from amiwarp.studies.evaluate.drawing import CHANCE
 from amiwarp.studies.evaluate.measures.density import density_variance, event_counts
-from amiwarp.studies.evaluate.measures.edge_match import THRESHOLDS, Counts, best_f, binary_entropy, match
+from amiwarp.studies.evaluate.measures.edge_match import Counts, best_f, binary_entropy, match
 from amiwarp.studies.evaluate.measures.true_edges import geometric_edges
 from amiwarp.studies.evaluate.registry import EVALUATIONS, load
 from amiwarp.studies.evaluate.report import refused, section, write
@@ -346,27 +346,6 @@ def test_cells_are_kept_and_the_report_is_one_file(tmp_path: Path) -> None:
     assert data["evaluations"][0]["tables"][0]["rows"][0][2] == 1440.0
     assert (tmp_path / "figures" / "apex_speed_blur.pdf").stat().st_size > 1000
     assert (tmp_path / "tables" / "apex_speed_rate.csv").read_text().startswith("apex,bandwidth,speed [rpm]")
-
-
-def stored_edges() -> CellResult:
-    """Return a cell of the edges with one row, of small pictures."""
-    picture = encode_picture(np.zeros((3, 4), np.uint8))
-    counts = [1] * len(THRESHOLDS)
-    names = (Stream.PLAIN.value, CHANCE)
-    values: dict[str, Any] = {
-        "images": [{"stream": name, "found": counts, "entropy": [0.5] * len(counts)} for name in names],
-        "rows": [{"stream": n, "truth": "Canny", "tolerance": 1.5, "matched": counts, "true": 9} for n in names],
-        "sectors": [{"stream": names[0], "angle": 7.5, "recall": 0.5}],
-        "pictures": {"Canny": picture, "geometry": picture},
-    }
-    return CellResult("edges", Condition(), values, "", 1.0)
-
-
-def stored_fading() -> CellResult:
-    """Return a cell of the fading with one part of a turn, two tiles and a film of two frames."""
-    tiles = {"part_ms": 1.0, "columns": 2, "rate": [[1.0, 2.0]], "speed": [[1.0, 2.0]], "camera_speed": [[0.0, 1.0]]}
-    film = [encode_picture(np.zeros((3, 4, 3), np.uint8))] * 2
-    return CellResult("fading", Condition(), {"rows": [], "film": film, "tiles": tiles}, "", 1.0)
 
 
 Change = Callable[[dict[str, Any]], object]

@@ -11,7 +11,7 @@ from mutation_files import KINDS, Checker, check, mutated, sample
 from amiwarp.io import convert, open_recording
 
 MUTANTS = 60
-"""Mutants per kind of input: over three thousand for 55 kinds. ``mutation_files.py`` runs any number."""
+"""Mutants per kind of input. ``mutation_files.py`` runs any number."""
 
 
 @pytest.fixture(scope="module")
