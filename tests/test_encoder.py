@@ -301,7 +301,8 @@ def test_csv_of_angles_counts_and_index(tmp_path):
         ("t_us,angle_deg\n0,1\n0,2\n", "line 3: t_us is not later"),
         ("t_us,count\n0,1\n1,2\n", "counts_per_turn"),
         ("t_us,angle_deg,index\n0,1,0\n1,2,7\n", "line 3: index"),
-        ("t_us,angle_deg\n\udcff,1\n", "reading the encoder"),
+        ("t_us,angle_deg\n\udcff,1\n", "line 2 is '.*,1'; expected 2 numbers"),
+        ("t_us,angle_deg\n#" + "9" * 1000 + "\n0,1\n1,2\n", "line 2 is longer than 1000 characters"),
     ],
 )
 def test_csv_refuses(tmp_path, text, message):
@@ -310,6 +311,16 @@ def test_csv_refuses(tmp_path, text, message):
     with pytest.raises(AmiwarpError, match=message) as caught:
         read_encoder_csv(path)
     assert "bad.csv" in str(caught.value)
+
+
+def test_csv_has_a_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr("amiwarp.io.encoder_csv.MOST_ROWS", 5)
+    path = tmp_path / "long.csv"
+    path.write_text("t_us,angle_deg\n" + "".join(f"{k},{k}\n" for k in range(5)))
+    assert len(read_encoder_csv(path).t) == 5
+    path.write_text("t_us,angle_deg\n" + "".join(f"{k},{k}\n" for k in range(6)))
+    with pytest.raises(AmiwarpError, match=r"long\.csv: has over 5 samples; give fewer, at a lower rate"):
+        read_encoder_csv(path)
 
 
 def test_csv_missing(tmp_path):

@@ -245,13 +245,14 @@ OPENED_OTHERWISE = {
     "amiwarp.plotting.clouds: np.load(points)": "own file",
     "amiwarp.viewer.downloads: path.read_bytes()": "own file",
     # What is no file.
-    "amiwarp.io.encoder_csv: np.loadtxt(lines, delimiter=',', ndmin=2, comments=None)": "lines",
     "amiwarp.io.text: np.loadtxt(kept, ndmin=2, comments=None, encoding='ascii')": "lines",
     "amiwarp.plotting.figures: Image.open(buffer)": "bytes",
     "amiwarp.simulation.worlds.mesh_files: Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)": "bytes",
     "amiwarp.simulation.worlds.mesh_files: trimesh.load(file, file_type=kind, resolver=files, force='scene', "
     "process=False)": "open file",
-    "amiwarp.studies.evaluate.results: Image.open(io.BytesIO(base64.b64decode(text, validate=True)), formats=['PNG'])": "bytes",
+    "amiwarp.studies.evaluate.results: Image.open(io.BytesIO(base64.b64decode(text, validate=True)), formats=['PNG'])": (
+        "bytes"
+    ),
 }
 """Calls that open a file for reading in another way, and what they open."""
 

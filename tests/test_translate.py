@@ -156,6 +156,12 @@ def test_bad_sequences_are_told(tmp_path: Path) -> None:
         translate(tmp_path / "loud.npy", WEDGE, fps=10.0)
 
 
+def test_tables_of_pictures_have_a_limit(tmp_path: Path) -> None:
+    (tmp_path / "times.csv").write_text("file,t_us\n" + "".join(f"a,{k}\n" for k in range(1_000_001)))
+    with pytest.raises(AmiwarpError, match=r"times\.csv: .*it lists over 1000000 pictures; split the folder"):
+        open_pictures(tmp_path)
+
+
 def test_a_video_that_breaks_off_is_told(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (40, 64, 64), np.uint8)
     write_video(tmp_path / "whole.avi", noise, 20)

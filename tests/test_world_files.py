@@ -2,6 +2,7 @@
 
 import json
 import re
+import struct
 import sys
 import tomllib
 from collections.abc import Callable
@@ -13,10 +14,13 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.input_files import inputs_in_use, inputs_noted
 from amiwarp.simulation.pictures import LUMINANCE, linear_luminance
 from amiwarp.simulation.worlds.mesh_files import load_mesh
+from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.simulation.worlds.world_files import load_world
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "world-files.md"
@@ -321,6 +325,85 @@ def test_files_that_a_mesh_names(tmp_path: Path, material: str | None, message: 
         (tmp_path / "quad.mtl").write_text(material)
     with pytest.raises(AmiwarpError, match=message):
         load_mesh(tmp_path / "quad.obj")
+
+
+def bare_glb(path: Path, count: int, sparse: bool = False) -> None:
+    """Write a GLB file of a triangle whose ``count`` vertices are declared without data, or with sparse data."""
+    indices = struct.pack("<3H", 0, 1, 2) + bytes(2)
+    vertices: dict[str, Any] = {"componentType": 5126, "count": count, "type": "VEC3"}
+    if sparse:
+        vertices["sparse"] = {
+            "count": 1, "indices": {"bufferView": 0, "componentType": 5123}, "values": {"bufferView": 0}
+        }  # fmt: skip
+    header = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "buffers": [{"byteLength": len(indices)}],
+        "bufferViews": [{"buffer": 0, "byteLength": 6}],
+        "accessors": [vertices, {"bufferView": 0, "componentType": 5123, "count": 3, "type": "SCALAR"}],
+    }
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = b"".join(
+        struct.pack("<I4s", len(data), kind) + data for data, kind in ((text, b"JSON"), (indices, b"BIN\0"))
+    )
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_small_files_that_declare_huge_meshes_are_refused(tmp_path: Path, sparse: bool) -> None:
+    bare_glb(tmp_path / "a.glb", 10, sparse)
+    (part,) = load_mesh(tmp_path / "a.glb")
+    assert np.asarray(part.mesh.vertices).shape == (10, 3)
+    bare_glb(tmp_path / "a.glb", 30_000_000, sparse)  # 1 GB in float64 alone
+    assert (tmp_path / "a.glb").stat().st_size < 1000
+    with pytest.raises(AmiwarpError, match=r"a\.glb: .*needs over 1024 MiB of memory at once"):
+        load_mesh(tmp_path / "a.glb")
+
+
+def test_the_largest_texture_is_read(tmp_path: Path) -> None:
+    quad(tmp_path / "quad.obj", "mtllib quad.mtl\n")
+    (tmp_path / "quad.mtl").write_text("newmtl paint\nmap_Kd paint.png\n")
+    Image.new("RGB", (8192, 8192), (GREY,) * 3).save(tmp_path / "paint.png")
+    (part,) = load_mesh(tmp_path / "quad.obj")
+    assert part.material.texture is not None
+    assert part.material.texture.shape == (8192, 8192)
+    expected = float(linear_luminance(np.full((2, 2), GREY, np.uint8))[0, 0])
+    np.testing.assert_allclose(part.material.texture[::999, ::999], expected, rtol=0, atol=1e-6)
+
+
+def test_files_of_a_mesh_are_inputs_of_the_command(tmp_path: Path) -> None:
+    quad(tmp_path / "quad.obj", "mtllib quad.mtl\n")
+    (tmp_path / "quad.mtl").write_text("newmtl paint\nmap_Kd paint.png\n")
+    picture(tmp_path / "paint.png")
+    with inputs_noted([]):
+        load_mesh(tmp_path / "quad.obj")
+        noted = {file.name for file in inputs_in_use()}
+    assert noted >= {"quad.obj", "quad.mtl", "paint.png"}
+
+
+def test_trajectories_have_a_limit(tmp_path: Path) -> None:
+    """Their splines take 1.7 kB for each pose."""
+    row = " 0 0 0 0 0 0 1\n"
+    (tmp_path / "a.txt").write_text("".join(f"{k}{row}" for k in range(500_001)))
+    with pytest.raises(AmiwarpError, match=r"a\.txt: has over 500000 poses; give fewer, at a lower rate"):
+        Trajectory.from_file(tmp_path / "a.txt")
+    with pytest.raises(AmiwarpError, match=r"trajectory has 500001 poses; give at most 500000"):
+        Trajectory(np.arange(500_001.0), np.zeros((500_001, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (500_001, 1)))
+    with pytest.raises(AmiwarpError, match=r"trajectory has 1000000001 poses; .*by a smaller rate_hz"):
+        Trajectory.from_function(lambda t: (Rotation.identity(), np.zeros(3)), 1000.0, rate_hz=1e6)
+    (tmp_path / "b.txt").write_text("0" + row + "#" * 1001 + "\n")
+    with pytest.raises(AmiwarpError, match=r"b\.txt: line 2 is longer than 1000 characters"):
+        Trajectory.from_file(tmp_path / "b.txt")
+
+
+def test_large_world_files_are_refused_before_they_are_parsed(tmp_path: Path) -> None:
+    (tmp_path / "w.json").write_text(json.dumps(tomllib.loads(EXAMPLE)) + " " * (8 << 20))
+    with pytest.raises(AmiwarpError, match=r"w\.json: is larger than 8 MiB"):
+        load_world(tmp_path / "w.json")
 
 
 def test_without_trimesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,13 +11,16 @@ import typer
 
 from amiwarp.cli.inputs import numbers, read_camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import read_text
+from amiwarp.io.input_files import text_lines
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 
 if TYPE_CHECKING:
     from amiwarp.simulation.sensor import SensorModel
+
+MOST_SPEEDS = 1_000_000
+"""Largest number of rows of a table of speeds."""
 
 _CAMERA, _PRISM, _SENSOR, _ENCODER = "Camera", "Prism", "Sensor", "Encoder"
 
@@ -111,11 +114,13 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def _read_speed(path: Path) -> list[tuple[float, ...]]:
-    try:
-        rows = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
-    except UnicodeDecodeError as error:
-        raise AmiwarpError(f"{path}: cannot be read: {error}") from error
-    return [numbers(row, 2, f"{path}: line {k}") for k, row in enumerate(rows, 1)]
+    rows = []
+    for number, line in text_lines(path):
+        if line.strip() and not line.startswith("#"):
+            rows.append(numbers(line, 2, f"{path}: line {number}"))
+        if len(rows) > MOST_SPEEDS:
+            raise AmiwarpError(f"{path}: has over {MOST_SPEEDS} speeds; give fewer, which are interpolated")
+    return rows
 
 
 def _sensor(text: str) -> Any:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from array import array
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,10 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.unwrapping import UnwrapError
-from amiwarp.io.input_files import errors_name, read_text
+from amiwarp.io.input_files import errors_name, text_lines
+
+MOST_ROWS = 10_000_000
+"""Largest number of samples of a log: 2.8 hours at 1 kHz."""
 
 
 def read_encoder_csv(
@@ -82,38 +87,45 @@ def _encoder(
     return Encoder.from_angles(t, direction * np.radians(columns["angle_deg"]))
 
 
-def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], list[int]]:
+def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], Sequence[int]]:
     """Return column names, values of shape ``(rows, columns)`` and the line number of each row."""
-    text = read_text(path, encoding="utf-8-sig")
-    rows = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
-    if not rows:
+    names: list[str] = []
+    values, numbers = array("d"), array("q")
+    for number, line in text_lines(path):
+        if not line.strip() or line[0] == "#":
+            continue
+        if not names:
+            names = _column_names(path, line)
+            continue
+        numbers.append(number)
+        if len(numbers) > MOST_ROWS:
+            raise AmiwarpError(f"{path}: has over {MOST_ROWS} samples; give fewer, at a lower rate")
+        try:
+            values.extend(map(float, line.split(",")))
+        except ValueError as error:
+            raise AmiwarpError(f"{path}: line {number} is '{line[:80]}'; expected {len(names)} numbers") from error
+        if len(values) != len(numbers) * len(names):
+            raise AmiwarpError(f"{path}: line {number} is '{line[:80]}'; expected {len(names)} numbers")
+    if not names:
         raise AmiwarpError(f"{path}: is empty; expected a header t_us,angle_deg or t_us,count")
-    names = [name.strip().lower() for name in rows[0][1].split(",")]
-    known = {"t_us", "angle_deg", "count", "index"}
-    if len(set(names)) != len(names) or not set(names) <= known or "t_us" not in names:
-        raise AmiwarpError(f"{path}: header '{rows[0][1][:80]}'; expected t_us,angle_deg or t_us,count, then index")
-    if ("count" in names) == ("angle_deg" in names):
-        raise AmiwarpError(f"{path}: header '{rows[0][1][:80]}'; expected one of angle_deg and count")
-    numbers, lines = [number for number, _ in rows[1:]], [line for _, line in rows[1:]]
-    if len(lines) < 2:
-        raise AmiwarpError(f"{path}: has {len(lines)} samples; expected at least 2")
-    try:
-        table = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
-    except ValueError:
-        table = np.zeros((0, 0))
-    # From 2**53 on, float64 cannot represent every whole microsecond.
-    if table.shape != (len(lines), len(names)) or not (np.abs(table) < 2.0**53).all():
-        raise AmiwarpError(f"{path}: {_first_bad_line(numbers, lines, len(names))}")
+    if len(numbers) < 2:
+        raise AmiwarpError(f"{path}: has {len(numbers)} samples; expected at least 2")
+    table = np.frombuffer(values).reshape(-1, len(names))
+    # From 2**53 on, float64 cannot represent every whole microsecond. NaN fails every comparison.
+    right = (np.abs(table) < 2.0**53).all(axis=1)
+    if not right.all():
+        row = int(np.argmin(right))
+        given = ",".join(f"{value:g}" for value in table[row])
+        raise AmiwarpError(f"{path}: line {numbers[row]} is '{given}'; expected {len(names)} finite numbers")
     return names, table, numbers
 
 
-def _first_bad_line(numbers: list[int], lines: list[str], width: int) -> str:
-    """Return a description of the first line that does not hold ``width`` finite numbers, for error messages."""
-    for number, line in zip(numbers, lines, strict=True):
-        try:
-            values = np.array([float(word) for word in line.split(",")])
-        except ValueError:
-            return f"line {number} is '{line[:80]}'; expected {width} numbers"
-        if values.size != width or not (np.abs(values) < 2.0**53).all():
-            return f"line {number} is '{line[:80]}'; expected {width} finite numbers"
-    return f"expected {width} finite numbers in each line"
+def _column_names(path: Path, header: str) -> list[str]:
+    """Return the names in a header."""
+    names = [name.strip().lower() for name in header.split(",")]
+    known = {"t_us", "angle_deg", "count", "index"}
+    if len(set(names)) != len(names) or not set(names) <= known or "t_us" not in names:
+        raise AmiwarpError(f"{path}: header '{header[:80]}'; expected t_us,angle_deg or t_us,count, then index")
+    if ("count" in names) == ("angle_deg" in names):
+        raise AmiwarpError(f"{path}: header '{header[:80]}'; expected one of angle_deg and count")
+    return names

@@ -17,6 +17,9 @@ from pathlib import Path
 from amiwarp.errors import WORD_HEAD, AmiwarpError, printable
 from amiwarp.io.regular_file import check_regular
 
+LONGEST_LINE = 1000
+"""Longest accepted line of a text file [characters]."""
+
 _sources: weakref.WeakKeyDictionary[object, tuple[Path, ...]] = weakref.WeakKeyDictionary()
 """Files that each open event source reads."""
 
@@ -135,3 +138,20 @@ def errors_name(path: Path, place: Callable[[], str]) -> Iterator[None]:
     except BaseException as error:
         what = " ".join(str(error).split())[:300] or type(error).__name__
         raise AmiwarpError(f"{path}: {place()}: {what}") from error
+
+
+def text_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the number and the text of each line of a UTF-8 file, with one line in memory at a time.
+
+    Raises :class:`AmiwarpError` if the file is not regular or a line is longer than :data:`LONGEST_LINE`.
+    """
+    with io.TextIOWrapper(open_input(path), "utf-8-sig", "replace") as file:
+        number = 0
+        while line := file.readline(LONGEST_LINE + 1):
+            number += 1
+            if len(line) > LONGEST_LINE:
+                raise AmiwarpError(
+                    f"{path}: line {number} is longer than {LONGEST_LINE} characters; give a text file with one row "
+                    "per line"
+                )
+            yield number, line.rstrip("\n")

@@ -22,8 +22,9 @@ from amiwarp.validation import choice, one_of, real, shown, whole
 
 Made = TypeVar("Made")
 
-MOST_BYTES = 64 << 20
-"""Largest JSON file that is read [bytes]. A calibration with all points of its search takes about 1 MB."""
+MOST_BYTES = 8 << 20
+"""Largest JSON file that is read [bytes]. Its values take up to 45 times as much memory. A calibration with all points
+of its search takes about 1 MB."""
 MOST_TOML_BYTES = 1 << 20
 """Largest TOML file that is read [bytes]. Such files are written by hand, and Python parses 1 MiB in seconds."""
 MOST_PARTS = 32

@@ -133,7 +133,9 @@ class ReadingProcess:
         code = self._child.wait()
         self.close()
         if code == -getattr(signal, "SIGXCPU", 0):
-            return AmiwarpError(f"reading took over {CPU_SECONDS} s of processor time; the file is damaged")
+            return AmiwarpError(
+                f"reading took over {CPU_SECONDS} s of processor time; the file is damaged or too large"
+            )
         if code < 0:
             return AmiwarpError(f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged")
         remedy = f"check that '{sys.executable}' is Python and that enough memory is free"

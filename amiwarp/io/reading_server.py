@@ -59,7 +59,8 @@ def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[NDArray[Any]]
     except AmiwarpError as error:
         return {"error": str(error)}, []
     except MemoryError:
-        return {"error": f"needs over {request['memory_bytes'] >> 20} MiB of memory at once; the file is damaged"}, []
+        most = request["memory_bytes"] >> 20
+        return {"error": f"needs over {most} MiB of memory at once; the file is damaged or too large"}, []
     except BaseException as error:  # panics of compiled decoders derive from BaseException
         return {"error": " ".join(str(error).split())[:300] or type(error).__name__}, []
 

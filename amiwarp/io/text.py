@@ -19,15 +19,12 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
-from amiwarp.io.input_files import errors_name, open_input
+from amiwarp.io.input_files import LONGEST_LINE, errors_name, open_input
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import RadialTangential
 
 READ_BYTES = 1 << 22
 """Amount of text that is parsed at once [bytes]: about 200,000 events."""
-
-LONGEST_LINE = 1000
-"""Longest accepted line of a text recording [characters]."""
 
 
 def open_text(path: Path) -> Recording:

@@ -20,8 +20,8 @@ from amiwarp.io.input_files import errors_name, input_path, open_input, register
 from amiwarp.simulation.pictures import MOST_PIXELS, linear_luminance, read_picture, srgb_to_linear
 from amiwarp.validation import real, shown
 
-MOST_TABLE_BYTES = 64 << 20
-"""Largest ``times.csv`` that is read [bytes], enough for a million pictures."""
+MOST_TABLE_BYTES, MOST_PICTURES = 64 << 20, 1_000_000
+"""Largest ``times.csv`` that is read [bytes], and largest number of pictures in it."""
 
 TIMES = "times.csv"
 """Name of the file, in a folder of pictures, that lists their times; its columns are file and t_us."""
@@ -276,8 +276,11 @@ def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
         if len(text) > MOST_TABLE_BYTES:
             raise AmiwarpError(f"it is larger than {MOST_TABLE_BYTES >> 20} MiB")
         rows = csv.DictReader(io.StringIO(text.decode("utf-8"), newline=""))
-        files, times = [], []
+        files: list[Path] = []
+        times = []
         for row in rows:
+            if len(files) == MOST_PICTURES:
+                raise AmiwarpError(f"it lists over {MOST_PICTURES} pictures; split the folder")
             name, t = row.get("file"), row.get("t_us")
             if not name or t is None:
                 raise AmiwarpError(f"line {rows.line_num} has no {'t_us' if name else 'file'}")

@@ -1,7 +1,12 @@
-"""Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh. Colours become luminance."""
+"""Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh. Colours become luminance.
+
+A file of a few bytes may declare a mesh of many gigabytes, so trimesh runs in the reading process, which has limits of
+memory and processor time (:mod:`amiwarp.io.reading_process`).
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import urllib.parse
 from pathlib import Path
@@ -11,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name, open_input
-from amiwarp.simulation.pictures import LUMINANCE, MOST_PIXELS, PICTURE_FORMATS, linear_luminance, srgb_to_linear
+from amiwarp.io.input_files import errors_name, note_input, open_input
+from amiwarp.io.reading_process import borrow, give_back
+from amiwarp.simulation.pictures import BAND, LUMINANCE, MOST_PIXELS, PICTURE_FORMATS, srgb_to_linear
 from amiwarp.simulation.worlds.scene import Material, Mesh
 from amiwarp.validation import one_of, real
 
@@ -29,6 +35,9 @@ TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Rotation matrix from a frame in which y points up to a frame in which z points up."""
 DEFAULT_REFLECTANCE = 0.5
 """Reflectance of meshes whose file gives neither colours nor a material."""
+
+Arrays = tuple[NDArray[Any] | None, ...]
+"""Vertices, faces, texture coordinates, light and texture of a part; None for an array that it has not."""
 
 
 class LoadedMesh(NamedTuple):
@@ -72,35 +81,65 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
         raise AmiwarpError(f"{path}: has an unknown mesh format {path.suffix!r}; give one of {', '.join(FORMATS)}")
     up = one_of(up or ("y" if kind in Y_UP else "z"), ("y", "z"), "axis that points up")
     turn = real(scale, "mesh scale", 1e-9, 1e9) * (TO_Z_UP if up == "y" else np.eye(3))
-    scene = _open(path, kind)
-    parts = []
+    if importlib.util.find_spec("trimesh") is None:
+        raise AmiwarpError(f"{path}: mesh files need trimesh; install it by: pip install 'amiwarp[worlds]'")
     with errors_name(path, lambda: "cannot be read as a mesh"):
-        for node in sorted(scene.graph.nodes_geometry):
-            placed, geometry = scene.graph[node]
-            part = scene.geometry[geometry]
-            if len(getattr(part, "faces", ())):
-                parts.append(_part(part, turn @ placed[:3, :3], turn @ placed[:3, 3], str(node), kind))
+        process = borrow()
+        try:
+            found, arrays = process.call(f"{__name__}:read_parts", path, kind, turn.tolist())
+        finally:
+            give_back(process)
+        for file in found["files"]:
+            note_input(Path(file))
+        parts = [_received(about, arrays) for about in found["parts"]]
     if not parts:
         raise AmiwarpError(f"{path}: holds no faces; give a file with triangles, not points or lines alone")
     return parts
 
 
-def _open(path: Path, kind: str) -> Any:
-    """Return the file as a trimesh scene."""
-    try:
-        import trimesh
-    except ImportError as error:
-        raise AmiwarpError(f"{path}: mesh files need trimesh; install it by: pip install 'amiwarp[worlds]'") from error
+def _received(about: dict[str, Any], arrays: list[NDArray[Any]]) -> LoadedMesh:
+    """Return a part that :func:`read_parts` described, and remove its arrays from the front of the list."""
+    values: list[Any] = [None if shape is None else arrays.pop(0).reshape(shape) for shape in about["shapes"]]
+    vertices, faces, uv, light, texture = values
+    return LoadedMesh(Mesh(vertices, faces, uv, light), Material(about["reflectance"], texture), about["name"])
+
+
+def read_parts(path: str, kind: str, turn: list[list[float]]) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Read the parts of a mesh file, in the reading process.
+
+    ``kind``: suffix of the file; ``turn``: matrix (3, 3) by which vertices are multiplied. The first value holds the
+    files that the mesh file refers to, and of each part the name, the reflectance and the shapes of its arrays:
+    vertices, faces, texture coordinates, light and texture. A shape is None if the part has no such array.
+    """
+    scene, files = _open(Path(path), kind)
+    parts: list[dict[str, Any]] = []
+    arrays: list[NDArray[Any]] = []
+    for node in sorted(scene.graph.nodes_geometry):
+        placed, geometry = scene.graph[node]
+        part = scene.geometry[geometry]
+        if len(getattr(part, "faces", ())):
+            matrix = np.array(turn) @ placed[:3]
+            values, reflectance = _part(part, matrix[:, :3], matrix[:, 3], kind)
+            shapes = [None if value is None else value.shape for value in values]
+            parts.append({"name": str(node), "reflectance": reflectance, "shapes": shapes})
+            arrays += [value.ravel() for value in values if value is not None]
+    return {"files": files, "parts": parts}, arrays
+
+
+def _open(path: Path, kind: str) -> tuple[Any, list[str]]:
+    """Return the file as a trimesh scene, and the files that it refers to."""
+    import trimesh
+
     files = _named_files(path)
-    with errors_name(path, lambda: "cannot be read as a mesh"), open_input(path) as file:
+    with open_input(path) as file:
         try:
             scene = trimesh.load(file, file_type=kind, resolver=files, force="scene", process=False)
         except Exception:
             if files.missing is None:
                 raise
         if files.missing is not None:
-            raise AmiwarpError(f"{path}: refers to the file {files.missing}; put a valid file next to the mesh file")
-    return scene
+            raise AmiwarpError(f"refers to the file {files.missing}; put a valid file next to the mesh file")
+    return scene, files.read
 
 
 def _named_files(path: Path) -> Any:
@@ -112,6 +151,10 @@ def _named_files(path: Path) -> Any:
 
         missing: str | None = None
         """First file that cannot be read, with the reason, for a message."""
+
+        def __init__(self) -> None:
+            super().__init__(str(path))
+            self.read: list[str] = []
 
         def get(self, name: str) -> bytes:
             """Return the content of a file; its name is relative to the folder of the mesh file."""
@@ -126,9 +169,10 @@ def _named_files(path: Path) -> Any:
                 what = "is missing" if isinstance(error, AmiwarpError) else f"cannot be read ({error})"
                 self.missing = self.missing or f"{name!r}, which {what}"
                 raise
+            self.read.append(str(file))
             return data
 
-    return NamedFiles(str(path))
+    return NamedFiles()
 
 
 def _check_picture(data: bytes) -> None:
@@ -139,8 +183,8 @@ def _check_picture(data: bytes) -> None:
         image.verify()
 
 
-def _part(part: Trimesh, matrix: NDArray[np.float64], offset: NDArray[np.float64], name: str, kind: str) -> LoadedMesh:
-    """Return one geometry of the file as a mesh with a material.
+def _part(part: Trimesh, matrix: NDArray[Any], offset: NDArray[Any], kind: str) -> tuple[Arrays, float]:
+    """Return the arrays and the reflectance of one geometry of the file.
 
     ``matrix`` and ``offset``: transformation from the geometry to the world; ``kind``: suffix of the file.
     """
@@ -148,19 +192,17 @@ def _part(part: Trimesh, matrix: NDArray[np.float64], offset: NDArray[np.float64
     faces = np.asarray(part.faces)
     visual: Any = part.visual
     if visual.kind == "texture":
-        return LoadedMesh(*_textured(visual, vertices, faces, kind), name)
+        return _textured(visual, vertices, faces, kind)
     if visual.kind == "face":  # faces of different colours cannot share vertices
         light = np.repeat(_reflectance(visual.face_colors, kind), 3)
-        return LoadedMesh(
-            Mesh(vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3), None, light), Material(1.0), name
-        )
+        return (vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3), None, light, None), 1.0
     if visual.kind == "vertex":
-        return LoadedMesh(Mesh(vertices, faces, None, _reflectance(visual.vertex_colors, kind)), Material(1.0), name)
-    return LoadedMesh(Mesh(vertices, faces), Material(DEFAULT_REFLECTANCE), name)
+        return (vertices, faces, None, _reflectance(visual.vertex_colors, kind), None), 1.0
+    return (vertices, faces, None, None, None), DEFAULT_REFLECTANCE
 
 
-def _textured(visual: Any, vertices: NDArray[np.float64], faces: NDArray[Any], kind: str) -> tuple[Mesh, Material]:
-    """Return mesh and material of a geometry whose file gives a material, with or without a texture."""
+def _textured(visual: Any, vertices: NDArray[Any], faces: NDArray[Any], kind: str) -> tuple[Arrays, float]:
+    """Return arrays and reflectance of a geometry whose file gives a material, with or without a texture."""
     material = visual.material
     pbr = hasattr(material, "baseColorFactor")
     picture = material.baseColorTexture if pbr else material.image
@@ -169,10 +211,10 @@ def _textured(visual: Any, vertices: NDArray[np.float64], faces: NDArray[Any], k
     shade = visual.vertex_attributes.get("color")
     light = None if shade is None else _reflectance(shade, kind)
     if picture is None or visual.uv is None:
-        return Mesh(vertices, faces, None, light), Material(factor)
+        return (vertices, faces, None, light, None), factor
     if not pbr:
         factor = 1.0  # in OBJ files, a texture replaces the diffuse colour
-    return Mesh(vertices, faces, np.asarray(visual.uv)[:, :2], light), Material(factor, _luminance(picture))
+    return (vertices, faces, np.asarray(visual.uv)[:, :2], light, _luminance(picture)), factor
 
 
 def _luminance(picture: Any) -> NDArray[np.float32]:
@@ -181,9 +223,14 @@ def _luminance(picture: Any) -> NDArray[np.float32]:
         raise AmiwarpError(
             f"a texture has {picture.width}x{picture.height} pixels, more than {MOST_PIXELS}; give a smaller picture"
         )
-    pixels = np.asarray(picture.convert("RGB"))
-    pixels = np.repeat(pixels, 2, axis=0) if len(pixels) < 2 else pixels
-    return linear_luminance(np.repeat(pixels, 2, axis=1) if pixels.shape[1] < 2 else pixels, name="texture")
+    table = srgb_to_linear(np.arange(256, dtype=np.float32) / 255)
+    light = np.empty((picture.height, picture.width), np.float32)
+    rows = max(1, BAND // (3 * picture.width))
+    for top in range(0, picture.height, rows):  # a large picture as a whole would need four times its memory
+        band = picture.crop((0, top, picture.width, min(top + rows, picture.height))).convert("RGB")
+        light[top : top + rows] = table[np.asarray(band)] @ np.array(LUMINANCE, np.float32)
+    light = np.repeat(light, 2, axis=0) if len(light) < 2 else light
+    return np.repeat(light, 2, axis=1) if light.shape[1] < 2 else light
 
 
 def _reflectance(colours: Any, kind: str) -> NDArray[np.float64]:

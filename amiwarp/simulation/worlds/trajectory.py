@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array as plain_array
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
-from amiwarp.io.input_files import read_text
+from amiwarp.io.input_files import text_lines
 from amiwarp.validation import array, real
 
 if TYPE_CHECKING:
@@ -23,6 +24,8 @@ LARGEST_SPEED = 1e3
 """Largest speed of a body or camera [m/s]. A higher speed is refused as a jump."""
 LARGEST_TURN_RATE = 1e3
 """Largest angular velocity of a body or camera [rad/s]. A higher angular velocity is refused as a jump."""
+MOST_POSES = 500_000
+"""Largest number of poses of a trajectory: 8 minutes at 1 kHz. Its splines take 1.7 kB for each pose."""
 COLUMNS = 8
 """Number of columns of a table of poses: t, x, y, z, qx, qy, qz, qw."""
 
@@ -58,6 +61,8 @@ class Trajectory:
         t = array(self.t, "trajectory's times").astype(np.float64)
         position = array(self.position, "trajectory's positions").astype(np.float64)
         rotation = array(self.rotation, "trajectory's orientations").astype(np.float64)
+        if t.size > MOST_POSES:
+            raise AmiwarpError(f"trajectory has {t.size} poses; give at most {MOST_POSES}, at a lower rate")
         if t.ndim != 1 or not t.size or position.shape != (t.size, 3) or rotation.shape != (t.size, 4):
             raise AmiwarpError(
                 f"trajectory has times {t.shape}, positions {position.shape}, orientations {rotation.shape}; "
@@ -192,7 +197,10 @@ class Trajectory:
             The sampled trajectory.
         """
         duration_s = real(duration_s, "duration_s", 1e-6, 1e6, " s")
-        t = np.linspace(0.0, duration_s, max(2, round(duration_s * real(rate_hz, "rate_hz", 1e-3, 1e6)) + 1))
+        count = max(2, round(duration_s * real(rate_hz, "rate_hz", 1e-3, 1e6)) + 1)
+        if count > MOST_POSES:
+            raise AmiwarpError(f"trajectory has {count} poses; give at most {MOST_POSES}, by a smaller rate_hz")
+        t = np.linspace(0.0, duration_s, count)
         poses = [pose(float(at)) for at in t]
         places = np.stack([np.asarray(place, np.float64) for _, place in poses])
         return cls(t, places, np.stack([turn.as_quat() for turn, _ in poses]))
@@ -218,24 +226,25 @@ class Trajectory:
             If the file does not exist, or is not a table of poses.
         """
         path = Path(path)
-        rows = []
-        for number, line in enumerate(read_text(path, errors="replace").splitlines(), 1):
+        values = plain_array("d")
+        for number, line in text_lines(path):
             words = line.split("#")[0].replace(",", " ").split()
             if not words or (number == 1 and words[0].lower() in ("t", "time", "timestamp", "t_s")):
                 continue
             try:
-                rows.append([float(word) for word in words])
+                row = [float(word) for word in words]
             except ValueError as error:
                 raise AmiwarpError(
                     f"{path}: line {number} is {line[:60]!r}; expected 8 numbers t x y z qx qy qz qw"
                 ) from error
-            if len(rows[-1]) != COLUMNS:
-                raise AmiwarpError(
-                    f"{path}: line {number} has {len(rows[-1])} numbers; expected 8: t x y z qx qy qz qw"
-                )
-        if not rows:
+            if len(row) != COLUMNS:
+                raise AmiwarpError(f"{path}: line {number} has {len(row)} numbers; expected 8: t x y z qx qy qz qw")
+            if len(values) == COLUMNS * MOST_POSES:
+                raise AmiwarpError(f"{path}: has over {MOST_POSES} poses; give fewer, at a lower rate")
+            values.extend(row)
+        if not values:
             raise AmiwarpError(f"{path}: holds no poses; expected lines of 8 numbers t x y z qx qy qz qw")
-        table = np.array(rows)
+        table = np.frombuffer(values).reshape(-1, COLUMNS)
         try:
             return cls(table[:, 0] - table[0, 0], table[:, 1:4], table[:, 4:])
         except AmiwarpError as error:
