@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import tomllib
 import unicodedata
 from collections.abc import Callable
 from dataclasses import asdict
@@ -35,9 +36,11 @@ from PIL import Image
 from amiwarp.calib import Calibration
 from amiwarp.cli.info import describe
 from amiwarp.cli.inputs import read_camera
+from amiwarp.cli.rig import _read_speed
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import check_events
 from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
 from amiwarp.events.sensors import ImuSamples
 from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels
 from amiwarp.io import RecordingWriter, open_recording, read_encoder_csv
@@ -47,7 +50,10 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import Fisheye
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.pictures import read_picture
-from amiwarp.simulation.sequences import open_pictures
+from amiwarp.simulation.sequences import _read_times, open_pictures
+from amiwarp.simulation.worlds.mesh_files import load_mesh
+from amiwarp.simulation.worlds.trajectory import Trajectory
+from amiwarp.simulation.worlds.world_files import load_world
 from amiwarp.studies import stability
 from amiwarp.studies.dataset.items import list_items
 from amiwarp.studies.dataset.making import Made
@@ -321,6 +327,107 @@ def read_specification(path: Path) -> None:
         assert len(item.file) < 200
 
 
+TILE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n"
+"""Triangle with texture coordinates, as an OBJ file."""
+
+WORLD = """format = "amiwarp-world"
+version = 1
+name = "tiles"
+ambient = 0.3
+sun = {direction = [1.0, -1.0, 2.0], intensity = 0.5, shadows = true}
+lamps = [{position = [0.0, -1.0, 2.0], intensity = 0.8, flicker_hz = 100.0}]
+sky = {luminance = 0.9}
+[[bodies]]
+name = "still"
+mesh = "tile.obj"
+position = [0.0, 0.0, 0.5]
+rotation = [0.0, 0.0, 0.0, 1.0]
+category = "tile"
+material = {reflectance = 0.7, emission = 0.0}
+[[bodies]]
+name = "moving"
+mesh = "tile.obj"
+scale = 0.01
+up = "z"
+trajectory = [{t = 0, position = [0, 0, 0]}, {t = 1, position = [1, 0, 0], rotation = [0, 0, 0, 1]}]
+[joints]
+nose = [{t = 0, position = [0, 0, 1]}]
+[camera]
+trajectory = [{t = 0, position = [0, -2, 1], look_at = [0, 0, 0]}, {t = 1, position = [0, -2, 2], look_at = [0, 0, 0]}]
+"""
+
+
+def write_mesh(colours: bool, path: Path) -> None:
+    """Write a box as the ending of the path says, with vertex colours, or with a material and a texture."""
+    import trimesh
+
+    box = trimesh.creation.box((1.0, 2.0, 3.0))
+    if colours:
+        box.visual.vertex_colors = [90, 120, 200, 255]
+    else:
+        picture = Image.fromarray(np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8))
+        material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture, baseColorFactor=[200, 100, 50, 255])
+        box.visual = trimesh.visual.TextureVisuals(np.random.default_rng(1).random((8, 2)), material)
+    scene = trimesh.Scene()
+    for x in (-2.0, 2.0):
+        scene.add_geometry(box, transform=trimesh.transformations.translation_matrix((x, 0, 0)))
+    made = (scene if path.suffix in (".glb", ".gltf") else box).export(
+        file_type=path.suffix[1:], **({"embed_buffers": True} if path.suffix == ".gltf" else {})
+    )
+    if isinstance(made, dict):
+        made = made["model.gltf"]
+    path.write_bytes(made if isinstance(made, bytes) else made.encode())
+
+
+def write_ascii(kind: str, path: Path) -> None:
+    """Write a box as text."""
+    import trimesh
+
+    box = trimesh.creation.box((1.0, 2.0, 3.0))
+    made = box.export(file_type="stl_ascii") if kind == "stl" else box.export(file_type="ply", encoding="ascii")
+    path.write_bytes(made if isinstance(made, bytes) else made.encode())
+
+
+def write_poses(separator: str, path: Path) -> None:
+    """Write a trajectory of 30 poses."""
+    rows = [separator.join(f"{v:.6f}" for v in (k / 100, k / 500, 0, 1, 0, 0, 0, 1)) for k in range(30)]
+    path.write_text("\n".join(["# t x y z qx qy qz qw" if separator == " " else "t,x,y,z,qx,qy,qz,qw", *rows]) + "\n")
+
+
+def read_mesh(path: Path) -> None:
+    for part in load_mesh(path):
+        for values in (part.mesh.vertices, part.mesh.uv, part.mesh.light, part.material.texture):
+            assert values is None or np.isfinite(np.asarray(values)).all()
+        assert np.asarray(part.mesh.faces).max() < len(np.asarray(part.mesh.vertices))
+        assert np.isfinite(part.material.reflectance)
+
+
+def read_trajectory(path: Path) -> None:
+    trajectory = Trajectory.from_file(path)
+    for values in trajectory.poses([0.0, 0.05, 1e3]):
+        assert np.isfinite(values).all()
+
+
+def read_world(path: Path) -> None:
+    (path.parent / "tile.obj").write_text(TILE)
+    world, camera = load_world(path)
+    for trajectory in (camera, *world.joints.values(), *(body.trajectory for body in world.bodies)):
+        for values in () if trajectory is None else trajectory.poses([0.0, 0.5, 1e3]):
+            assert np.isfinite(values).all()
+    for body in world.bodies:
+        assert np.isfinite(np.asarray(body.mesh.vertices)).all()
+    assert np.isfinite([world.ambient, world.sky.luminance, *(lamp.intensity for lamp in world.lamps)]).all()
+
+
+def read_times(path: Path) -> None:
+    files, times = _read_times(path)
+    assert len(files) == len(times)
+
+
+def read_speed(path: Path) -> None:
+    assert np.isfinite(_read_speed(path)).all()
+
+
 def read_recording(path: Path) -> None:
     """Read a recording in every possible way, check the events, and describe it as ``amiwarp info`` does."""
     recording = open_recording(path)
@@ -333,6 +440,7 @@ def read_recording(path: Path) -> None:
     if count:
         assert len(source.between(source.t_first, source.t_last + 1)) == count
         assert len(source.slice(1, 7)) == min(count - 1, 6)
+    check_finite(recording)
     if recording.truth is not None:
         recording.truth.of_events(0, count)
         for index in range(0 if recording.truth.frames is None else len(recording.truth.frames.t)):
@@ -346,7 +454,36 @@ def read_recording(path: Path) -> None:
     if recording.frames is not None:
         for index in range(len(recording.frames.t)):
             assert recording.frames[index].shape == recording.frames.size[::-1]
-    json.dumps(describe(recording, str(path)), ensure_ascii=False).encode()
+    json.dumps(describe(recording, str(path)), ensure_ascii=False, allow_nan=False).encode()
+
+
+def check_finite(recording: Recording) -> None:
+    """Check that the values of a recording are finite, except those to which the format gives a meaning."""
+    if recording.encoder is not None:
+        assert np.isfinite(recording.encoder.angle).all()
+    if recording.imu is not None:
+        for values in (recording.imu.angular_velocity, recording.imu.acceleration):
+            assert (np.isfinite(values).all(axis=1) | np.isnan(values).all(axis=1)).all()
+    truth = recording.truth
+    if truth is None:
+        return
+    assert np.isfinite(list(truth.parameters.values())).all()
+    known = truth.of_events(0, len(recording.events))
+    assert not any(np.isinf(values).any() for values in (known.points, known.place) if values is not None)
+    assert known.depth is None or (np.isfinite(known.depth) | (known.depth == np.inf)).all()
+    for index in range(0 if truth.frames is None else len(truth.frames.t)):
+        assert truth.frames is not None
+        frame = truth.frames[index]
+        for values in (frame.normal, frame.intensity, frame.intensity_with_prism, frame.rotation, frame.position):
+            assert np.isfinite(values).all()
+        assert not np.isinf(frame.flow).any()
+        assert not np.isinf(frame.flow_with_prism).any()
+        assert (np.isfinite(frame.depth) | (frame.depth == np.inf)).all()
+        assert all(np.isfinite(place).all() for place in frame.joints.values())
+    if truth.poses is not None:
+        poses = truth.poses[:]
+        assert np.isfinite(poses.camera).all()
+        assert all(np.isfinite(rows).all() for rows in (*poses.bodies.values(), *poses.joints.values()))
 
 
 def read_log(path: Path) -> None:
@@ -426,6 +563,30 @@ KINDS: dict[str, Kind] = {
     },
     "stack_npy": (".npy", write_stack, read_pictures),
     "video_mp4": (".mp4", write_video, read_pictures),
+    **{
+        f"mesh_{ending}_{name}": (f".{ending}", partial(write_mesh, name == "colours"), read_mesh)
+        for ending in ("glb", "gltf")
+        for name in ("colours", "texture")
+    },
+    "mesh_ply": (".ply", partial(write_mesh, True), read_mesh),
+    "mesh_stl": (".stl", partial(write_mesh, True), read_mesh),
+    "mesh_obj": (".obj", lambda path: path.write_text(TILE * 3), read_mesh),
+    "mesh_ply_ascii": (".ply", partial(write_ascii, "ply"), read_mesh),
+    "mesh_stl_ascii": (".stl", partial(write_ascii, "stl"), read_mesh),
+    "trajectory_tum": (".txt", partial(write_poses, " "), read_trajectory),
+    "trajectory_csv": (".csv", partial(write_poses, ","), read_trajectory),
+    "world_toml": (".toml", lambda path: path.write_text(WORLD), read_world),
+    "world_json": (".json", lambda path: path.write_text(json.dumps(tomllib.loads(WORLD))), read_world),
+    "times_csv": (
+        ".csv",
+        lambda path: path.write_text("file,t_us\n" + "".join(f"{k}.png,{k * 1000}\n" for k in range(20))),
+        read_times,
+    ),
+    "speed_csv": (
+        ".csv",
+        lambda path: path.write_text("# s,rpm\n" + "".join(f"{k / 10},{700 + k}\n" for k in range(20))),
+        read_speed,
+    ),
 }  # fmt: skip
 """Every kind of input that is read from a file."""
 

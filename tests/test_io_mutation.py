@@ -4,6 +4,8 @@ import os
 import random
 from collections.abc import Iterator
 
+import h5py
+import numpy as np
 import pytest
 from io_samples import WRITERS, make_events, refusal, write_sample
 from mutation_files import KINDS, Checker, check, mutated, sample
@@ -38,6 +40,38 @@ def test_mutants_are_read_or_refused(tmp_path, checker, name):
         path.unlink()
     # If none were refused, the mutants would test nothing. Nearly all mutants of kinds with checksums are refused.
     assert outcomes["refused"] > 0
+
+
+MEANINGS = {
+    np.nan: {"truth/x", "truth/y", "truth/events/place", "truth/frames/flow", "truth/frames/flow_with_prism"},
+    np.inf: {"truth/events/depth", "truth/frames/depth"},
+    -np.inf: set(),
+}
+"""Values that are not finite, with the datasets in which they have a meaning."""
+
+
+@pytest.mark.parametrize("value", MEANINGS)
+@pytest.mark.parametrize("name", ["truth_plain", "sensors_plain", "hdf5_plain"])
+def test_values_that_are_not_finite_are_refused(tmp_path, name, value):
+    """One element of each floating dataset."""
+    path = tmp_path / "sample.h5"
+    path.write_bytes(sample(name))
+    with h5py.File(path) as file:
+        found = []
+        file.visititems(
+            lambda key, item: found.append(key) if getattr(item, "dtype", np.dtype(int)).kind == "f" else None
+        )
+    read = set()
+    for key in found:
+        path.write_bytes(sample(name))
+        with h5py.File(path, "r+") as file:
+            values = file[key][()]
+            values.reshape(-1)[values.size // 2] = value
+            file[key][...] = values
+        if check(path, name) is None:
+            read.add(key)
+    assert len(found) >= 1
+    assert read == MEANINGS[value] & set(found)
 
 
 @pytest.mark.parametrize("name", WRITERS)

@@ -25,7 +25,7 @@ G = 9.80665
 def make_imu(count: int = 3000) -> ImuSamples:
     rng = np.random.default_rng(0)
     turning = rng.normal(size=(count, 3))
-    turning[:, 1] = np.nan
+    turning[::7] = np.nan  # these samples hold no angular velocity
     return ImuSamples(1_000_000 + np.arange(count) // 2 * 1000, turning, rng.normal(size=(count, 3)))
 
 
@@ -73,6 +73,14 @@ def test_wrong_arrays_are_refused(tmp_path: Path) -> None:
         ImuSamples(t[::-1].copy(), rows, rows)
     with pytest.raises(AmiwarpError, match="IMU times are float64"):
         ImuSamples(t * 1.0, rows, rows)  # type: ignore[arg-type]
+    for value in (np.nan, np.inf, -np.inf):
+        wrong = rows.copy()
+        wrong[1, 2] = value
+        with pytest.raises(AmiwarpError, match=r"IMU acceleration of sample 1 is \[0\.0, 0\.0, .*expected finite"):
+            ImuSamples(t, rows, wrong)
+    unknown = rows.copy()
+    unknown[1] = np.nan  # the sample does not hold the quantity
+    assert np.isnan(ImuSamples(t, unknown, rows).angular_velocity[1]).all()
     with pytest.raises(AmiwarpError, match="frame is float64 of shape"):
         MemoryImages(t, np.zeros((3, 2, 2)))
     with pytest.raises(AmiwarpError, match="frames have int64 times of shape"):
@@ -96,6 +104,7 @@ def test_damage_is_named(tmp_path: Path) -> None:
     faults = {
         "imu/acceleration": (np.zeros((8, 3)), r"'imu/acceleration' has shape \(8, 3\), its times are 9"),
         "imu/t": (np.arange(9)[::-1], "IMU times decrease"),
+        "imu/angular_velocity": (np.full((9, 3), np.inf), "IMU angular_velocity of sample 0 is .*expected finite"),
         "frames/image": (np.zeros((5, 7, 9)), "dataset 'frames/image' is float64"),
         "frames/t": (np.arange(4), r"'frames/image' has shape \(5, 7, 9\), its times are 4"),
     }

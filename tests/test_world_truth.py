@@ -212,6 +212,17 @@ def test_a_writer_refuses_truth_that_does_not_fit(tmp_path: Path, recording: ami
     ):
         writer.append(events, truth=bad)
     frame = frames_of(recording)[0]
+    endless = np.array([1.0, -np.inf], np.float32)
+    with (
+        pytest.raises(AmiwarpError, match="'truth/events/depth' holds -inf"),
+        amiwarp.RecordingWriter(tmp_path / "bad.h5", width=4, height=4) as writer,
+    ):
+        writer.append(events, truth=amiwarp.EventTruth(depth=endless))
+    with (
+        pytest.raises(AmiwarpError, match="'truth/frames/intensity' holds nan"),
+        amiwarp.RecordingWriter(tmp_path / "bad.h5", width=SIZE[0], height=SIZE[1]) as writer,
+    ):
+        writer.append_frame(dataclasses.replace(frame, intensity=np.full_like(frame.intensity, np.nan)))
     with (
         pytest.raises(AmiwarpError, match="expected \\(4, 4\\)"),
         amiwarp.RecordingWriter(tmp_path / "bad.h5", width=4, height=4) as writer,

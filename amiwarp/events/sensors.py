@@ -16,13 +16,13 @@ from amiwarp.errors import AmiwarpError
 class ImuSamples:
     """Samples of an inertial measurement unit (IMU), in order of time.
 
-    The axes are those of the IMU, as the file stores them. The acceleration includes gravity. A quantity that was not
-    recorded is NaN.
+    The axes are those of the IMU, as the file stores them. The acceleration includes gravity. A quantity that a sample
+    does not hold is NaN on all three axes.
 
     Raises
     ------
     AmiwarpError
-        If the arrays have other shapes or data types, or the times decrease.
+        If the arrays have other shapes or data types, the times decrease, or a value is not finite, except as above.
 
     Examples
     --------
@@ -48,6 +48,13 @@ class ImuSamples:
             if values.dtype != np.float64 or values.shape != shape:
                 raise AmiwarpError(
                     f"IMU {name} is {values.dtype} of shape {values.shape}; give float64 of shape {shape}"
+                )
+            bad = ~(np.isfinite(values).all(axis=1) | np.isnan(values).all(axis=1))
+            if bad.any():
+                at = int(np.argmax(bad))
+                raise AmiwarpError(
+                    f"IMU {name} of sample {at} is {values[at].tolist()}; expected finite numbers, or three NaN for a "
+                    "quantity that the sample does not hold"
                 )
         if (self.t[1:] < self.t[:-1]).any():
             raise AmiwarpError("IMU times decrease; give the samples in order of time")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -145,6 +145,23 @@ MAPS = {
     "intensity_with_prism": (np.float32, ()),
 }
 """Arrays of :class:`FrameTruth` with one value per pixel: data type, and shape after (height, width)."""
+
+
+NOT_FINITE: dict[str, Callable[[Any], Any]] = {
+    "depth": np.isposinf, **dict.fromkeys(("x", "y", "place", "flow", "flow_with_prism"), np.isnan)
+}  # fmt: skip
+"""Tests for the values that are not finite and have a meaning, such as the depth of the sky, by the last part of a
+dataset's name."""
+
+
+def check_truth(name: str, values: NDArray[Any]) -> None:
+    """Raise :class:`AmiwarpError` if values of the dataset ``name`` are not finite, except :data:`NOT_FINITE`."""
+    if values.dtype.kind != "f" or np.isfinite(values).all():
+        return
+    known = NOT_FINITE.get(name.rpartition("/")[2])
+    bad = ~np.isfinite(values) if known is None else ~(np.isfinite(values) | known(values))
+    if bad.any():
+        raise AmiwarpError(f"'{name}' holds {values[bad][0]}, which has no meaning there; give finite numbers")
 
 
 class FrameStore(Protocol):

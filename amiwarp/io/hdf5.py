@@ -93,7 +93,8 @@ class Column:
 
     def __init__(self, file: Hdf5File, handle: int, name: str, about: Mapping[str, Any]) -> None:
         self._file = weakref.proxy(file)
-        self._name = name
+        self.name = name
+        """Name of the dataset in the file."""
         self._count = int(about["count"])
         self._filters = ", ".join(about["filters"]) or "no filter"
         self.dtype = np.dtype(about["dtype"])
@@ -125,7 +126,7 @@ class Column:
             values = self._stored.read(start, stop)
             if values is None:
                 raise AmiwarpError(
-                    f"dataset '{self._name}' has a damaged chunk: its checksum is wrong; copy the file again"
+                    f"dataset '{self.name}' has a damaged chunk: its checksum is wrong; copy the file again"
                 )
             return values
         piece = max(1, PIECE // max(1, math.prod(self.row)))
@@ -134,12 +135,12 @@ class Column:
 
     def _ask(self, start: int, stop: int) -> NDArray[Any]:
         try:
-            (values,) = self._file.ask("read", self._name, start, stop)
+            (values,) = self._file.ask("read", self.name, start, stop)
         except AmiwarpError as error:
-            where = f"dataset '{self._name}' ({self._filters}), elements {start} .. {stop}"
+            where = f"dataset '{self.name}' ({self._filters}), elements {start} .. {stop}"
             raise AmiwarpError(f"{where}: {error}") from error
         if values.size != (stop - start) * math.prod(self.row) or values.dtype != self.dtype:
-            raise AmiwarpError(f"dataset '{self._name}' changed while it was read; open the file again")
+            raise AmiwarpError(f"dataset '{self.name}' changed while it was read; open the file again")
         return values.reshape(stop - start, *self.row)
 
 

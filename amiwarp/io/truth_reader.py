@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import rounded_times
 from amiwarp.events.recording import Truth
-from amiwarp.events.truth import MAPS, EventValues, FrameTruth, Poses, WorldLabels, rotation_of
+from amiwarp.events.truth import MAPS, EventValues, FrameTruth, Poses, WorldLabels, check_truth, rotation_of
 from amiwarp.io.camera_attributes import attribute
 from amiwarp.io.hdf5 import Column, Hdf5File
 from amiwarp.io.input_files import errors_name
@@ -74,7 +74,7 @@ def _points(path: Path, file: Hdf5File, count: int) -> _StoredRows | None:
 
 def _read_points(x: Column, y: Column, start: int, stop: int) -> NDArray[np.float32]:
     """Return rows of two datasets as points [px], shape (n, 2)."""
-    return np.stack([x.read(start, stop), y.read(start, stop)], axis=1).astype(np.float32, copy=False)
+    return np.stack([_read_as(column, np.float32, start, stop) for column in (x, y)], axis=1)
 
 
 def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> EventValues | None:
@@ -92,8 +92,12 @@ def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> EventVal
 
 
 def _read_as(column: Column, dtype: Any, start: int, stop: int) -> NDArray[Any]:
-    """Read rows of a dataset as ``dtype``; raise :class:`AmiwarpError` for integers that do not fit."""
+    """Read rows of a dataset as ``dtype``.
+
+    Raises :class:`AmiwarpError` for integers that do not fit, and for values without meaning.
+    """
     values = column.read(start, stop)
+    check_truth(column.name, values)
     if values.dtype.kind in "iu" and values.size and not np.can_cast(values.dtype, dtype):
         limits = np.iinfo(dtype)
         if values.min() < limits.min or values.max() > limits.max:
@@ -156,8 +160,8 @@ class _StoredFrames:
         at = range(len(self.t))[index]
         with errors_name(self._path, lambda: f"truth/frames {index}"):
             maps = {name: _read_as(self._maps[name], dtype, at, at + 1)[0] for name, (dtype, _) in MAPS.items()}
-            pose = self._pose.read(at, at + 1)[0].astype(np.float64)
-            joints = np.zeros((0, 3)) if self._joints is None else self._joints.read(at, at + 1)[0].astype(np.float64)
+            pose = _read_as(self._pose, np.float64, at, at + 1)[0]
+            joints = np.zeros((0, 3)) if self._joints is None else _read_as(self._joints, np.float64, at, at + 1)[0]
             named = dict(zip(self._joint_names, joints, strict=True))
             return FrameTruth(t_us=int(self.t[at]), **maps, rotation=rotation_of(pose), position=pose[:3], joints=named)
 
@@ -210,9 +214,9 @@ class _StoredPoses:
         with errors_name(self._path, lambda: f"truth/poses {start} .. {stop}"):
             tables = {
                 what: {} if column is None else dict(
-                    zip(names, np.moveaxis(column.read(start, stop).astype(np.float64), 1, 0), strict=True)
+                    zip(names, np.moveaxis(_read_as(column, np.float64, start, stop), 1, 0), strict=True)
                 )
                 for what, (names, column) in self._tables.items()
             }  # fmt: skip
-            camera = self._camera.read(start, stop).astype(np.float64)
+            camera = _read_as(self._camera, np.float64, start, stop)
             return Poses(rounded_times(self._t.read(start, stop)), camera, **tables)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels, as_poses
+from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels, as_poses, check_truth
 from amiwarp.io.chunks import Codec
 from amiwarp.io.native_layout import Columns
 from amiwarp.io.row_writer import ROWS, RowWriter
@@ -30,7 +30,7 @@ EVENT_COLUMNS: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
 def event_columns(truth: EventTruth, count: int) -> Columns:
     """Return the ground truth of ``count`` events as datasets.
 
-    Raises :class:`AmiwarpError` for arrays of another length or shape.
+    Raises :class:`AmiwarpError` for arrays of another length or shape, and for values without meaning.
     """
     columns: Columns = {}
     if truth.points is not None:
@@ -45,6 +45,8 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
             if values.shape != (count, *row):
                 raise AmiwarpError(f"truth of {name} has shape {values.shape}; expected {(count, *row)}")
             columns[f"truth/events/{name}"] = values
+    for name, values in columns.items():
+        check_truth(name, values)
     return columns
 
 
@@ -110,6 +112,10 @@ class TruthWriter(RowWriter):
         self._check_later("truth/known/t", t_us)
         self._append("truth/known/t", np.array([t_us], np.int64), ROWS)
         self._append("truth/known/mask", np.asarray(mask, np.uint8)[None], 1)
+
+    def _append(self, name: str, values: NDArray[Any], chunk_rows: int) -> None:
+        check_truth(name, values)
+        super()._append(name, values, chunk_rows)
 
     def _append_joints(self, name: str, joints: Mapping[str, NDArray[np.float64]]) -> None:
         """Append the positions of joints [m], shape (k, 3) each, to the dataset ``name``."""
