@@ -63,6 +63,7 @@ from .io.formats import Format as Format
 from .io.formats import open_recording as open_recording
 from .io.native_writer import RecordingWriter as RecordingWriter
 from .io.output_formats import OutputFormat as OutputFormat
+from .io.output_formats import Rounding as Rounding
 from .io.recorded_dataset import RecordedDataset as RecordedDataset
 from .io.truth_export import save_flow_dsec as save_flow_dsec
 from .io.truth_export import save_flow_mvsec as save_flow_mvsec

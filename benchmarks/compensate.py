@@ -36,7 +36,8 @@ import numpy as np
 import warp as wp
 
 from amiwarp.compensation.piece_buffers import PIECE
-from amiwarp.compensation.recordings import BlockCompensator, compensate, inside_image
+from amiwarp.compensation.recordings import BlockCompensator, compensate
+from amiwarp.events.checks import inside_image
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
@@ -163,7 +164,7 @@ def error_of(
     found = np.stack([moved.x, moved.y], axis=1)
     away = np.linalg.norm(found - truth(name, model, xy, encoder.angle_at(raw.t), prism, phase), axis=1)
     same = np.array_equal(raw.t, moved.t) and np.array_equal(raw.p, moved.p)
-    same &= np.array_equal(inside.astype(bool), inside_image(found, WIDTH, HEIGHT))
+    same &= np.array_equal(inside.astype(bool), inside_image(*found.T, WIDTH, HEIGHT))
     return float(away.max()) if same and np.isfinite(away).all() else math.inf
 
 

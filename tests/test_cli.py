@@ -330,13 +330,43 @@ def test_convert_says_what_a_format_leaves_out(place: Path) -> None:
     assert (data["format"], data["left_out"]) == (
         "aedat4", ["encoder", "camera", "prism", "ground truth", "metadata"]
     )  # fmt: skip
-    result = run("convert", "recording.h5", "out.bin", "--format", "text")
+    assert "the format text are written as .txt, not '.bin'" in fails(
+        1, "convert", "recording.h5", "out.bin", "--format", "text"
+    )
+    result = run("convert", "recording.h5", "out.txt", "--format", "text")
     assert result.exit_code == 0
     left_out = "sensor size, encoder, camera, prism, ground truth, metadata"
     assert f"note: text does not hold, and leaves out: {left_out}\n" in result.stdout
-    assert len((place / "out.bin").read_text().splitlines()) == data["events"]
+    assert len((place / "out.txt").read_text().splitlines()) == data["events"]
     assert "leaves out" not in run("convert", "recording.h5", "plain.h5", "--codec", "gzip").stdout
     assert ok("info", "plain.h5")["events"] == data["events"]
+
+
+def test_rounding_is_reported(place: Path) -> None:
+    """By compensate and by convert, as text and as JSON."""
+    ok("compensate", "recording.h5", "moved.h5", "--calibration", "calibration.json")
+    found = ok("compensate", "recording.h5", "a.raw", "--calibration", "calibration.json", "--round", "nearest")
+    assert (found["format"], found["rounding"], found["dropped"]) == ("evt3", "nearest", found["outside"])
+    assert found["left_out"] == ["encoder", "camera", "prism", "ground truth", "metadata"]
+    assert ok("info", "a.raw", "--count")["events"] == found["events"] - found["dropped"]
+    note = f"note: rounded to whole pixels (nearest); {found['dropped']:,} events outside are dropped\n"
+    left_out = "leaves out: encoder, camera, prism, ground truth, metadata\n"
+    for command in (
+        ("compensate", "recording.h5", "b.raw", "--calibration", "calibration.json"),
+        ("convert", "moved.h5", "c.raw"),
+    ):
+        result = run(*command, "--round", "nearest")
+        assert result.exit_code == 0, result.stderr
+        assert note in result.stdout
+        assert left_out in result.stdout
+        assert (place / command[2]).read_bytes() == (place / "a.raw").read_bytes()
+    same, other = (
+        ok("convert", "moved.h5", f"{seed}.npz", "--round", "dithered", "--seed", seed)["dropped"] for seed in "34"
+    )
+    dithered = ("--calibration", "calibration.json", "--round", "dithered", "--seed", "3")
+    assert ok("compensate", "recording.h5", "3b.npz", *dithered)["dropped"] == same != other
+    assert (place / "3b.npz").read_bytes() == (place / "3.npz").read_bytes()
+    assert "give --round" in fails(1, "compensate", "recording.h5", "d.raw", "--calibration", "calibration.json")
 
 
 def test_info_prints_a_table(place: Path) -> None:

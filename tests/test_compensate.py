@@ -1,20 +1,31 @@
 """Compensation of recordings: no event is lost or reordered, and positions are those of the model."""
 
+import contextlib
+import json
 import math
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import reference
 import warp as wp
+from calibration_sample import exact_calibration
 from conftest import TRUE_PRISM
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from typer.testing import CliRunner
 
 from amiwarp.calib import Calibration
-from amiwarp.compensation.recordings import compensate, compensate_events, compensated_blocks, inside_image
+from amiwarp.cli.app import app
+from amiwarp.compensation.recordings import compensate, compensate_events, compensated_blocks
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import inside_image
 from amiwarp.events.device_encoder import encoder_params
 from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.events import Events, MemoryEvents
@@ -22,8 +33,11 @@ from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import edge_blur, truth_model
 from amiwarp.imaging.sharpness_costs import sharpness
 from amiwarp.imaging.warped_image import iwe
-from amiwarp.io import open_recording, save_recording
+from amiwarp.io import convert, open_recording, read_encoder_csv, save_recording
 from amiwarp.io.chunks import CHUNK
+from amiwarp.io.evt3_writer import Evt3Encoder
+from amiwarp.io.ros_messages import PACKET_DEFINITION
+from amiwarp.io.rosbag import opened_bag
 from amiwarp.kernels.encoder_angle import EncoderParams, theta_u32_at
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
@@ -31,7 +45,7 @@ from amiwarp.optics.circle_models import CircleModel
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import Fisheye, RadialTangential
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import FlatSide
+from amiwarp.optics.prism import FlatSide, Prism
 
 
 @wp.kernel
@@ -47,6 +61,17 @@ def angle_error(encoder: Encoder, t: np.ndarray, device: str) -> float:
     launch(angles, len(t), [params, wp.array(t, dtype=wp.int64, device=device)], [out], device=device)
     away = encoder.angle_at(t) / TWO_PI - out.numpy() / 2.0**32
     return float(np.abs(away - np.round(away)).max())
+
+
+@pytest.fixture(scope="module")
+def exact(recording: Recording) -> Calibration:
+    """The true model of the recording."""
+    assert recording.camera is not None
+    assert recording.truth is not None
+    values = {
+        name: recording.truth.parameters.get(name, 0.0) for name in ("apex", "index", "phase", "tilt_x", "tilt_y")
+    }
+    return exact_calibration(recording.camera, TRUE_PRISM, values)
 
 
 EPOCH = 1_700_000_000_000_000
@@ -153,7 +178,7 @@ def test_file_keeps_time_polarity_and_order(
     assert recording.encoder is not None
     expected = compensate_events(raw, calibration.model, recording.encoder, device=device)
     np.testing.assert_array_equal(np.stack([moved.x, moved.y], axis=1), expected)
-    outside = ~inside_image(expected, *recording.events.size)
+    outside = ~inside_image(*expected.T, *recording.events.size)
     assert summary.outside == outside.sum() > 0
     np.testing.assert_array_equal(out.events.inside(0, len(raw)), ~outside)
     assert list(tmp_path.iterdir()) == [tmp_path / "out.h5"]
@@ -253,9 +278,208 @@ def test_an_interrupt_leaves_nothing(recording: Recording, calibration: Calibrat
     assert list(tmp_path.iterdir()) == []
 
 
+FORMATS = {
+    # file: (format, rounding)
+    "out.npz": (None, None),
+    "out.txt": (None, None),
+    "round.npz": (None, "nearest"),
+    "round.txt": (None, "dithered"),
+    "out.raw": (None, "dithered"),
+    "out.aedat4": (None, "nearest"),
+    "dsec.h5": ("dsec", "dithered"),
+    "out.mcap": (None, "nearest"),
+    "out.db3": (None, "dithered"),
+}
+
+
+def events_of(path: Path) -> list[np.ndarray]:
+    source = open_recording(path).events
+    events = source.slice(0, len(source))
+    return [events.x, events.y, events.t, events.p]
+
+
+@pytest.mark.parametrize("file", FORMATS)
+def test_other_formats_hold_what_the_native_one_holds(
+    recording: Recording, exact: Calibration, tmp_path: Path, file: str
+) -> None:
+    """Compensated into a format, or into the native one and converted, with any size of the blocks."""
+    chosen, rounding = FORMATS[file]
+    options = {"format": chosen, "rounding": rounding, "seed": 4}
+    blocks: list[Events] = []
+    native = compensate(recording, exact, tmp_path / "native.h5", on_block=blocks.append)
+    found = compensate(recording, exact, tmp_path / file, on_block=blocks.append, **options)
+    (tmp_path / "converted").mkdir()
+    converted = convert(tmp_path / "native.h5", tmp_path / "converted" / file, **options)
+    assert (found.events, found.outside) == (native.events, native.outside)
+    assert sum(len(block) for block in blocks) == 2 * native.events
+    assert (found.rounding, found.dropped) == (rounding, converted.dropped)
+    assert found.events - found.dropped == converted.events
+    assert (found.dropped > 0) == (rounding is not None)
+    assert found.format == converted.format
+    size = ("sensor size",) if file.endswith(".txt") else ()
+    assert found.left_out == (*size, "encoder", "camera", "prism", "ground truth", "metadata")
+    ours, theirs = events_of(tmp_path / file), events_of(tmp_path / "converted" / file)
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(a, b)
+    expected = events_of(tmp_path / "native.h5")
+    if rounding == "nearest":
+        x, y = (np.floor(values.astype(np.float64) + 0.5) for values in expected[:2])
+        kept = (x >= 0) & (x < 200) & (y >= 0) & (y < 150)
+        expected = [x[kept], y[kept], expected[2][kept], expected[3][kept]]
+    if rounding != "dithered":
+        for a, b in zip(ours, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 if file == "out.txt" else 0)
+
+
+def test_a_format_of_whole_pixels_needs_rounding(recording: Recording, exact: Calibration, tmp_path: Path) -> None:
+    with pytest.raises(AmiwarpError, match=r"out\.raw: .*give --round \(rounding= in Python\) nearest or dithered"):
+        compensate(recording, exact, tmp_path / "out.raw")
+    with pytest.raises(AmiwarpError, match=r"out\.h5: rounding is dithered, but the native format holds sub-pixels"):
+        compensate(recording, exact, tmp_path / "out.h5", rounding="dithered")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_codec_of_compensated_recordings(recording: Recording, exact: Calibration, tmp_path: Path) -> None:
+    compensate(recording, exact, tmp_path / "a.h5")
+    compensate(recording, exact, tmp_path / "b.h5", codec="gzip")
+    with h5py.File(tmp_path / "b.h5") as file:
+        assert file["events/x"].compression == "gzip"
+    for a, b in zip(events_of(tmp_path / "a.h5"), events_of(tmp_path / "b.h5"), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+HOST_NS = 1_700_000_000_123_456_789
+"""Time of the computer at time 0 of the camera [ns]."""
+
+DELAY_NS = 4_000_000
+"""Time from the first event of a message to its recording [ns]."""
+
+LATCHED = Qos(
+    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, QosTime(0, 0), QosTime(1, 2),
+    QosLiveliness.AUTOMATIC, QosTime(3, 4), False,
+)  # fmt: skip
+
+
+def write_bag(path: Path, events: Events) -> None:
+    """Write a bag as a robot records it: events, and messages of other topics, among them an unknown type."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(PACKET_DEFINITION, "event_camera_msgs/msg/EventPacket"))
+    store.register(get_types_from_msg("float64[] values\nstring name", "rig_msgs/msg/State"))
+    kinds = store.types
+    storage = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    messages: list[tuple[int, str, Any]] = []
+    coder = Evt3Encoder(0)
+    for number, packet in enumerate(MemoryEvents(events, 200, 150).blocks(duration_us=3_000)):
+        t = int(packet.t[0]) * 1000
+        stamp = kinds["builtin_interfaces/msg/Time"](*divmod(HOST_NS + t, 10**9))
+        header = kinds["std_msgs/msg/Header"](stamp, "camera")
+        words = coder.encode(packet, self_contained=True).view(np.uint8)
+        message = kinds["event_camera_msgs/msg/EventPacket"](header, 150, 200, number, 0, "evt3", False, words)
+        messages.append((HOST_NS + DELAY_NS + t, "/cam/events", message))
+    for number in range(40):
+        state = kinds["rig_msgs/msg/State"](np.arange(number, dtype=np.float64), "é" * number)
+        messages.append((HOST_NS + 7_000_000 * number, "/rig/state", state))
+    messages.append((HOST_NS - 5, "/note", kinds["std_msgs/msg/String"]("a calibration")))
+    with Writer(path.with_suffix(""), version=9, storage_plugin=storage) as writer:
+        topics = {
+            topic: writer.add_connection(
+                topic, message.__msgtype__, typestore=store,
+                offered_qos_profiles=[LATCHED] if topic == "/note" else [],
+            )
+            for topic, message in {topic: message for _, topic, message in messages}.items()
+        }  # fmt: skip
+        for t, topic, message in sorted(messages, key=lambda one: one[0]):
+            writer.write(topics[topic], t, store.serialize_cdr(message, message.__msgtype__))
+    next(path.with_suffix("").glob(f"*{path.suffix}")).rename(path)
+
+
+def bag_of_rosbags(path: Path) -> tuple[dict[str, Any], dict[str, list[tuple[int, bytes]]]]:
+    """Return the topics of a bag, and the messages of each."""
+    with opened_bag(str(path)) as (bag, _):
+        topics = {one.topic: (one.msgtype, one.msgdef, one.ext) for one in bag.connections}
+        found: dict[str, list[tuple[int, bytes]]] = {topic: [] for topic in topics}
+        for one, t, raw in bag.messages(connections=bag.connections):
+            found[one.topic].append((t, bytes(raw)))
+    return topics, found
+
+
+@pytest.mark.parametrize("target", ["out.mcap", "out.db3"])
+@pytest.mark.parametrize("source", ["in.mcap", "in.db3"])
+def test_a_bag_is_compensated_and_keeps_its_other_topics(
+    recording: Recording, exact: Calibration, tmp_path: Path, source: str, target: str
+) -> None:
+    events, encoder = recording.events.slice(0, 60_000), recording.encoder
+    assert encoder is not None
+    write_bag(tmp_path / source, events)
+    exact.save(tmp_path / "calibration.json")
+    rows = [f"{t},{angle!r}" for t, angle in zip(encoder.t, np.degrees(encoder.angle).tolist(), strict=True)]
+    (tmp_path / "encoder.csv").write_text("\n".join(["t_us,angle_deg", *rows]))
+    before = (tmp_path / source).read_bytes()
+    line = ["compensate", source, target, "--calibration", "calibration.json", "--encoder", "encoder.csv", "--json"]
+    with contextlib.chdir(tmp_path):
+        result = CliRunner().invoke(app, [*line, "--round", "nearest"])
+        assert result.exit_code == 0, result.stderr
+    data = json.loads(result.stdout)
+    xy = np.floor(compensate_events(events, exact.model, read_encoder_csv(tmp_path / "encoder.csv")) + np.float64(0.5))
+    kept = (xy[:, 0] >= 0) & (xy[:, 0] < 200) & (xy[:, 1] >= 0) & (xy[:, 1] < 150)
+    assert (data["events"], data["dropped"], data["rounding"]) == (len(events), (~kept).sum(), "nearest")
+    assert data["left_out"] == ["encoder"]
+    assert (tmp_path / source).read_bytes() == before
+    topics, messages = bag_of_rosbags(tmp_path / source)
+    out_topics, out_messages = bag_of_rosbags(tmp_path / target)
+    assert out_topics.keys() == topics.keys()
+    for topic in ("/rig/state", "/note"):
+        assert out_messages[topic] == messages[topic]
+        assert out_topics[topic] == topics[topic]
+    found = open_recording(tmp_path / target)
+    assert found.metadata["topic"] == "/cam/events"
+    x, y, t, p = events_of(tmp_path / target)
+    np.testing.assert_array_equal(np.stack([x, y], axis=1), xy[kept])
+    np.testing.assert_array_equal(t, events.t[kept])
+    np.testing.assert_array_equal(p, events.p[kept])
+    # Messages keep the clock of the computer.
+    at = 0
+    with AnyReader([tmp_path / target]) as reader:
+        for connection, recorded, raw in reader.messages([one for one in reader.connections if "cam" in one.topic]):
+            packet = reader.deserialize(raw, connection.msgtype)
+            stamp = packet.header.stamp.sec * 10**9 + packet.header.stamp.nanosec
+            assert (recorded, stamp) == (HOST_NS + DELAY_NS + 1000 * int(t[at]), HOST_NS + 1000 * int(t[at]))
+            at += int(np.count_nonzero(packet.events.view("<u2") >> 12 == 2))
+    assert at == len(t)
+
+
+def test_a_real_bag_is_compensated(data_dir: Path, tmp_path: Path) -> None:
+    """It has no prism: one without deflection leaves every event in place. Its triggers are the encoder."""
+    source = data_dir / "rosbag/ros2_evt3_640x480_trig10Hz.db3"
+    camera = Camera.from_fov(640, 480, 1.0)
+    values = {"apex": 1e-9, "index": 1.5, "phase": 0.0, "tilt_x": 0.0, "tilt_y": 0.0}
+    exact_calibration(camera, Prism(1e-9), values).save(tmp_path / "calibration.json")
+    line = ["compensate", source, tmp_path / "out.mcap", "--calibration", tmp_path / "calibration.json"]
+    options = ["--encoder-from", "triggers:6", "--round", "nearest"]
+    result = CliRunner().invoke(app, [str(word) for word in [*line, *options]])
+    assert result.exit_code == 0, result.stderr
+    text = " ".join(result.stdout.split())
+    assert "rounded to whole pixels (nearest); 0 events outside are dropped" in text
+    assert "leaves out: encoder, triggers" in text
+    for a, b in zip(events_of(tmp_path / "out.mcap"), events_of(source), strict=True):
+        np.testing.assert_array_equal(a, b)
+    given, found = (bag_of_rosbags(path)[1]["/event_camera/events"] for path in (source, tmp_path / "out.mcap"))
+    assert (found[0][0], found[-1][0]) == (given[0][0], given[-1][0])
+
+
+def test_other_topics_are_named_if_they_are_left_out(recording: Recording, exact: Calibration, tmp_path: Path) -> None:
+    write_bag(tmp_path / "in.mcap", recording.events.slice(0, 5000))
+    opened = replace(open_recording(tmp_path / "in.mcap"), encoder=recording.encoder)
+    found = compensate(opened, exact, tmp_path / "out.npz")
+    assert found.left_out == ("encoder", "other topics", "metadata")
+    assert convert(tmp_path / "in.mcap", tmp_path / "out.raw").left_out == ("other topics", "metadata")
+    assert convert(tmp_path / "in.mcap", tmp_path / "copy.db3").left_out == ()
+    assert bag_of_rosbags(tmp_path / "copy.db3")[1]["/note"] == bag_of_rosbags(tmp_path / "in.mcap")[1]["/note"]
+
+
 def test_inside_image_at_its_border() -> None:
     xy = np.array([[-0.5, 0], [-0.51, 0], [9.49, 4.49], [9.5, 0], [0, 4.5], [np.nan, 0]], dtype=np.float32)
-    np.testing.assert_array_equal(inside_image(xy, 10, 5), [True, False, True, False, False, False])
+    np.testing.assert_array_equal(inside_image(*xy.T, 10, 5), [True, False, True, False, False, False])
 
 
 def test_total_reflection_is_marked_not_spread(recording: Recording, tmp_path: Path) -> None:

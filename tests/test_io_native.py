@@ -246,8 +246,9 @@ def test_writer_refuses_its_path(tmp_path):
             save_recording(target, recording, overwrite=True)
         with pytest.raises(AmiwarpError, match="is read in this run"):
             write(target, make(10), overwrite=True)
+    (tmp_path / "folder.h5").mkdir()
     with pytest.raises(AmiwarpError, match="is a folder"):
-        write(tmp_path, make(10))
+        write(tmp_path / "folder.h5", make(10))
     with pytest.raises(AmiwarpError, match="does not exist"):
         write(tmp_path / "no" / "a.h5", make(10))
     with pytest.raises(AmiwarpError, match="outside the writer's 'with' block"):

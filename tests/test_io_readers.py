@@ -1,11 +1,13 @@
 """Every format reads back exactly. Damage is repaired and counted, or refused with the file and the position."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from io_samples import SIZE, WRITERS, make_events, refusal, write_evt, write_sample
+from io_samples_extra import write_evimo, write_mvsec
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
@@ -259,6 +261,11 @@ def test_dat_times_run_on_past_32_bits(tmp_path, monkeypatch):
     [
         ({"t": np.arange(5.0)}, "array t is float64; expected integers"),
         ({"x": np.full(5, np.nan)}, "array x is float64"),
+        (
+            {"y": np.arange(5.0)},
+            "x is int64, y is float64; expected integers, or floating numbers for comp",
+        ),
+        ({"x": np.full(5, 1e300), "y": np.arange(5.0)}, "x holds a coordinate that is too large for float32"),
         ({"x": np.arange(4)}, "array x has shape"),
         ({"p": np.zeros((5, 1), int)}, "array p has shape"),
         ({"t": np.full(5, 2**63, np.uint64)}, "beyond int64"),
@@ -275,6 +282,42 @@ def test_npz_refuses(tmp_path, arrays, message):
     np.savez(tmp_path / "b.npz", x=np.arange(5), t=np.arange(5))
     with pytest.raises(AmiwarpError, match="no array y, p"):
         open_recording(tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize("write", [write_evimo, write_mvsec])
+def test_fractions_of_pixels_are_not_cut_off(tmp_path, write):
+    """Rows of these data sets are floating, also for whole pixels."""
+    x = EVENTS.x.astype(np.float32)
+    moved = replace(EVENTS, x=x, y=EVENTS.y.astype(np.float32))
+    write(tmp_path / "whole", moved)
+    (path,) = tmp_path.glob("whole*")
+    assert_equal(open_recording(path).events.slice(0, 999), EVENTS)
+    x[100] += 0.75
+    write(tmp_path / "moved", moved)
+    (path,) = tmp_path.glob("moved*")
+    with pytest.raises(AmiwarpError, match=rf"moved.*: a coordinate is {x[100]:g}; expected whole pixels"):
+        open_recording(path)
+
+
+def test_one_fraction_in_text_is_damage(tmp_path):
+    lines = [f"{k * 1e-4:.6f} {k % 64} {k % 48} {k % 2}" for k in range(100)]
+    lines[60] = "0.006000 12.7 5 1"
+    write_lines(tmp_path / "a.txt", lines)
+    with pytest.raises(AmiwarpError, match=r"a\.txt: line 61 is '0\.006000 12\.7 5 1'"):
+        open_recording(tmp_path / "a.txt")
+
+
+def test_fractions_in_text_are_read_block_by_block(tmp_path, monkeypatch):
+    """What the first block shows holds for the whole file, also for a block of whole numbers."""
+    monkeypatch.setattr("amiwarp.io.text.READ_BYTES", 200)
+    lines = [f"{k * 1e-4:.6f} {k / (8 if k < 90 else 1)} -0.25 1" for k in range(100)]
+    write_lines(tmp_path / "a.txt", lines)
+    events = open_recording(tmp_path / "a.txt").events.slice(0, 100)
+    np.testing.assert_array_equal(events.x, np.float32([k / (8 if k < 90 else 1) for k in range(100)]), strict=True)
+    np.testing.assert_array_equal(events.y, np.full(100, -0.25, np.float32), strict=True)
+    write_lines(tmp_path / "b.txt", [*(f"{k * 1e-4:.6f} {k % 64} 5 1" for k in range(50)), *lines[50:]])
+    with pytest.raises(AmiwarpError, match=r"b\.txt: line 51 is '0\.005000 6\.25 -0\.25 1'"):
+        open_recording(tmp_path / "b.txt")
 
 
 def test_evt_headers(tmp_path):

@@ -2,6 +2,7 @@
 
 import contextlib
 import itertools
+import math
 import os
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from amiwarp.io import convert, open_recording, save_recording
 from amiwarp.io.chunks import CHUNK, Codec
 from amiwarp.io.evt3_writer import Evt3Encoder
 from amiwarp.io.export import export
-from amiwarp.io.output_formats import OutputFormat
+from amiwarp.io.output_formats import OutputFormat, Rounding
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 
@@ -300,7 +301,7 @@ def test_what_is_left_out_is_named(tmp_path, name):
         metadata={"seed": 7},
     )
     size = ("sensor size",) if name is OutputFormat.TEXT else ()
-    left_out = convert(source, tmp_path / "out.x", format=name).left_out
+    left_out = convert(source, tmp_path / f"out{CLIENTS[name][0]}").left_out
     assert left_out == (*size, "encoder", "camera", "prism", "ground truth", "metadata")
     assert convert(source, tmp_path / "out.h5").left_out == ()
 
@@ -335,11 +336,12 @@ REFUSED = [
     ),
     ("a.txt", {}, {"t": [2**53]}, "text holds"),
     ("a.raw", {}, {"t": [5, HOURS_28 + 6]}, "span 100000000001 us, RAW EVT 3.0 holds up to 100000000000 us"),
-    ("a.csv", {}, {}, r"the extension '\.csv' is of no format .* among \.h5, .*--format .*native, dsec, evt3"),
+    ("a.csv", {}, {}, r"the extension '\.csv' is of no format .* among \.h5, .*the formats native, dsec, evt3"),
+    ("a.txt", {"format": "evt3"}, {}, r"the format evt3 are written as \.raw, not '\.txt'; .* ends in \.raw"),
     ("a.h5", {"format": "bag"}, {}, "format is 'bag'; choose among native, dsec"),
     ("a.h5", {"codec": "zip"}, {}, "codec is 'zip'; choose among blosc, gzip"),
     ("a.npz", {"codec": "gzip"}, {}, r"codec is gzip, which is for HDF5 \(\.h5\)"),
-    ("a.raw", {"format": "ros2"}, {}, r"has the extension \.mcap or \.db3"),
+    ("a.raw", {"format": "ros2"}, {}, r"the format ros2 are written as \.mcap or \.db3, not '\.raw'"),
 ]
 
 
@@ -358,14 +360,139 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path, out, options, made, mess
     assert sorted(os.listdir(tmp_path)) == before
 
 
+def moved(count: int = 3000) -> Events:
+    """Return compensated events: inside and outside the image, at the edges of pixels, and without coordinates."""
+    events, rng = make_events(count), np.random.default_rng(8)
+    x, y = (rng.uniform(-3.0, side + 2.0, count).astype(np.float32) for side in SIZE)
+    x[:8] = [-0.5, np.nextafter(np.float32(-0.5), np.float32(-1)), SIZE[0] - 0.5, SIZE[0] - 1, 0.5, 1.5, 2.5, 3e20]
+    y[:8] = [0, 0, 0, SIZE[1] - 0.5, 0.5, -0.5, np.nextafter(np.float32(0.5), np.float32(0)), 7]
+    x[8::50], y[8::50] = np.nan, np.nan
+    return Events(x, y, events.t, events.p)
+
+
+def pixels(found: Columns) -> np.ndarray:
+    return np.stack([np.asarray(found[0], np.int64), np.asarray(found[1], np.int64)], axis=1)
+
+
 @pytest.mark.parametrize("name", CLIENTS)
-def test_fractional_pixels_are_refused(tmp_path, name):
-    events = make_events(100)
-    compensated = Events(events.x.astype(np.float32) + 0.5, events.y.astype(np.float32), events.t, events.p)
-    source = save(tmp_path / "source.h5", compensated)
-    with pytest.raises(AmiwarpError, match=r"out.*fractional pixels, .* holds whole pixels; write a native recording"):
+def test_other_programs_read_compensated_events_at_their_nearest_pixel(tmp_path, name):
+    events = moved()
+    at = [[math.floor(float(v) + 0.5) if v == v else -1 for v in values] for values in (events.x, events.y)]
+    kept = np.array([0 <= x < SIZE[0] and 0 <= y < SIZE[1] for x, y in zip(*at, strict=True)])
+    assert kept[:8].tolist() == [True, False, False, False, True, True, True, False]
+    source, path = save(tmp_path / "source.h5", events), tmp_path / f"out{CLIENTS[name][0]}"
+    summary = convert(source, path, format=name.split()[0], rounding="nearest")
+    assert (summary.events, summary.dropped, summary.rounding) == (kept.sum(), (~kept).sum(), Rounding.NEAREST)
+    found = CLIENTS[name][1](path)
+    np.testing.assert_array_equal(pixels(found), np.array(at).T[kept])
+    np.testing.assert_array_equal(found[2], events.t[kept])
+    np.testing.assert_array_equal(found[3], events.p[kept])
+    again = open_recording(path).events
+    assert_columns(found, again.slice(0, len(events)))
+
+
+@pytest.mark.parametrize("name", CLIENTS)
+def test_dithered_pixels_have_the_mean_of_the_coordinates(tmp_path, name):
+    count = 40_000
+    events = make_events(count)
+    x = np.where(np.arange(count) % 2, np.float32(20.25), np.float32(100.9))
+    y = np.where(np.arange(count) % 2, np.float32(-0.3), np.float32(SIZE[1] - 0.2))  # 30 % and 80 % drop out
+    source = save(tmp_path / "source.h5", Events(x, y, events.t, events.p))
+
+    def written_with(seed: int) -> Columns:
+        path = tmp_path / f"out{CLIENTS[name][0]}"
+        summary = convert(source, path, format=name.split()[0], rounding=Rounding.DITHERED, seed=seed, overwrite=True)
+        found = CLIENTS[name][1](path)
+        assert summary.dropped == count - len(found[0]) == count - summary.events
+        return found
+
+    found = written_with(5)
+    for row, (least, share, kept) in {0: (20, 0.25, 0.7), SIZE[1] - 1: (100, 0.9, 0.2)}.items():
+        columns = np.asarray(found[0], np.int64)[np.asarray(found[1], np.int64) == row]
+        assert set(columns.tolist()) == {least, least + 1}
+        # five standard deviations
+        assert columns.mean() == pytest.approx(least + share, abs=5.0 * (share * (1 - share) / columns.size) ** 0.5)
+        assert columns.size / (count / 2) == pytest.approx(kept, abs=5.0 * (kept * (1 - kept) / (count / 2)) ** 0.5)
+    same, other = written_with(5), written_with(6)
+    assert all(np.array_equal(a, b) for a, b in zip(found, same, strict=True))
+    assert len(other[0]) != len(found[0]) or not np.array_equal(pixels(other), pixels(found))
+
+
+@pytest.mark.parametrize("name", [name for name in CLIENTS if name not in ("npz", "text")])
+def test_fractional_pixels_need_rounding(tmp_path, name):
+    source = save(tmp_path / "source.h5", moved(100))
+    remedy = r"give --round \(rounding= in Python\) nearest or dithered, or write \.h5, \.npz or \.txt"
+    with pytest.raises(AmiwarpError, match=rf"out.*fractional pixels, .* holds whole pixels; {remedy}"):
         convert(source, tmp_path / f"out{CLIENTS[name][0]}", format=name.split()[0])
     assert os.listdir(tmp_path) == ["source.h5"]
+
+
+def test_rounding_where_it_does_not_apply_is_refused(tmp_path):
+    source = save(tmp_path / "source.h5", moved(100))
+    with pytest.raises(AmiwarpError, match=r"out\.h5: rounding is nearest, but the native format holds sub-pixels"):
+        convert(source, tmp_path / "out.h5", rounding="nearest")
+    with pytest.raises(AmiwarpError, match=r"out\.raw: rounding is 'up'; choose among nearest, dithered"):
+        convert(source, tmp_path / "out.raw", rounding="up")
+    with pytest.raises(AmiwarpError, match="seed = -1 is not a whole number"):
+        convert(source, tmp_path / "out.raw", rounding="dithered", seed=-1)
+    whole = save(tmp_path / "whole.h5", make_events(100))
+    with pytest.raises(AmiwarpError, match=r"out\.raw: .*events have whole pixels and are not rounded; leave --round"):
+        convert(whole, tmp_path / "out.raw", rounding="nearest")
+    assert sorted(os.listdir(tmp_path)) == ["source.h5", "whole.h5"]
+
+
+def test_npz_holds_sub_pixels(tmp_path):
+    events = moved()
+    summary = convert(save(tmp_path / "source.h5", events), tmp_path / "out.npz")
+    assert (summary.events, summary.dropped, summary.rounding, summary.left_out) == (len(events), 0, None, ())
+    with np.load(tmp_path / "out.npz") as archive:
+        assert [archive[name].dtype.str for name in "xytp"] == ["<f4", "<f4", "<i8", "|u1"]
+        assert_columns(tuple(archive[name] for name in "xytp"), events)
+
+
+def test_text_holds_sub_pixels_to_a_millionth(tmp_path):
+    events = moved()
+    events = events[~(np.abs(events.x) > 1e6)]
+    convert(save(tmp_path / "source.h5", events), tmp_path / "out.txt")
+    table = np.loadtxt(tmp_path / "out.txt")
+    np.testing.assert_array_equal(np.rint(table[:, 0] * 1e6), events.t)
+    np.testing.assert_array_equal(table[:, 3], events.p)
+    for column, values in zip(table.T[1:3], (events.x, events.y), strict=True):
+        np.testing.assert_allclose(column, values.astype(np.float64), rtol=0, atol=0.51e-6)  # px
+        far = np.abs(values) >= 16  # there, neighbouring float32 numbers differ by more
+        np.testing.assert_array_equal(column.astype(np.float32)[far], values[far])
+
+
+def test_text_has_no_coordinates_beyond_the_image_plane(tmp_path):
+    """A ray along the image plane would need a number that no reader takes for a pixel."""
+    events = moved()
+    convert(save(tmp_path / "source.h5", events), tmp_path / "out.txt")
+    assert (tmp_path / "out.txt").read_text().splitlines()[7].split()[1:3] == ["nan", "7.000000"]
+    assert np.isnan(open_recording(tmp_path / "out.txt").events.slice(7, 8).x).all()
+
+
+@pytest.mark.parametrize("ending", [".npz", ".txt"])
+def test_amiwarp_reads_sub_pixels_back_as_compensated_events(tmp_path, ending):
+    events = moved()
+    source = save(tmp_path / "source.h5", events)
+    convert(source, tmp_path / f"out{ending}")
+    camera = Camera(*SIZE, 200.0, 200.0, 150.0, 110.0)
+    summary = convert(tmp_path / f"out{ending}", tmp_path / "back.h5", camera=camera)
+    assert (summary.events, summary.repairs) == (len(events), {})
+    first, back = open_recording(source).events, open_recording(tmp_path / "back.h5").events
+    assert not back.slice(0, 1).whole_pixels
+    assert back.size == SIZE
+    found, expected = back.slice(0, len(events)), first.slice(0, len(events))
+    for name in "tp":
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    for name in "xy":
+        given = getattr(expected, name).copy()
+        given[np.abs(given) > 2**31] = np.nan if ending == ".txt" else given[np.abs(given) > 2**31]
+        np.testing.assert_allclose(getattr(found, name), given, rtol=0, atol=0 if ending == ".npz" else 1e-6)
+    inside = [-0.5 <= x < SIZE[0] - 0.5 and -0.5 <= y < SIZE[1] - 0.5 for x, y in zip(events.x, events.y, strict=True)]
+    np.testing.assert_array_equal(first.inside(0, len(events)), inside)
+    inside[1] = ending == ".txt"  # within a millionth of the edge
+    np.testing.assert_array_equal(back.inside(0, len(events)), inside)
 
 
 @pytest.mark.parametrize("name", CLIENTS)
@@ -380,7 +507,7 @@ def test_an_interrupted_conversion_leaves_what_was_there(tmp_path, name):
         convert(source, path, format=name.split()[0])
     with pytest.raises(KeyboardInterrupt):
         convert(source, path, format=name.split()[0], progress=interrupt, overwrite=True)
-    with pytest.raises(AmiwarpError, match="is read in this run"):
+    with pytest.raises(AmiwarpError, match=r"is read in this run|are written as .*, not '\.h5'"):
         convert(source, source, format=name.split()[0], overwrite=True)
     assert sorted(os.listdir(tmp_path)) == sorted([path.name, "source.h5"])
     assert path.read_bytes() == b"mine"

@@ -1,11 +1,14 @@
 """No command overwrites a file that it reads, under any name, or any other existing file without --force."""
 
+import contextlib
 import errno
 import fcntl
 import importlib
+import inspect
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import socket
@@ -15,6 +18,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import is_dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_type_hints
 
 import numpy as np
@@ -24,6 +28,7 @@ from PIL import Image
 from typer.models import ArgumentInfo
 from typer.testing import CliRunner, Result
 
+import amiwarp
 from amiwarp.calib import Calibration
 from amiwarp.cli.app import SUMMARIES, app
 from amiwarp.cli.options import NO_FILE, OUTPUT, OUTPUT_FOLDER
@@ -31,6 +36,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
+from amiwarp.events.truth import Poses
 from amiwarp.imaging.choices import Layers
 from amiwarp.imaging.export import IweFiles
 from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
@@ -40,6 +46,20 @@ from amiwarp.io.json_files import read_json
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+
+SPECIFICATION = """
+format = "amiwarp-dataset-specification"
+version = 1
+name = "small"
+duration_s = 0.01
+prisms = [{ apex_deg = 1.0 }]
+speeds_rpm = [720.0]
+[camera]
+size = [64, 48]
+fov_deg = 40.0
+[[sources]]
+pictures = "pictures/*.png"
+"""
 
 SIZE = (64, 48)
 CAMERA = Camera.from_fov(*SIZE, math.radians(40.0))
@@ -111,6 +131,7 @@ OVER_INPUTS = (
     ("compensate a.h5 {} --calibration cal.json", "cal.json"),
     ("compensate a.h5 out.h5 --calibration cal.json --iwe {}", "cal.json"),
     ("compensate a.h5 {} --calibration cal.json --preset tr.tum", "tr.tum"),
+    ("compensate a.h5 {} --calibration cal.json --encoder enc.csv", "enc.csv"),
     ("reconstruct a.h5 {} --calibration cal.json", "a.h5"),
     ("reconstruct a.h5 out.png --calibration cal.json --mask {}", "cal.json"),
     ("simulate {} --picture pic.png --duration 0.01", "pic.png"),
@@ -201,7 +222,9 @@ def test_no_command_writes_over_what_it_reads(place: Path, line: str, read: str,
     for more in ((), ("--force",)):
         result = run(*line.format(target).split(), *more)
         assert result.exit_code == 1, result.output
-        expected = "is read in this run" if more else "is read in this run|exists|written as|expected one of"
+        expected = (
+            "is read in this run|written here as" if more else "is read in this run|exists|written as|expected one of"
+        )
         assert any(word in result.stderr for word in expected.split("|")), result.stderr
         assert result.stderr.count("\n") == 1
         assert snapshot(place) == before
@@ -238,6 +261,137 @@ def test_what_exists_is_replaced_by_force_alone(place: Path, line: str) -> None:
     if words[0] in ("convert", "compensate", "simulate", "record", "live"):
         assert run(*words, "--force").exit_code == 0
         assert there.read_bytes() != b"mine"
+
+
+NOT_WRITTEN = ("raw", "mcap", "jpg", "xyz", "")
+"""Extensions of which a command that writes something else must not make a file."""
+
+FOLDER = ("h5", "npz", "png", "json", "csv")
+"""Extensions that folders must not have."""
+
+NAMES: dict[tuple[str, str], tuple[str, tuple[str, ...]]] = {
+    # (command, option): (command line, refused extensions)
+    ("calibrate", "out"): ("calibrate a.h5 {}", ("h5", "png", *NOT_WRITTEN)),
+    ("calibrate", "figure"): ("calibrate a.h5 new.json --figure {}", ("h5", "svg", *NOT_WRITTEN)),
+    ("compensate", "out"): ("compensate a.h5 {} --calibration cal.json", ("json", "csv", "bag", "jpg", "")),
+    ("compensate", "iwe"): ("compensate a.h5 new.h5 --calibration cal.json --iwe {}", ("h5", "tif", *NOT_WRITTEN)),
+    ("convert", "out"): ("convert a.h5 {}", ("json", "csv", "bag", "jpg", "")),
+    ("live", "out"): ("live a.h5 --fast --calibration cal.json --out {}", ("npz", "txt", *NOT_WRITTEN)),
+    ("live", "record"): ("live a.h5 --fast --calibration cal.json --record {}", ("npz", "txt", *NOT_WRITTEN)),
+    ("reconstruct", "out"): ("reconstruct a.h5 {} --calibration cal.json", ("h5", *NOT_WRITTEN)),
+    ("reconstruct", "mask"): (
+        "reconstruct a.h5 new.png --calibration cal.json --mask {}", ("h5", "mp4", *NOT_WRITTEN),
+    ),
+    ("record", "out"): ("record a.h5 {} --fast", ("npz", "txt", *NOT_WRITTEN)),
+    ("simulate", "out"): ("simulate {} --picture pic.png --duration 0.01", ("npz", "txt", *NOT_WRITTEN)),
+    ("simulate", "preview"): ("simulate new.h5 --world room --duration 0.01 --preview {}", ("h5", *NOT_WRITTEN)),
+    ("translate", "out"): ("translate v.npy {} --fps 100", ("npz", "txt", *NOT_WRITTEN)),
+    ("view", "screenshot"): ("view a.h5 --screenshot {}", ("h5", "svg", *NOT_WRITTEN)),
+    ("chart", "out"): ("chart --quick --out {}", FOLDER),
+    ("dataset", "out"): ("dataset spec.toml {}", FOLDER),
+    ("demo", "out"): ("demo --size 64x48 --duration 0.1 --picture pic.png --out {}", FOLDER),
+    ("design", "out"): ("design --size 64x48 --apex-deg 1 --rpm 720 --out {}", FOLDER),
+    ("evaluate", "out"): ("evaluate --quick --out {}", FOLDER),
+    ("stability", "out"): ("stability --quick --out {}", FOLDER),
+    ("truth", "out"): ("truth world.h5 {} --poses tum", FOLDER),
+}  # fmt: skip
+"""Every option that names a file or a folder to write. Other extensions would be false names for the content."""
+
+
+def output_options() -> set[tuple[str, str]]:
+    """Return command and name of every option that is marked as an output."""
+    found = set()
+    for command in SUMMARIES:
+        hints = get_type_hints(importlib.import_module(f"amiwarp.cli.{command}").run, include_extras=True)
+        for kind in [hint for hint in hints.values() if is_dataclass(hint)]:
+            hints |= get_type_hints(kind, include_extras=True)
+        marked = {OUTPUT, OUTPUT_FOLDER}
+        found |= {(command, name) for name, hint in hints.items() if marked & set(getattr(hint, "__metadata__", ()))}
+    return found
+
+
+def test_names_are_tested_of_every_output() -> None:
+    assert output_options() == set(NAMES)
+
+
+@pytest.fixture
+def world(place: Path) -> None:
+    """Add a recording with true poses, and the specification of a data set."""
+    with RecordingWriter(place / "world.h5", width=64, height=48) as writer:
+        writer.append(events())
+        writer.append_poses(Poses(np.array([0, 1000]), np.tile([0.0, 0, 0, 0, 0, 0, 1], (2, 1))))
+    (place / "spec.toml").write_text(SPECIFICATION)
+
+
+@pytest.mark.usefixtures("world")
+@pytest.mark.parametrize("option", NAMES, ids=" ".join)
+def test_commands_refuse_a_name_that_means_another_format(place: Path, option: tuple[str, str]) -> None:
+    line, endings = NAMES[option]
+    before = sorted(place.rglob("*"))
+    for ending in endings:
+        name = f"false.{ending}".removesuffix(".")
+        result = run(*line.format(name).split())
+        assert (result.exit_code, result.stdout) == (1, ""), (name, result.output)
+        refusal = result.stderr.strip().splitlines()[-1]
+        folder = NAMES[option][1] is FOLDER
+        remedy = "give the name of a folder" if folder else "give a name that ends in|amiwarp convert|choose among"
+        assert re.search(rf"{re.escape(name)}: .*({remedy})", refusal), (name, refusal)
+        assert sorted(place.rglob("*")) == before
+
+
+def test_commands_that_write_native_recordings_name_the_conversion(place: Path) -> None:
+    result = run("simulate", "s.raw", "--picture", "pic.png", "--duration", "0.01")
+    assert "write s.h5, then run: amiwarp convert s.h5 s.raw" in result.stderr
+
+
+CALLS: dict[str, Callable[[Path, Any], object]] = {
+    "Calibration.save": lambda path, given: given.calibration.save(path),
+    "RecordingWriter": lambda path, _: amiwarp.RecordingWriter(path, width=64, height=48).__enter__(),
+    "Simulation.write": lambda path, given: given.simulation.write(path),
+    "Trajectory.save_tum": lambda path, _: amiwarp.Trajectory.still([0, 0, 0], look_at=[0, 1, 0]).save_tum(path),
+    "compensate": lambda path, given: amiwarp.compensate(given.recording, given.calibration, path),
+    "convert": lambda path, _: amiwarp.convert("a.h5", path),
+    "save_flow_dsec": lambda path, given: amiwarp.save_flow_dsec(path, given.frames),
+    "save_flow_mvsec": lambda path, given: amiwarp.save_flow_mvsec(path, given.frames),
+    "save_poses_tum": lambda path, given: amiwarp.save_poses_tum(path, given.poses),
+    "save_recording": lambda path, given: amiwarp.save_recording(path, given.recording),
+}
+"""Every public function that can replace a file, called with a path."""
+
+
+def replacing() -> set[str]:
+    """Return the public functions and methods with a parameter ``overwrite``."""
+    found = set()
+    for name in amiwarp.__all__:
+        public = getattr(amiwarp, name)
+        functions = {name: public} | {
+            f"{name}.{method}": function
+            for method, function in (vars(public).items() if inspect.isclass(public) else ())
+            if inspect.isfunction(function) and not method.startswith("_")
+        }
+        for key, function in functions.items():
+            with contextlib.suppress(TypeError, ValueError):
+                if "overwrite" in inspect.signature(function).parameters:
+                    found.add(key)
+    return found
+
+
+def test_functions_refuse_a_name_that_means_another_format(place: Path) -> None:
+    assert replacing() == set(CALLS)
+    camera, prism = amiwarp.Camera.from_fov(*SIZE, 1.0), Prism(0.01)
+    simulation = amiwarp.Simulation(amiwarp.Scene.from_picture("pic.png"), camera, prism, 0.01)
+    frames = SimpleNamespace(t=np.array([0, 1000]))
+    poses = amiwarp.Poses(t=np.array([0]), camera=np.zeros((1, 7)))
+    given = SimpleNamespace(
+        recording=open_recording("a.h5"), calibration=Calibration.load("cal.json"), simulation=simulation,
+        frames=frames, poses=poses,
+    )  # fmt: skip
+    before = sorted(place.rglob("*"))
+    for name, call in CALLS.items():
+        for ending in (".h5", ".png") if name == "save_flow_dsec" else (".jpg", ".bag", ".csv"):
+            with pytest.raises(AmiwarpError, match=rf"false\{ending}: .*; (give|choose)"):
+                call(Path(f"false{ending}"), given)
+    assert sorted(place.rglob("*")) == before
 
 
 def test_default_output_of_calibrate_is_refused_before_the_search(place: Path) -> None:
@@ -345,6 +499,7 @@ ENDLESS = (
     "compensate {} out.h5 --calibration cal.json",
     "compensate a.h5 out.h5 --calibration {}",
     "compensate a.h5 out.h5 --calibration cal.json --preset {}",
+    "compensate a.h5 out.h5 --calibration cal.json --encoder {}",
     "reconstruct {} out.png --calibration cal.json",
     "reconstruct a.h5 out.png --calibration {}",
     "simulate out.h5 --picture {}",
@@ -590,10 +745,11 @@ def test_api_calls_guard_what_they_read(place: Path) -> None:
         lambda: compensate(recording, calibration, "a.h5", overwrite=True),
         lambda: save_recording("a.h5", recording, overwrite=True),
         lambda: convert("a.h5", "a.h5", overwrite=True),
-        lambda: calibration.save("a.h5", overwrite=True),
     ):
         with pytest.raises(AmiwarpError, match="is read in this run"):
             write()
+    with pytest.raises(AmiwarpError, match=r"a\.h5: calibrations are written as \.json"):
+        calibration.save("a.h5", overwrite=True)
     for write in (
         lambda: compensate(recording, calibration, "cal.json"),
         lambda: convert("a.h5", "cal.json"),
@@ -658,7 +814,7 @@ from amiwarp.reconstruction.export import save_grey
 from amiwarp.imaging.export import save_png
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 noise = np.random.default_rng(0).random((60, 80), np.float32)
-for write in (lambda p: save_grey(noise, p, bits=16), lambda p: save_png(p, np.uint8(255 * noise))):
+for write in (lambda p: save_grey(noise, p, bits=16), lambda p: save_png(p.with_suffix(".png"), np.uint8(255 * noise))):
     try:
         write(Path(sys.argv[1]))
     except AmiwarpError as error:
@@ -671,7 +827,8 @@ def test_pictures_on_a_full_disk(tmp_path: Path, name: str) -> None:
     """Pillow itself reports no error for a partly written TIFF."""
     words = [sys.executable, "-c", FULL, tmp_path / name]
     done = subprocess.run(words, env=environment(), capture_output=True, text=True, check=True)
-    assert [f"{name}: cannot be written: File too large" in line for line in done.stdout.splitlines()] == [True, True]
+    failed = [line.partition(": cannot be written: File too large")[0] for line in done.stdout.splitlines()]
+    assert failed == [str(tmp_path / name), str(tmp_path / "a.png")]
     assert os.listdir(tmp_path) == []
 
 

@@ -366,7 +366,7 @@ def test_command_refuses(recording: Recording, tmp_path: Path) -> None:
     calibration().save(tmp_path / "c.json")
     before = {p.name for p in tmp_path.iterdir()}
     for out, more, said in (
-        ("p.bmp", [], "ends in .bmp"),
+        ("p.bmp", [], "pictures are written as .png, .tif, .tiff, .npy or .mp4, not '.bmp'"),
         ("none/p.png", [], "does not exist"),
         ("p.png", ["--fps", "20"], "--fps applies to a video"),
         ("v.mp4", ["--mask", "m.png"], "--mask"),

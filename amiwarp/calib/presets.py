@@ -17,6 +17,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import fields_of, read_json
+from amiwarp.io.output_formats import check_ending
 from amiwarp.optics.models import MODELS
 from amiwarp.validation import one_of, shown
 
@@ -45,6 +46,7 @@ class Preset:
 
     def save(self, path: Path) -> None:
         """Write the JSON file. Raises :class:`AmiwarpError` if it exists or cannot be written."""
+        check_ending(path, "presets are written", [".json"])
         data = {"format": FORMAT, "version": VERSION, "kind": self.kind, "settings": dict(self.settings),
                 "measured": dict(self.measured)}  # fmt: skip
         write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")

@@ -21,6 +21,7 @@ from amiwarp.io.atomic_output import write_text
 from amiwarp.io.camera_json import camera_from_json, camera_to_json
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import build, fields_of, read_json
+from amiwarp.io.output_formats import check_ending
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.models import MODELS
@@ -199,16 +200,18 @@ class Calibration:
         Parameters
         ----------
         path : path
-            The file.
+            The file, which ends in ``.json``.
         overwrite : bool
             Whether to replace an existing file.
 
         Raises
         ------
         AmiwarpError
-            If the file exists and ``overwrite`` is False, or if it cannot be written.
+            If the file has another extension, exists and ``overwrite`` is False, or cannot be written.
         """
-        write_text(Path(path), json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n", overwrite=overwrite)
+        path = Path(path)
+        check_ending(path, "calibrations are written", [".json"])
+        write_text(path, json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n", overwrite=overwrite)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Calibration:

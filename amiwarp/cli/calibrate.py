@@ -18,6 +18,7 @@ from amiwarp.events.events import MemoryEvents
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import check_output
+from amiwarp.io.output_formats import check_ending
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
@@ -254,9 +255,10 @@ def run(
     opened = complete(open_recording(recording), camera, prism)
     opened = cut(opened, window) if window else opened
     out = out or recording.with_name(f"{recording.stem}.calibration.json")
+    check_ending(out, "calibrations are written", [".json"])
     check_output(out)
-    if figure is not None and figure.suffix.lower() != ".png":
-        raise AmiwarpError(f"{figure}: figures are written as .png; give a name that ends in .png")
+    if figure is not None:
+        check_ending(figure, "figures are written", [".png"])
     with progress("calibrating") as advance:
         if method is CalibrationMethod.PAPER:
             check_paper(search, parameters, preset)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import contextlib
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from amiwarp.cli.console import choose_device, progress, report
+from amiwarp.cli.convert import EncoderOptions, Format, HdfCodec, Round, format_notes
+from amiwarp.cli.inputs import Topic
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Layers
 from amiwarp.io import open_recording
+from amiwarp.io.chunks import Codec
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
@@ -65,19 +69,33 @@ class IweOptions:
 
 def run(
     recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
-    out: Annotated[Path, typer.Argument(help="Compensated recording to write (.h5)."), OUTPUT],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            help="Compensated recording to write. Its extension gives the format: .h5 (native), .npz or .txt with "
+            "sub-pixels; with --round .raw (Prophesee EVT 3.0), .aedat4, .mcap or .db3 (ROS 2 bag)."
+        ),
+        OUTPUT,
+    ],
     *,
     calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
     preset: Annotated[
         Path | None,
         typer.Option(help="Preset from 'amiwarp chart': sets the prism model to use. Default: the calibrated model."),
     ] = None,
+    format: Format = None,
+    codec: HdfCodec = Codec.BLOSC,
+    round: Round = None,
+    encoder: EncoderOptions,
+    topic: Topic = None,
     iwe: IweOptions,
     common: Common,
 ) -> None:
     """Compensate the prism's motion: move every event to its position without the prism.
 
-    Positions are sub-pixel. All events are kept, in order. Memory use does not depend on the length of the recording.
+    Positions are sub-pixel, and all events are kept, in order; --round gives whole pixels and drops events outside the
+    image. Memory use does not depend on the length of the recording. From a ROS 2 bag to a ROS 2 bag, all other topics
+    are copied.
 
     A PNG shows counts from 0 (black) to their 99.5th percentile over pixels with events (white), with gamma 0.5.
     """
@@ -89,19 +107,24 @@ def run(
     found = Calibration.load(calibration)
     if preset is not None:
         found = simplified(found, Preset.load(preset, "compensation").settings["model"])
-    opened = open_recording(recording)
+    log = encoder.build(recording, topic)
+    opened = open_recording(recording, topic=topic)
+    opened = opened if log is None else replace(opened, encoder=log)
     files = iwe.build(opened, device)
-    with progress("compensating") as advance:
-        if files is None:
-            done = compensate(opened, found, out, device=device, progress=advance)
-        else:
-            with files:
-                done = compensate(opened, found, out, device=device, progress=advance, on_block=files.add)
+    with progress("compensating") as advance, files or contextlib.nullcontext():
+        done = compensate(
+            opened, found, out, device=device, progress=advance, on_block=None if files is None else files.add,
+            format=format, codec=codec, rounding=round, seed=common.seed,
+        )  # fmt: skip
     data: dict[str, Any] = {
         "file": str(out),
         "model": found.model_name,
         "events": done.events,
         "outside": done.outside,
+        "format": done.format,
+        "rounding": done.rounding,
+        "dropped": done.dropped,
+        "left_out": list(done.left_out),
         "seconds": done.seconds,
         "mev_per_s": done.mev_per_s,
         "device": device,
@@ -113,4 +136,8 @@ def run(
 def _lines(d: dict[str, Any]) -> list[str]:
     images = d["iwe"] if len(d["iwe"]) <= 3 else [f"{d['iwe'][0]} .. {d['iwe'][-1]} ({len(d['iwe'])} files)"]
     speed = f"{d['seconds']:.2f} s, {d['mev_per_s']:.3g} Mev/s by the {d['model']} model on {d['device']}"
-    return [f"{d['file']}: {d['events']:,} events ({d['outside']:,} outside the image), {speed}", *images]
+    return [
+        f"{d['file']}: {d['events']:,} events ({d['outside']:,} outside the image), {speed}",
+        *format_notes(d),
+        *images,
+    ]

@@ -16,12 +16,28 @@ from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import convert, open_recording, read_encoder_csv, read_encoder_triggers
 from amiwarp.io.chunks import Codec
-from amiwarp.io.output_formats import LIMITS, OutputFormat
+from amiwarp.io.output_formats import LIMITS, OutputFormat, Rounding
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
 
 EXAMPLE = "amiwarp convert events.raw recording.h5 --encoder encoder.csv --counts-per-turn 4096 --fov-deg 60"
+
+Format = Annotated[
+    OutputFormat | None, typer.Option(help="Format to write, if not that of the extension: dsec.", show_default=False)
+]
+"""Option that chooses a format whose extension means another one."""
+HdfCodec = Annotated[Codec, typer.Option(help="Compression of HDF5. Programs without HDF5's Blosc filter read gzip.")]
+"""Option for the compression of HDF5."""
+Round = Annotated[
+    Rounding | None,
+    typer.Option(
+        help="Round compensated events to whole pixels, as RAW, AEDAT 4, DSEC and ROS 2 need. nearest: to the nearest "
+        "pixel; dithered: up or down at random (--seed), unbiased. Events outside the image are dropped.",
+        show_default=False,
+    ),
+]
+"""Option for the rounding of compensated events."""
 
 _PANEL = "Encoder"
 
@@ -102,12 +118,9 @@ def run(
         OUTPUT,
     ],
     *,
-    format: Annotated[
-        OutputFormat | None, typer.Option(help="Format to write, if not that of the extension.", show_default=False)
-    ] = None,
-    codec: Annotated[
-        Codec, typer.Option(help="Compression of HDF5. Programs without HDF5's Blosc filter read gzip.")
-    ] = Codec.BLOSC,
+    format: Format = None,
+    codec: HdfCodec = Codec.BLOSC,
+    round: Round = None,
     encoder: EncoderOptions,
     camera: CameraOptions,
     prism: NominalPrismOptions,
@@ -116,8 +129,8 @@ def run(
 ) -> None:
     """Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.
 
-    Other formats hold the events only; the command lists what it leaves out. Memory use does not depend on the length
-    of the recording.
+    Other formats hold the events only; the command lists what it leaves out. From a ROS 2 bag to a ROS 2 bag, all other
+    topics are copied. Memory use does not depend on the length of the recording.
     """
     began = time.perf_counter()
     log = encoder.build(source, topic)
@@ -130,7 +143,7 @@ def run(
     with progress("converting") as advance:
         summary = convert(
             source, out, encoder=log, camera=lens, prism=wedge, topic=topic, format=format, codec=codec,
-            progress=advance,
+            progress=advance, rounding=round, seed=common.seed,
         )  # fmt: skip
     seconds = time.perf_counter() - began
     data: dict[str, Any] = {"file": str(out), **asdict(summary), "seconds": seconds}
@@ -138,6 +151,16 @@ def run(
     slip = data.pop("index_slip")
     data["slip_deg"] = None if slip is None else math.degrees(slip)
     report(common, data, _lines(data))
+
+
+def format_notes(d: dict[str, Any]) -> list[str]:
+    """Return what the format of the output has changed and left out."""
+    lines = []
+    if d["rounding"] is not None:
+        lines.append(f"note: rounded to whole pixels ({d['rounding']}); {d['dropped']:,} events outside are dropped")
+    if d["left_out"]:
+        lines.append(f"note: {LIMITS[d['format']].label} does not hold, and leaves out: {', '.join(d['left_out'])}")
+    return lines
 
 
 def _lines(d: dict[str, Any]) -> list[str]:
@@ -153,8 +176,7 @@ def _lines(d: dict[str, Any]) -> list[str]:
         lines.append(
             f"warning: the encoder has {len(d['encoder_gaps'])} gaps, the first at {first[0]} .. {first[1]} us"
         )
-    if d["left_out"]:
-        lines.append(f"note: {LIMITS[d['format']].label} does not hold, and leaves out: {', '.join(d['left_out'])}")
+    lines += format_notes(d)
     if d["slip_deg"] is not None:
         lines.append(f"encoder slips up to {d['slip_deg']:.3g} deg at its index pulses")
     return lines

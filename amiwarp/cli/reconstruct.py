@@ -138,10 +138,12 @@ def run(
     brightness.
     """
     from amiwarp.calib import Calibration
-    from amiwarp.reconstruction.export import VIDEO, check_path
+    from amiwarp.reconstruction.export import MASK_SUFFIXES, VIDEO, check_path
     from amiwarp.reconstruction.picture import Reconstruction
 
     check_path(out)
+    if picture.mask is not None:
+        check_path(picture.mask, MASK_SUFFIXES)
     video = out.suffix.lower() == VIDEO
     if video and (picture.mask is not None or picture.bits != 8):
         raise AmiwarpError("--mask and --bits apply to a single picture; leave them out for a video")

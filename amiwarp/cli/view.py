@@ -19,6 +19,7 @@ from amiwarp.cli.rig import parse_size
 from amiwarp.cli.streams import SourceOptions, check_angles
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
+from amiwarp.io.output_formats import check_ending
 from amiwarp.viewer.choices import Axis, Colour, View
 from amiwarp.viewer.host_names import warning
 
@@ -78,8 +79,7 @@ class ScreenshotOptions:
         from amiwarp.viewer.page_values import notes
         from amiwarp.viewer.phase_estimate import estimate_phase
 
-        if path.suffix.lower() != ".png":
-            raise AmiwarpError(f"{path}: pictures are written as .png; give a name that ends in .png")
+        check_ending(path, "pictures are written", [".png"])
         third = self.axis or (Axis.ANGLE if inspector.has_encoder or inspector.knobs.rpm else Axis.TIME)
         width, height = parse_size(self.size)
         if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:

@@ -10,6 +10,7 @@ import typer
 
 from amiwarp.cli.options import OUTPUT
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.output_formats import check_ending
 from amiwarp.simulation.worlds.choices import Seeing
 
 if TYPE_CHECKING:
@@ -95,8 +96,8 @@ class WorldOptions:
                     raise AmiwarpError(f"{name} applies to a world; give --world, or remove {name}")
         if self.motion_px is not None and self.seeing is Seeing.RAYS:
             raise AmiwarpError("--motion-px applies to maps; give --seeing maps, or remove --motion-px")
-        if self.preview is not None and self.preview.suffix.lower() != ".png":
-            raise AmiwarpError(f"{self.preview}: --preview writes a PNG file; give a name that ends in .png")
+        if self.preview is not None:
+            check_ending(self.preview, "previews are written", [".png"])
 
     def build_scene(self, duration_s: float, *, seed: int, blur: float) -> WorldScene:
         """Return the world and the camera's trajectory. ``blur``: standard deviation of the optical blur [px]."""

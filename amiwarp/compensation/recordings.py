@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
@@ -21,9 +22,13 @@ from amiwarp.events.device_encoder import encoder_params
 from amiwarp.events.device_events import DeviceEvents, check_order, device_for, limits, wait
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
-from amiwarp.io.chunks import compile_checksums
+from amiwarp.io.atomic_output import check_output
+from amiwarp.io.chunks import Codec, compile_checksums, in_order
+from amiwarp.io.conversion import bag_of, left_out
+from amiwarp.io.export import export
 from amiwarp.io.native_reader import NativeEvents
 from amiwarp.io.native_writer import FlaggedEvents
+from amiwarp.io.output_formats import OutputFormat, Rounding, check_codec, check_rounding, output_format
 from amiwarp.kernels.event_arrays import join_columns
 from amiwarp.kernels.launch import launch
 from amiwarp.progress import Progress
@@ -54,9 +59,17 @@ class CompensationSummary:
     events: int
     """Number of compensated events."""
     outside: int
-    """Number of events outside the image or without coordinates (NaN). They are kept and marked."""
+    """Number of events outside the image or without coordinates (NaN). They are kept unless coordinates are rounded."""
     seconds: float
     """Duration of the compensation, including reading and writing [s]."""
+    format: OutputFormat = OutputFormat.NATIVE
+    """Format that was written."""
+    rounding: Rounding | None = None
+    """How coordinates were rounded to whole pixels, or None if they were not."""
+    dropped: int = 0
+    """Number of events that were not written, because after rounding they are outside the image."""
+    left_out: tuple[str, ...] = ()
+    """Parts of the recording that a format other than the native one does not hold, such as ``"encoder"``."""
 
     @property
     def mev_per_s(self) -> float:
@@ -170,12 +183,6 @@ def _compensate_on_device(events: DeviceEvents, model: Model, encoder: Encoder) 
     return xy
 
 
-def inside_image(xy: NDArray[np.float32], width: int, height: int) -> NDArray[np.bool_]:
-    """Return which points (n, 2) lie on a pixel of the image; NaN does not."""
-    x, y = xy[:, 0], xy[:, 1]
-    return (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
-
-
 def compensated_blocks(
     recording: Recording, model: Model, encoder: Encoder, *, device: Any = "cpu", **blocks: int
 ) -> Iterator[Events]:
@@ -200,11 +207,18 @@ def compensate(
     progress: Progress | None = None,
     on_block: Callable[[Events], None] | None = None,
     overwrite: bool = False,
+    format: OutputFormat | str | None = None,
+    codec: Codec | str = Codec.BLOSC,
+    rounding: Rounding | str | None = None,
+    seed: int = 0,
 ) -> CompensationSummary:
     """Compensate a recording and write the result to a file.
 
     Events keep their time, polarity and order; coordinates become sub-pixel float32 values. Events outside the image
-    are kept, and marked in ``events/inside``. Memory use is constant.
+    are kept; the native format marks them in ``events/inside``. Memory use is constant.
+
+    The native format, npz and text (to 1e-6 px) hold sub-pixel coordinates. The other formats need ``rounding``. From a
+    ROS 2 bag to a ROS 2 bag, the messages of all other topics are copied.
 
     Parameters
     ----------
@@ -213,7 +227,7 @@ def compensate(
     calibration : Calibration
         Calibration of the same camera and prism.
     out_path : str or os.PathLike
-        Path of the new recording.
+        Path of the new recording. Its extension gives the format, as for :func:`convert`.
     device : str or warp.Device, optional
         Device to compute on.
     progress : Progress, optional
@@ -222,17 +236,25 @@ def compensate(
         Called with each block of compensated events, in order.
     overwrite : bool, optional
         Replace an existing file.
+    format : OutputFormat or str, optional
+        The format to write, if not that of the extension. The layout of DSEC (``"dsec"``) needs it.
+    codec : Codec or str, default "blosc"
+        Compression of HDF5. Programs without HDF5's Blosc filter read ``"gzip"``.
+    rounding : Rounding or str, optional
+        How to round coordinates to whole pixels. Events outside the image after that are dropped and counted.
+    seed : int, default 0
+        Seed of the random numbers of ``"dithered"``. The same recording and seed give the same result.
 
     Returns
     -------
     CompensationSummary
-        Number of events, and duration.
+        Number of events, duration, and what the format leaves out.
 
     Raises
     ------
     AmiwarpError
-        If the calibration is for another sensor size, the encoder does not cover the events, or the output cannot be
-        written, is the recording itself, or exists. No partial file remains.
+        If the calibration is for another sensor size, the encoder does not cover the events, the format cannot hold
+        them, or the output cannot be written, is the recording itself, or exists. No partial file remains.
 
     Examples
     --------
@@ -248,13 +270,18 @@ def compensate(
     2
     """
     began = time.perf_counter()
+    out_path = Path(out_path)
+    check_output(out_path, overwrite=overwrite)
+    chosen = output_format(out_path, format)
+    codec = check_codec(out_path, codec, chosen)
+    rounding = check_rounding(out_path, rounding, chosen)
     width, height = recording.events.size
     check_size(calibration, recording.events.size, recording.name)
     n = len(recording.events)
     encoder = recording.encoder
     if n:
         encoder = calibration.encoder_for(encoder, recording.events.t_first, recording.events.t_last)
-    outside = done = 0
+    outside = done = dropped = 0
     metadata: dict[str, MetadataValue] = {**recording.metadata, "compensated_with": calibration.model_name}
     truth = None if recording.truth is None else recording.truth.parameters
 
@@ -267,17 +294,41 @@ def compensate(
         if progress is not None:
             progress("compensating", done / n)
 
+    compensator = None
+    if encoder is not None and n:
+        compensator = BlockCompensator(
+            calibration.model, encoder, recording.events.t_first, recording.events.t_last, device
+        )
+    if chosen is not OutputFormat.NATIVE:
+        with contextlib.closing(_counted(recording.events, compensator, count)) as blocks:
+            dropped = export(
+                recording.events, out_path, chosen, (width, height), codec=codec, progress=None, overwrite=overwrite,
+                blocks=blocks, rounding=rounding, seed=seed, bag=bag_of(recording),
+            )  # fmt: skip
+        missing = left_out(recording, chosen)
+        seconds = time.perf_counter() - began
+        return CompensationSummary(done, outside, seconds, chosen, rounding, dropped, missing)
     with RecordingWriter(
         out_path, width=width, height=height, camera=recording.camera or calibration.camera, prism=recording.prism,
-        encoder=encoder, truth_parameters=truth, metadata=metadata, overwrite=overwrite,
+        encoder=encoder, truth_parameters=truth, metadata=metadata, overwrite=overwrite, codec=codec,
     ) as writer:  # fmt: skip
-        if encoder is not None and n:
-            first, last = recording.events.t_first, recording.events.t_last
-            compensator = BlockCompensator(calibration.model, encoder, first, last, device)
+        if compensator is not None:
             compile_checksums()
             pieces = compensated_pieces(recording.events, compensator)
-            writer.fill(pieces, count=PIECE, t_first=first, done=count)
+            writer.fill(pieces, count=PIECE, t_first=recording.events.t_first, done=count)
     return CompensationSummary(done, outside, time.perf_counter() - began)
+
+
+def _counted(
+    source: EventSource, compensator: BlockCompensator | None, count: Callable[[Events, NDArray[np.uint8]], None]
+) -> Generator[Events, None, None]:
+    """Yield the compensated events, which threads compute ahead, and count them when they are written."""
+    if compensator is None:
+        return
+    with contextlib.closing(in_order(compensated_pieces(source, compensator))) as pieces:
+        for events, inside, _ in pieces:
+            yield events
+            count(events, inside)
 
 
 def compensated_pieces(source: EventSource, compensator: BlockCompensator) -> Iterator[Callable[[], FlaggedEvents]]:

@@ -165,6 +165,11 @@ def check_coordinates(
         fail(~(np.isfinite(events.x) & np.isfinite(events.y)), "has a coordinate that is not finite; drop it")
 
 
+def inside_image(x: NDArray[Any], y: NDArray[Any], width: int, height: int) -> NDArray[np.bool_]:
+    """Return which points lie on a pixel of the image; NaN does not."""
+    return np.asarray((x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5))
+
+
 def _fail(events: Events, where: str, first_index: int, bad: NDArray[np.bool_], what: str) -> None:
     index = int(np.argmax(bad))
     x, y, t = events.x[index], events.y[index], events.t[index]

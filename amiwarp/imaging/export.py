@@ -20,6 +20,7 @@ from amiwarp.imaging.choices import Layers
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
 from amiwarp.imaging.warped_image import PIECE, CanvasShape, Votes
 from amiwarp.io.atomic_output import NewFile, allocate, check_output
+from amiwarp.io.output_formats import check_ending
 from amiwarp.validation import choice
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ def to_picture(image: NDArray[np.float32], layers: Layers) -> NDArray[np.uint8]:
 
 def save_png(path: Path, picture: Any, *, overwrite: bool = False) -> None:
     """Write an 8-bit picture (an array or a Pillow image) as a PNG file. On failure no file remains."""
+    check_ending(path, "pictures are written", [".png"])
     with NewFile(path, overwrite=overwrite) as new:
         encode_png(new.part, picture)
 
@@ -97,8 +99,7 @@ class IweFiles:
         Raises :class:`AmiwarpError` for an ending other than .png or .npy, and for too many windows.
         """
         for path in paths:
-            if path.suffix.lower() not in (".png", ".npy"):
-                raise AmiwarpError(f"{path}: images of events are written as .png or .npy; give one of these suffixes")
+            check_ending(path, "images of events are written", [".png", ".npy"])
         self.written: list[Path] = []
         self._layers = layers = choice(Layers, layers, "layers")
         width, height = source.size

@@ -26,19 +26,21 @@ def write_aedat4(part: Path, blocks: Iterable[Events], about: Outline) -> None:
     """Write all events, then count them in the file."""
     from faery.extension import aedat
 
+    written = 0
     with aedat.Encoder(part, _description(about), ("lz4", 1)) as encoder:
         for events in blocks:
             packet = np.empty(len(events), PACKET_EVENT)
             for name in ("t", "x", "y", "p"):
                 packet[name] = getattr(events, name)
             encoder.write(0, packet)
+            written += len(events)
     try:
-        count = len(open_aedat4(part).events) if about.count else 0
+        count = len(open_aedat4(part).events) if written else 0
     except AmiwarpError:  # the file is truncated
         count = 0
     # The encoder does not report whether it could write its last bytes.
-    if count != about.count or shutil.disk_usage(part.parent).free < LAST_BYTES:
-        raise AmiwarpError(f"the disk is full: {count} of {about.count} events could be written; free some space")
+    if count != written or shutil.disk_usage(part.parent).free < LAST_BYTES:
+        raise AmiwarpError(f"the disk is full: {count} of {written} events could be written; free some space")
 
 
 def _description(about: Outline) -> list[Any]:

@@ -307,7 +307,12 @@ def write_text(path: Path, text: str, *, overwrite: bool = False) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder and its parents. Raises :class:`AmiwarpError` if that fails."""
+    """Create a folder and its parents. Raises :class:`AmiwarpError` if that fails, or for the name of a file."""
+    from amiwarp.io.output_formats import check_folder  # on use, because it loads NumPy
+
+    for new in (path, *path.parents):
+        if not os.path.lexists(new):
+            check_folder(new)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -14,9 +14,10 @@ from amiwarp.io.atomic_output import check_output
 from amiwarp.io.chunks import Codec
 from amiwarp.io.copying import copy_events
 from amiwarp.io.export import export
+from amiwarp.io.file_scan import RECORDS, FileEvents
 from amiwarp.io.formats import open_recording
 from amiwarp.io.native_writer import RecordingWriter
-from amiwarp.io.output_formats import LIMITS, OutputFormat, check_codec, output_format
+from amiwarp.io.output_formats import LIMITS, Bag, OutputFormat, Rounding, check_codec, check_rounding, output_format
 from amiwarp.optics.camera import Camera
 from amiwarp.progress import Progress
 
@@ -68,6 +69,10 @@ class ConversionSummary:
     """Format that was written."""
     left_out: tuple[str, ...]
     """Parts of the recording that the format does not hold, such as ``"encoder"``. Empty for the native format."""
+    rounding: Rounding | None = None
+    """How coordinates were rounded to whole pixels, or None if they were not."""
+    dropped: int = 0
+    """Number of events that were not written, because after rounding they are outside the image."""
 
 
 def convert(
@@ -82,11 +87,15 @@ def convert(
     overwrite: bool = False,
     format: OutputFormat | str | None = None,
     codec: Codec | str = Codec.BLOSC,
+    rounding: Rounding | str | None = None,
+    seed: int = 0,
 ) -> ConversionSummary:
     """Convert a recording to the native format or to another one, in constant memory.
 
     Only the native format holds the encoder, the camera, the prism, the ground truth, the IMU samples, the frames and
-    the metadata. All formats keep x, y, t and p of every event exactly.
+    the metadata. All formats keep x, y, t and p of every event exactly, with two exceptions for compensated events:
+    text holds their coordinates to 1e-6 px, and formats of whole pixels need ``rounding``. From a ROS 2 bag to a ROS 2
+    bag, the messages of all other topics are copied.
 
     Parameters
     ----------
@@ -111,6 +120,11 @@ def convert(
         The format to write, if not that of the extension. The layout of DSEC (``"dsec"``) needs it.
     codec : Codec or str, default "blosc"
         Compression of HDF5. Programs without HDF5's Blosc filter read ``"gzip"``.
+    rounding : Rounding or str, optional
+        How to round the coordinates of compensated events to whole pixels. Events outside the image after that are
+        dropped and counted.
+    seed : int, default 0
+        Seed of the random numbers of ``"dithered"``. The same events and seed give the same result.
 
     Returns
     -------
@@ -131,11 +145,19 @@ def convert(
     2
     >>> amiwarp.convert("out.h5", "out.aedat4").left_out
     ('prism',)
+
+    Compensated events get whole pixels for programs that need them:
+
+    >>> moved = amiwarp.Events.from_arrays(x=[1.3, 2.9], y=[0.0, 0.2], t=[0, 10], p=[1, 0])
+    >>> amiwarp.save_recording("moved.h5", amiwarp.Recording(amiwarp.MemoryEvents(moved, width=4, height=4)))
+    >>> amiwarp.convert("moved.h5", "moved.raw", rounding="nearest").events
+    2
     """
     out_path = Path(out_path)
     check_output(out_path, overwrite=overwrite)
     chosen = output_format(out_path, format)
     codec = check_codec(out_path, codec, chosen)
+    rounding = check_rounding(out_path, rounding, chosen)
     opened = open_recording(source_path, topic=topic)
     recording = replace(
         opened, encoder=encoder or opened.encoder, camera=camera or opened.camera, prism=prism or opened.prism
@@ -143,11 +165,15 @@ def convert(
     size = recording.events.size
     if recording.camera is not None and not getattr(recording.events, "size_is_known", True):
         size = recording.camera.width, recording.camera.height
+    dropped = 0
     if chosen is OutputFormat.NATIVE:
         _write_native(recording, out_path, size, codec, progress, overwrite)
     else:
-        export(recording.events, out_path, chosen, size, codec=codec, progress=progress, overwrite=overwrite)
-    return _summary(recording, size, chosen)
+        dropped = export(
+            recording.events, out_path, chosen, size, codec=codec, progress=progress, overwrite=overwrite,
+            rounding=rounding, seed=seed, bag=bag_of(recording),
+        )  # fmt: skip
+    return _summary(recording, size, chosen, rounding, dropped)
 
 
 def _write_native(
@@ -174,15 +200,17 @@ def _write_native(
         overwrite=overwrite,
         codec=codec,
     ) as writer:
-        copy_events(recording, writer, progress)
+        copy_events(recording, writer, size, progress)
 
 
-def _summary(recording: Recording, size: tuple[int, int], chosen: OutputFormat) -> ConversionSummary:
+def _summary(
+    recording: Recording, size: tuple[int, int], chosen: OutputFormat, rounding: Rounding | None, dropped: int
+) -> ConversionSummary:
     source, encoder = recording.events, recording.encoder
     ends = (source.t_first, source.t_last) if len(source) else None
     slip = np.zeros(0) if encoder is None else encoder.slip()
     return ConversionSummary(
-        events=len(source),
+        events=len(source) - dropped,
         t_first=ends[0] if ends else None,
         t_last=ends[1] if ends else None,
         width=size[0],
@@ -192,21 +220,37 @@ def _summary(recording: Recording, size: tuple[int, int], chosen: OutputFormat) 
         encoder_gaps=() if encoder is None else _gaps(encoder),
         index_slip=float(np.abs(slip).max()) if slip.size else None,
         format=chosen,
-        left_out=() if chosen is OutputFormat.NATIVE else _left_out(recording, LIMITS[chosen].holds_size),
+        left_out=() if chosen is OutputFormat.NATIVE else left_out(recording, chosen),
+        rounding=rounding,
+        dropped=dropped,
     )
 
 
-def _left_out(recording: Recording, holds_size: bool) -> tuple[str, ...]:
-    """Return what a recording has in addition to its events, and the size if that is not held either."""
-    known = {"format", *SOURCE_NAMES, *getattr(recording.events, "repairs", {})}
+def bag_of(recording: Recording) -> Bag | None:
+    """Return the ROS 2 bag and the topic that a recording is read from, or None for other recordings."""
+    source, about = recording.events, recording.metadata
+    if not isinstance(source, FileEvents) or about.get("format") != "rosbag2":
+        return None
+    return Bag(source.path, str(about["topic"]))
+
+
+def left_out(recording: Recording, chosen: OutputFormat) -> tuple[str, ...]:
+    """Return what a recording has in addition to its events and a format other than the native one does not hold."""
+    known = {"format", *SOURCE_NAMES, *getattr(recording.events, "repairs", {}), "other_topics"}
+    from_bag = str(recording.metadata.get("format")).startswith("rosbag")
+    copied = chosen is OutputFormat.ROS2 and bag_of(recording) is not None
+    if copied:
+        known |= {"topic", *RECORDS}
     found = {
-        "sensor size": not holds_size,
+        "sensor size": not LIMITS[chosen].holds_size,
         "encoder": recording.encoder is not None,
         "camera": recording.camera is not None,
         "prism": recording.prism is not None,
         "ground truth": recording.truth is not None,
-        "IMU samples": recording.imu is not None,
-        "frames": recording.frames is not None,
+        "IMU samples": recording.imu is not None and not copied,
+        "frames": recording.frames is not None and not copied,
+        "triggers": copied and bool(recording.metadata.get("triggers")),
+        "other topics": bool(recording.metadata.get("other_topics")) and from_bag and not copied,
         "metadata": not set(recording.metadata) <= known,
     }
     return tuple(name for name, left in found.items() if left)

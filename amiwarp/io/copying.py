@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
+from amiwarp.events.checks import inside_image
 from amiwarp.io.native_writer import RecordingWriter
 
 if TYPE_CHECKING:
@@ -15,8 +16,13 @@ POSE_BLOCK = 1 << 16
 """Number of poses that are copied at a time."""
 
 
-def copy_events(recording: Recording, writer: RecordingWriter, progress: Progress | None = None) -> None:
-    """Append all events of a recording to a writer, with their ground truth and flags, IMU samples and frames."""
+def copy_events(
+    recording: Recording, writer: RecordingWriter, size: tuple[int, int], progress: Progress | None = None
+) -> None:
+    """Append all events of a recording to a writer, with their ground truth and flags, IMU samples and frames.
+
+    ``size`` is that of the image [px]. Flags that a source of compensated events does not have follow from it.
+    """
     source, truth = recording.events, recording.truth
     flags = {name: getattr(source, name, None) for name in ("inside", "extrapolated")}
     start = 0
@@ -24,6 +30,8 @@ def copy_events(recording: Recording, writer: RecordingWriter, progress: Progres
         stop = start + len(block)
         known = None if truth is None else truth.of_events(start, stop)
         marks = {name: None if flag is None else flag(start, stop) for name, flag in flags.items()}
+        if marks["inside"] is None and not block.whole_pixels:
+            marks["inside"] = inside_image(block.x, block.y, *size)
         writer.append(block, truth=known, **marks)
         start = stop
         if progress is not None:
@@ -56,7 +64,7 @@ def save_recording(path: str | os.PathLike[str], recording: Recording, *, overwr
     Parameters
     ----------
     path : str or path-like
-        The file to write.
+        The file to write, which ends in ``.h5`` or ``.hdf5``. :func:`convert` writes other formats.
     recording : Recording
         The recording.
     overwrite : bool, default False
@@ -65,7 +73,7 @@ def save_recording(path: str | os.PathLike[str], recording: Recording, *, overwr
     Raises
     ------
     AmiwarpError
-        If the path cannot be written, is being read, or exists without ``overwrite``.
+        If the path has another extension, cannot be written, is being read, or exists without ``overwrite``.
 
     Examples
     --------
@@ -87,4 +95,4 @@ def save_recording(path: str | os.PathLike[str], recording: Recording, *, overwr
         metadata=recording.metadata,
         overwrite=overwrite,
     ) as writer:
-        copy_events(recording, writer)
+        copy_events(recording, writer, source.size)

@@ -1,8 +1,8 @@
 """Event source for files without an index: a first pass counts, checks and repairs; later uses read the file again.
 
 Two faults of real recordings are repaired and counted, in all formats alike. An event that is earlier than one before
-it is moved to the largest time so far. An event outside the frame is dropped. If more than 1 % of the events have one
-of these faults, the file is refused, because then its format, size or order must be wrong.
+it is moved to the largest time so far. An event outside the frame is dropped, unless it is compensated. If more than
+1 % of the events have one of these faults, the file is refused, because then its format, size or order must be wrong.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import rounded_times
+from amiwarp.events.checks import as_coordinate, rounded_times
 from amiwarp.events.events import DEFAULT_BLOCK, Events, regroup
 from amiwarp.io.input_files import errors_name, register_reader
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
 
 Packet: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 """Packet of events: arrays x, y [px], t [us] and p (ON if positive) as stored in the file: integers or booleans of one
-shape ``(n,)``."""
+shape ``(n,)``. x and y of compensated events are floating."""
 
 KEEP_EVENTS = 1 << 22
 """Largest recording that stays in memory after the first pass [events], 55 MB."""
@@ -73,8 +73,18 @@ PROGRESS = ("read", "total")
 
 
 def whole_pixels(values: NDArray[Any]) -> NDArray[np.int64]:
-    """Return floating coordinates as integers. NaN and values beyond 32 bits become -1, which lies outside."""
-    return np.where(np.abs(values) < 2**31, values, -1).astype(np.int64)
+    """Return floating coordinates as integers. NaN and values beyond 32 bits become -1, which lies outside.
+
+    Raises :class:`AmiwarpError` for a fraction, which would be lost.
+    """
+    known = np.where(np.abs(values) < 2**31, values, -1)
+    whole = known.astype(np.int64)
+    if not np.array_equal(whole, known):
+        given = known[whole != known][0]
+        raise AmiwarpError(
+            f"a coordinate is {given:g}; expected whole pixels (compensated events: amiwarp's .h5 or .npz)"
+        )
+    return whole
 
 
 def microseconds(seconds: NDArray[Any]) -> NDArray[np.int64]:
@@ -274,10 +284,11 @@ class FileEvents:
     def _repair(self, x: NDArray[Any], y: NDArray[Any], t: NDArray[Any], p: NDArray[Any], counts: PassCounts) -> Events:
         # Sensor coordinates are uint16. Larger values would wrap around.
         width, height = self._size or (LARGEST_SIZE, LARGEST_SIZE)
+        compensated = x.dtype.kind == "f"
         inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        if not inside.all():
+        if not compensated and not inside.all():
             counts.outside += int(inside.size - np.count_nonzero(inside))
-            x, y, t, p = x[inside], y[inside], t[inside], p[inside]
+            x, y, t, p, inside = x[inside], y[inside], t[inside], p[inside], inside[inside]
         if not t.size:
             return Events.empty()
         times = rounded_times(t)
@@ -286,5 +297,11 @@ class FileEvents:
         counts.late += int(np.count_nonzero(ordered != times))
         counts.t_first = counts.t_first if counts.count else int(ordered[0])
         counts.t_last, counts.count = int(ordered[-1]), counts.count + ordered.size
-        counts.x_max, counts.y_max = max(counts.x_max, int(x.max())), max(counts.y_max, int(y.max()))
-        return Events(x.astype(np.uint16), y.astype(np.uint16), ordered, (p > 0).astype(np.uint8))
+        if inside.any():
+            counts.x_max = max(counts.x_max, int(np.rint(x[inside].max())))
+            counts.y_max = max(counts.y_max, int(np.rint(y[inside].max())))
+        x, y = (
+            as_coordinate(name, values) if compensated else values.astype(np.uint16)
+            for name, values in (("x", x), ("y", y))
+        )
+        return Events(x, y, ordered, (p > 0).astype(np.uint8))

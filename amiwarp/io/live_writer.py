@@ -32,6 +32,7 @@ from amiwarp.io.copying import save_recording
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import Columns, check_frame, check_lengths, make_dataset, ms_entries, write_header
 from amiwarp.io.native_reader import open_native
+from amiwarp.io.output_formats import check_native
 from amiwarp.optics.camera import Camera
 
 if TYPE_CHECKING:
@@ -65,8 +66,9 @@ class LiveWriter:
     are in the file after ``flush_s`` [s] at the latest, if :meth:`append` or :meth:`tick` is called that often. Use it
     in one thread.
 
-    Raises :class:`AmiwarpError` for a path that cannot be written or exists (unless ``overwrite``), for an existing
-    part file, and for events that are unsorted or outside the frame. After bad events the recording can continue.
+    Raises :class:`AmiwarpError` for a path that does not end in .h5 or .hdf5, cannot be written or exists (unless
+    ``overwrite``), for an existing part file, and for events that are unsorted or outside the frame. After bad events
+    the recording can continue.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class LiveWriter:
     ) -> None:
         """Prepare the writer. The times of written encoder samples are shifted by ``clock_offset_us``."""
         self.path, self._overwrite = Path(path), overwrite
+        check_native(self.path)
         check_frame(self.path, width, height, camera)
         self.part = self.path.resolve().with_name(f"{self.path.stem}.part.h5")
         self._size = (int(width), int(height))

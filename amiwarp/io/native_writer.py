@@ -37,6 +37,7 @@ from amiwarp.io.native_layout import (
     ms_entries,
     write_header,
 )
+from amiwarp.io.output_formats import check_native
 from amiwarp.io.record_appender import RecordAppender
 from amiwarp.io.truth_writer import event_columns
 from amiwarp.optics.camera import Camera
@@ -59,7 +60,7 @@ class RecordingWriter(RecordAppender):
     Parameters
     ----------
     path : str or path-like
-        The file to write.
+        The file to write, which ends in ``.h5`` or ``.hdf5``.
     width, height : int
         Sensor size [px].
     camera : Camera, optional
@@ -82,8 +83,8 @@ class RecordingWriter(RecordAppender):
     Raises
     ------
     AmiwarpError
-        If the path cannot be written, is being read, or exists without ``overwrite``; or if events are unsorted or
-        outside the frame.
+        If the path has another extension, cannot be written, is being read, or exists without ``overwrite``; or if
+        events are unsorted or outside the frame.
 
     Examples
     --------
@@ -110,6 +111,7 @@ class RecordingWriter(RecordAppender):
         codec: Codec | str = Codec.BLOSC,
     ) -> None:
         self.path, self._overwrite = Path(path), overwrite
+        check_native(self.path)
         self._codec = choice(Codec, codec, f"{self.path}: codec")
         check_frame(self.path, width, height, camera)
         self._size = (int(width), int(height))

@@ -1,10 +1,11 @@
 """Reader of NumPy arrays of events: archives (.npz) and the folders of EV-IMO2.
 
-An archive holds the integer arrays x, y [px], t [us] and p (1 is ON, 0 or -1 is OFF), or one structured array
-``event_data`` with these fields (N-ImageNet), or one array ``events`` with the columns t [s], x, y, p (EV-IMO). The
-optional numbers ``width`` and ``height`` give the sensor size. Otherwise it is the smallest known sensor that holds all
-events. A folder of EV-IMO2 holds ``dataset_events_t.npy`` [s], ``dataset_events_xy.npy`` and ``dataset_events_p.npy``.
-Arrays are read in pieces, so that memory does not depend on the size that a file declares.
+An archive holds the integer arrays x, y [px], t [us] and p (1 is ON, 0 or -1 is OFF), with floating x and y for
+compensated events, or one structured array ``event_data`` with these fields (N-ImageNet), or one array ``events`` with
+the columns t [s], x, y, p (EV-IMO). The optional numbers ``width`` and ``height`` give the sensor size. Otherwise it is
+the smallest known sensor that holds all events. A folder of EV-IMO2 holds ``dataset_events_t.npy`` [s],
+``dataset_events_xy.npy`` and ``dataset_events_p.npy``. Arrays are read in pieces, so that memory does not depend on the
+size that a file declares.
 """
 
 from __future__ import annotations
@@ -91,7 +92,8 @@ def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
         names = {name.removesuffix(".npy") for name in archive.namelist()}
         missing = [name for name in "xytp" if name not in names]
         if not missing:
-            arrays = {name: opened.enter_context(_array(archive, name)) for name in "xytp"}
+            kinds = {"x": "iubf", "y": "iubf", "t": "iub", "p": "iub"}
+            arrays = {name: opened.enter_context(_array(archive, name, kinds[name])) for name in "xytp"}
             yield from _columns(path, arrays, notes)
         elif "event_data" in names:
             array = opened.enter_context(_array(archive, "event_data", "V"))
@@ -113,6 +115,10 @@ def _columns(path: Path, arrays: Mapping[str, Array], notes: dict[str, int]) -> 
     for name, (_, shape, _) in arrays.items():
         if len(shape) != 1 or shape != count:
             raise AmiwarpError(f"{path}: array {name} has shape {shape}, t {count}; expected one length (n,)")
+    x_type, y_type = (arrays[name][2] for name in "xy")
+    if (x_type.kind == "f") != (y_type.kind == "f"):
+        given = f"array x is {x_type}, y is {y_type}"
+        raise AmiwarpError(f"{path}: {given}; expected integers, or floating numbers for compensated events")
     for length in _lengths(count[0], notes):
         x, y, t, p = (_next(array, length) for array in arrays.values())
         yield x, y, t, p

@@ -19,24 +19,27 @@ from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.io.output_formats import Outline
 
 COLUMNS = {"x": "<u2", "y": "<u2", "t": "<i8", "p": "|u1"}
-"""Types of the arrays."""
+"""Types of the arrays. x and y of compensated events are float32."""
 
 
 def write_npz(part: Path, blocks: Iterable[Events], about: Outline) -> None:
     """Write all events."""
+    columns, count = COLUMNS, 0
     with scratch_folder(part.parent) as folder:
         with contextlib.ExitStack() as opened:
             files = {name: opened.enter_context((folder / name).open("wb")) for name in COLUMNS}
             for events in blocks:
-                for name, dtype in COLUMNS.items():
+                columns = COLUMNS if events.whole_pixels else {**COLUMNS, "x": "<f4", "y": "<f4"}
+                count += len(events)
+                for name, dtype in columns.items():
                     files[name].write(np.ascontiguousarray(getattr(events, name), dtype).data)
         with zipfile.ZipFile(part, "x") as archive:
-            for name, dtype in COLUMNS.items():
+            for name, dtype in columns.items():
                 with (
                     archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member,
                     (folder / name).open("rb") as column,
                 ):
-                    header = {"descr": dtype, "fortran_order": False, "shape": (about.count,)}
+                    header = {"descr": dtype, "fortran_order": False, "shape": (count,)}
                     npy.write_array_header_1_0(member, header)
                     shutil.copyfileobj(column, member, 1 << 20)
             for name in ("width", "height"):

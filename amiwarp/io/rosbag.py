@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import struct
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
@@ -59,6 +62,9 @@ def read_head(path: str, topic: str | None) -> Reply:
     with opened_bag(path) as (bag, ros1):
         connection = _choose(bag, topic, 1 if ros1 else 2)
         counts: dict[str, int] = {}
+        others = len({other.topic for other in bag.connections} - {connection.topic})
+        if others:
+            counts["other_topics"] = others
         for other in bag.connections:
             if other.msgtype in OTHER:
                 name = OTHER[other.msgtype]
@@ -86,6 +92,49 @@ def read_packets(notes: dict[str, int], path: str, topic: str, triggers: bool) -
             notes["read"] = notes.get("read", 0) + 1
             notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
             yield edges if triggers else events
+
+
+def read_stamps(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[Any, ...]]:
+    """Yield for each message of a topic of a ROS 2 bag that holds events: the times of its first event [us], of its
+    recording and of its header [ns]. Runs in the reading process.
+    """
+    with opened_bag(path) as (bag, ros1):
+        connections = [found for found in bag.connections if found.topic == topic]
+        decode = _decoder(connections[0], ros1=ros1)
+        for _, recorded, raw in bag.messages(connections=connections):
+            t = decode(raw)[0][2]
+            if len(t):
+                seconds, rest = struct.unpack_from("<iI", raw, 4)  # all types of messages with events begin so
+                yield tuple(np.array([value], np.int64) for value in (t[0], recorded, seconds * 10**9 + rest))
+
+
+def read_topics(path: str, topic: str) -> Reply:
+    """Return the other topics of a ROS 2 bag, with what a writer needs to know of them. Runs in the reading process."""
+    with opened_bag(path) as (bag, _):
+        return [
+            {
+                "topic": one.topic,
+                "type": one.msgtype,
+                "definition": one.msgdef.data,
+                "digest": one.digest,
+                "serialization": one.ext.serialization_format,
+                "qos": [[getattr(value, "value", value) for value in qos] for qos in one.ext.offered_qos_profiles],
+            }
+            for one in bag.connections
+            if one.topic != topic
+        ], []
+
+
+def read_others(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[Any, ...]]:
+    """Yield the other messages of a ROS 2 bag: bytes, length, time of recording [ns], and the index of the topic among
+    those of :func:`read_topics`. Runs in the reading process.
+    """
+    with opened_bag(path) as (bag, _):
+        others = [one for one in bag.connections if one.topic != topic]
+        places = {one.id: at for at, one in enumerate(others)}
+        for one, recorded, raw in bag.messages(connections=others) if others else ():
+            numbers = (np.array([value], np.int64) for value in (len(raw), recorded, places[one.id]))
+            yield np.frombuffer(raw, np.uint8), *numbers
 
 
 @contextlib.contextmanager

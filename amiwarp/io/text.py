@@ -2,7 +2,8 @@
 
 A first line ``width height``, which some exporters write, gives the sensor size. Otherwise it is that of the smallest
 known sensor that holds all events (240x180 for that dataset). A ``calib.txt`` in the same folder gives the camera as
-``fx fy cx cy k1 k2 p1 p2 k3``. Empty lines and lines that start with ``#`` are ignored.
+``fx fy cx cy k1 k2 p1 p2 k3``. Empty lines and lines that start with ``#`` are ignored. If most of the first events
+have fractional x or y, all are compensated, and ``nan`` marks events without coordinates.
 """
 
 from __future__ import annotations
@@ -75,6 +76,7 @@ def _last_time(path: Path, estimate: int) -> int | None:
 
 
 def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
+    fractional: bool | None = None
     with open_input(path) as file:
         _, line_number = _read_size(path, file)
         rest = b""
@@ -86,39 +88,49 @@ def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
                 raise AmiwarpError(f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters")
             if newline:
                 lines = whole.split(b"\n")
-                yield _parse(path, lines, line_number)
+                fractional, events = _parse(path, lines, line_number, fractional)
+                yield events
                 line_number += len(lines)
         if rest.strip():
-            yield _parse(path, [rest], line_number)
+            yield _parse(path, [rest], line_number, fractional)[1]
 
 
-def _parse(path: Path, lines: list[bytes], line_number: int) -> Packet:
-    """Return the events in lines of text; ``line_number`` is the number of the line before them."""
+def _parse(path: Path, lines: list[bytes], line_number: int, fractional: bool | None) -> tuple[bool | None, Packet]:
+    """Return whether the events of a file are compensated, and those in lines of text.
+
+    ``line_number`` is the number of the line before them, ``fractional`` what the lines before have shown.
+    """
     kept = [line for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
     if not kept:
         nothing = np.zeros(0, np.int64)
-        return nothing, nothing, nothing, nothing
+        return fractional, (nothing, nothing, nothing, nothing)
     try:
         table = np.loadtxt(kept, ndmin=2, comments=None, encoding="ascii")
     except ValueError:
         table = np.zeros((0, 0))
-    if table.shape != (len(kept), 4) or not _plausible(table).all():
-        raise AmiwarpError(
-            f"{path}: {_first_bad_line(lines, line_number)}; expected 't x y p' with t in seconds, p 0 or 1"
-        )
+    if fractional is None and table.shape[1] == 4:
+        fractional = bool((table[:, 1:3] != np.floor(table[:, 1:3])).any(axis=1).mean() > 0.5)
+    if table.shape != (len(kept), 4) or not _plausible(table, fractional).all():
+        bad = _first_bad_line(lines, line_number, fractional)
+        raise AmiwarpError(f"{path}: {bad}; expected 't x y p' with t in seconds, p 0 or 1")
     t, x, y, p = table.T
-    return x.astype(np.int64), y.astype(np.int64), np.rint(t * 1e6).astype(np.int64), p.astype(np.int64)
+    t, p = np.rint(t * 1e6).astype(np.int64), p.astype(np.int64)
+    return fractional, (x, y, t, p) if fractional else (x.astype(np.int64), y.astype(np.int64), t, p)
 
 
-def _plausible(table: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _plausible(table: NDArray[np.float64], fractional: bool | None) -> NDArray[np.bool_]:
     """Return for each row ``t x y p`` whether its numbers are usable."""
     t, x, y, p = table.T
-    # Pixels must be whole and fit 32 bits. Pixels outside the frame are dropped later. NaN fails every comparison.
-    whole: Any = (np.abs(x) < 2**31) & (np.abs(y) < 2**31) & (np.floor(x) == x) & (np.floor(y) == y)
-    return np.asarray((np.abs(t) < 2**62 / 1e6) & whole & ((p == 0) | (p == 1) | (p == -1)))
+    # Pixels must fit 32 bits. Pixels outside the frame are dropped later. NaN fails every comparison.
+    places: Any = (np.abs(x) < 2**31) & (np.abs(y) < 2**31)
+    if fractional:
+        places |= np.isnan(x) | np.isnan(y)
+    else:
+        places &= (np.floor(x) == x) & (np.floor(y) == y)
+    return np.asarray((np.abs(t) < 2**62 / 1e6) & places & ((p == 0) | (p == 1) | (p == -1)))
 
 
-def _first_bad_line(lines: list[bytes], line_number: int) -> str:
+def _first_bad_line(lines: list[bytes], line_number: int, fractional: bool | None) -> str:
     """Return a description of the first line that does not hold an event, for error messages."""
     for number, line in enumerate(lines, line_number + 1):
         if not line.strip() or line.lstrip().startswith(b"#"):
@@ -127,6 +139,6 @@ def _first_bad_line(lines: list[bytes], line_number: int) -> str:
             row = np.array([[float(word) for word in line.split()]])
         except ValueError:
             row = np.zeros((1, 0))
-        if row.shape != (1, 4) or not _plausible(row).all():
+        if row.shape != (1, 4) or not _plausible(row, fractional).all():
             return f"line {number} is '{line[:80].decode('ascii', 'replace').strip()}'"
     return f"line {line_number + 1} or after it is malformed"

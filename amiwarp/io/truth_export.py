@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import FrameStore, PoseStore
 from amiwarp.io.atomic_output import NewFile, make_folder
+from amiwarp.io.output_formats import POSE_ENDINGS, check_ending
 from amiwarp.progress import Progress
 
 DSEC_SCALE, DSEC_ZERO = 128.0, 1 << 15
@@ -148,8 +149,7 @@ def save_flow_mvsec(
     3
     """
     path = Path(path)
-    if path.suffix.lower() != ".npz":
-        raise AmiwarpError(f"{path}: MVSEC stores flow in a .npz file; give a name that ends in .npz")
+    check_ending(path, "the flow of MVSEC is written", [".npz"])
     intervals = _intervals(frames)
     lengths = [stop - start for start, stop in intervals]
     lengths.append(lengths[-1])
@@ -179,7 +179,7 @@ def save_poses_tum(
     Parameters
     ----------
     path : str or path-like
-        File to write.
+        File to write, with the suffix .txt or .tum.
     poses : PoseStore
         Poses of the camera and of moving bodies.
     body : str, optional
@@ -201,6 +201,7 @@ def save_poses_tum(
     [0.0, 0.001]
     """
     path = Path(path)
+    check_ending(path, "poses are written", POSE_ENDINGS)
     known = sorted(poses[:0].bodies)
     if body is not None and body not in known:
         raise AmiwarpError(f"body {body!r} has no poses; choose among {', '.join(known) or 'none: no body moves'}")

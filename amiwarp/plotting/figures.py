@@ -18,6 +18,7 @@ from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
 from amiwarp.imaging.warped_image import iwe
 from amiwarp.io.atomic_output import write_text
+from amiwarp.io.output_formats import check_ending
 from amiwarp.plotting import clouds
 from amiwarp.reconstruction.choices import Tone
 from amiwarp.reconstruction.export import limits, tones
@@ -363,6 +364,7 @@ def save(figure: Any, path: Path, *, all_colours: bool = False, overwrite: bool 
 
 def save_svg(figure: Any, path: Path) -> None:
     """Write a figure as an SVG without a date; the write is atomic."""
+    check_ending(path, "figures are written here", [".svg"])
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None})
     write_text(path, text.getvalue())

@@ -12,6 +12,7 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.export import encode_image
 from amiwarp.io.atomic_output import NewFile, check_output
+from amiwarp.io.output_formats import check_ending
 from amiwarp.reconstruction.choices import CONTRAST, Tone
 from amiwarp.validation import choice
 
@@ -28,6 +29,8 @@ LIMITS_UPDATE = 0.1
 """Weight of a new frame in the running average of a video's black and white levels. A small weight prevents flicker."""
 STILL_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
 """File suffixes of single pictures."""
+MASK_SUFFIXES = (".png", ".tif", ".tiff")
+"""File suffixes of masks."""
 VIDEO = ".mp4"
 """File suffix of videos."""
 
@@ -59,8 +62,7 @@ def tones(
 
 def check_path(path: Path, endings: tuple[str, ...] = (*STILL_SUFFIXES, VIDEO)) -> None:
     """Raise :class:`AmiwarpError` for a file suffix that is not in ``endings``, or a folder that does not exist."""
-    if path.suffix.lower() not in endings:
-        raise AmiwarpError(f"{path}: ends in {path.suffix or 'no suffix'}; expected one of {', '.join(endings)}")
+    check_ending(path, "pictures are written", endings)
     check_output(path)
 
 
@@ -85,7 +87,7 @@ def save_picture(
 
 def save_mask(picture: Picture, path: Path) -> None:
     """Write the mask of known pixels as .png or .tif: white where events determine the picture."""
-    check_path(path, STILL_SUFFIXES[:3])
+    check_path(path, MASK_SUFFIXES)
     save_grey(picture.known.astype(np.float32), path, bits=8)
 
 

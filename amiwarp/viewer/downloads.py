@@ -17,6 +17,7 @@ from amiwarp.imaging.export import encode_image, encode_png
 from amiwarp.io import RecordingWriter
 from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.file_scan import FileEvents
+from amiwarp.io.output_formats import check_ending
 from amiwarp.viewer.window_loading import kept
 
 if TYPE_CHECKING:
@@ -73,14 +74,11 @@ def write_image(images: ShownImages, path: Path, *, before: bool = False) -> Non
     values = images.before if before else images.after
     if values is None:
         raise AmiwarpError(f"there is no image of {images.kind.value} before compensation; export the compensated one")
-    if path.suffix not in IMAGE_SUFFIXES:
-        raise AmiwarpError(
-            f"{path.name}: images are written as {', '.join(IMAGE_SUFFIXES)}; give one of these suffixes"
-        )
+    ending = check_ending(path, "images are written", IMAGE_SUFFIXES)
     with NewFile(path) as new:
-        if path.suffix == ".png":
+        if ending == ".png":
             encode_png(new.part, images.scale.rgb(values))
-        elif path.suffix == ".npy":
+        elif ending == ".npy":
             with open(new.part, "wb") as file:
                 np.save(file, np.asarray(values, np.float32))
         else:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
 from amiwarp.io.input_files import text_lines
+from amiwarp.io.output_formats import POSE_ENDINGS, check_ending
 from amiwarp.validation import array, real
 
 if TYPE_CHECKING:
@@ -256,13 +257,15 @@ class Trajectory:
         Parameters
         ----------
         path : str or Path
-            File to write.
+            File to write, with the suffix .txt or .tum.
         overwrite : bool
             Whether to replace an existing file.
         """
+        path = Path(path)
+        check_ending(path, "poses are written", POSE_ENDINGS)
         table = np.column_stack([self.t, self.position, self.rotation])
         lines = [" ".join(repr(float(value)) for value in row) for row in table]
-        write_text(Path(path), "# t x y z qx qy qz qw\n" + "\n".join(lines) + "\n", overwrite=overwrite)
+        write_text(path, "# t x y z qx qy qz qw\n" + "\n".join(lines) + "\n", overwrite=overwrite)
 
 
 def looking_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Rotation:
