@@ -400,6 +400,14 @@ def test_trajectories_have_a_limit(tmp_path: Path) -> None:
         Trajectory.from_file(tmp_path / "b.txt")
 
 
+def test_huge_poses_are_refused_without_warnings() -> None:
+    t, still = np.arange(2.0), [0.0, 0.0, 0.0, 1.0]
+    with pytest.raises(AmiwarpError, match="quaternion of length inf; give unit"):
+        Trajectory(t, np.zeros((2, 3)), np.array([still, [1e200, 0.0, 0.0, 0.0]]))
+    with pytest.raises(AmiwarpError, match="moves at inf m/s"):
+        Trajectory(t, np.array([[1e300, 0.0, 0.0], [-1e300, 0.0, 0.0]]), np.array([still, still]))
+
+
 def test_large_world_files_are_refused_before_they_are_parsed(tmp_path: Path) -> None:
     (tmp_path / "w.json").write_text(json.dumps(tomllib.loads(EXAMPLE)) + " " * (8 << 20))
     with pytest.raises(AmiwarpError, match=r"w\.json: is larger than 8 MiB"):

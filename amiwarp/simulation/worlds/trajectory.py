@@ -73,10 +73,12 @@ class Trajectory:
             raise AmiwarpError("trajectory holds values that are not finite; remove these poses")
         if not (np.diff(t) > 0).all():
             raise AmiwarpError("trajectory's times do not increase; sort the poses and remove duplicates")
-        length = np.linalg.norm(rotation, axis=1, keepdims=True)
-        if not (np.abs(length - 1.0) < 0.01).all():
+        with np.errstate(over="ignore"):  # the length of huge values is infinite
+            length = np.linalg.norm(rotation, axis=1, keepdims=True)
+        off = np.abs(length - 1.0)
+        if not (off < 0.01).all():
             raise AmiwarpError(
-                f"trajectory has a quaternion of length {float(length.min()):.3g}; give unit quaternions"
+                f"trajectory has a quaternion of length {float(length[np.argmax(off), 0]):.3g}; give unit quaternions"
             )
         for name, values in (("t", t), ("position", position), ("rotation", rotation / length)):
             object.__setattr__(self, name, values)
@@ -90,7 +92,8 @@ class Trajectory:
         if t.size < 2:
             return
         step = np.diff(t)
-        speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
+        with np.errstate(over="ignore"):
+            speed = np.linalg.norm(np.diff(position, axis=0), axis=1) / step
         orientation: Any = Rotation.from_quat(np.asarray(self.rotation, np.float64))
         rate = (orientation[:-1].inv() * orientation[1:]).magnitude() / step
         for what, found, limit, unit in (
