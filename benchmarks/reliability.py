@@ -43,6 +43,36 @@ START_S = 0.3
 CELLS = "cells"
 """Folder of complete intermediate results, from which the next run continues."""
 
+EXPORTS = """import signal, sys
+signal.signal(signal.SIGTERM, signal.default_int_handler)
+try:
+    import amiwarp
+    truth = amiwarp.open_recording(sys.argv[1]).truth
+    amiwarp.save_poses_tum(sys.argv[2] + "/poses.txt", truth.poses)
+    amiwarp.save_flow_mvsec(sys.argv[2] + "/flow.npz", truth.frames)
+    amiwarp.save_flow_dsec(sys.argv[2] + "/dsec", truth.frames)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+"""Program that exports the ground truth of a world."""
+
+SPECIFICATION = """format = "amiwarp-dataset-specification"
+version = 1
+name = "killed"
+duration_s = 0.02
+prisms = [{ apex_deg = 0.5 }, { apex_deg = 1.0 }]
+speeds_rpm = [720.0]
+sensors = ["davis346"]
+seeds = 15
+splits = { train = 1.0 }
+[camera]
+size = [64, 48]
+fov_deg = 60.0
+[[sources]]
+pictures = "pic.png"
+"""
+"""Specification of a data set of 30 recordings."""
+
 COMMANDS = {
     "simulate": ("simulate OUT/o.h5 --picture IN/pic.png --size 160x120 --duration 0.4", ("o.h5",)),
     "translate": ("translate IN/v.npy OUT/o.h5 --fps 100", ("o.h5",)),
@@ -82,11 +112,28 @@ COMMANDS = {
         "stability --quick --axes apex --minutes 0.01 --out OUT",
         ("atlas.csv", "atlas.json", "atlas.pdf", "axis_apex.png", "overview.png", "summary.md", CELLS),
     ),
+    "simulate, world": (
+        "simulate OUT/o.h5 --world room --size 64x48 --duration 0.1 --truth-hz 200 --preview OUT/p.png",
+        ("o.h5", "p.png"),
+    ),
+    "truth exports": ("IN/exports.py IN/world.h5 OUT", ("poses.txt", "flow.npz", "dsec")),
+    "dataset": (
+        "dataset IN/set.toml OUT --workers 1",
+        ("journal.jsonl", "manifest.json", "manifest.parquet", "train"),
+    ),
+    "evaluate": (
+        "evaluate --recording IN/s.h5 --recording IN/truth.h5 --seeds 1 --workers 1 --out OUT",
+        ("report.html", "report.json", "tables", "figures", CELLS),
+    ),
 }
-"""Command lines by name, each with the files that it writes. IN is the folder of inputs; OUT is empty at the start."""
+"""Command lines by name, each with the files that it writes. IN is the folder of inputs; OUT is empty at the start.
+A line that begins with IN is a Python program."""
 
-LIVE = ("record", "live")
-"""Commands that keep the events received until they are killed: their file is valid, but may be shorter."""
+SHORTER = ("record", "live", "dataset")
+"""Commands whose file is valid, but may be shorter: they keep what was finished when they were killed."""
+
+CONTINUED = ("stability", "dataset", "evaluate")
+"""Commands that continue a stopped run if they are given again."""
 
 
 def prepare(folder: Path) -> Path:
@@ -110,6 +157,7 @@ def prepare(folder: Path) -> Path:
         "simulate IN/s.h5 --picture IN/pic.png --size 160x120 --duration 0.3 --nominal-apex-deg 1.1",
         "simulate IN/truth.h5 --picture IN/pic.png --size 160x120 --duration 0.5",
         "calibrate IN/s.h5 IN/cal.json",
+        "simulate IN/world.h5 --world room --size 64x48 --duration 0.2 --truth-hz 500",
     ):
         subprocess.run(words(line, inputs, inputs), check=True, stdout=subprocess.DEVNULL)
     many_events(inputs)
@@ -117,6 +165,8 @@ def prepare(folder: Path) -> Path:
     (inputs / "enc.csv").write_text(
         "t_us,angle_deg\n" + "".join(f"{a},{b:.6f}\n" for a, b in zip(t, t * 4.32e-3, strict=True))
     )
+    (inputs / "exports.py").write_text(EXPORTS)
+    (inputs / "set.toml").write_text(SPECIFICATION)
     (inputs / "done").touch()
     return inputs
 
@@ -140,7 +190,7 @@ def many_events(inputs: Path, count: int = 3_000_000) -> None:
 
 def words(line: str, inputs: Path, out: Path) -> list[str]:
     text = [word.replace("IN/", f"{inputs}/").replace("OUT", str(out)) for word in line.split()]
-    return [sys.executable, "-m", "amiwarp", *text]
+    return [sys.executable, *(() if line.startswith("IN/") else ("-m", "amiwarp")), *text]
 
 
 def digest(folder: Path) -> dict[str, str]:
@@ -150,7 +200,7 @@ def digest(folder: Path) -> dict[str, str]:
 def size_of(path: Path) -> Any:
     """Read a file completely, and return a property that identifies a complete file of its kind."""
     if path.is_dir():
-        return all(json.loads(f.read_text())["results"] for f in path.glob("[!.]*"))
+        return all(size_of(f) for f in path.rglob("[!.]*"))
     if path.suffix == ".pdf":
         return path.read_bytes()[:5] + path.read_bytes()[-6:]
     if path.suffix == ".h5":
@@ -164,6 +214,13 @@ def size_of(path: Path) -> Any:
             return image.mode
     if path.suffix == ".npy":
         return np.load(path).shape
+    if path.suffix == ".npz":
+        with np.load(path) as arrays:
+            return sorted((name, arrays[name].shape) for name in arrays)
+    if path.suffix == ".parquet":
+        import pyarrow.parquet
+
+        return pyarrow.parquet.read_table(path).num_rows
     if path.suffix == ".mp4":
         import av
 
@@ -172,7 +229,7 @@ def size_of(path: Path) -> Any:
     text = path.read_text()
     if path.suffix == ".json":
         return sorted(json.loads(text))
-    return text[-6:] if path.suffix == ".svg" else text.count("\n")
+    return text[-6:] if path.suffix in (".svg", ".html") else text.count("\n")
 
 
 @contextlib.contextmanager
@@ -231,14 +288,13 @@ def judge(name: str, out: Path, expected: dict[str, Any], number: signal.Signals
             continue
         if file not in kept and file not in expected:
             wrong.append(f"{file} was left")
-        elif file not in kept and found != expected[file] and not (name in LIVE and found <= expected[file]):
+        elif file not in kept and found != expected[file] and not (name in SHORTER and found <= expected[file]):
             wrong.append(f"{file} holds {found}, whole {expected[file]}")
     if number is not signal.SIGKILL:
         wrong += [f"{file} was left" for file in unfinished | kept]
     remove_abandoned.cache_clear()
-    for place in (out, out / CELLS):
-        if place.is_dir():
-            NewFile(place / "next").discard()
+    for place in (out, *(found for found in out.rglob("[!.]*") if found.is_dir())):
+        NewFile(place / "next").discard()
     wrong += [f"{f.name} outlived the next run" for f in left if f.exists()]
     # exit status -number: the signal arrived while Python was starting or exiting
     if code not in ({-9, 0} if number is signal.SIGKILL else {130, 0, -number, -signal.SIGINT}):
@@ -275,6 +331,8 @@ def kills(name: str, inputs: Path, folder: Path, count: int, rng: random.Random)
         wrong += [f"{line} is still running" for line in alive]
         if "Traceback" in error and not starting:
             wrong.append(f"traceback: {error[-300:]}")
+        if name in CONTINUED:
+            wrong += continued(name, inputs, out, expected)
         ended[f"{number.name}: {how}"] += 1
         problems += [f"{number.name} after {after:.2f} s: {text}" for text in wrong]
     if digest(inputs) != before:
@@ -282,6 +340,17 @@ def kills(name: str, inputs: Path, folder: Path, count: int, rng: random.Random)
     return {"command": name, "kills": count, "run_s": seconds, "ended": dict(sorted(ended.items())),
             "runs_that_left_unfinished_files_to_the_next": unfinished, "longest_end_s": longest,
             "problems": problems}  # fmt: skip
+
+
+def continued(name: str, inputs: Path, out: Path, expected: dict[str, Any]) -> list[str]:
+    """Run a command again on what a killed run left; return the problems of the files."""
+    with begun(COMMANDS[name][0], inputs, out) as process:
+        _, error = process.communicate(timeout=600)
+    wrong = [f"the next run ended with {process.returncode}: {error[-300:]}"] if process.returncode else []
+    for file, whole in expected.items():
+        if not (out / file).exists() or size_of(out / file) != whole:
+            wrong.append(f"{file} is not whole after the next run")
+    return wrong
 
 
 def emptied(folder: Path) -> Path:
@@ -321,7 +390,7 @@ def disks(name: str, inputs: Path, folder: Path) -> dict[str, Any]:
                 except (AmiwarpError, OSError, ValueError) as damage:
                     wrong.append(f"{file} is damaged: {damage}")
                     continue
-                if found != expected[file] and not (name in LIVE and found <= expected[file]):
+                if found != expected[file] and not (name in SHORTER and found <= expected[file]):
                     wrong.append(f"{file} holds {found}, whole {expected[file]}")
             if code == 0 and there != set(expected):
                 wrong.append("exit status 0 without all files")
