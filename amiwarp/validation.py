@@ -1,16 +1,28 @@
-"""Checks of single values given by users.
+"""Checks of values given by users, and the check of the arguments of public functions against their annotations.
 
-Each check returns the value in its plain type, or raises :class:`AmiwarpError` that says what was expected.
+Each check of a single value returns it in its plain type, or raises :class:`AmiwarpError` that says what was expected.
 """
 
 from __future__ import annotations
 
+import builtins
+import collections.abc
+import contextlib
+import difflib
 import enum
+import functools
 import math
 import numbers
+import os
+import re
 import reprlib
-from collections.abc import Callable, Collection
-from typing import Any, TypeVar
+import sys
+import types
+import typing
+from collections.abc import Callable, Collection, Iterable, Sequence
+from pathlib import Path
+from types import FunctionType
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +34,9 @@ Choice = TypeVar("Choice", bound=enum.StrEnum)
 
 Kind = TypeVar("Kind")
 """Type variable: any class."""
+
+Target = TypeVar("Target", bound=Callable[..., Any])
+"""Type variable: any function or class."""
 
 UNUSABLE = (TypeError, ValueError, OverflowError, RecursionError)
 """Exceptions that Python and NumPy raise for values of unexpected types."""
@@ -164,3 +179,222 @@ def _range(what: str, low: float, high: float) -> str:
 def _plain(number: float) -> str:
     """Return a limit of a range as text."""
     return str(number) if isinstance(number, int) else f"{number:.6g}"
+
+
+_FILES = {
+    "Recording": "open it with amiwarp.open_recording",
+    "Calibration": "read it with amiwarp.Calibration.load",
+    "World": "read it with amiwarp.load_world",
+    "Trajectory": "read it with amiwarp.Trajectory.from_file",
+    "Scene": "read it with amiwarp.Scene.from_picture",
+}
+"""What to do with a path where an object is expected, by the name of the object's class."""
+
+_NUMBERS = frozenset(("int", "float", "None"))
+"""Names in the annotation of one number."""
+_PLAIN = _NUMBERS | {"str", "Any", "ArrayLike", "Literal", "us", "s", "tuple", "slice"}
+"""Names in annotations of values that functions check themselves, because they know ranges, choices and shapes."""
+_TEXT, _TEXTS = ({"str"}, {"str", "None"}), ({"str", "tuple"}, {"str", "Sequence"})
+"""Names in annotations of a text, and of a sequence of texts."""
+
+
+def guarded(target: Target) -> Target:
+    """Decorate a public function or class, so that calls check the kinds of objects by the annotations.
+
+    Objects, functions, mappings, NumPy arrays, paths, truth values, devices, and the numbers of functions, methods and
+    records are checked. Ranges, choices and shapes are the function's own business. An annotation is resolved when a
+    value first needs it, because its types may be imported for type checkers only. Raises :class:`AmiwarpError`.
+    """
+    if not isinstance(target, type):
+        return cast(Target, _checked_call(target, target.__name__, 0))
+    record = hasattr(target, "__dataclass_fields__") and not (
+        hasattr(target, "__post_init__") or hasattr(target, "check")
+    )
+    for name, member in list(vars(target).items()):
+        if name.startswith("_") and name != "__init__":
+            continue
+        label = target.__name__ if name == "__init__" else f"{target.__name__}.{name}"
+        if isinstance(member, FunctionType):
+            setattr(target, name, _checked_call(member, label, 1, record or name != "__init__"))
+        elif isinstance(member, classmethod):
+            setattr(target, name, classmethod(_checked_call(member.__func__, label, 1)))
+    return target
+
+
+def _checked_call(function: Any, label: str, first: int, numbers_too: bool = True) -> Any:
+    """Return the function with checks of its arguments from the index ``first`` on."""
+    code = function.__code__
+    names = code.co_varnames[first : code.co_argcount + code.co_kwonlyargcount]
+    found = [(name, _Parameter(function, label, name, numbers_too)) for name in names]
+    positional = [(first + k, one) for k, (_, one) in enumerate(found[: code.co_argcount - first]) if one.guarded]
+    named = {name: one for name, one in found if one.guarded}
+    if not named:
+        return function
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        for index, parameter in positional:
+            if index < len(args) and type(args[index]) not in parameter.known:
+                parameter.check(args[index])
+        for name, value in kwargs.items():
+            if name in named and type(value) not in named[name].known:
+                named[name].check(value)
+        return function(*args, **kwargs)
+
+    return call
+
+
+class _Parameter:
+    """Parameter of a guarded function."""
+
+    def __init__(self, function: Any, label: str, name: str, numbers_too: bool) -> None:
+        self._function, self._label, self._name = function, label, name
+        self.known = set[type]()  # types of which each instance is accepted
+        words = frozenset(re.findall(r"[A-Za-z]\w*", str(function.__annotations__.get(name, "Any"))))
+        self._number = numbers_too and words <= _NUMBERS
+        self._text = numbers_too and words in _TEXT and function.__name__ == "__init__"
+        plain = words <= _PLAIN and not (self._number or self._text or (numbers_too and words in _TEXTS))
+        self.guarded = name == "device" or not plain
+        self._optional = "None" in words or (function.__kwdefaults__ or {}).get(name, ...) is None
+
+    @functools.cached_property
+    def _kind(self) -> Any:
+        """The annotated type."""
+        annotation, names = self._function.__annotations__[self._name], self._function.__globals__
+        return eval(annotation, names, _PublicNames(names)) if isinstance(annotation, str) else annotation
+
+    def check(self, value: Any) -> None:
+        """Raise :class:`AmiwarpError` if the value is not of the annotated type."""
+        if value is None and self._optional:
+            return
+        kind = self._kind
+        if self._number:
+            what, floating = f"{self._label}: {self._name}", float in (kind, *typing.get_args(kind))
+            real(value, what) if floating else whole(value, what, *INT64)
+            return
+        if self._name == "device":
+            unmet = _no_device(value, kind, here="workers" not in self._function.__annotations__)
+        else:
+            unmet = _unmet("text" if self._text else kind, value)
+        if unmet:
+            path = isinstance(value, str | os.PathLike)
+            hint = next((f"; {_FILES[name]}" for name in _FILES if path and name in unmet.split()), "")
+            raise AmiwarpError(f"{self._label}: {self._name} is {shown(value)}; expected {unmet}{hint}")
+        if isinstance(value, bool | None) or type(value).__module__.startswith("amiwarp."):
+            self.known.add(type(value))
+
+
+class _PublicNames(dict[str, Any]):
+    """Names in annotations that a module imports for type checkers only."""
+
+    def __init__(self, module: dict[str, Any]) -> None:
+        super().__init__()
+        self._module = module
+
+    def __missing__(self, name: str) -> Any:
+        if name in self._module or hasattr(builtins, name):
+            raise KeyError(name)
+        for place in (collections.abc, typing, np.typing):
+            if hasattr(place, name):
+                return getattr(place, name)
+        return getattr(sys.modules["amiwarp"], name, Any)  # Any for types of libraries that are imported where used
+
+
+def _unmet(kind: Any, value: Any) -> str:
+    """Return what a type expects, in words, if a value does not fit; else an empty text."""
+    origin, parts = typing.get_origin(kind) or kind, typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        paths = {os.PathLike, Path} & {typing.get_origin(part) or part for part in parts}
+        words = list(dict.fromkeys(_unmet(part, value) for part in parts if not (paths and part is str)))
+        return "" if "" in words else " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+    if origin in _CHECKS:
+        fits, wording = _CHECKS[origin]
+        return "" if fits(value) else wording
+    if not isinstance(origin, type) or issubclass(origin, enum.Enum | int | float | str):
+        return ""
+    if issubclass(origin, collections.abc.Mapping):
+        whole_mapping = isinstance(value, collections.abc.Mapping) and all(isinstance(key, str) for key in value)
+        return _unmet_entries("mapping (dict) by names", parts[1:], value.values() if whole_mapping else None)
+    if issubclass(origin, tuple | list) or origin is collections.abc.Sequence:
+        return _unmet_entries("tuple or list", parts[:1], value if isinstance(value, list | tuple) else None)
+    if getattr(origin, "_is_protocol", False):
+        return "" if _has_members(origin, value) else origin.__name__
+    library = origin.__module__.partition(".")[0]
+    return "" if isinstance(value, origin) else f"{'' if library == 'amiwarp' else library + '.'}{origin.__name__}"
+
+
+def _unmet_entries(what: str, kinds: Sequence[Any], entries: Iterable[Any] | None) -> str:
+    """Return what a container expects, in words, if it or one of its entries does not fit; else an empty text."""
+    if entries is None:
+        return what
+    unmet = (_unmet(_INSIDE.get(kind, kind), entry) for entry in entries for kind in kinds)
+    return next((f"{what}, each {words}" for words in unmet if words), "")
+
+
+def _has_members(protocol: Any, value: Any) -> bool:
+    """Return whether a value has what a protocol names, without calling its properties."""
+    if protocol in type(value).__mro__:
+        return True
+    every = {name for base in protocol.__mro__ if getattr(base, "_is_protocol", False) for name in vars(base)}
+    names = {name for name in every if name[0] != "_" or name in ("__getitem__", "__len__")}
+    held = getattr(value, "__dict__", {})
+    simple = isinstance(value, type) or type(value).__module__ == "builtins"
+    return not simple and all(hasattr(type(value), name) or name in held for name in names)
+
+
+_INSIDE: dict[Any, Any] = {float: "number", str: "text"}
+"""Checks of plain values in a container, which functions take as they are."""
+INT64 = -(1 << 63), (1 << 63) - 1
+"""Limits of whole numbers whose range the function does not state."""
+
+
+def _fits_number(value: Any) -> bool:
+    with contextlib.suppress(AmiwarpError):
+        real(value, "")
+        return True
+    return False
+
+
+def _fits_path(value: Any) -> bool:
+    with contextlib.suppress(Exception):  # other classes may raise anything
+        return b"\0" not in os.fsencode(os.fspath(value)) and isinstance(os.fspath(value), str)
+    return False
+
+
+_CHECKS: dict[Any, tuple[Callable[[Any], bool], str]] = {
+    bool: (lambda value: isinstance(value, bool | np.bool_), "True or False"),
+    types.NoneType: (lambda value: value is None, "None"),
+    **dict.fromkeys((os.PathLike, Path), (_fits_path, "a path")),
+    np.ndarray: (
+        lambda value: isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and not np.ma.is_masked(value),
+        "a NumPy array of numbers without masked values",
+    ),
+    collections.abc.Callable: (callable, "a function"),
+    collections.abc.Iterable: (np.iterable, "an iterable"),
+    "number": (_fits_number, "a finite number"),
+    "text": (lambda value: isinstance(value, str), "a text"),
+}
+"""Check of a value, and what it expects in words, by type."""
+
+
+def _no_device(value: Any, kind: Any, *, here: bool) -> str:
+    """Return the devices, in words, if a value names none of them. ``here``: this machine must have the device."""
+    if not here:
+        fits = isinstance(value, str) and re.fullmatch(r"cpu|cuda(:\d+)?", value)
+        return "" if fits else "a device, such as cpu or cuda:0"
+    import warp as wp
+
+    with contextlib.suppress(Exception):  # Warp raises several kinds of errors
+        if isinstance(value, str if kind is str else str | wp.Device):
+            wp.get_device(value)
+            return ""
+    return f"a device of this machine; choose among {', '.join(device.alias for device in wp.get_devices())}"
+
+
+def check_names(given: Collection[str], known: Collection[str], what: str) -> None:
+    """Raise :class:`AmiwarpError`, which names the nearest known name, if a given name is none of the known ones."""
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(str(name), known, 1)
+            meant = f"did you mean {near[0]}?" if near else f"choose among {', '.join(known)}"
+            raise AmiwarpError(f"{what}{shown(name)[1:-1]} is unknown; {meant}")

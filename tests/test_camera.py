@@ -249,7 +249,7 @@ def test_impossible_lenses_are_refused(lens: Any, value: Any) -> None:
 
 @pytest.mark.parametrize("fov", [0.0, -1.0, 5e-324, 1e-300, math.pi, math.nan])
 def test_impossible_field_of_view_is_refused(fov: float) -> None:
-    with pytest.raises(AmiwarpError, match="field of view"):
+    with pytest.raises(AmiwarpError, match=r"field of view|fov = nan"):
         Camera.from_fov(640, 480, fov)
 
 

@@ -180,7 +180,7 @@ def test_bad_settings_are_refused() -> None:
     ):
         with pytest.raises(amiwarp.AmiwarpError, match=message):
             amiwarp.CornerDetector(size, detector=method)  # type: ignore[arg-type]
-    with pytest.raises(amiwarp.AmiwarpError, match="expected a Events"):
+    with pytest.raises(amiwarp.AmiwarpError, match="expected Events or DeviceEvents"):
         amiwarp.detect_corners(np.zeros((3, 4)), (40, 30))  # type: ignore[call-overload]
 
 

@@ -36,7 +36,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.events.truth import Poses
+from amiwarp.events.truth import MAPS, FrameTruth, MemoryFrames, Poses
 from amiwarp.imaging.choices import Layers
 from amiwarp.imaging.export import IweFiles
 from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
@@ -380,7 +380,10 @@ def test_functions_refuse_a_name_that_means_another_format(place: Path) -> None:
     assert replacing() == set(CALLS)
     camera, prism = amiwarp.Camera.from_fov(*SIZE, 1.0), Prism(0.01)
     simulation = amiwarp.Simulation(amiwarp.Scene.from_picture("pic.png"), camera, prism, 0.01)
-    frames = SimpleNamespace(t=np.array([0, 1000]))
+    maps = {name: np.zeros((3, 4, *shape), dtype) for name, (dtype, shape) in MAPS.items()}
+    pose = {"rotation": np.array([0.0, 0.0, 0.0, 1.0]), "position": np.zeros(3), "joints": {}}
+    instants = [FrameTruth(t_us=t, **maps, **pose) for t in (0, 1000)]
+    frames = MemoryFrames(instants)
     poses = amiwarp.Poses(t=np.array([0]), camera=np.zeros((1, 7)))
     given = SimpleNamespace(
         recording=open_recording("a.h5"), calibration=Calibration.load("cal.json"), simulation=simulation,

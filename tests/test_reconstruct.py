@@ -186,7 +186,8 @@ def test_hot_pixels_leave_no_salt(recording: Recording, picture: Picture) -> Non
     n, each = 60, 400
     x, y = np.repeat(rng.integers(0, 200, n), each), np.repeat(rng.integers(0, 150, n), each)
     t = rng.integers(0, 200_000, n * each)
-    hot = Events.from_arrays(x.astype(np.uint16), y.astype(np.uint16), t, rng.integers(0, 2, n * each))
+    p = rng.integers(0, 2, n * each).astype(np.uint8)
+    hot = Events(x.astype(np.uint16), y.astype(np.uint16), t, p)  # unsorted
     clean = recording.events.slice(0, len(recording.events))
     found = reconstruct(with_events(recording, Events.concatenate([clean, hot])), model=MODEL, start_us=START)
     assert found.hot >= 0.9 * n

@@ -203,7 +203,8 @@ def test_what_is_in_order_passes_untouched():
 
 
 def test_a_packet_is_sorted_and_equal_times_keep_their_order():
-    events = Events.from_arrays([0, 1, 2, 3], [0, 0, 0, 0], [5, 3, 5, 3], [1, 0, 1, 0])
+    x, p = np.arange(4, dtype=np.uint16), np.array([1, 0, 1, 0], np.uint8)
+    events = Events(x, np.zeros(4, np.uint16), np.array([5, 3, 5, 3]), p)
     got = EventSorter().put(events)
     assert got.t.tolist() == [3, 3, 5, 5]
     assert got.x.tolist() == [1, 3, 0, 2]

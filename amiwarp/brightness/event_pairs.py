@@ -24,6 +24,7 @@ from amiwarp.kernels.photometric import HELD, Pairs
 from amiwarp.kernels.square_sums import split_by_time
 from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
+from amiwarp.validation import guarded
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -41,6 +42,7 @@ SAMPLED = 1 << 15
 """Number of pairs whose times give the statistics of all."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class SensorTiming:
     """Known timing of the sensor [us]; 0 for unknown values.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 from amiwarp.calib.result import Calibration
@@ -11,8 +11,10 @@ from amiwarp.calib.sharpness.search import AUTO, Settings
 from amiwarp.calib.single_model import calibrate_model
 from amiwarp.events.recording import Recording
 from amiwarp.progress import Progress
+from amiwarp.validation import check_names, guarded
 
 
+@guarded
 def calibrate(
     recording: Recording,
     settings: Settings | None = None,
@@ -65,6 +67,7 @@ def calibrate(
     >>> round(calibration.parameters["apex"], 3)
     0.03
     """
+    check_names(changes, [entry.name for entry in fields(Settings)], "calibrate: setting ")
     settings = replace(settings or Settings(), **changes)
     settings.check()
     if settings.model == AUTO:

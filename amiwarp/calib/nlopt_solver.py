@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import one_of
+from amiwarp.validation import guarded, one_of
 
 GLOBAL_ALGORITHMS = (
     "GN_DIRECT",
@@ -49,6 +49,7 @@ SAME_OPTIMUM_PX = 1.0
 """Distance from a known optimum below which a search would end there [px]."""
 
 
+@guarded
 @dataclass(frozen=True, kw_only=True)
 class SearchStage:
     """Record of one run of a search algorithm: its best point and all evaluated points."""

@@ -23,7 +23,7 @@ from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism, UnsizedPrism
-from amiwarp.validation import instance, one_of, real, shown, vector
+from amiwarp.validation import guarded, instance, one_of, real, shown, vector
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -75,6 +75,7 @@ DEGENERATE_WITH_APEX = ("index", *LENS)
 degenerate with the apex."""
 
 
+@guarded
 @dataclass(frozen=True, kw_only=True)
 class ParameterSpace:
     """Free parameters of one model: names, bounds and start, and their conversion to and from the search vector.
@@ -188,6 +189,7 @@ class ParameterSpace:
         ndarray
             The vector [px], shape ``(n,)`` for n free parameters.
         """
+        _check_given(values, self.names)
         v = np.array([values[n] * self.pixels[n] for n in self.names])
         if self.cartesian:
             v[:2] = v[0] * math.cos(values["phase"]), v[0] * math.sin(values["phase"])
@@ -207,6 +209,8 @@ class ParameterSpace:
             Values of all parameters of the model, in their units. A value outside its bounds is moved to the nearer
             bound.
         """
+        if v.shape != (len(self.names),):
+            raise AmiwarpError(f"v has shape {v.shape}; give one entry for each of {', '.join(self.names)}")
         values, entries = dict(self.start), v.tolist()
         for name, entry in zip(self.names, entries, strict=True):
             values[name] = entry / self.pixels[name]
@@ -236,6 +240,8 @@ class ParameterSpace:
         -----
         The covariance is propagated to first order, J C Jᵀ, with the Jacobian J of the values by central differences.
         """
+        if covariance.shape != (len(self.names), len(self.names)):
+            raise AmiwarpError(f"covariance has shape {covariance.shape}; give {(len(self.names), len(self.names))}")
         jacobian = np.empty((len(self.names), len(self.names)))
         for k in range(len(self.names)):
             h = np.zeros(len(self.names))
@@ -315,6 +321,13 @@ def _difference(name: str, a: float, b: float) -> float:
     return math.remainder(a - b, 2.0 * math.pi) if name == "phase" else a - b
 
 
+def _check_given(values: Mapping[str, float], names: tuple[str, ...]) -> None:
+    """Raise :class:`AmiwarpError` if a parameter has no value."""
+    missing = [name for name in names if name not in values]
+    if missing:
+        raise AmiwarpError(f"values have no {', '.join(missing)}; give the value of each parameter")
+
+
 def size_name(model: str) -> str:
     """Return the name of the parameter that sets the size of the orbit in ``model``: ``apex`` or ``deflection``."""
     return "apex" if model in ("exact", "ellipse") else "deflection"
@@ -344,6 +357,7 @@ def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
 def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
     """Build the optical model of the parameter values; ``camera`` and ``prism`` give all other values."""
     one_of(model, MODELS, "model")
+    _check_given(values, (size_name(model), "phase"))
     camera = with_lens(camera, values)
     if model == "circle":
         return CircleModel(camera, values["deflection"], values["phase"], prism.flat_side)

@@ -19,7 +19,7 @@ from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import fields_of, read_json
 from amiwarp.io.output_formats import check_ending
 from amiwarp.optics.models import MODELS
-from amiwarp.validation import one_of, shown
+from amiwarp.validation import check_names, one_of, shown
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
@@ -93,27 +93,20 @@ def settings_to(settings: Settings) -> dict[str, Any]:
 def check(kind: str, settings: Mapping[str, Any]) -> None:
     """Check a preset's settings; raise :class:`AmiwarpError` naming an unknown field or an invalid value."""
     if kind == "compensation":
-        _check_names(settings, ("model",), "")
+        check_names(settings, ("model",), "preset field ")
         one_of(settings.get("model"), MODELS, "model")
         return
-    _check_names(settings, (*CALIBRATION, "photometric"), "")
+    check_names(settings, (*CALIBRATION, "photometric"), "preset field ")
     photometric = settings.get("photometric", {})
     if not isinstance(photometric, dict):
         raise AmiwarpError(f"field photometric is {shown(photometric)}; expected an object with settings by name")
-    _check_names(photometric, PHOTOMETRIC, "photometric.")
+    check_names(photometric, PHOTOMETRIC, "preset field photometric.")
     plain = {n: v for n, v in settings.items() if n != "photometric"}
     for name, value in plain.items():
         _check_type(name, value, getattr(Settings(), name))
     for name, value in photometric.items():
         _check_type(f"photometric.{name}", value, getattr(PhotometricSettings(), name))
     settings_from(settings).check()
-
-
-def _check_names(given: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
-    unknown = [name for name in given if name not in known]
-    if unknown:
-        field = f"{where}{shown(unknown[0])[1:-1]}"
-        raise AmiwarpError(f"preset field {field} is unknown; choose among {', '.join(known)}")
 
 
 def _check_type(name: str, value: Any, default: Any) -> None:

@@ -26,7 +26,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
-from amiwarp.validation import one_of, real, shown
+from amiwarp.validation import guarded, one_of, real, shown
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,6 +42,7 @@ OPTIONAL = ("middle_us", "ladder")
 SHARPNESS = [kind.value for kind in Sharpness]
 
 
+@guarded
 @dataclass(frozen=True, kw_only=True)
 class Calibration:
     """Calibrated parameters of one model of a camera and its prism.

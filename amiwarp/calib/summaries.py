@@ -6,10 +6,14 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from amiwarp.errors import AmiwarpError
+from amiwarp.validation import guarded, shown
+
 if TYPE_CHECKING:
     from amiwarp.calib.nlopt_solver import SearchStage
 
 
+@guarded
 @dataclass(frozen=True, kw_only=True)
 class StageSummary:
     """Summary of one stage of the search, as the calibration file stores it."""
@@ -52,14 +56,17 @@ class StageSummary:
         StageSummary
             The summary.
         """
-        both = zip(values, stage.scores.tolist(), strict=True)
-        points = [{**{n: at[n] for n in names}, "score": score} for at, score in both]
+        scores, found = stage.scores.tolist(), list(values)
+        if len(found) != len(scores) or not all(isinstance(at, Mapping) and at.keys() >= {*names} for at in found):
+            raise AmiwarpError(f"values are {shown(found)}; give {', '.join(names)} at each of {len(scores)} points")
+        points = [{**{n: at[n] for n in names}, "score": score} for at, score in zip(found, scores, strict=True)]
         return cls(
             name=name, algorithm=stage.algorithm, evaluations=stage.evaluations, seconds=stage.seconds,
             sharpness=stage.score, ended=stage.ended, points=points,
         )  # fmt: skip
 
 
+@guarded
 @dataclass(frozen=True, kw_only=True)
 class PhotometricSummary:
     """Result of the photometric stage, and whether it is accepted."""
@@ -109,6 +116,7 @@ class PhotometricSummary:
     """Corrections of the given camera and prism, and where the result does not hold, one sentence each."""
 
 
+@guarded
 @dataclass(frozen=True, kw_only=True)
 class ModelCandidate:
     """One model that the automatic choice considered, and the evidence for and against it."""
@@ -138,6 +146,7 @@ class ModelCandidate:
     """Reason why the model was chosen or not, in words."""
 
 
+@guarded
 @dataclass(frozen=True, kw_only=True)
 class FreedParameter:
     """One parameter, or a pair, that the first calibration kept fixed: whether it was freed, and why."""
@@ -158,6 +167,7 @@ class FreedParameter:
     """Reason why the parameter was freed or not, in words."""
 
 
+@guarded
 @dataclass(frozen=True, kw_only=True)
 class ModelChoice:
     """Result of the automatic choice of the model: the candidates and the evidence."""

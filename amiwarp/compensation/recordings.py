@@ -32,6 +32,7 @@ from amiwarp.io.output_formats import OutputFormat, Rounding, check_codec, check
 from amiwarp.kernels.event_arrays import join_columns
 from amiwarp.kernels.launch import launch
 from amiwarp.progress import Progress
+from amiwarp.validation import guarded
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -46,6 +47,7 @@ DEFAULT_BLOCK = 1 << 20
 """Number of events per block if the caller does not give one."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class CompensationSummary:
     """Summary of the compensation of a recording.
@@ -126,6 +128,7 @@ def _column(values: NDArray[Any], dtype: Any, padded: int) -> Any:
 def compensate_events(events: Events, model: Model, encoder: Encoder, *, device: Any = ...) -> NDArray[np.float32]: ...
 @overload
 def compensate_events(events: DeviceEvents, model: Model, encoder: Encoder, *, device: Any = ...) -> wp.array: ...
+@guarded
 def compensate_events(
     events: Events | DeviceEvents, model: Model, encoder: Encoder, *, device: Any = None
 ) -> NDArray[np.float32] | wp.array:
@@ -198,6 +201,7 @@ def compensated_blocks(
         yield compensator(block, all_cores=True)[0]
 
 
+@guarded
 def compensate(
     recording: Recording,
     calibration: Calibration,

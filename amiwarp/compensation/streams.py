@@ -12,9 +12,10 @@ import warp as wp
 
 from amiwarp.compensation.batches import BatchInFlight, BatchPipeline, StagedBatch
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import check_sensor
+from amiwarp.events.checks import TIME_LIMIT, check_sensor
 from amiwarp.events.device_events import DeviceEvents, limits, wait
 from amiwarp.events.events import Events
+from amiwarp.validation import guarded, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,6 +42,7 @@ QueuedPacket: TypeAlias = tuple[Events | DeviceEvents, int, int, int]
 """Queued packet, its last event time, the time when it was queued, and its time of arrival [us]."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class Compensated:
     """Compensated events of one packet, or of several that were ready together.
@@ -65,6 +67,7 @@ class Compensated:
     """Arrival time of the first packet of these events, by the caller's clock [us]."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class DeviceCompensated:
     """Compensated events of one packet on a device.
@@ -95,6 +98,7 @@ def held_bytes(events: Events | DeviceEvents) -> int:
     return OVERHEAD + events.x.nbytes + events.y.nbytes + events.t.nbytes + events.p.nbytes
 
 
+@guarded
 class Compensator:
     """Motion compensation of a stream: put packets as they arrive, take those that are ready.
 
@@ -149,10 +153,13 @@ class Compensator:
         device: Any = "cpu",
     ) -> None:
         self.encoder = encoder
-        self.wait_us, self.start_us = wait_us, start_us
-        self.most_waiting, self.most_bytes = most_waiting, most_bytes
+        self.wait_us = whole(wait_us, "wait_us", 0, TIME_LIMIT, " us")
+        self.start_us = whole(start_us, "start_us", 0, TIME_LIMIT, " us")
+        self.most_waiting = whole(most_waiting, "most_waiting", 0, TIME_LIMIT, " events")
+        self.most_bytes = whole(most_bytes, "most_bytes", 0, TIME_LIMIT, " bytes")
         self._device = wp.get_device(device)
-        self.batch = batch or (1 << 16 if self._device.is_cpu else 1 << 20)
+        batch = (1 << 16 if self._device.is_cpu else 1 << 20) if batch is None else batch
+        self.batch = whole(batch, "batch", 1, 1 << 28, " events")
         self._pipeline = BatchPipeline(model, self.batch, self._device)
         self._least_returned = LEAST_RETURNED if self._device.is_cuda else math.inf
         self._queue: deque[QueuedPacket] = deque()

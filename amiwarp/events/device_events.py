@@ -15,7 +15,7 @@ from amiwarp.events.checks import TIME_LIMIT
 from amiwarp.events.device_arrays import event_column, positive
 from amiwarp.events.events import Events
 from amiwarp.kernels import event_arrays as kernels
-from amiwarp.validation import instance
+from amiwarp.validation import guarded, instance
 
 THREADS = 1 << 15
 """Number of CUDA threads that look for the limits of events."""
@@ -24,6 +24,7 @@ COORDINATES = (("uint16", "uint16"), ("float32", "float32"))
 """Types of x and y: of a sensor, or compensated."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class DeviceEvents:
     """A block of events as four Warp arrays on one device.

@@ -14,9 +14,10 @@ from amiwarp.events.checks import check_events
 from amiwarp.events.device_events import DeviceEvents, device_for, limits, part
 from amiwarp.events.events import DEFAULT_BLOCK, Events, EventSource, regroup
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import instance, whole
+from amiwarp.validation import guarded, instance, whole
 
 
+@guarded
 class DeviceMemoryEvents(EventSource):
     """Source of events that are held on a device, for recordings.
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import TIME_LIMIT, as_times
 from amiwarp.events.unwrapping import unwrap_angles, unwrap_counts
-from amiwarp.validation import array, instance, real, whole
+from amiwarp.validation import array, guarded, instance, real, whole
 
 TWO_PI = 2.0 * math.pi
 """One turn [rad]."""
@@ -26,6 +26,7 @@ LARGEST_ANGLE = 1e10
 """Largest accepted magnitude of a prism angle [rad]: 1.6e9 turns. Up to this angle float64 resolves 2e-6 rad."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class Encoder:
     """Samples of the prism angle over time.
@@ -54,8 +55,6 @@ class Encoder:
     """Times of the index pulses on the encoder's clock [us], shape ``(k,)``; None if the encoder has none."""
 
     def __post_init__(self) -> None:
-        for name in ("t", "angle"):
-            instance(getattr(self, name), np.ndarray, f"encoder {name}")
         if self.t.ndim != 1 or self.t.shape != self.angle.shape or self.t.size < 2:
             shapes = f"t {self.t.shape}, angle {self.angle.shape}"
             raise AmiwarpError(f"encoder samples have shapes {shapes}; expected two equal lengths of at least 2")

@@ -11,12 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import as_times
 from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.validation import array
+from amiwarp.validation import array, guarded, real, whole
 
 RESTART_US = 1
 """Time between the extrapolated sample that ends the samples before a restart and the first sample after it [us]."""
 
 
+@guarded
 class EncoderStream:
     """Buffer of the latest samples of a live encoder. Angles after the last sample are extrapolated.
 
@@ -52,9 +53,8 @@ class EncoderStream:
     """Number of latest gaps that are remembered."""
 
     def __init__(self, clock_offset_us: float = 0.0, *, capacity: int = 1 << 16) -> None:
-        if capacity < 16:
-            raise AmiwarpError(f"capacity = {capacity} samples; give a capacity of 16 samples or more")
-        self.clock_offset_us = clock_offset_us
+        capacity = whole(capacity, "capacity", 16, 1 << 28, " samples")
+        self.clock_offset_us = real(clock_offset_us, "clock_offset_us")
         self.dropped = 0
         """Number of samples that were dropped because they were not later than the sample before them."""
         self._t, self._angle = np.zeros(2 * capacity, np.int64), np.zeros(2 * capacity, np.float64)

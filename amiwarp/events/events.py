@@ -15,14 +15,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import SENSOR_DTYPE, as_coordinate, as_polarity, as_times, check_events, check_order
+from amiwarp.events.checks import (
+    SENSOR_DTYPE,
+    TIME_LIMIT,
+    as_coordinate,
+    as_polarity,
+    as_times,
+    check_events,
+    check_order,
+)
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import instance, whole
+from amiwarp.validation import guarded, instance, whole
 
 DEFAULT_BLOCK = 1 << 20
 """Default number of events per block."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class Events:
     """A block of events as four arrays.
@@ -228,6 +237,7 @@ class EventSource(Protocol):
         """
 
 
+@guarded
 class MemoryEvents(EventSource):
     """Source of events that are held in memory. Its methods return views where they can.
 
@@ -303,13 +313,9 @@ def regroup(chunks: Iterable[Events], *, count: int | None = None, duration_us: 
     if count is not None and duration_us is not None:
         raise AmiwarpError("blocks have both count and duration_us; give one of them")
     if duration_us is not None:
-        if duration_us < 1:
-            raise AmiwarpError(f"duration_us = {duration_us} per block; expected at least 1")
-        return _by_duration(chunks, int(duration_us))
+        return _by_duration(chunks, whole(duration_us, "duration_us", 1, TIME_LIMIT, " us per block"))
     count = DEFAULT_BLOCK if count is None else count
-    if count < 1:
-        raise AmiwarpError(f"count = {count} events per block; expected at least 1")
-    return _by_count(chunks, int(count))
+    return _by_count(chunks, whole(count, "count", 1, TIME_LIMIT, " events per block"))
 
 
 def _by_count(chunks: Iterable[Events], count: int) -> Iterator[Events]:

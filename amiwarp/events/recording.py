@@ -13,7 +13,7 @@ from amiwarp.events.checks import as_times
 from amiwarp.events.events import EventSource
 from amiwarp.events.sensors import ImageStore, ImuSamples
 from amiwarp.events.truth import EventTruth, EventValues, FrameStore, KnownStore, PoseStore, WorldLabels
-from amiwarp.validation import array
+from amiwarp.validation import array, guarded
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
@@ -31,6 +31,7 @@ class PointStore(Protocol):
         """Return the points of a slice [px], shape ``(n, 2)``, float32."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
     """Ground truth of a simulated recording.
@@ -132,6 +133,7 @@ class Truth:
         return EventTruth(self.points(start, stop), *(None if store is None else store[which] for store in stores))
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
     """Events with the encoder, camera and prism that recorded them.

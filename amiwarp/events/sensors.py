@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.validation import guarded
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuSamples:
     """Samples of an inertial measurement unit (IMU), in order of time.
@@ -92,6 +94,7 @@ class ImageStore(Protocol):
         """Return a frame: grey levels, uint8 or uint16, shape ``(height, width)``."""
 
 
+@guarded
 class MemoryImages:
     """Frames of a recording that are held in memory.
 
@@ -116,6 +119,7 @@ class MemoryImages:
     """
 
     def __init__(self, t: NDArray[np.int64], images: Sequence[NDArray[Any]] | NDArray[Any]) -> None:
+        images = [] if isinstance(images, np.ndarray) and not images.ndim else images
         if t.dtype != np.int64 or t.shape != (len(images),) or not len(t) or (t[1:] < t[:-1]).any():
             raise AmiwarpError(
                 f"frames have {t.dtype} times of shape {t.shape} for {len(images)} images; give ordered int64 times, "

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.validation import guarded, shown
 
 
 class Cause(enum.StrEnum):
@@ -49,6 +50,7 @@ class EventValues(Protocol):
         """Return the rows in a slice of events, shape ``(n,)`` or ``(n, k)``."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class EventTruth:
     """Ground truth of a block of events. An array is None if its values are not known.
@@ -76,6 +78,7 @@ class EventTruth:
     """Point that each event saw, in the world's frame [m], shape ``(n, 3)``; NaN for the sky."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class WorldLabels:
     """Names and classes of the instances in a simulated world.
@@ -95,11 +98,15 @@ class WorldLabels:
     """Class label of each instance, in the order of ``instances``; an empty string for an instance without a class."""
 
     def __post_init__(self) -> None:
+        for names in (self.instances, self.categories):
+            if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
+                raise AmiwarpError(f"world labels have {shown(names)}; give a tuple of texts")
         if len(self.categories) != len(self.instances):
             given = f"{len(self.instances)} instances and {len(self.categories)} categories"
             raise AmiwarpError(f"world labels have {given}; give one category per instance")
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class FrameTruth:
     """Ground truth of all pixels at one instant.
@@ -190,6 +197,7 @@ class MemoryFrames:
         return self._frames[index]
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class Poses:
     """Poses of a camera and of moving bodies, and positions of joints, at several times.
@@ -214,6 +222,10 @@ class Poses:
     joints: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     """Positions of named points in the world, such as joints [m], shape ``(k, 3)`` each."""
 
+    def __post_init__(self) -> None:
+        if self.t.ndim != 1:
+            raise AmiwarpError(f"poses have times of shape {self.t.shape}; give shape (k,)")
+
     @classmethod
     def concatenate(cls, blocks: Sequence[Poses]) -> Poses:
         """Join successive tables of poses.
@@ -228,6 +240,8 @@ class Poses:
         Poses
             The joined table.
         """
+        if not blocks:
+            raise AmiwarpError("poses are joined of no tables; give at least one")
         bodies = {name: np.concatenate([block.bodies[name] for block in blocks]) for name in blocks[0].bodies}
         joints = {name: np.concatenate([block.joints[name] for block in blocks]) for name in blocks[0].joints}
         camera = np.concatenate([block.camera for block in blocks])

@@ -12,7 +12,7 @@ from amiwarp.events.events import Events
 from amiwarp.kernels import background_activity as kernels
 from amiwarp.kernels.launch import load
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import instance, vector, whole
+from amiwarp.validation import guarded, instance, vector, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,6 +21,7 @@ SUPPORT_US = 10_000
 """Default time within which a neighbour supports an event [us]."""
 
 
+@guarded
 def find_background_activity(
     events: Events, size: tuple[int, int], *, window_us: int = SUPPORT_US
 ) -> NDArray[np.bool_]:

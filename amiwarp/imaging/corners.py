@@ -15,7 +15,7 @@ from amiwarp.kernels import corners as kernels
 from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import choice, vector, whole
+from amiwarp.validation import choice, guarded, vector, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,6 +42,7 @@ def detect_corners(
 def detect_corners(
     events: DeviceEvents, size: tuple[int, int], *, detector: CornerMethod = ..., device: Any = ...
 ) -> wp.array: ...
+@guarded
 def detect_corners(
     events: Events | DeviceEvents,
     size: tuple[int, int],
@@ -91,6 +92,7 @@ def detect_corners(
     return CornerDetector(size, detector=detector, device=device_for(events, device)).detect(events)
 
 
+@guarded
 class CornerDetector:
     """Finds corners among the events of a stream, packet by packet.
 

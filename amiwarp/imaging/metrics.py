@@ -17,6 +17,7 @@ from amiwarp.imaging.warped_image import iwe
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.model_error import ModelError, predicted_error
 from amiwarp.optics.prism import Prism
+from amiwarp.validation import guarded
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -82,6 +83,7 @@ def find_edges(image: NDArray[np.float32]) -> Edges:
     return Edges(points, np.stack([nx[ridge], ny[ridge]], axis=1), index[nearest[0], nearest[1]])
 
 
+@guarded
 def edge_blur(
     sharp_xy: NDArray[np.float32], width: int, height: int, *, of: NDArray[np.float32] | None = None
 ) -> float:
@@ -121,7 +123,10 @@ def edge_blur(
     >>> round(amiwarp.edge_blur(np.stack([x, y], axis=1).astype(np.float32), 40, 40), 1)
     0.5
     """
-    return edge_blurs(sharp_xy, width, height, [sharp_xy if of is None else of])[0]
+    of = sharp_xy if of is None else of
+    if sharp_xy.ndim != 2 or sharp_xy.shape[1] != 2 or of.shape != sharp_xy.shape:
+        raise AmiwarpError(f"sharp_xy has shape {sharp_xy.shape} and of {of.shape}; give (n, 2) for both")
+    return edge_blurs(sharp_xy, width, height, [of])[0]
 
 
 def edge_blurs(
@@ -182,6 +187,7 @@ def entropy(image: NDArray[np.float32]) -> float:
     return -sharpness(image, Sharpness.ENTROPY)
 
 
+@guarded
 def truth_model(camera: Camera, truth: Truth, flat_side: FlatSide) -> ExactModel:
     """Return the optical model that generated a simulated recording.
 
@@ -211,6 +217,7 @@ def truth_model(camera: Camera, truth: Truth, flat_side: FlatSide) -> ExactModel
     return ExactModel(camera, prism, p["phase"], (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0)))
 
 
+@guarded
 def model_error(model: Model, truth: ExactModel) -> ModelError:
     """Compute the distance between the displacement fields of a fitted model and the true one.
 

@@ -20,7 +20,7 @@ from amiwarp.kernels.iwe_sums import gather_sums, smooth_and_add, smooth_votes
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.page_locked import page_locked
 from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
-from amiwarp.validation import array, choice, on_gpu, real
+from amiwarp.validation import array, choice, guarded, on_gpu, real
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -209,6 +209,7 @@ def relative_variance(variance: float, mean: float, smoothing: float) -> float:
     return (variance - random_variance(smoothing)) / mean
 
 
+@guarded
 def sharpness(
     image: Any,
     kind: Sharpness = Sharpness.VARIANCE,

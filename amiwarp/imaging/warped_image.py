@@ -22,7 +22,7 @@ from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
-from amiwarp.validation import choice, whole
+from amiwarp.validation import choice, guarded, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -174,6 +174,7 @@ def iwe(
     camera_rotation: CameraRotation | None = ..., pad: int = ..., per_polarity: bool = ..., vote: Vote = ...,
     device: Any = ...,
 ) -> wp.array: ...  # fmt: skip
+@guarded
 def iwe(
     events: Events | DeviceEvents,
     width: int,

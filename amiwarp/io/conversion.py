@@ -20,6 +20,7 @@ from amiwarp.io.native_writer import RecordingWriter
 from amiwarp.io.output_formats import LIMITS, Bag, OutputFormat, Rounding, check_codec, check_rounding, output_format
 from amiwarp.optics.camera import Camera
 from amiwarp.progress import Progress
+from amiwarp.validation import guarded
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
@@ -33,6 +34,7 @@ SOURCE_NAMES = ("source_name", "source_format")
 """Metadata that name the recording that was converted."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class ConversionSummary:
     """Summary of the conversion of a recording.
@@ -75,6 +77,7 @@ class ConversionSummary:
     """Number of events that were not written, because after rounding they are outside the image."""
 
 
+@guarded
 def convert(
     source_path: str | os.PathLike[str],
     out_path: str | os.PathLike[str],

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from amiwarp.events.checks import inside_image
 from amiwarp.io.native_writer import RecordingWriter
+from amiwarp.validation import guarded
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording, Truth
@@ -58,6 +59,7 @@ def _copy_world_truth(truth: Truth, writer: RecordingWriter) -> None:
             writer.append_poses(truth.poses[start : start + POSE_BLOCK])
 
 
+@guarded
 def save_recording(path: str | os.PathLike[str], recording: Recording, *, overwrite: bool = False) -> None:
     """Write a recording to a native HDF5 file.
 

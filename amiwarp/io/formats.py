@@ -14,7 +14,7 @@ from amiwarp.io.file_kinds import name_kind
 from amiwarp.io.input_files import errors_name, open_input
 from amiwarp.io.nmnist import looks_like_bin
 from amiwarp.io.regular_file import check_regular
-from amiwarp.validation import choice
+from amiwarp.validation import choice, guarded
 
 
 class Format(enum.StrEnum):
@@ -112,6 +112,7 @@ def _looks_like_text(head: bytes) -> bool:
         return False
 
 
+@guarded
 def open_recording(
     path: str | os.PathLike[str], *, format: Format | str | None = None, topic: str | None = None
 ) -> Recording:

@@ -41,7 +41,7 @@ from amiwarp.io.output_formats import check_native
 from amiwarp.io.record_appender import RecordAppender
 from amiwarp.io.truth_writer import event_columns
 from amiwarp.optics.camera import Camera
-from amiwarp.validation import choice
+from amiwarp.validation import choice, guarded
 
 if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
@@ -51,6 +51,7 @@ FlaggedEvents: TypeAlias = tuple[Events, NDArray[np.uint8], Mapping[str, Sequenc
 that are encoded already, by the name of the dataset."""
 
 
+@guarded
 class RecordingWriter(RecordAppender):
     """Writer that streams a recording into a native HDF5 file.
 

@@ -14,7 +14,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.io.formats import open_recording
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import read_json
-from amiwarp.validation import instance, shown, whole
+from amiwarp.validation import guarded, instance, shown, whole
 
 FORMAT, VERSION = "amiwarp-dataset", 1
 """Values of the manifest's fields ``format`` and ``version``."""
@@ -33,6 +33,7 @@ class _Item:
     events: int
 
 
+@guarded
 class RecordedDataset:
     """Recordings of a data set with their labels, for PyTorch's ``DataLoader`` or any other loop.
 

@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.truth import FrameStore, PoseStore
+from amiwarp.events.truth import FrameStore, Poses, PoseStore
 from amiwarp.io.atomic_output import NewFile, make_folder
 from amiwarp.io.output_formats import POSE_ENDINGS, check_ending
 from amiwarp.progress import Progress
+from amiwarp.validation import guarded, instance, shown
 
 DSEC_SCALE, DSEC_ZERO = 128.0, 1 << 15
 """Encoding of displacements in DSEC's flow pictures: levels per pixel, and the level of displacement 0."""
@@ -31,6 +32,7 @@ POSE_ROWS = 1 << 14
 """Number of poses that are read and written at a time."""
 
 
+@guarded
 def save_flow_dsec(
     folder: str | os.PathLike[str],
     frames: FrameStore,
@@ -98,6 +100,7 @@ def save_flow_dsec(
     return len(intervals)
 
 
+@guarded
 def save_flow_mvsec(
     path: str | os.PathLike[str],
     frames: FrameStore,
@@ -171,6 +174,7 @@ def save_flow_mvsec(
     return len(lengths)
 
 
+@guarded
 def save_poses_tum(
     path: str | os.PathLike[str], poses: PoseStore, *, body: str | None = None, overwrite: bool = False
 ) -> None:
@@ -202,9 +206,10 @@ def save_poses_tum(
     """
     path = Path(path)
     check_ending(path, "poses are written", POSE_ENDINGS)
-    known = sorted(poses[:0].bodies)
-    if body is not None and body not in known:
-        raise AmiwarpError(f"body {body!r} has no poses; choose among {', '.join(known) or 'none: no body moves'}")
+    given: Any = poses  # an array of numbers can be sliced too
+    known = sorted(instance(None if isinstance(given, np.ndarray) else given[:0], Poses, "poses[:0]").bodies)
+    if body is not None and not (isinstance(body, str) and body in known):
+        raise AmiwarpError(f"body {shown(body)} has no poses; choose among {', '.join(known) or 'none: no body moves'}")
     with NewFile(path, overwrite=overwrite) as new, open(new.part, "w") as file:
         file.write("# timestamp tx ty tz qx qy qz qw\n")
         for start in range(0, len(poses), POSE_ROWS):

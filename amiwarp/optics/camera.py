@@ -10,7 +10,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.lens import Distortion
-from amiwarp.validation import array, real, shown, whole
+from amiwarp.validation import INT64, array, guarded, real, shown, whole
 
 LARGEST_SIZE = 65536
 """Largest width and height of a sensor [px], because columns and rows of events are uint16."""
@@ -29,6 +29,7 @@ Rows = TypeVar("Rows")
 have the same type."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class Camera:
     """Camera intrinsics: image size, focal lengths, principal point and lens distortion.
@@ -167,6 +168,7 @@ class Camera:
 
 def check_size(width: float, height: float, where: object) -> None:
     """Raise :class:`AmiwarpError` for a sensor size out of 1 .. :data:`LARGEST_SIZE` px; ``where`` names the source."""
+    width, height = (whole(size, f"{where}: size of the sensor", *INT64) for size in (width, height))
     if not (1 <= width <= LARGEST_SIZE and 1 <= height <= LARGEST_SIZE):
         raise AmiwarpError(f"{where}: size {width}x{height}; expected 1 .. {LARGEST_SIZE} pixels each way")
 

@@ -7,14 +7,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.errors import AmiwarpError
+from amiwarp.validation import guarded, real, shown
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.optics.camera import Camera
 
-    Vector = tuple[float, float, float]
+Vector = tuple[float, float, float]
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class CameraRotation:
     """Angular velocity of the camera in its own frame, constant or linear in time.
@@ -75,6 +79,8 @@ class CameraRotation:
         numpy.ndarray
             Rotation vectors [rad], shape (n, 3).
         """
+        if not (np.abs(tau) <= 1e9).all():
+            raise AmiwarpError(f"tau = {shown(tau)} is not within 1e9 s of the reference time; give seconds")
         return np.outer(tau, self.angular_velocity) + np.outer(0.5 * tau**2, self.angular_acceleration)
 
     def params(self) -> Any:
@@ -109,6 +115,7 @@ class CameraRotation:
             Largest displacement along x and y [px], shape (2,). It is the image size if every border pixel leaves the
             view.
         """
+        half_s = real(half_s, "half_s", 0.0, 1e9, " s")
         rotations = self.rotation(np.array([-half_s, half_s]))
         if not rotations.any():
             return np.zeros(2)

@@ -10,9 +10,10 @@ from amiwarp.kernels.refraction import CircleParams, RadialCircleParams
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.displacement import PointDisplacement, phase_values, struct_of
 from amiwarp.optics.prism import FlatSide, Prism, check_index, check_phase
-from amiwarp.validation import choice, instance, real
+from amiwarp.validation import choice, guarded, instance, real
 
 
+@guarded
 @dataclass(frozen=True)
 class CircleModel(PointDisplacement):
     """Circle model: rotates every bearing vector by one constant angle.
@@ -97,6 +98,7 @@ class CircleModel(PointDisplacement):
         return sine, 2.0 * math.sin(self.deflection / 2.0) ** 2, *phase_values(self.phase)
 
 
+@guarded
 @dataclass(frozen=True)
 class RadialCircleModel(PointDisplacement):
     """Radial circle model: rotates each bearing vector by an angle that grows away from the optical axis.

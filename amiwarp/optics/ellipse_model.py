@@ -17,7 +17,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.displacement import PointDisplacement, model_camera, phase_values
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import check_phase
-from amiwarp.validation import array, instance
+from amiwarp.validation import array, guarded, instance, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,6 +29,7 @@ HARMONIC_ANGLES = 16
 """Number of angles at which a model is approximated."""
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class EllipseModel(PointDisplacement):
     """Ellipse model: stores the mean and the first harmonic of the displacement for every observed pixel.
@@ -156,9 +157,12 @@ class EllipseModel(PointDisplacement):
         AmiwarpError
             If the pairs do not determine all coefficients.
         """
-        xy = np.asarray(xy, dtype=np.float64)
-        theta = np.asarray(theta, dtype=np.float64)
-        shift = np.asarray(compensated, dtype=np.float64) - xy
+        xy, theta = np.asarray(xy, dtype=np.float64), np.asarray(theta, dtype=np.float64)
+        compensated, degree = np.asarray(compensated, dtype=np.float64), whole(degree, "degree", 0, 20)
+        if xy.ndim != 2 or xy.shape[1] != 2 or compensated.shape != xy.shape or theta.shape != xy.shape[:1]:
+            given = f"xy has shape {xy.shape}, theta {theta.shape} and compensated {compensated.shape}"
+            raise AmiwarpError(f"{given}; give (n, 2), (n,) and (n, 2)")
+        shift = compensated - xy
         valid = np.isfinite(shift).all(axis=1)
         basis = _polynomials(camera, xy[valid], degree)
         angle = theta[valid][:, None]

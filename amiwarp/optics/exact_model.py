@@ -13,7 +13,7 @@ from amiwarp.kernels.refraction import ExactParams
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.displacement import PointDisplacement, phase_values, struct_of
 from amiwarp.optics.prism import FlatSide, Prism, check_phase, check_tilt
-from amiwarp.validation import instance
+from amiwarp.validation import guarded, instance
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,6 +23,7 @@ UPRIGHT_ROWS = np.eye(3)
 """Rotation of a prism axis without tilt: the identity matrix."""
 
 
+@guarded
 @dataclass(frozen=True)
 class ExactModel(PointDisplacement):
     """Exact model: refracts each ray at both faces of the prism, in closed form.

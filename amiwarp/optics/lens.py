@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from amiwarp.validation import real
+from amiwarp.validation import guarded, real
 
 LARGEST_COEFFICIENT = 1e6
 """Largest accepted magnitude of a distortion coefficient. The coefficients of long lenses reach thousands."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class RadialTangential:
     """OpenCV's radial-tangential distortion. The coefficients are in OpenCV's order.
@@ -35,6 +36,7 @@ class RadialTangential:
         _check_coefficients(self)
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class Fisheye:
     """OpenCV's fisheye (equidistant) distortion.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.validation import guarded
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class ModelError:
     """Distance between two models over the image and one turn of the prism."""
@@ -27,6 +29,7 @@ class ModelError:
     """Constant angle that was subtracted from the first model's theta before the comparison [rad]; 0 by default."""
 
 
+@guarded
 def predicted_error(model: Model, exact: Model, *, remove_lag: bool = False, grid: int = 24) -> ModelError:
     """Return the distance between two optical models of the same prism, over the image and 36 prism angles.
 

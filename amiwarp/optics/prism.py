@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import choice, real, vector
+from amiwarp.validation import choice, guarded, real, vector
 
 LARGEST_APEX = math.radians(30.0)
 """Upper limit of the apex angle [rad]. Larger values are mistakes, such as angles in degrees."""
@@ -30,6 +30,7 @@ class FlatSide(enum.StrEnum):
     """The flat face points to the camera."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class Prism:
     """Wedge prism in air, given by its apex angle, refractive index and flat side.
@@ -67,6 +68,7 @@ class Prism:
         return deflection_from_apex(self.apex, self.index, self.flat_side)
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class UnsizedPrism:
     """A prism of unknown apex angle: its refractive index and the side of its flat face.
@@ -106,6 +108,7 @@ NominalPrism: TypeAlias = Prism | UnsizedPrism
 """Nominal prism before calibration, with or without a known apex angle."""
 
 
+@guarded
 def deflection_from_apex(apex: float, index: float, flat_side: FlatSide = FlatSide.SCENE) -> float:
     """Return the deflection of the camera's axial ray by a wedge, about ``(index - 1) * apex``.
 
@@ -137,7 +140,7 @@ def deflection_from_apex(apex: float, index: float, flat_side: FlatSide = FlatSi
     >>> round(amiwarp.deflection_from_apex(0.02, 1.5168), 6)
     0.010337
     """
-    scene = choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE
+    scene, index = choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE, check_index(index, "index")
     # The ray starts at the camera. With the flat face to the scene it enters the tilted face and leaves the flat one.
     sine = index * math.sin(apex - math.asin(math.sin(apex) / index) if scene else apex)
     if not abs(sine) <= 1.0:
@@ -148,6 +151,7 @@ def deflection_from_apex(apex: float, index: float, flat_side: FlatSide = FlatSi
     return math.asin(sine) - (0.0 if scene else apex)
 
 
+@guarded
 def apex_from_deflection(deflection: float, index: float, flat_side: FlatSide = FlatSide.SCENE) -> float:
     """Return the apex angle for a deflection of the camera's axial ray.
 
@@ -172,6 +176,7 @@ def apex_from_deflection(deflection: float, index: float, flat_side: FlatSide = 
     >>> round(amiwarp.apex_from_deflection(amiwarp.deflection_from_apex(0.02, 1.5168), 1.5168), 9)
     0.02
     """
+    index = check_index(index, "index")
     if choice(FlatSide, flat_side, "flat_side") is FlatSide.SCENE:
         return math.atan2(math.sin(deflection), math.sqrt(index**2 - math.sin(deflection) ** 2) - 1.0)
     return math.atan2(math.sin(deflection), index - math.cos(deflection))

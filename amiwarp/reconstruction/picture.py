@@ -20,6 +20,7 @@ from amiwarp.brightness.solver import BrightnessMap, Smoothness
 from amiwarp.brightness.tiles import Tiles
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import TIME_LIMIT
 from amiwarp.events.device_source import DeviceMemoryEvents, device_of, read_between
 from amiwarp.events.encoder_speed import turn_between
 from amiwarp.kernels.page_locked import start_read
@@ -36,7 +37,7 @@ from amiwarp.reconstruction.window import (
     settled_span,
     start_lowest_weight,
 )
-from amiwarp.validation import choice
+from amiwarp.validation import choice, guarded, real, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -59,6 +60,7 @@ SPANS_PER_TURN = 8
 """Number of time spans per turn. A pixel that is silent in all spans of a turn adds one no-change equation per span."""
 
 
+@guarded
 class Reconstruction:
     """Reconstruction of pictures from time windows of one recording.
 
@@ -264,11 +266,13 @@ class Reconstruction:
         int
             Number of pictures, at least 1.
         """
+        step_us = real(step_us, "step_us", 1.0, TIME_LIMIT, " us")
         room = self.recording.events.t_last + 1 - start_us - length_us
         return max(1, math.floor(room / step_us) + 1)
 
     def _table(self, start_us: int, length_us: int) -> tuple[EventTable, NDArray[np.int32]]:
         """Return the window's events without hot pixels, and the number of events per pixel, shape (height, width)."""
+        length_us = whole(length_us, "length_us", 1, TIME_LIMIT, " us")
         events = read_between(self.recording.events, start_us, start_us + length_us)
         width, height = self.recording.events.size
         table = EventTable([events], np.zeros((height, width), np.int32), self.device)
@@ -322,6 +326,7 @@ class Reconstruction:
         return map_tile(self.model, self.camera_rotation.about(start_us + length_us // 2), length_us)
 
 
+@guarded
 def reconstruct(
     recording: Recording,
     calibration: Calibration | None = None,

@@ -10,11 +10,13 @@ import warp as wp
 
 from amiwarp.events.device_events import wait
 from amiwarp.kernels.picture import exponentiate
+from amiwarp.validation import guarded, real
 
 ARRAYS = ("log", "known", "unknowns")
 """Names of the arrays of a picture."""
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class Picture:
     """Picture of the scene over a time window, without the prism.
@@ -85,6 +87,7 @@ class Picture:
             Intensity, float32, shape ``(height, width)``; NaN where the picture is not filled. It is where the picture
             is.
         """
+        contrast = real(contrast, "contrast", 0.0, 10.0)
         if isinstance(self.log, wp.array):
             out = wp.empty_like(self.log)
             wp.launch(exponentiate, out.shape, inputs=[self.log, contrast], outputs=[out], device=out.device)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.optics.prism import check_phase, check_tilt
-from amiwarp.validation import array, real, whole
+from amiwarp.validation import INT64, array, guarded, real, whole
 
 ROTATION_INTERVAL = 1e-3
 """Interval of the steps in which a changing angular velocity is integrated [s]."""
@@ -25,6 +25,7 @@ LARGEST_OFFSET_US = 1e7
 events."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class PrismMotion:
     """Motion of the prism: its tilt azimuth is ``phase + angle(t)``, with ``angle(0) = 0``.
@@ -109,6 +110,7 @@ class PrismMotion:
         ndarray
             Angles [rad], shape ``(n,)``.
         """
+        t_us = array(t_us, "t_us")
         at, speed = self._table().T
         before = np.concatenate([[0.0], np.cumsum(np.diff(at) * (speed[1:] + speed[:-1]) / 2.0)])
 
@@ -126,6 +128,7 @@ class PrismMotion:
         return float(np.abs(self._table()[:, 1]).max())
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraMotion:
     """Rotation of the camera about its own axes. At t = 0 it faces the picture.
@@ -205,6 +208,7 @@ def _check_table(what: str, table: NDArray[np.float64], columns: int = 2) -> Non
         raise AmiwarpError(f"{what}: the times of its rows do not increase; sort the rows by time")
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class EncoderModel:
     """Errors that a simulated encoder makes.
@@ -268,6 +272,8 @@ class EncoderModel:
         Encoder
             Samples with times on the encoder's clock. Its clock offset is 0: calibration has to find it.
         """
+        duration_us = whole(duration_us, "duration_us", 0, round(1e6 * LONGEST_S), " us")
+        seed = whole(seed, "seed", 0, INT64[1])
         rng = np.random.default_rng([seed, 0xE2C])  # independent of the pixels' random numbers
         interval = 1e6 / self.rate_hz
         spare = math.ceil((abs(self.clock_offset_us) + 8.0 * self.jitter_us) / interval) + 2

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.simulation.pictures import linear_luminance, read_picture
-from amiwarp.validation import real
+from amiwarp.validation import guarded, real
 
 
 class Frames(Protocol):
@@ -58,6 +58,7 @@ class Still:
         yield 0, self.light
 
 
+@guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
     """Scene in front of the camera: pictures on a plane at infinity.

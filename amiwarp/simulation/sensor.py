@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from amiwarp.validation import one_of, real
+from amiwarp.validation import guarded, one_of, real
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class SensorModel:
     """Model of an event camera's pixels and readout.

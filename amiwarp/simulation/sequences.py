@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import TIME_LIMIT
 from amiwarp.io.input_files import errors_name, input_path, open_input, register_reader
+from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.simulation.pictures import MOST_PIXELS, linear_luminance, read_picture, srgb_to_linear
-from amiwarp.validation import real, shown
+from amiwarp.validation import guarded, real, shown, vector, whole
 
 MOST_TABLE_BYTES, MOST_PICTURES = 64 << 20, 1_000_000
 """Largest ``times.csv`` that is read [bytes], and largest number of pictures in it."""
@@ -30,6 +31,7 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", "
 """File suffixes of pictures in a folder."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
 class PictureFolder:
     """Folder of picture files with a time for each picture.
@@ -51,6 +53,12 @@ class PictureFolder:
     """Width and height of each picture [px]."""
     start_us: int | None = None
     """Time of the first picture in ``times.csv`` [us], or None if the times come from a rate."""
+
+    def __post_init__(self) -> None:
+        if len(self.files) < 2 or self.times_us.shape != (len(self.files),):
+            given = f"{len(self.files)} files and times of shape {self.times_us.shape}"
+            raise AmiwarpError(f"pictures have {given}; give at least two files and a time for each")
+        vector(self.size, 2, "size of the pictures", lambda size, what: whole(size, what, 1, LARGEST_SIZE))
 
     @property
     def interval_us(self) -> float:
@@ -87,6 +95,7 @@ class PictureFolder:
             yield t, light
 
 
+@guarded
 @dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
 class PictureStack:
     """Array of pictures with a constant rate.
@@ -105,6 +114,11 @@ class PictureStack:
     """Number of pictures per second [Hz]."""
     name: str
     """Name of the stack in messages."""
+
+    def __post_init__(self) -> None:
+        if self.pictures.ndim not in (3, 4):
+            raise AmiwarpError(f"pictures have shape {self.pictures.shape}; give (n, height, width) or (..., 3)")
+        real(self.fps, "fps", 1e-6, 1e6, " pictures per second")
 
     @property
     def size(self) -> tuple[int, int]:
@@ -147,6 +161,7 @@ class PictureStack:
             )
 
 
+@guarded
 @dataclass(frozen=True, slots=True, weakref_slot=True, eq=False)
 class VideoFile:
     """Video file, decoded by PyAV frame by frame. Frames with a time stamp not later than the one before are skipped.
@@ -168,6 +183,10 @@ class VideoFile:
     """Duration of the video, after its times were multiplied by ``stretch`` [us]."""
     stretch: float = 1.0
     """Factor by which the times in the video file are multiplied."""
+
+    def __post_init__(self) -> None:
+        real(self.fps, "fps", 1e-6, 1e6, " pictures per second")
+        real(self.stretch, "stretch", 0.0, 1e9)
 
     @property
     def interval_us(self) -> float:

@@ -25,6 +25,7 @@ from amiwarp.simulation.scene import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.worlds.recorded_truth import RecordedTruth, chosen_instants
 from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.validation import guarded
 
 if TYPE_CHECKING:
     import warp as wp
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class Simulation:
     """Description of a simulated recording: all that determines its events.
@@ -305,6 +307,7 @@ class Simulation:
         return len(writer)
 
 
+@guarded
 def simulate(
     scene: Scene | WorldScene | str | Path | NDArray[Any],
     camera: Camera,

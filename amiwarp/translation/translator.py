@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from amiwarp.simulation.simulator import Simulation
 from amiwarp.translation.datasets import DataSet
 from amiwarp.translation.inputs import TranslatorInput, translator_input, with_camera
 from amiwarp.translation.interpolation import Interpolation
-from amiwarp.validation import choice
+from amiwarp.validation import check_names, choice, guarded
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from amiwarp.optics.prism import Prism
 
 
+@guarded
 def translation(
     source: str | Path | Pictures | Recording | TranslatorInput,
     prism: Prism,
@@ -68,6 +70,7 @@ def translation(
     )
 
 
+@guarded
 def translate(
     source: str | Path | Pictures | Recording,
     prism: Prism,
@@ -125,5 +128,6 @@ def translate(
     >>> amiwarp.translate(stack, amiwarp.Prism(0.03)).events.size
     (32, 24)
     """
+    check_names(settings, [*inspect.signature(translation).parameters][5:], "translate: setting ")
     work = translation(source, prism, events=events, dataset=dataset, progress=progress, **settings)
     return work.run(progress=progress)

@@ -21,7 +21,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import check_output
+from amiwarp.validation import guarded
 from amiwarp.viewer.choices import View
 from amiwarp.viewer.cloud_scene import Look, Scene
 from amiwarp.viewer.comparison import RECORDED
@@ -110,6 +112,7 @@ def open_window(make_inspector: Callable[[], Inspector], library: Library | None
         asyncio.run(serve_and_show())
 
 
+@guarded
 class NotebookPage:
     """The inspector's page below a notebook cell.
 
@@ -140,6 +143,7 @@ class NotebookPage:
         """Show nothing more than the page, which is already shown."""
 
 
+@guarded
 def view(
     recording: Recording,
     calibration: Calibration | None = None,
@@ -174,7 +178,12 @@ def view(
     --------
     >>> amiwarp.view(amiwarp.open_recording("recording.h5"))  # doctest: +SKIP
     """
-    from IPython.display import IFrame, display
+    try:
+        loop = asyncio.get_running_loop()
+        from IPython.display import IFrame, display
+    except (ImportError, RuntimeError) as error:  # no IPython, or no running loop
+        given = f"{recording.name}: view shows a recording in a notebook"
+        raise AmiwarpError(f"{given}; elsewhere, run in a shell: amiwarp view FILE") from error
 
     from amiwarp.kernels.quiet_start import start_quietly
 
@@ -182,7 +191,7 @@ def view(
     Inspector(recording, calibration, device=device)  # raises errors in the cell, before the page is served
     make_inspector = partial(Inspector, recording, calibration, device=device)
     serving = _serve(make_inspector, None, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
-    return NotebookPage(asyncio.get_running_loop().create_task(serving))
+    return NotebookPage(loop.create_task(serving))
 
 
 def save_screenshot(

@@ -30,7 +30,7 @@ from amiwarp.calib.photometric.sensor_timing import (
 )
 from amiwarp.calib.progress_share import stage_share
 from amiwarp.calib.summaries import PhotometricSummary, StageSummary
-from amiwarp.validation import real, whole
+from amiwarp.validation import guarded, real, whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -53,6 +53,7 @@ LARGEST_FINE_COST = 0.3
 half of the events are noise, a finer map follows them, and orbits come out too small."""
 
 
+@guarded
 @dataclass(frozen=True)
 class PhotometricSettings:
     """Settings of the photometric stage of a calibration.

@@ -21,7 +21,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.choices import Sharpness
 from amiwarp.optics.models import MODELS
 from amiwarp.progress import Progress
-from amiwarp.validation import choice, one_of, real, shown, whole
+from amiwarp.validation import choice, guarded, one_of, real, shown, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,6 +43,7 @@ STAGES = ("sharpness", "photometric")
 """Names of the stages of a calibration, in order."""
 
 
+@guarded
 @dataclass(frozen=True)
 class Settings:
     """Settings of a calibration.

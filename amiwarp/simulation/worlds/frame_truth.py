@@ -19,6 +19,7 @@ from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.renderer import SurfaceView, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.sight import WorldSight
 from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.validation import guarded
 
 if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
@@ -29,6 +30,7 @@ MOMENT_S = 1e-4
 """Half of the time over which optical flow is computed as a difference quotient [s]."""
 
 
+@guarded
 class TruthRenderer:
     """Renders the ground truth of a simulated world at any instant.
 

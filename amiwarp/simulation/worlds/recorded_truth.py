@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.checks import TIME_LIMIT
 from amiwarp.events.recording import Truth
 from amiwarp.events.truth import EventTruth, FrameTruth, MemoryFrames, MemoryMasks, Poses, WorldLabels, as_poses
 from amiwarp.simulation.known import KnownPixels
 from amiwarp.simulation.worlds.frame_truth import TruthRenderer
 from amiwarp.simulation.worlds.world_scene import WorldScene
-from amiwarp.validation import array, real
+from amiwarp.validation import array, real, shown
 
 if TYPE_CHECKING:
     from amiwarp.events.truth import EventValues
@@ -47,6 +48,8 @@ def chosen_instants(
             )
         return np.unique(np.minimum(np.rint(np.arange(count) * (1e6 / rate)), duration_us).astype(np.int64))
     times = array([] if truth_times_us is None else truth_times_us, "truth_times_us")
+    if not (np.abs(times) <= TIME_LIMIT).all():
+        raise AmiwarpError(f"truth_times_us is {shown(times)}; give finite times within 0 .. {duration_us} us")
     found = np.rint(times).astype(np.int64)
     if found.ndim != 1 or (found < 0).any() or (found > duration_us).any() or (np.diff(found) <= 0).any():
         raise AmiwarpError(f"truth_times_us must increase and lie within 0 .. {duration_us} us; sort the times")

@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.validation import array, instance, real, vector
+from amiwarp.validation import array, guarded, instance, real, vector
 
 MOST_INSTANCES = 65535
 """Largest number of instances of a world. Instance numbers are stored as uint16, and number 0 is the sky."""
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Triangle mesh.
@@ -39,7 +40,7 @@ class Mesh:
 
     def __post_init__(self) -> None:
         vertices = array(self.vertices, "mesh's vertices").astype(np.float64)
-        faces = np.asarray(self.faces)
+        faces = array(self.faces, "mesh's faces")
         if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
             raise AmiwarpError(f"mesh's vertices have shape {vertices.shape}; give finite numbers of shape (n, 3)")
         if faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
@@ -63,6 +64,7 @@ class Mesh:
         return centre, float(np.linalg.norm(vertices - centre, axis=1).max())
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class Material:
     """Material of a surface that reflects light evenly in all directions (Lambert)."""
@@ -87,6 +89,7 @@ class Material:
             object.__setattr__(self, "texture", texture)
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class Body:
     """Rigid body of a world."""
@@ -105,6 +108,7 @@ class Body:
     """Instance label. Bodies with the same label count as one object. None stands for the body's name."""
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class Sun:
     """Distant light source, whose light comes from one direction everywhere."""
@@ -125,6 +129,7 @@ class Sun:
         object.__setattr__(self, "intensity", real(self.intensity, "sun intensity", 0.0, 1e6))
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class Lamp:
     """Point light source."""
@@ -149,6 +154,7 @@ class Lamp:
             object.__setattr__(self, name, real(getattr(self, name), f"lamp {name}", 0.0, high))
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class Sky:
     """Background at infinity, which is seen where no body is."""
@@ -174,6 +180,7 @@ class Sky:
             object.__setattr__(self, "panorama", panorama)
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class World:
     """Three-dimensional scene: bodies, lights and a sky.

@@ -16,7 +16,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
 from amiwarp.io.input_files import text_lines
 from amiwarp.io.output_formats import POSE_ENDINGS, check_ending
-from amiwarp.validation import array, real
+from amiwarp.validation import array, guarded, real, shown
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -31,6 +31,7 @@ COLUMNS = 8
 """Number of columns of a table of poses: t, x, y, z, qx, qy, qz, qw."""
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Pose of a camera or a body over time, interpolated smoothly between given poses.
@@ -145,7 +146,7 @@ class Trajectory:
 
         at, position = self._table()
         orientation: Any = Rotation.from_quat(np.asarray(self.rotation, np.float64))
-        inside = np.clip(np.atleast_1d(np.asarray(t, np.float64)), at[0], at[-1])
+        inside = np.clip(np.atleast_1d(np.asarray(array(t, "t"), np.float64)), at[0], at[-1])
         if at.size == 1:
             ones = np.ones(inside.size)
             return np.repeat(orientation.as_matrix(), inside.size, axis=0), ones[:, None] * position
@@ -177,7 +178,7 @@ class Trajectory:
             Trajectory with one pose for all times.
         """
         quaternion = rotation if look_at is None else looking_at(position, look_at).as_quat()
-        return cls([0.0], np.asarray(position, np.float64)[None], np.asarray(quaternion, np.float64)[None])
+        return cls([0.0], array(position, "position")[None], array(quaternion, "rotation")[None])
 
     @classmethod
     def from_function(
@@ -278,6 +279,9 @@ def looking_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0
     """
     from scipy.spatial.transform import Rotation
 
+    for point in (array(position, "position"), array(target, "look_at")):
+        if point.shape != (3,) or not (np.abs(point) <= 1e9).all():
+            raise AmiwarpError(f"a point of a camera that looks at a place is {shown(point)}; give 3 numbers in m")
     forward = np.asarray(target, np.float64) - np.asarray(position, np.float64)
     distance = float(np.linalg.norm(forward))
     if not distance > 0.0:

@@ -15,7 +15,7 @@ from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.worlds.mesh_files import LoadedMesh, load_mesh
 from amiwarp.simulation.worlds.scene import Body, Lamp, Material, Sky, Sun, World
 from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
-from amiwarp.validation import one_of, real, shown
+from amiwarp.validation import guarded, one_of, real, shown
 
 FORMAT, VERSION = "amiwarp-world", 1
 """Expected values of the fields ``format`` and ``version`` of a world file."""
@@ -65,6 +65,7 @@ class PoseEntry:
     look_at: Vector | None = None
 
 
+@guarded
 def load_world(path: str | Path) -> tuple[World, Trajectory | None]:
     """Read a world and its camera trajectory from a TOML or JSON file.
 

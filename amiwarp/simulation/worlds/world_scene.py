@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from amiwarp.simulation.worlds.choices import Seeing
 from amiwarp.simulation.worlds.scene import World
 from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.validation import choice, instance, one_of, real
+from amiwarp.validation import choice, guarded, instance, one_of, real, shown
 
 SAMPLES = (1, 4, 9, 16)
 """Allowed numbers of rays per pixel or per texel."""
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class WorldScene:
     """Scene of a simulation in which a camera moves through a world, as an alternative to :class:`amiwarp.Scene`."""
@@ -44,4 +45,4 @@ class WorldScene:
         object.__setattr__(self, "seeing", choice(Seeing, self.seeing, "seeing"))
         object.__setattr__(self, "motion_px", real(self.motion_px, "motion_px", 0.01, 2.0, " px"))
         if self.samples is not None:
-            one_of(str(self.samples), [str(n) for n in SAMPLES], "samples")
+            one_of(shown(self.samples), [str(n) for n in SAMPLES], "samples")

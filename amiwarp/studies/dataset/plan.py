@@ -20,6 +20,7 @@ from amiwarp.studies.dataset.manifest import Journal, check_folder
 from amiwarp.studies.dataset.run import threads_of_worker, worker_count
 from amiwarp.studies.dataset.sources import content_digest
 from amiwarp.studies.dataset.specification import load_specification
+from amiwarp.validation import guarded
 
 SAMPLES = 24
 """Largest number of recordings that are sampled for each kind of source."""
@@ -29,6 +30,7 @@ SAMPLING_S = 10.0
 """Time after which no further sample of a kind of source begins [s]."""
 
 
+@guarded
 @dataclass(frozen=True)
 class DatasetPlan:
     """What :func:`plan_dataset` expects of a data set.
@@ -68,7 +70,7 @@ class DatasetPlan:
     @property
     def seconds(self) -> float:
         """Expected time [s], if the workers do not slow each other down."""
-        return self.worker_seconds / self.workers
+        return self.worker_seconds / max(self.workers, 1)
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ class _Cost:
         )
 
 
+@guarded
 def plan_dataset(
     specification: str | Path,
     out: str | Path,

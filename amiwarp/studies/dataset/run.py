@@ -20,7 +20,7 @@ from amiwarp.studies.dataset.items import Item, list_items
 from amiwarp.studies.dataset.making import Failed, Job, Made, make
 from amiwarp.studies.dataset.manifest import Journal, check_folder, require_pyarrow, write_manifest
 from amiwarp.studies.dataset.specification import load_specification
-from amiwarp.validation import whole
+from amiwarp.validation import guarded, whole
 
 MOST_READERS = 8
 """Largest number of threads that read finished recordings."""
@@ -30,6 +30,7 @@ MOST_WORKERS = 4096
 """Largest number of local workers."""
 
 
+@guarded
 @dataclass(frozen=True)
 class DatasetSummary:
     """What :func:`make_dataset` did.
@@ -85,6 +86,7 @@ class _Run:
     failed: list[Failed] = field(default_factory=list)
 
 
+@guarded
 def make_dataset(
     specification: str | Path,
     out: str | Path,

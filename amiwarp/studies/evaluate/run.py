@@ -18,9 +18,10 @@ from amiwarp.studies.evaluate.cells import Job, Store, compile_kernels, plan, ru
 from amiwarp.studies.evaluate.registry import EVALUATIONS, SHORT
 from amiwarp.studies.evaluate.report import REPORT_FILES, section, write
 from amiwarp.studies.evaluate.results import FULL, QUICK, CellResult
-from amiwarp.validation import whole
+from amiwarp.validation import guarded, whole
 
 
+@guarded
 @dataclass(frozen=True)
 class EvaluationSummary:
     """What :func:`evaluate` did.
@@ -51,6 +52,7 @@ class EvaluationSummary:
     """What was wrong with each damaged cell, which was run again."""
 
 
+@guarded
 def evaluate(
     out: str | Path,
     *,

@@ -11,7 +11,7 @@ from amiwarp.simulation.worlds.named import ball, corridor, desk, person, room, 
 from amiwarp.simulation.worlds.named.motion import TRAJECTORIES, Viewpoint, camera_trajectory
 from amiwarp.simulation.worlds.scene import World
 from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.validation import one_of, real, whole
+from amiwarp.validation import guarded, one_of, real, whole
 
 LONGEST_S = 3600.0
 """Longest duration of a built-in world [s]."""
@@ -40,6 +40,7 @@ WORLDS = tuple(NAMED)
 """Names of the built-in worlds."""
 
 
+@guarded
 def named_world(
     name: str, trajectory: str = "handheld", *, seed: int = 0, duration_s: float = 1.0
 ) -> tuple[World, Trajectory]:
