@@ -30,13 +30,9 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 
 Choice = TypeVar("Choice", bound=enum.StrEnum)
-"""Type variable: an enumeration whose members have names."""
-
 Kind = TypeVar("Kind")
-"""Type variable: any class."""
-
 Target = TypeVar("Target", bound=Callable[..., Any])
-"""Type variable: any function or class."""
+"""Type variables: an enumeration whose members have names, any class, and any function or class."""
 
 UNUSABLE = (TypeError, ValueError, OverflowError, RecursionError)
 """Exceptions that Python and NumPy raise for values of unexpected types."""
@@ -210,7 +206,8 @@ def guarded(target: Target) -> Target:
     record = hasattr(target, "__dataclass_fields__") and not (
         hasattr(target, "__post_init__") or hasattr(target, "check")
     )
-    for name, member in list(vars(target).items()):
+    bases = [base for base in reversed(target.__mro__[:-1]) if not getattr(base, "_is_protocol", False)]
+    for name, member in {name: one for base in bases for name, one in vars(base).items()}.items():
         if name.startswith("_") and name != "__init__":
             continue
         label = target.__name__ if name == "__init__" else f"{target.__name__}.{name}"
@@ -233,13 +230,15 @@ def _checked_call(function: Any, label: str, first: int, numbers_too: bool = Tru
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
+        given = args
         for index, parameter in positional:
             if index < len(args) and type(args[index]) not in parameter.known:
-                parameter.check(args[index])
+                plain = parameter.check(args[index])
+                given = given if plain is args[index] else (*given[:index], plain, *given[index + 1 :])
         for name, value in kwargs.items():
             if name in named and type(value) not in named[name].known:
-                named[name].check(value)
-        return function(*args, **kwargs)
+                kwargs[name] = named[name].check(value)
+        return function(*given, **kwargs)
 
     return call
 
@@ -255,7 +254,9 @@ class _Parameter:
         self._text = numbers_too and words in _TEXT and function.__name__ == "__init__"
         plain = words <= _PLAIN and not (self._number or self._text or (numbers_too and words in _TEXTS))
         self.guarded = name == "device" or not plain
-        self._optional = "None" in words or (function.__kwdefaults__ or {}).get(name, ...) is None
+        self._arrays = "NDArray" in words and words.isdisjoint(("Callable", "Mapping", "dict", "tuple"))
+        last = (function.__kwdefaults__ or {}).get(name, ...)
+        self._optional = last is None or (words > {"None"} and words <= _PLAIN)
 
     @functools.cached_property
     def _kind(self) -> Any:
@@ -263,32 +264,34 @@ class _Parameter:
         annotation, names = self._function.__annotations__[self._name], self._function.__globals__
         return eval(annotation, names, _PublicNames(names)) if isinstance(annotation, str) else annotation
 
-    def check(self, value: Any) -> None:
-        """Raise :class:`AmiwarpError` if the value is not of the annotated type."""
-        if value is None and self._optional:
-            return
+    def check(self, value: Any) -> Any:
+        """Return the value, NumPy's numbers as plain ones; raise :class:`AmiwarpError` if it is not of the type."""
+        if (value is None and self._optional) or (self._arrays and _fits_array(value)):
+            return value
         kind = self._kind
         if self._number:
+            if type(value) is int and INT64[0] <= value <= INT64[1]:
+                return value  # a shortcut
             what, floating = f"{self._label}: {self._name}", float in (kind, *typing.get_args(kind))
-            real(value, what) if floating else whole(value, what, *INT64)
-            return
+            found = real(value, what) if floating else whole(value, what, *INT64)
+            return found if isinstance(value, np.generic | np.ndarray) else value
         if self._name == "device":
             unmet = _no_device(value, kind, here="workers" not in self._function.__annotations__)
         else:
             unmet = _unmet("text" if self._text else kind, value)
         if unmet:
-            path = isinstance(value, str | os.PathLike)
-            hint = next((f"; {_FILES[name]}" for name in _FILES if path and name in unmet.split()), "")
+            hints = _FILES.keys() & unmet.split() if isinstance(value, str | os.PathLike) else ()
+            hint = "".join(f"; {_FILES[name]}" for name in sorted(hints))
             raise AmiwarpError(f"{self._label}: {self._name} is {shown(value)}; expected {unmet}{hint}")
         if isinstance(value, bool | None) or type(value).__module__.startswith("amiwarp."):
             self.known.add(type(value))
+        return value
 
 
 class _PublicNames(dict[str, Any]):
     """Names in annotations that a module imports for type checkers only."""
 
     def __init__(self, module: dict[str, Any]) -> None:
-        super().__init__()
         self._module = module
 
     def __missing__(self, name: str) -> Any:
@@ -319,16 +322,14 @@ def _unmet(kind: Any, value: Any) -> str:
         return _unmet_entries("tuple or list", parts[:1], value if isinstance(value, list | tuple) else None)
     if getattr(origin, "_is_protocol", False):
         return "" if _has_members(origin, value) else origin.__name__
-    library = origin.__module__.partition(".")[0]
-    return "" if isinstance(value, origin) else f"{'' if library == 'amiwarp' else library + '.'}{origin.__name__}"
+    library = origin.__module__.partition(".")[0] + "."
+    return "" if isinstance(value, origin) else f"{library}{origin.__name__}".removeprefix("amiwarp.")
 
 
 def _unmet_entries(what: str, kinds: Sequence[Any], entries: Iterable[Any] | None) -> str:
     """Return what a container expects, in words, if it or one of its entries does not fit; else an empty text."""
-    if entries is None:
-        return what
-    unmet = (_unmet(_INSIDE.get(kind, kind), entry) for entry in entries for kind in kinds)
-    return next((f"{what}, each {words}" for words in unmet if words), "")
+    unmet = (_unmet(_INSIDE.get(kind, kind), entry) for entry in entries or () for kind in kinds)
+    return what if entries is None else next((f"{what}, each {words}" for words in unmet if words), "")
 
 
 def _has_members(protocol: Any, value: Any) -> bool:
@@ -342,10 +343,8 @@ def _has_members(protocol: Any, value: Any) -> bool:
     return not simple and all(hasattr(type(value), name) or name in held for name in names)
 
 
-_INSIDE: dict[Any, Any] = {float: "number", str: "text"}
-"""Checks of plain values in a container, which functions take as they are."""
-INT64 = -(1 << 63), (1 << 63) - 1
-"""Limits of whole numbers whose range the function does not state."""
+_INSIDE: dict[Any, Any] = {float: "number", str: "text"}  # in a container, plain values are checked too
+INT64 = -(1 << 63), (1 << 63) - 1  # limits of whole numbers whose range the function does not state
 
 
 def _fits_number(value: Any) -> bool:
@@ -353,6 +352,10 @@ def _fits_number(value: Any) -> bool:
         real(value, "")
         return True
     return False
+
+
+def _fits_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and not np.ma.is_masked(value)
 
 
 def _fits_path(value: Any) -> bool:
@@ -365,12 +368,9 @@ _CHECKS: dict[Any, tuple[Callable[[Any], bool], str]] = {
     bool: (lambda value: isinstance(value, bool | np.bool_), "True or False"),
     types.NoneType: (lambda value: value is None, "None"),
     **dict.fromkeys((os.PathLike, Path), (_fits_path, "a path")),
-    np.ndarray: (
-        lambda value: isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and not np.ma.is_masked(value),
-        "a NumPy array of numbers without masked values",
-    ),
+    np.ndarray: (_fits_array, "a NumPy array of numbers without masked values"),
     collections.abc.Callable: (callable, "a function"),
-    collections.abc.Iterable: (np.iterable, "an iterable"),
+    collections.abc.Iterable: (lambda value: np.iterable(value) and not isinstance(value, str), "an iterable"),
     "number": (_fits_number, "a finite number"),
     "text": (lambda value: isinstance(value, str), "a text"),
 }

@@ -1,18 +1,21 @@
-"""Public constructors with any values: a valid object or an AmiwarpError of one line; arrays are not changed."""
+"""Public functions, classes and methods with any values: a result, or an AmiwarpError of one line."""
 
+import contextlib
 import copy
+import inspect
+import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Iterator
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from public_calls import CAMERA, RECORDING, REFUSED, PublicCall, public_calls, write_files
 
-from amiwarp.calib import Settings
+import amiwarp
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import TIME_LIMIT, check_events
 from amiwarp.events.encoder import LARGEST_ANGLE, Encoder
@@ -20,19 +23,8 @@ from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.optics.camera import LARGEST_FOCAL, Camera
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
-from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import Fisheye, RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
-from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.simulation.scene import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation
-
-CAMERA = Camera.from_fov(4, 3, 1.0)
-TABLE = np.zeros((3, 4, 2), np.float32)
-STILL = Scene.from_picture(np.ones((4, 4), np.float32))
+from amiwarp.validation import shown
 
 
 class Odd:
@@ -54,93 +46,112 @@ def nested(depth: int) -> list[Any]:
     return out
 
 
-JUNK = st.one_of(
-    st.sampled_from(
-        [None, True, False, "", "scene", "1.5", b"1", 1j, math.nan, math.inf, -math.inf, 1e300, -1e300, 1e-300, 5e-324,
-         10**400, -(10**400), 10**5000, 2**62, -(2**63), 2**64, -1, 0, 65536, 65537, [], {}, (), object, Odd(),
-         Fraction(1, 3), nested(200), nested(5000), [1, "a"], [[1], [2, 3]], {"a": 1}, range(3)]
-    ),
-    st.sampled_from(
-        [np.float32(1.5), np.float64(math.nan), np.int64(3), np.uint16(7), np.bool_(True), np.str_("scene"),
-         np.datetime64("2020"), np.array(2.0), np.array([math.nan, 1.0]), np.array([None, 3], object),
-         np.array(["a"]), np.array([1 + 2j]), np.zeros((2, 2)), np.zeros(0), np.arange(3, dtype=np.int64),
-         np.array([-(2**63), 2**63 - 1]), np.array([1e300, 2.0]), np.array([0.0, 10.0]), np.zeros((3, 4, 2))]
-    ),
-    st.floats(),
-    st.integers(-(2**70), 2**70),
-    st.text(max_size=5),
-    st.lists(st.floats() | st.integers() | st.none() | st.text(max_size=2), max_size=5),
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Door:
-    """A public constructor and valid arguments."""
-
-    make: Callable[..., Any]
-    good: dict[str, Any]
-
-
-MADE = np.array([0, 1000], np.int64), np.array([0.0, 0.1])
-DOORS = [
-    Door(Camera, {"width": 4, "height": 3, "fx": 3.0, "fy": 3.0, "cx": 1.5, "cy": 1.0, "distortion": None}),
-    Door(Camera.from_fov, {"width": 4, "height": 3, "fov": 1.0, "distortion": None}),
-    Door(RadialTangential, {"k1": 0.1, "k2": 0.1, "p1": 0.0, "p2": 0.0, "k3": 0.0}),
-    Door(Fisheye, {"k1": 0.1, "k2": 0.1, "k3": 0.0, "k4": 0.0}),
-    Door(Prism, {"apex": 0.02, "index": 1.5, "flat_side": "scene"}),
-    Door(UnsizedPrism, {"index": 1.5, "flat_side": "scene"}),
-    Door(CircleModel, {"camera": CAMERA, "deflection": 0.01, "phase": 0.0, "flat_side": "scene"}),
-    Door(RadialCircleModel, {"camera": CAMERA, "deflection": 0.01, "phase": 0.0, "index": 1.5, "flat_side": "scene"}),
-    Door(ExactModel, {"camera": CAMERA, "prism": Prism(0.02), "phase": 0.0, "tilt": (0.0, 0.0)}),
-    Door(EllipseModel, {"camera": CAMERA, "offset": TABLE, "cosine": TABLE, "sine": TABLE, "phase": 0.0}),
-    Door(PrismMotion, {"rpm": 720.0, "phase": 0.0, "tilt": (0.0, 0.0)}),
-    Door(lambda **g: PrismMotion.from_function(lambda t: g["rpm"], g["duration_s"]), {"rpm": 720.0, "duration_s": 0.1}),
-    Door(CameraMotion, {"rates": (0.0, 0.0, 0.0)}),
-    Door(EncoderModel, {"counts_per_turn": 100, "rate_hz": 1e3, "jitter_us": 1.0, "clock_offset_us": 0.0,
-                        "dropouts_hz": 0.0, "dropout_us": 1.0}),
-    Door(SensorModel, {"contrast_on": 0.2, "contrast_off": 0.2, "mismatch": 0.0, "refractory_us": 1.0,
-                       "latency_us": 1.0, "latency_jitter_us": 1.0, "leak_hz": 0.0, "shot_noise_hz": 0.0,
-                       "hot_fraction": 0.0, "hot_hz": 0.0, "cutoff_hz": 300.0, "shot_noise_dark": 4.0,
-                       "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "row_us": 1.0,
-                       "bus_rate_mev_s": 10.0, "bus_queue": 100.0}),
-    Door(SensorModel.preset, {"name": "gen4"}),
-    Door(Scene, {"frames": STILL.frames, "fov": None, "blur": 0.5}),
-    Door(Simulation, {"scene": STILL, "camera": CAMERA, "prism": Prism(0.02), "duration_s": 0.1,
-                      "motion": PrismMotion(), "camera_motion": CameraMotion(), "sensor": SensorModel(),
-                      "encoder_model": EncoderModel(), "nominal_prism": None, "seed": 0}),
-    Door(Events.from_arrays, {"x": [1], "y": [2], "t": [3], "p": [1]}),
-    Door(Events, {"x": np.zeros(1, np.uint16), "y": np.zeros(1, np.uint16), "t": np.zeros(1, np.int64),
-                  "p": np.zeros(1, np.uint8)}),
-    Door(MemoryEvents, {"events": Events.from_arrays([1], [2], [3], [1]), "width": 4, "height": 3}),
-    Door(Encoder, {"t": MADE[0], "angle": MADE[1], "clock_offset_us": 0.0, "index_t": None}),
-    Door(Encoder.from_angles, {"t_us": MADE[0], "angle": MADE[1], "clock_offset_us": 0.0}),
-    Door(lambda **g: Encoder(*MADE).with_index(g["pulses"]), {"pulses": [500]}),
-    Door(Encoder.constant_speed, {"rpm": 720.0, "t_first": 0, "t_last": 1000, "interval_us": 1000}),
-    Door(lambda **g: Settings(**g).check(), {
-        "model": "exact", "sharpness": "variance", "global_algorithm": None, "stages": ("sharpness",), "events": 100,
-        "global_evaluations": 10, "tolerance_px": 0.01, "smoothing_px": 1.0, "fold": 0, "seed": 0,
-        "start": {"apex": 0.02}, "bounds": {"apex": (0.0, 0.1)},
-    }),
+HOSTILE: list[Any] = [
+    None, True, False, "", "scene", "nothing", "1.5", "a\0b", b"1", 1j, math.nan, math.inf, -math.inf, 1e300, -1e300,
+    1e-300, 5e-324, 0.5, 10**400, -(10**400), 10**5000, 2**62, -(2**63), 2**64, 2**70, -1, 0, [], {}, (),
+    object(), Odd(), Camera, Fraction(1, 3), nested(200), nested(5000), [1, "a"], [None], [[1], [2, 3]], [math.nan],
+    {"a": None}, {1: 2}, {1.5}, (1, 2, 3, 4, 5), range(3),
+    np.float32(1.5), np.float64(math.nan), np.int64(3), np.uint16(7), np.bool_(True), np.str_("scene"),
+    np.datetime64("2020"), np.array(2.0), np.array([math.nan, 1.0]), np.array([None, 3], object), np.array(["a"]),
+    np.array([1 + 2j]), np.zeros((2, 2)), np.zeros(0), np.arange(3, dtype=np.int64), np.array([-(2**63), 2**63 - 1]),
+    np.array([1e300, 2.0]), np.array([0.0, 10.0]), np.zeros((3, 4, 2)), np.ma.masked_array([1, 2], [0, 1]),
 ]  # fmt: skip
+"""Values of every wrong kind: one of them fits each parameter at most."""
 
 
-@pytest.mark.parametrize("door", DOORS, ids=lambda door: getattr(door.make, "__qualname__", "?"))
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_a_valid_object_or_one_line(door: Door, data: st.DataObject) -> None:
-    door.make(**door.good)
-    name = data.draw(st.sampled_from(list(door.good)))
-    junk = data.draw(JUNK)
-    before = copy.deepcopy(junk) if isinstance(junk, np.ndarray) else None
-    said = ""
+def use(result: Any) -> None:
+    """Read what a result holds: the first items of an iterator, and the properties of an object."""
+    if isinstance(result, Iterator):
+        for _ in itertools.islice(result, 2):
+            pass
+    kind = type(result)
+    if kind.__module__.startswith("amiwarp"):
+        for name in (name for name in dir(kind) if not name.startswith("_")):
+            if isinstance(inspect.getattr_static(kind, name), property):
+                with contextlib.suppress(AmiwarpError):
+                    getattr(result, name)
+        if hasattr(kind, "check"):
+            result.check()
+
+
+def outcome(call: PublicCall, **changed: Any) -> str:
+    """Call a function, and return its error message; empty if there is none."""
+    thing, function = call.target()
     try:
-        door.make(**{**door.good, name: junk})
+        use(function(**{**call.arguments(function), **changed}))
     except AmiwarpError as error:
-        said = str(error)
-    assert "\n" not in said
-    assert len(said) < 1000
-    if before is not None:
-        np.testing.assert_array_equal(junk, before)
+        return str(error)
+    finally:
+        if isinstance(thing, RecordingWriter):
+            thing.__exit__(ValueError, None, None)
+    return ""
+
+
+CALLS = list(public_calls())
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make an empty folder the current one, with the files that the calls read."""
+    monkeypatch.chdir(tmp_path)
+    write_files()
+
+
+@pytest.mark.parametrize("call", CALLS, ids=lambda call: call.label)
+@pytest.mark.usefixtures("folder")
+def test_public_calls_return_or_say_what_is_wrong(call: PublicCall) -> None:
+    message = outcome(call)
+    assert (REFUSED[call.label] in message) if call.label in REFUSED else (message == "")
+    for name, annotation in call.parameters().items():
+        for junk in HOSTILE:
+            if isinstance(junk, type) and re.search("Callable|Progress", annotation):
+                continue  # a class can be called
+            if (call.label, name) == ("evaluate", "only") and isinstance(junk, list | tuple) and not len(junk):
+                continue  # runs every evaluation
+            before = copy.deepcopy(junk) if isinstance(junk, np.ndarray) else None
+            try:
+                message = outcome(call, **{name: junk})
+            except Exception as error:
+                raise AssertionError(f"{call.label}({name}={shown(junk)}) ends in {type(error).__name__}") from error
+            assert "\n" not in message
+            assert len(message) < 1000
+            if before is not None:
+                np.testing.assert_array_equal(junk, before)
+
+
+@pytest.mark.parametrize("call", CALLS, ids=lambda call: call.label)
+@pytest.mark.usefixtures("folder")
+def test_unknown_keywords_and_too_many_arguments(call: PublicCall) -> None:
+    _, function = call.target()
+    with pytest.raises((TypeError, AmiwarpError), match="nothing_like_it"):
+        function(**call.arguments(function), nothing_like_it=1)
+    with pytest.raises((TypeError, AmiwarpError)):
+        function(*[None] * 30)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: amiwarp.calibrate("rec.h5"), "calibrate: recording is 'rec.h5'; expected Recording; open it with"),
+        (
+            lambda: amiwarp.calibrate(RECORDING, modle="exact"),
+            "calibrate: setting modle is unknown; did you mean m",
+        ),
+        (lambda: amiwarp.calibrate(RECORDING, {"model": "exact"}), "settings is {'model'.*expected Settings or None"),
+        (
+            lambda: amiwarp.translate("a.mp4", Prism(0.02), sede=1),
+            "translate: setting sede is unknown; did you mean",
+        ),
+        (lambda: amiwarp.calibrate(RECORDING, device="gpu"), "device is 'gpu'; expected a device of this machine.*cpu"),
+        (lambda: RECORDING.encoder.angle_at(math.nan), "nan|NaN|whole"),
+        (lambda: amiwarp.World(1.0, ()), "World|world"),
+        (lambda: amiwarp.Recording(RECORDING.events, "davis"), "Recording: camera is 'davis'; expected Camera or None"),
+        (lambda: amiwarp.Camera(CAMERA), "missing"),
+    ],
+)
+def test_common_mistakes(wrong: Callable[[], Any], message: str) -> None:
+    with pytest.raises((AmiwarpError, TypeError), match=message):
+        wrong()
 
 
 @pytest.mark.parametrize(

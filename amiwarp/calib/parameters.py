@@ -301,6 +301,8 @@ def check_names(
     free: tuple[str, ...] | None, start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
 ) -> None:
     """Check that parameter names are strings and their values finite numbers; else raise :class:`AmiwarpError`."""
+    if free is not None and not isinstance(free, tuple | list):
+        raise AmiwarpError(f"free is {shown(free)}; expected a tuple of parameter names, or None")
     for name in free or ():
         instance(name, str, "free parameter")
     for given, what in ((start, "start"), (bounds, "bounds")):

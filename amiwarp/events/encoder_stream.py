@@ -231,8 +231,10 @@ class EncoderStream:
         numpy.ndarray
             True for times in a gap, before the first sample or after the last, shape (n,).
         """
+        if t.ndim != 1:
+            raise AmiwarpError(f"t has shape {t.shape}; give shape (n,)")
         out = np.zeros(t.size, np.bool_)
-        if len(self) < 2:
+        if len(self) < 2 or not t.size:
             return ~out
         for low, high in self._estimated_spans():
             if low < t[-1] and t[0] < high:

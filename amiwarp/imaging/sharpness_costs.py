@@ -169,7 +169,7 @@ def gaussian(sigma: float) -> NDArray[np.float32]:
     The symmetric kernel of these weights sums to 1.
     """
     sigma = real(sigma, "smoothing", 0.0, LARGEST_SMOOTHING, " px, a standard deviation")
-    if sigma == 0.0:
+    if sigma < 1e-6:  # the weights of the neighbours are 0 in float32
         return np.ones(1, dtype=np.float32)
     k = np.arange(math.ceil(3.0 * sigma) + 1)
     weights = np.exp(-0.5 * (k / sigma) ** 2)

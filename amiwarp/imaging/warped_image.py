@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, overload
@@ -62,6 +63,8 @@ class CanvasShape:
         for name in ("width", "height"):
             object.__setattr__(self, name, whole(getattr(self, name), f"canvas {name}", 1, LARGEST_SIZE, " pixels"))
         object.__setattr__(self, "pad", whole(self.pad, "canvas pad", 0, LARGEST_SIZE, " pixels"))
+        if math.prod(self.shape) > 1 << 29:
+            raise AmiwarpError(f"the image has shape {self.shape}, more than {1 << 29} pixels; give a smaller pad")
 
     @property
     def layers(self) -> int:

@@ -41,7 +41,7 @@ from amiwarp.io.output_formats import check_native
 from amiwarp.io.record_appender import RecordAppender
 from amiwarp.io.truth_writer import event_columns
 from amiwarp.optics.camera import Camera
-from amiwarp.validation import choice, guarded
+from amiwarp.validation import choice, guarded, shown
 
 if TYPE_CHECKING:
     from amiwarp.optics.prism import NominalPrism
@@ -250,6 +250,8 @@ class RecordingWriter(RecordAppender):
     ) -> tuple[Events, NDArray[np.uint8]]:
         """Compute, encode and write a piece whose first event is event ``start``. Runs in a thread."""
         with self._chunks.stopping():
+            if not callable(piece):
+                raise AmiwarpError(f"{self.path}: a piece is {shown(piece)}; expected a function")
             events, inside, known = piece()
             known = known if self._codec is Codec.BLOSC else {}
             with errors_name(self.path, lambda: f"after {start} events"):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import guarded
+from amiwarp.validation import guarded, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,6 +65,7 @@ def predicted_error(model: Model, exact: Model, *, remove_lag: bool = False, gri
     from scipy.optimize import minimize_scalar
 
     camera = exact.camera
+    grid = whole(grid, "grid", 1, 1000)
     columns = max(2, round(grid * camera.width / camera.height))
     x = np.round(np.linspace(0, camera.width - 1, columns))
     y = np.round(np.linspace(0, camera.height - 1, max(2, grid)))

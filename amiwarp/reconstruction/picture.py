@@ -272,8 +272,12 @@ class Reconstruction:
 
     def _table(self, start_us: int, length_us: int) -> tuple[EventTable, NDArray[np.int32]]:
         """Return the window's events without hot pixels, and the number of events per pixel, shape (height, width)."""
-        length_us = whole(length_us, "length_us", 1, TIME_LIMIT, " us")
+        whole(start_us, "start_us", -TIME_LIMIT, TIME_LIMIT, " us")
+        whole(length_us, "length_us", 1, 3_600_000_000, " us")
         events = read_between(self.recording.events, start_us, start_us + length_us)
+        if not len(events):
+            where = f"{start_us} .. {start_us + length_us} us"
+            raise AmiwarpError(f"{self.recording.name}: no events in {where}; give another window")
         width, height = self.recording.events.size
         table = EventTable([events], np.zeros((height, width), np.int32), self.device)
         return table, table.exclude_hot_pixels()

@@ -38,6 +38,7 @@ from amiwarp.optics.model_error import predicted_error
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import UnsizedPrism
 from amiwarp.progress import Progress
+from amiwarp.validation import real
 
 if TYPE_CHECKING:
     from amiwarp.calib.parameters import ParameterSpace
@@ -62,7 +63,7 @@ def calibrate_auto(
     by quantisation and timing. Raises :class:`AmiwarpError` if the recording cannot determine the exact model.
     """
     began = time.perf_counter()
-    if budget_px is not None and not budget_px > 0.0:
+    if budget_px is not None and not real(budget_px, "budget_px") > 0.0:
         raise AmiwarpError(f"budget_px = {budget_px}; give an error above 0, for example 0.03")
     settings = replace(settings, model="exact")
     ready: list[Groundwork] = []

@@ -83,7 +83,8 @@ class Material:
         object.__setattr__(self, "reflectance", real(self.reflectance, "material reflectance", 0.0, 1.0))
         object.__setattr__(self, "emission", real(self.emission, "material emission", 0.0, 1e6))
         if self.texture is not None:
-            texture = array(self.texture, "material texture").astype(np.float32)
+            with np.errstate(over="ignore"):  # infinity is refused
+                texture = array(self.texture, "material texture").astype(np.float32)
             if texture.ndim != 2 or min(texture.shape) < 2 or not (np.isfinite(texture).all() and texture.min() >= 0):
                 raise AmiwarpError(f"material texture has shape {texture.shape}; give values >= 0, (height, width)")
             object.__setattr__(self, "texture", texture)
@@ -170,7 +171,8 @@ class Sky:
     def __post_init__(self) -> None:
         object.__setattr__(self, "luminance", real(self.luminance, "sky luminance", 0.0, 1e6))
         if self.panorama is not None:
-            panorama = array(self.panorama, "sky panorama").astype(np.float32)
+            with np.errstate(over="ignore"):  # infinity is refused
+                panorama = array(self.panorama, "sky panorama").astype(np.float32)
             if (
                 panorama.ndim != 2
                 or min(panorama.shape) < 2
