@@ -4,11 +4,13 @@ import itertools
 
 import numpy as np
 import pytest
+import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import check_events
+from amiwarp.events.device_events import DeviceEvents, device_for
 from amiwarp.events.events import Events, EventSource, MemoryEvents, regroup
 from amiwarp.events.recording import Truth
 
@@ -159,3 +161,20 @@ def test_truth_points():
     truth = Truth({"apex": 0.03}, points)
     np.testing.assert_array_equal(truth.points(1, 3), points[1:3])
     assert Truth({}).points(0, 4) is None
+
+
+def test_blocks_on_a_device_are_joined_in_order():
+    blocks = [
+        DeviceEvents.from_arrays(*(getattr(make(t), name) for name in "xytp"), device="cpu") for t in ([1, 2], [3])
+    ]
+    joined = DeviceEvents.concatenate(blocks)
+    assert joined.t.numpy().tolist() == [1, 2, 3]
+    assert DeviceEvents.concatenate(blocks[:1]) is blocks[0]
+    with pytest.raises(AmiwarpError, match="at least one"):
+        DeviceEvents.concatenate([])
+
+
+def test_events_on_the_host_go_to_the_device_that_is_named():
+    assert device_for(make([1]), None) == wp.get_device("cpu")
+    with pytest.raises(Exception, match="cuda:77"):
+        device_for(make([1]), "cuda:77")

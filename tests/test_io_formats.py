@@ -3,7 +3,9 @@
 import gzip
 import io
 import json
+import lzma
 import os
+import pickle
 import struct
 import tarfile
 import zipfile
@@ -13,7 +15,7 @@ import h5py
 import numpy as np
 import pytest
 from faery.extension import aedat, evt
-from io_samples import make_events, refusal, to_faery
+from io_samples import make_events, refusal, to_faery, write_aedat4
 from io_samples_extra import (
     ENCODERS,
     LATE,
@@ -178,6 +180,44 @@ def test_aedat2_of_a_dvs128_and_wrapping_times(tmp_path):
     (tmp_path / "a.aedat").write_bytes((tmp_path / "a.aedat").read_bytes().replace(b"DVS128", b"Cochlea"))
     with pytest.raises(AmiwarpError, match=r"a\.aedat: .*names camera 'eu.seebetter.*Cochlea'; expected one of dvs128"):
         open_recording(tmp_path / "a.aedat")
+
+
+def test_triggers_of_a_dvs128(tmp_path):
+    """The bit above the address marks an edge; its other bits are none of an event."""
+    edges = np.array([[1 << 15 | 0x7FFF, 1000], [1 << 15, 3000]], ">u4").tobytes()
+    events = small(EVENTS, 128, 128, t_first=0)
+    write_aedat2(tmp_path / "a.aedat", events, chip="DVS128", between=edges)
+    recording = open_recording(tmp_path / "a.aedat")
+    assert_equal(recording.events.slice(0, 999), events)
+    assert recording.metadata["triggers"] == 2
+    assert np.diff(read_encoder_triggers(tmp_path / "a.aedat").t).tolist() == [2000]
+
+
+def test_fields_of_words_are_read_over_their_whole_range(tmp_path):
+    """The corners of the largest frame of each format, both polarities, and each bit of the coordinates alone."""
+    bits = [0, *(1 << k for k in range(16))]
+
+    def corners(width: int, height: int) -> Events:
+        pairs = [(x, y) for x in (*(b for b in bits if b < width), width - 1) for y in (0, height - 1)]
+        pairs += [(x, y) for x in (0, width - 1) for y in bits if y < height]
+        x, y = np.array(pairs, np.uint16).T
+        return Events(x, y, 64 * 4096 + 37 * np.arange(len(pairs)), np.arange(len(pairs), dtype=np.uint8) % 2)
+
+    for version, width, height, shifts in (("1", 512, 256, (9, 17)), ("2", 16384, 16384, (14, 28))):
+        events = corners(width, height)
+        x, y, p = (column.astype(np.uint32) for column in (events.x, events.y, events.p))
+        words = np.stack([events.t.astype(np.uint32), x | y << shifts[0] | p << shifts[1]], axis=1).astype("<u4")
+        head = f"% Version {version}\n% Width {width}\n% Height {height}\n".encode() + b"\x0c\x08"
+        (tmp_path / f"{version}.dat").write_bytes(head + words.tobytes())
+        recording = open_recording(tmp_path / f"{version}.dat")
+        assert (recording.metadata["format"], recording.events.size) == (f"dat{version}", (width, height))
+        assert_equal(recording.events.slice(0, 999), events)
+    events = corners(2048, 2048)
+    for vectors in (False, True):
+        columns, _ = Evt2Decoder(vectors=vectors).decode(evt2_words(events, vectors=vectors))
+        assert_equal(Events.from_arrays(*columns), events)
+    (x, y, t, p), _ = Evt3Decoder().decode(evt3_words(events))
+    assert_equal(Events.from_arrays(x, y, t, p), events)
 
 
 def test_aedat3_triggers_sources_and_overflow(tmp_path):
@@ -458,7 +498,41 @@ FOREIGN = {
     r"is AEDAT 1\.0; only 2\.0, 3\.1 and 4": b"#!AER-DAT1.0\r\n" + bytes(99),
     "is a JSON document": json.dumps({"width": 3}).encode(),
     "is a PDF document": b"%PDF-1.7\n" + bytes(99),
+    "is a MATLAB 7.3 file; save": b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(200),
+    "is a GIF picture; .*simulate": b"GIF89a" + bytes(99),
+    "is a BMP picture": b"BM" + bytes(99),
+    "is a TIFF picture": b"II*\0" + bytes(99),
+    "is a TIFF picture; .*simulate": b"MM\0*" + bytes(99),
+    "is a WebP picture": b"RIFF" + bytes(4) + b"WEBPVP8 " + bytes(99),
+    "is a RIFF file of sound or pictures": b"RIFF" + bytes(4) + b"WAVEfmt " + bytes(99),
+    "is a Matroska or WebM video; .*translate": b"\x1aE\xdf\xa3" + bytes(99),
+    "is an xz archive; unpack": lzma.compress(b"1 2 3"),
+    "is a Zstandard archive; unpack": b"\x28\xb5\x2f\xfd" + bytes(99),
+    "is an LZ4 archive; unpack": b"\x04\x22\x4d\x18" + bytes(99),
+    "is a 7-Zip archive; unpack": b"7z\xbc\xaf\x27\x1c" + bytes(99),
+    "is a RAR archive; unpack": b"Rar!\x1a\x07\x01\0" + bytes(99),
+    "is a pcap capture of network packets; give": b"\xa1\xb2\xc3\xd4" + bytes(99),
+    "is a pcap capture of network packets; give the events": b"\x4d\x3c\xb2\xa1" + bytes(99),
+    "is a pcapng capture": b"\n\r\r\n" + bytes(99),
+    "is a Parquet table": b"PAR1" + bytes(99),
+    "is an Arrow table": b"ARROW1\0\0" + bytes(99),
+    "is a Python pickle; .* never loaded": pickle.dumps({"x": list(range(999))}, protocol=4),
+    "is a program": b"\x7fELF\x02\x01\x01" + bytes(99),
+    "is an XML document": b'<?xml version="1.0"?><a/>',
 }
+
+
+@pytest.mark.parametrize(("old", "new"), [(b"<", b"\xff"), (b"</", b"<<"), (b"<dv", b"")])
+def test_a_damaged_header_of_aedat4_is_named(tmp_path, old, new):
+    write_aedat4(tmp_path / "a.aedat4", EVENTS)
+    whole = (tmp_path / "a.aedat4").read_bytes()
+    start = len(b"#!AER-DAT4.0\r\n")
+    (size,) = struct.unpack_from("<I", whole, start)
+    header = whole[start + 4 : start + 4 + size].replace(old, new, 1)
+    path = tmp_path / "b.aedat4"
+    path.write_bytes(whole[:start] + struct.pack("<I", len(header)) + header + whole[start + 4 + size :])
+    with pytest.raises(AmiwarpError, match=r"b\.aedat4: the header is damaged"):
+        open_recording(path)
 
 
 @pytest.mark.parametrize("message", FOREIGN)

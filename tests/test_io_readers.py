@@ -50,7 +50,13 @@ def assert_same_source(given: EventSource, expected: EventSource) -> None:
         assert_equal(got, wanted)
     middle = (given.t_first + given.t_last) // 2
     assert_equal(given.between(middle, middle + 1234), expected.between(middle, middle + 1234))
-    assert_equal(given.slice(31, 57), expected.slice(31, 57))
+    n, first, last = len(expected), expected.t_first, expected.t_last
+    for bounds in (31, 57), (-5, -3), (-5, 3), (0, 1), (7, 3), (n - 1, n), (n - 2, n + 5), (n, n + 5):
+        assert_equal(given.slice(*bounds), expected.slice(*bounds))
+    one = int(expected.slice(n // 2, n // 2 + 1).t[0])
+    spans = (first - 9, first), (first, first), (first, first + 1), (one, one), (one - 1, one), (one, one + 1)
+    for span in (*spans, (last, last), (last, last + 1), (last + 1, last + 9), (first - 9, last + 9)):
+        assert_equal(given.between(*span), expected.between(*span))
 
 
 @pytest.mark.parametrize("file", REAL)
@@ -143,6 +149,16 @@ def test_paths_and_formats_that_are_none(tmp_path):
     (tmp_path / "old.aedat").write_bytes(b"#!AER-DAT1.0\r\n")
     with pytest.raises(AmiwarpError, match=r"is AEDAT 1\.0; only 2\.0, 3\.1 and 4 are read"):
         open_recording(tmp_path / "old.aedat")
+
+
+def test_a_file_without_a_size_gets_that_of_the_smallest_sensor_that_holds_it():
+    sensors = [(128, 128), (240, 180), (304, 240), (320, 240), (346, 260), (640, 480), (1280, 720)]
+    for smaller, (width, height) in zip([(0, 0), *sensors], sensors, strict=False):
+        assert scan.smallest_sensor(width - 1, height - 1) == (width, height)
+        assert scan.smallest_sensor(smaller[0], 0) == (width, height)
+    assert scan.smallest_sensor(0, 479) == (640, 480)
+    assert scan.smallest_sensor(1279, 720) == (1280, 721)
+    assert scan.smallest_sensor(1280, 719) == (1281, 720)
 
 
 def write_lines(path: Path, lines: list[str]) -> Path:

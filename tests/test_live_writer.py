@@ -303,6 +303,19 @@ def test_an_interrupt_during_the_start_leaves_no_file(tmp_path, monkeypatch, mom
     assert os.listdir(tmp_path) == []
 
 
+def test_the_space_to_finish_is_reserved_before_events_are_accepted(tmp_path):
+    """A whole chunk fits on the disk beyond what HDF5 has written. Half a chunk waits in memory."""
+    rng = np.random.default_rng(4)
+    n = CHUNK // 2
+    with live(tmp_path / "a.h5", flush_s=1e9) as writer:
+        for k in range(5):
+            t = np.sort(rng.integers(0, 10**6, n)) + 10**6 * k
+            x, y = (rng.integers(0, size, n) for size in SIZE)
+            writer.append(Events.from_arrays(x, y, t, rng.integers(0, 2, n)))
+            if k % 2 == 0:
+                assert os.stat(writer.part).st_blocks * 512 >= writer._file.id.get_filesize() + 13 * CHUNK
+
+
 def test_an_empty_recording(tmp_path):
     with live(tmp_path / "a.h5") as writer:
         writer.tick()

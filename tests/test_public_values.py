@@ -23,6 +23,7 @@ from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.optics.camera import LARGEST_FOCAL, Camera
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
 from amiwarp.validation import shown
 
@@ -273,3 +274,11 @@ def test_an_unsized_prism_has_a_valid_index() -> None:
         with pytest.raises(AmiwarpError, match="prism index"):
             UnsizedPrism(index=index)
     assert UnsizedPrism(index=1.6, flat_side="camera").with_apex(0.03) == Prism(0.03, 1.6, FlatSide.CAMERA)
+
+
+def test_a_tilt_lies_below_a_right_angle() -> None:
+    below = math.nextafter(math.pi / 2.0, 0.0)
+    assert ExactModel(CAMERA, Prism(0.03), tilt=(below, -below)).tilt == (below, -below)
+    for tilt in ((math.pi / 2.0, 0.0), (0.0, -math.pi / 2.0), (0.1,)):
+        with pytest.raises(AmiwarpError, match="tilt"):
+            ExactModel(CAMERA, Prism(0.03), tilt=tilt)  # type: ignore[arg-type]

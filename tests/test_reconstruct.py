@@ -29,7 +29,7 @@ from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.choices import Fill, Tone
-from amiwarp.reconstruction.export import save_picture, save_video, tones
+from amiwarp.reconstruction.export import save_film, save_picture, save_video, tones
 from amiwarp.reconstruction.known import nodes_near, without_small_holes, without_small_regions
 from amiwarp.reconstruction.picture import Reconstruction, reconstruct
 from amiwarp.reconstruction.result import Picture
@@ -341,6 +341,22 @@ def test_video(recording: Recording, truth: NDArray[np.float32], tmp_path: Path)
     assert len(frames) == 5
     assert frames[0].shape == (150, 200)
     assert np.abs(frames[0].astype(float) - 255.0 * tones(pictures[0], Tone.MAPPED)).mean() < 4.0
+
+
+def test_a_film_in_colour_keeps_its_place_if_its_size_is_odd(tmp_path: Path) -> None:
+    """The codec needs even sizes: the last row and column are repeated."""
+    grey = np.full((31, 45), 200, np.uint8)
+    colour = np.stack([grey, grey // 4, np.zeros_like(grey)], axis=2)
+    colour[:16] = 0
+    for value in grey, colour, colour[:, :44], colour[:30]:
+        assert save_film([value] * 3, tmp_path / f"{value.shape}.mp4", fps=10.0) == 3
+        with av.open(str(tmp_path / f"{value.shape}.mp4")) as container:
+            (frame, *_) = [f.to_ndarray(format="rgb24") for f in container.decode(container.streams.video[0])]
+        rows, columns = value.shape[:2]
+        assert frame.shape == (rows + rows % 2, columns + columns % 2, 3)
+        expected = value if value.ndim == 3 else np.repeat(value[:, :, None], 3, axis=2)
+        assert np.abs(frame[:rows, :columns].astype(int) - expected).mean() < 8.0
+        assert np.abs(frame[-1, 4:-4].astype(int) - expected[-1, 4 : columns - 4].mean(axis=0)).max() < 40
 
 
 def test_command(recording: Recording, tmp_path: Path) -> None:

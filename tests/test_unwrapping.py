@@ -128,6 +128,15 @@ def test_what_cannot_be_told_is_refused(shown, per_turn, bits, message):
         Encoder.from_counts(t, shown(count), counts_per_turn=per_turn, counter_bits=bits)
 
 
+@pytest.mark.parametrize("period", [230, 245, 252])
+@pytest.mark.parametrize("n", [20, 24, 30])
+def test_a_short_log_shows_a_period_that_no_counter_has(period, n):
+    """Near 8 bits, but not there; the message names the period that is seen."""
+    count = 30 * np.arange(n)
+    with pytest.raises(AmiwarpError, match=rf"wraps by about {period},? which is no known period"):
+        Encoder.from_counts(np.arange(n) * 1000, count % period, counts_per_turn=1000)
+
+
 def test_a_gap_longer_than_a_counter_lasts_is_refused():
     t, count = steady(720.0, 1000)
     kept = (t < 500_000) | (t > 540_000)
