@@ -18,6 +18,7 @@ import argparse
 import ast
 import contextlib
 import difflib
+import functools
 import itertools
 import json
 import os
@@ -48,7 +49,7 @@ ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / "benchmarks" / "mutants.toml"
 
 TESTS_S = 60.0
-"""Total duration of the tests of the area, and of other tests, that are run on one mutant [s]."""
+"""Default of the total duration of the tests of the area, and of other tests, that are run on one mutant [s]."""
 
 PATIENCE, START_S = 8.0, 240.0
 """A mutant hangs after this multiple of its tests' duration and this time [s], in which kernels are compiled."""
@@ -186,29 +187,50 @@ class Map:
 
     def __init__(self, folder: Path) -> None:
         """Read a record that :func:`record` made."""
-        self.seconds: dict[str, float] = json.loads((folder / "durations.json").read_text())
+        known = json.loads((folder / "tests.json").read_text())
+        self.seconds: dict[str, float] = known["seconds"]
+        self._called: dict[str, list[str]] = known["called"]
         self._data = coverage.CoverageData(str(folder / "lines"))
         self._data.read()
 
-    def tests(self, mutant: Mutant, files: list[str]) -> list[list[str]]:
+    def tests(self, mutant: Mutant, files: list[str], most_s: float) -> list[list[str]]:
         """Return the tests of a mutant: those of its area that run its function, then others that do.
 
-        Those of its line come first, then the fastest. If it is unknown which tests run it, all of the area are taken.
+        Those of files that name the module come first, then those that run the line, then the fastest. If no test is
+        known to run the function, those that call the module in the reading process are taken, or all of the area.
         """
-        own = {test for test in self.seconds if Path(test.partition("::")[0]).stem.removeprefix("test_") in files}
+        own = {test for test in self.seconds if Path(_file_of(test)).stem.removeprefix("test_") in files}
         lines: dict[int, list[str]] = {}
         for name in self._data.measured_files():
             if name.endswith(mutant.module):
                 lines = self._data.contexts_by_lineno(name)
         first, last, _ = _function(ast.parse((ROOT / mutant.module).read_text()), mutant.line)
-        near = {test for line in range(first, last + 1) for test in lines.get(line, ()) if test in self.seconds} or own
-        here = set(lines.get(mutant.line, ()))
-        return [self._affordable(tests, here) for tests in (near & own, near - own)]
+        near = {test for line in range(first, last + 1) for test in lines.get(line, ()) if test in self.seconds}
+        dotted = mutant.module.removesuffix(".py").replace("/", ".")
+        near = near or {test for test, called in self._called.items() if dotted in called} or own
+        here, naming = set(lines.get(mutant.line, ())), _files_naming(dotted)
 
-    def _affordable(self, tests: set[str], here: set[str]) -> list[str]:
-        ordered = sorted(tests, key=lambda test: (test not in here, self.seconds[test]))
-        totals = itertools.accumulate(self.seconds[test] for test in ordered)
-        return [test for test, total in zip(ordered, totals, strict=True) if total < TESTS_S]
+        def affordable(tests: set[str]) -> list[str]:
+            ordered = sorted(
+                tests, key=lambda test: (_file_of(test) not in naming, test not in here, self.seconds[test])
+            )
+            totals = itertools.accumulate(self.seconds[test] for test in ordered)
+            return [test for test, total in zip(ordered, totals, strict=True) if total < most_s]
+
+        return [affordable(tests) for tests in (near & own, near - own)]
+
+
+def _file_of(test: str) -> str:
+    return test.partition("::")[0]
+
+
+@functools.cache
+def _files_naming(dotted: str) -> set[str]:
+    """Return the test files that import a module by its name."""
+    package, _, name = dotted.rpartition(".")
+    statement = re.compile(rf"^\s*(from|import) {package}(\.{name}\b| import .*\b{name}\b)", re.MULTILINE)
+    files = ROOT.glob("tests/test_*.py")
+    return {str(path.relative_to(ROOT)) for path in files if statement.search(path.read_text())}
 
 
 def _function(tree: ast.AST, line: int, prefix: str = "") -> tuple[int, int, str]:
@@ -238,7 +260,7 @@ def record(folder: Path, copy: Path, files: list[str]) -> None:
         "[run]\nsource_pkgs = amiwarp\nomit = */kernels/*,*/viewer/*,*/plotting/*\nconcurrency = thread\n"
         f"relative_files = true\ndata_file = {folder / 'lines'}\n"
     )
-    environment = {"MUTANTS_DURATIONS": str(folder / "durations.json")}
+    environment = {"MUTANTS_DURATIONS": str(folder / "tests.json")}
     command = [
         "-m",
         "coverage",
@@ -326,7 +348,7 @@ class Worker:
         """Run the tests in a new process. Return what failed."""
         code, output = _run(self.copy, ["-m", "pytest", *tests], limit_s, {})
         if code == 4 and "not found:" in output:  # the change renames parametrised tests
-            files = sorted({test.partition("::")[0] for test in tests})
+            files = sorted({_file_of(test) for test in tests})
             code, output = _run(self.copy, ["-m", "pytest", *files], 4 * limit_s, {})
         reasons = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR", "E  ", "timeout"))]
         return "" if code == 0 else reasons[-1] if reasons else output.strip()[-200:]
@@ -347,23 +369,30 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, help="another seed gives another sample")
     parser.add_argument("--only", nargs="+", metavar="AREA", help="names of areas")
     parser.add_argument("--jobs", type=int, default=2, help="mutants at the same time")
+    parser.add_argument("--seconds", type=float, default=TESTS_S, help="duration of the tests of one mutant")
     parser.add_argument("--map", type=Path, metavar="FOLDER", help="folder that keeps which test runs which line")
     parser.add_argument("--out", type=Path, help="file of all mutants and their outcomes")
+    parser.add_argument("--again", type=Path, metavar="FILE.json", help="judge only the survivors of an earlier --out")
     given = parser.parse_args()
     config = tomllib.loads(CONFIG.read_text())
     areas = [area for area in config["area"] if given.only is None or area["name"] in given.only]
     mutants = sample(areas, given.count, given.seed)
     rows: list[dict[str, Any]] = []
+    if given.again:
+        earlier = json.loads(given.again.read_text())["mutants"]
+        rows = [row for row in earlier if row["outcome"] != "survived"]
+        settled = {(row["module"], row["before"], row["after"]) for row in rows}
+        mutants = [mutant for mutant in mutants if (mutant.module, mutant.before, mutant.after) not in settled]
     names = list(dict.fromkeys(name for area in areas for name in area["tests"]))
     files_of = {area["name"]: area["tests"] for area in areas}
     with tempfile.TemporaryDirectory() as scratch, contextlib.ExitStack() as opened:
         unneeded = shutil.ignore_patterns(".*", "_build", "results")
         copies = [Path(shutil.copytree(ROOT, Path(scratch) / str(k), ignore=unneeded)) for k in range(given.jobs)]
         folder = given.map or Path(scratch) / "map"
-        if not (folder / "durations.json").exists():
+        if not (folder / "tests.json").exists():
             record(folder, copies[0], names)
         known = Map(folder)
-        files = sorted({test.partition("::")[0] for test in known.seconds})
+        files = sorted({_file_of(test) for test in known.seconds})
         workers: SimpleQueue[Worker] = SimpleQueue()
         for copy in copies:
             workers.put(opened.enter_context(contextlib.closing(Worker(copy, files))))
@@ -371,7 +400,8 @@ def main() -> None:
         def one(mutant: Mutant) -> None:
             worker = workers.get()
             try:
-                outcome, cause = worker.judge(mutant, known.tests(mutant, files_of[mutant.area]), known.seconds)
+                tests = known.tests(mutant, files_of[mutant.area], given.seconds)
+                outcome, cause = worker.judge(mutant, tests, known.seconds)
             finally:
                 workers.put(worker)
             if outcome == "survived" and (reason := explained(mutant, config.get("equivalent", []))):

@@ -23,9 +23,11 @@ PIPES = os.environ.pop("MUTANTS_PIPES", "")
 """Numbers of the pipes for requests and replies, or nothing to run the tests as usual."""
 
 DURATIONS = os.environ.pop("MUTANTS_DURATIONS", "")
-"""File for the durations of the tests."""
+"""File for the durations of the tests, and for the modules that each calls in the reading process."""
 
 _seconds: dict[str, float] = {}
+_called: dict[str, list[str]] = {}
+_modules: set[str] = set()
 _failures: list[str] = []
 
 
@@ -36,10 +38,11 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     if recording is not None:
         recording.switch_context(item.nodeid)
     began = time.perf_counter()
+    _modules.clear()
     try:
         return (yield)
     finally:
-        _seconds[item.nodeid] = time.perf_counter() - began
+        _seconds[item.nodeid], _called[item.nodeid] = time.perf_counter() - began, sorted(_modules)
         if recording is not None:
             recording.switch_context("")
 
@@ -51,10 +54,24 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items.sort(key=lambda item: rank.get(item.nodeid, 0))
 
 
-def pytest_sessionfinish() -> None:
-    """Write the durations."""
+def pytest_sessionstart() -> None:
+    """Note calls to the reading process, in which coverage does not run."""
     if DURATIONS:
-        Path(DURATIONS).write_text(json.dumps(_seconds))
+        from amiwarp.io.reading_process import ReadingProcess
+
+        send = ReadingProcess.send
+
+        def noted(process: ReadingProcess, function: str, *arguments: object) -> None:
+            _modules.add(function.partition(":")[0])
+            send(process, function, *arguments)
+
+        ReadingProcess.send = noted  # type: ignore[method-assign]
+
+
+def pytest_sessionfinish() -> None:
+    """Write the durations and the calls."""
+    if DURATIONS:
+        Path(DURATIONS).write_text(json.dumps({"seconds": _seconds, "called": _called}))
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
