@@ -592,6 +592,28 @@ def test_a_source_on_a_device_refuses_bad_events(device: str) -> None:
         DeviceMemoryEvents(DeviceEvents.from_arrays([1, 1], [1, 1], [5, 4], [0, 1], device=device), WIDTH, HEIGHT)
 
 
+def test_a_source_on_a_device_takes_compensated_events_that_left_the_frame(device: str) -> None:
+    """NaN marks an event without a position. The first event out of order is named, not the first NaN."""
+    x, t = np.array([math.nan, 200.0, 3.0], np.float32), np.array([5, 6, 7])
+    arrays = [wp.array(values, device=device) for values in (x, x, t, np.ones(3, np.uint8))]
+    assert len(DeviceMemoryEvents(DeviceEvents(*arrays), WIDTH, HEIGHT)) == 3
+    arrays[2] = wp.array(t[[0, 2, 1]], device=device)
+    with pytest.raises(AmiwarpError, match=r"event 2 .*earlier than the one before"):
+        DeviceMemoryEvents(DeviceEvents(*arrays), WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("on", [1, 2, 255])
+def test_any_positive_polarity_is_on(on: int, device: str) -> None:
+    place = wp.array(np.arange(3, dtype=np.uint16), device=device)
+    columns = (
+        place,
+        place,
+        wp.array(np.arange(3), device=device),
+        wp.array(np.array([0, on, 0], np.uint8), device=device),
+    )
+    assert DeviceEvents.from_arrays(*columns).p.numpy().tolist() == [0, 1, 0]
+
+
 def streamed(encoder: Encoder) -> EncoderStream:
     stream = EncoderStream()
     stream.append(encoder.t, encoder.angle)

@@ -184,6 +184,24 @@ def test_file_keeps_time_polarity_and_order(
     assert list(tmp_path.iterdir()) == [tmp_path / "out.h5"]
 
 
+def test_times_that_do_not_begin_at_the_first_event_are_kept(
+    recording: Recording, calibration: Calibration, tmp_path: Path
+) -> None:
+    """Other programs may count times from another instant. Encoded times are then not copied."""
+    save_recording(tmp_path / "a.h5", recording)
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        index = file["ms_to_idx"][()]
+        index = np.concatenate([np.zeros(7, index.dtype), index])
+        del file["ms_to_idx"]
+        file["ms_to_idx"] = index
+        file["events/t"][...] = file["events/t"][()] + 7000
+        file["t_offset"][()] -= 7000
+    given = open_recording(tmp_path / "a.h5")
+    compensate(given, calibration, tmp_path / "out.h5", device="cpu")
+    out = open_recording(tmp_path / "out.h5").events
+    np.testing.assert_array_equal(out.slice(0, len(out)).t, recording.events.slice(0, len(out)).t)
+
+
 def test_compensation_sharpens(recording: Recording, calibration: Calibration) -> None:
     width, height = recording.events.size
     raw = recording.events.slice(0, len(recording.events))

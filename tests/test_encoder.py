@@ -142,6 +142,8 @@ def test_a_gap_at_the_end_is_not_extrapolated_over():
         (lambda: Encoder.from_counts([0, 9], [0, 1], counts_per_turn=10, index_t_us=[10]), "pulse at 10 us"),
         (lambda: Encoder.from_counts([0, 9], [0, 1], counts_per_turn=10, index_t_us=[]), "no index pulse"),
         (lambda: Encoder.constant_speed(np.nan, 0, 1), "constant_speed: rpm = nan is not a finite number"),
+        (lambda: Encoder.constant_speed(1.0, -(2**62), -(2**62) + 9), "constant speed: t_first"),
+        (lambda: Encoder.constant_speed(1.0, 2**62 - 9, 2**62), "constant speed: t_last"),
         (lambda: Encoder.constant_speed(1.0, 0, 1).with_clock_offset(np.inf), "clock_offset_us"),
         (lambda: Encoder(np.arange(3), np.array([0.0, np.inf, 1.0])), "sample 1 has angle inf"),
         (lambda: Encoder(np.arange(3, dtype=np.int32), np.zeros(3)), "int64"),
@@ -251,6 +253,18 @@ def test_a_stream_refuses_what_is_no_angle():
         stream.over(0, 1)
     with pytest.raises(AmiwarpError, match="capacity = 3 is not a whole number in 16"):
         EncoderStream(capacity=3)
+
+
+def test_one_count_a_turn_is_taken():
+    encoder = Encoder.from_counts(np.arange(50) * 1000, np.arange(50), counts_per_turn=1, counter_bits=16)
+    np.testing.assert_allclose(np.diff(encoder.angle), TWO_PI, rtol=0, atol=1e-12)
+
+
+def test_the_clock_offset_is_a_plain_number():
+    for given_offset in (5, np.float32(5.0), np.int64(5)):
+        encoder = Encoder(np.array([0, 1000]), np.array([0.0, 1.0]), given_offset)
+        assert type(encoder.clock_offset_us) is float
+        assert encoder.clock_offset_us == 5.0
 
 
 def test_the_largest_number_of_counts_is_taken():

@@ -47,6 +47,7 @@ from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.io import convert, open_recording, read_encoder_triggers
 from amiwarp.io import file_scan as scan
 from amiwarp.io.evt_words import Evt2Decoder, Evt3Decoder, words_of
+from amiwarp.io.rosbag import read_packets
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.lens import RadialTangential
 
@@ -533,6 +534,48 @@ def test_a_damaged_header_of_aedat4_is_named(tmp_path, old, new):
     path.write_bytes(whole[:start] + struct.pack("<I", len(header)) + header + whole[start + 4 + size :])
     with pytest.raises(AmiwarpError, match=r"b\.aedat4: the header is damaged"):
         open_recording(path)
+
+
+def test_a_packet_of_aedat4_that_ends_beyond_the_table_is_named(tmp_path):
+    write_aedat4(tmp_path / "a.aedat4", EVENTS)
+    data = bytearray((tmp_path / "a.aedat4").read_bytes())
+    start = len(b"#!AER-DAT4.0\r\n")
+    at = start + 4 + struct.unpack_from("<I", data, start)[0]
+    (size,) = struct.unpack_from("<i", data, at + 4)
+    struct.pack_into("<i", data, at + 4, len(data))
+    (tmp_path / "b.aedat4").write_bytes(data)
+    with pytest.raises(AmiwarpError, match=rf"b\.aedat4: byte {at}: a packet ends beyond"):
+        open_recording(tmp_path / "b.aedat4")
+    assert 0 < size < len(data)
+
+
+AEDAT2_CHIPS = {"DVS128": (128, 128), "Davis128": (128, 128), "Davis208Mono": (208, 192), "Davis240C": (240, 180),
+                "Davis346blue": (346, 260), "Davis640": (640, 480), "Tmpdiff128": (128, 128)}  # fmt: skip
+
+
+@pytest.mark.parametrize("chip", AEDAT2_CHIPS)
+def test_a_camera_of_aedat2_has_its_size(tmp_path, chip):
+    write_aedat2(tmp_path / "a.aedat", EVENTS[:0], chip=chip)
+    header = (tmp_path / "a.aedat").read_bytes()
+    (tmp_path / "a.aedat").write_bytes(header + np.array([[0, 1000]], ">u4").tobytes())
+    assert open_recording(tmp_path / "a.aedat").events.size == AEDAT2_CHIPS[chip]
+
+
+def test_a_ros_message_may_hold_no_events(tmp_path):
+    for ros1, write, name in (True, write_ros1, "a.bag"), (False, write_ros2, "b"):
+        nothing = array_message(typestore(ros1), EVENTS[:0], ros1=ros1)
+        messages = [nothing, *arrays(EVENTS, ros1=ros1), nothing]
+        path = write(tmp_path / name, {"/dvs/events": messages}) or tmp_path / name
+        assert_equal(open_recording(path).events.slice(0, 999), EVENTS)
+
+
+def test_a_bag_tells_how_many_of_its_messages_are_read(tmp_path):
+    messages = arrays(EVENTS, ros1=True)
+    write_ros1(tmp_path / "a.bag", {"/dvs/events": messages})
+    notes: dict[str, int] = {}
+    read = [notes["read"] for _ in read_packets(notes, str(tmp_path / "a.bag"), "/dvs/events", False)]
+    assert read == list(range(1, len(messages) + 1))
+    assert notes["total"] == len(messages)
 
 
 @pytest.mark.parametrize("message", FOREIGN)

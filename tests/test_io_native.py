@@ -488,6 +488,25 @@ def test_filled_files_are_those_of_append(tmp_path):
             np.testing.assert_array_equal(filled[name][()], appended[name][()], strict=True)
 
 
+def test_events_out_of_order_within_a_piece_are_refused(tmp_path):
+    sensor = make(50)
+    t = sensor.t - sensor.t[0]
+    t[7] = t[6] - 1
+    events = Events(sensor.x.astype(np.float32), sensor.y.astype(np.float32), t, sensor.p)
+    with pytest.raises(AmiwarpError, match=r"event 7 .* earlier than the one before"):  # noqa: SIM117
+        with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+            writer.fill([lambda: (events, np.ones(50, np.uint8), {})], count=CHUNK, t_first=0, done=lambda *_: None)
+    assert_nothing_left(tmp_path)
+
+
+@pytest.mark.parametrize("flag", ["inside", "extrapolated"])
+def test_a_flag_for_each_event(tmp_path, flag):
+    with pytest.raises(AmiwarpError, match=rf"events/{flag} has shape \(9,\); expected \(10,\)"):  # noqa: SIM117
+        with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+            writer.append(make(10), **{flag: np.ones(9)})
+    assert_nothing_left(tmp_path)
+
+
 def test_an_infinite_position_outside_the_image_is_refused(tmp_path):
     sensor = make(50)
     events = Events(sensor.x.astype(np.float32), sensor.y.astype(np.float32), sensor.t - sensor.t[0], sensor.p)

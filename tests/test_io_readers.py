@@ -345,6 +345,9 @@ def test_evt_headers(tmp_path):
         (b"% evt 2.0\n% geometry 400x300\n", (400, 300)),
         (b"% evt 2.0\n% plugin_name hal_plugin_gen41_evk3\n", (1280, 720)),
         (b"% evt 2.0\n% plugin_name hal_plugin_gen3_fx3\n", (640, 480)),
+        (b"% evt 2.0\n% plugin_name hal_plugin_gen31_fx3\n", (640, 480)),
+        (b"% evt 2.0\n% plugin_name hal_plugin_gen4_fx3\n", (1280, 720)),
+        (b"% evt 2.0\n% plugin_name hal_plugin_imx636_evk4\n", (1280, 720)),
         (b"% evt 2.0\n", (320, 240)),
     ):
         path.write_bytes(header + body + b"\1")

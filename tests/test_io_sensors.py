@@ -65,6 +65,18 @@ def test_native_recordings_keep_both_bit_for_bit(tmp_path: Path, dtype: Any) -> 
     assert (len(again), again.rate_hz) == (0, None)
 
 
+def test_frames_in_order_take_one_pass_over_the_file(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last frame ends it, which frees the process that reads."""
+    frames: Any = open_recording(data_dir / "aedat/aedat4_davis346_cars.aedat4").frames
+    passes, start = [], frames._images
+    monkeypatch.setattr(frames, "_images", lambda: passes.append(start()) or passes[-1])
+    seen = [frames[index] for index in range(len(frames.t))]
+    assert len(passes) == 1
+    assert passes[0].gi_frame is None
+    np.testing.assert_array_equal(frames[1], seen[1])
+    assert len(passes) == 2
+
+
 def test_wrong_arrays_are_refused(tmp_path: Path) -> None:
     t, rows = np.arange(3), np.zeros((3, 3))
     with pytest.raises(AmiwarpError, match=r"IMU acceleration is float64 of shape \(2, 3\); give float64"):

@@ -225,6 +225,14 @@ def test_dv_processing_reads_aedat4(tmp_path, count):
     assert_columns(by_dv_processing(written(tmp_path, "aedat4", events)), events)
 
 
+def test_text_is_what_a_person_would_write(tmp_path):
+    events = Events.from_arrays([0, 7, 10, 319], [239, 100, 5, 0], [0, 9, 1_000_000, 123_456_789], [1, 0, 0, 1])
+    save_recording(tmp_path / "a.h5", Recording(MemoryEvents(events, *SIZE)))
+    convert(tmp_path / "a.h5", tmp_path / "a.txt")
+    expected = "0.000000 0 239 1\n0.000009 7 100 0\n1.000000 10 5 0\n123.456789 319 0 1\n"
+    assert (tmp_path / "a.txt").read_text() == expected
+
+
 REAL = {
     "evt/evt3_driving_1280x720.raw": 219_596,
     "evt/evt2_balls_640x480.raw": 521_252,

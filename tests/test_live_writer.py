@@ -99,6 +99,18 @@ def test_index_pulses_may_come_before_the_samples_about_them(tmp_path):
     np.testing.assert_array_equal(open_recording(tmp_path / "a.h5").encoder.index_t, [5_000_500, 5_001_500])
 
 
+def test_an_unfinished_recording_has_its_index_pulses(tmp_path):
+    t = np.arange(0, 500_000, 1000)
+    with live(tmp_path / "a.h5", flush_s=0.0) as writer:
+        writer.append(Events.from_arrays([1, 2], [1, 2], [0, 400_000], [0, 1]))
+        writer.append_encoder(t, t * 1e-4, t[::60])
+        writer.append(Events.from_arrays([3], [3], [450_000], [0]))
+        shutil.copy(writer.part, tmp_path / "copy.h5")
+    encoder = open_recording(tmp_path / "copy.h5").encoder
+    np.testing.assert_array_equal(encoder.index_t, t[::60][t[::60] <= encoder.t[-1]])
+    assert len(encoder.index_t) > 3
+
+
 def test_compensated_events_keep_fractions_flags_and_nan(tmp_path):
     sensor = make(CHUNK + 99)
     x = sensor.x.astype(np.float32) - 20.25

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 import reference
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
+from amiwarp.optics.device_camera import camera_params, pinhole_params
 from amiwarp.optics.displacement import compensate_by_each, wrap_angle
 from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
@@ -594,3 +597,33 @@ def test_the_reach_of_a_pan_is_that_of_the_border() -> None:
     assert CameraRotation(angular_acceleration=(0.0, 100.0, 0.0)).reach(camera, 0.1)[0] > reach[0]
     flipped = CameraRotation(angular_velocity=(0.0, math.pi, 0.0))
     np.testing.assert_array_equal(flipped.reach(camera, 1.0), [201.0, 101.0])
+
+
+@wp.kernel
+def undo_rotation(
+    pinhole: PinholeParams,
+    general: CameraParams,
+    rotation: CameraRotationParams,
+    time: float,
+    xy: wp.array(dtype=wp.vec2),
+    out: wp.array2d(dtype=wp.vec2),
+):
+    i = wp.tid()
+    out[0, i] = undo_camera_rotation(pinhole, xy[i], rotation, time)
+    out[1, i] = undo_camera_rotation(general, xy[i], rotation, time)
+
+
+def test_a_rotation_is_undone_as_the_rotation_of_bearings(device: str) -> None:
+    """For a camera without distortion, whose principal point lies off the centre and whose pixels are not square."""
+    camera = Camera(201, 101, 150.0, 140.0, 90.0, 55.0)
+    rotation = CameraRotation((0.4, -0.6, 0.9), (2.0, 1.0, -3.0))
+    xy = np.array([[0.0, 0.0], [200.0, 0.0], [90.0, 55.0], [17.5, 80.25], [0.0, 100.0]])
+    out = wp.zeros((2, len(xy)), dtype=wp.vec2, device=device)
+    for time in (-0.1, 0.0, 0.15):
+        inputs = [pinhole_params(camera), camera_params(camera, device), rotation.params(), time,
+                  wp.array(xy.astype(np.float32), dtype=wp.vec2, device=device)]  # fmt: skip
+        wp.launch(undo_rotation, len(xy), inputs=inputs, outputs=[out], device=device)
+        rays = np.column_stack([(xy - [90.0, 55.0]) / [150.0, 140.0], np.ones(len(xy))])
+        turned = Rotation.from_rotvec(rotation.rotation(np.array([time]))[0]).apply(rays)
+        expected = turned[:, :2] / turned[:, 2:] * [150.0, 140.0] + [90.0, 55.0]
+        np.testing.assert_allclose(out.numpy(), [expected, expected], rtol=0, atol=1e-3)  # px

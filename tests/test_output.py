@@ -845,6 +845,34 @@ def test_a_stack_of_images_takes_its_room_on_the_disk_first(tmp_path: Path) -> N
         assert found.st_blocks * 512 >= found.st_size > 20 * 4 * SIZE[0] * SIZE[1]
 
 
+def test_every_image_of_a_window_is_checked_before_the_first(tmp_path: Path) -> None:
+    source = MemoryEvents(events(), *SIZE)
+    (tmp_path / "a_00002.png").write_bytes(b"mine")
+    for paths, message in (["a.png"], r"a_00002\.png: exists"), (["a.npy", "a.png"], r"a_00002\.png: exists"):
+        with pytest.raises(AmiwarpError, match=message):
+            IweFiles([tmp_path / p for p in paths], source, window_us=10_000, layers=Layers.MERGED, device="cpu")
+    IweFiles([tmp_path / "a.npy"], source, window_us=10_000, layers=Layers.MERGED, device="cpu")
+    IweFiles([tmp_path / "a.png"], source, window_us=None, layers=Layers.MERGED, device="cpu")
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOSPC, errno.EFBIG])
+def test_only_a_full_disk_refuses_to_reserve_space(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """A file system that cannot reserve space is used without."""
+
+    def refuse(handle: int, start: int, count: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    with (tmp_path / "a").open("wb") as file:
+        if number in (errno.ENOSPC, errno.EFBIG):
+            with pytest.raises(OSError, match=os.strerror(number)):
+                output.allocate(file.fileno(), 0, 100)
+        else:
+            output.allocate(file.fileno(), 0, 100)
+
+
 def compensated(given: Events) -> Events:
     return Events(given.x.astype(np.float32), given.y.astype(np.float32), given.t, given.p)
 

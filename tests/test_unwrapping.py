@@ -116,6 +116,7 @@ def test_a_steady_rotation_is_never_refused(bits):
         (lambda c: np.where(c < 9000, c, c - 9000), 1000, None, "sample 750: .*counter_bits"),
         (lambda c: c % 4096, 4095, None, "may wrap at 4,09"),
         (lambda c: c % 1024, 1000, 8, "do not fit in 8 bits"),
+        (lambda c: c % 200 + 100, 1000, 8, r"counts 100 \.\. 296 do not fit in 8 bits"),
         (lambda c: c % 256, 1000, 9, "sample .*wrapping at 9 bits"),
         (lambda c: c % 70_000, 1000, 0, "do not fit in one turn"),
         (lambda c: c, 1000, 7, "counter_bits = 7; give 8 to 64"),
@@ -135,6 +136,14 @@ def test_a_short_log_shows_a_period_that_no_counter_has(period, n):
     count = 30 * np.arange(n)
     with pytest.raises(AmiwarpError, match=rf"wraps by about {period},? which is no known period"):
         Encoder.from_counts(np.arange(n) * 1000, count % period, counts_per_turn=1000)
+
+
+@pytest.mark.parametrize("step", [20, 100])
+def test_a_prism_that_jumps_by_less_than_half_a_turn_is_believed(step):
+    """At rest before and after: no counter wraps by so few counts."""
+    count = np.repeat([40, 40 + step], 30)
+    encoder = Encoder.from_counts(np.arange(60) * 1000, count, counts_per_turn=1000)
+    assert np.ptp(encoder.angle) == pytest.approx(step * TWO_PI / 1000, abs=1e-12)
 
 
 def test_a_gap_longer_than_a_counter_lasts_is_refused():
