@@ -196,8 +196,8 @@ class Map:
     def tests(self, mutant: Mutant, files: list[str], most_s: float) -> list[list[str]]:
         """Return the tests of a mutant: those of its area that run its function, then others that do.
 
-        Those of files that name the module come first, then those that run the line, then the fastest. If no test is
-        known to run the function, those that call the module in the reading process are taken, or all of the area.
+        Those of files that name the module come first, then those that run the line, then the fastest. Tests that call
+        the module in the reading process may run it, too. If nothing is known, all tests of the area are taken.
         """
         own = {test for test in self.seconds if Path(_file_of(test)).stem.removeprefix("test_") in files}
         lines: dict[int, list[str]] = {}
@@ -207,7 +207,8 @@ class Map:
         first, last, _ = _function(ast.parse((ROOT / mutant.module).read_text()), mutant.line)
         near = {test for line in range(first, last + 1) for test in lines.get(line, ()) if test in self.seconds}
         dotted = mutant.module.removesuffix(".py").replace("/", ".")
-        near = near or {test for test, called in self._called.items() if dotted in called} or own
+        near |= {test for test, called in self._called.items() if any(dotted in _imported(name) for name in called)}
+        near = near or own
         here, naming = set(lines.get(mutant.line, ())), _files_naming(dotted)
 
         def affordable(tests: set[str]) -> list[str]:
@@ -222,6 +223,14 @@ class Map:
 
 def _file_of(test: str) -> str:
     return test.partition("::")[0]
+
+
+@functools.cache
+def _imported(dotted: str) -> frozenset[str]:
+    """Return a module of ``amiwarp.io`` and those that it imports there, directly or not."""
+    path = ROOT / f"{dotted.replace('.', '/')}.py"
+    names = re.findall(r"^from (amiwarp\.io\.\w+) import", path.read_text(), re.MULTILINE) if path.exists() else ()
+    return frozenset({dotted}).union(*map(_imported, names))
 
 
 @functools.cache
@@ -354,12 +363,19 @@ class Worker:
         return "" if code == 0 else reasons[-1] if reasons else output.strip()[-200:]
 
 
-def explained(mutant: Mutant, equivalents: list[dict[str, Any]]) -> str:
-    """Return the reason why a mutant changes nothing that a test can see, or an empty text."""
-    for known in equivalents:
-        if known["module"] == mutant.module and known["before"] == mutant.before and mutant.after in known["after"]:
-            return str(known["reason"])
-    return ""
+def explained(row: dict[str, Any], equivalents: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the outcome of a mutant. A survivor that changes nothing which a test can see is equivalent."""
+    for known in equivalents if row["outcome"] == "survived" else ():
+        if all(known[name] == row[name] for name in ("module", "before")) and row["after"] in known["after"]:
+            return row | {"outcome": "equivalent", "cause": known["reason"]}
+    return row
+
+
+def score(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the share of killed mutants among those that are not equivalent, and the number of each outcome."""
+    outcomes = Counter(row["outcome"] for row in rows)
+    share = outcomes["killed"] / max(len(rows) - outcomes["equivalent"], 1)
+    return {"score": round(share, 3), "outcomes": dict(outcomes)}
 
 
 def main() -> None:
@@ -378,9 +394,12 @@ def main() -> None:
     areas = [area for area in config["area"] if given.only is None or area["name"] in given.only]
     mutants = sample(areas, given.count, given.seed)
     rows: list[dict[str, Any]] = []
+    before: dict[str, Any] | None = None
     if given.again:
-        earlier = json.loads(given.again.read_text())["mutants"]
-        rows = [row for row in earlier if row["outcome"] != "survived"]
+        earlier = json.loads(given.again.read_text())
+        known_rows = [explained(row, config.get("equivalent", [])) for row in earlier["mutants"]]
+        before = earlier.get("before", score(known_rows))
+        rows = [row for row in known_rows if row["outcome"] != "survived"]
         settled = {(row["module"], row["before"], row["after"]) for row in rows}
         mutants = [mutant for mutant in mutants if (mutant.module, mutant.before, mutant.after) not in settled]
     names = list(dict.fromkeys(name for area in areas for name in area["tests"]))
@@ -404,31 +423,22 @@ def main() -> None:
                 outcome, cause = worker.judge(mutant, tests, known.seconds)
             finally:
                 workers.put(worker)
-            if outcome == "survived" and (reason := explained(mutant, config.get("equivalent", []))):
-                outcome, cause = "equivalent", reason
             row = {key: value for key, value in asdict(mutant).items() if key not in ("function", "code")}
-            rows.append(row | {"outcome": outcome, "cause": cause})
-            print(
-                f"{outcome:10} {mutant.module}:{mutant.line} {mutant.before}  ->  {mutant.after}  [{cause}]", flush=True
-            )
+            row = explained(row | {"outcome": outcome, "cause": cause}, config.get("equivalent", []))
+            rows.append(row)
+            change = f"{mutant.module}:{mutant.line} {mutant.before}  ->  {mutant.after}"
+            print(f"{row['outcome']:10} {change}  [{row['cause']}]", flush=True)
 
         with ThreadPoolExecutor(given.jobs) as pool:
             list(pool.map(one, sorted(mutants, key=lambda mutant: not mutant.function)))  # the slow ones last
     rows.sort(key=lambda row: (row["module"], row["line"]))
-    totals = Counter(row["outcome"] for row in rows)
-    score = totals["killed"] / (len(rows) - totals["equivalent"])
-    print(f"{dict(totals)}: {100 * score:.1f} % of those that are not equivalent are killed")
+    total = score(rows)
+    print(f"{total['outcomes']}: {100 * total['score']:.1f} % of those that are not equivalent are killed")
     if given.out:
-        by_area = {name: dict(Counter(row["outcome"] for row in rows if row["area"] == name)) for name in files_of}
-        result = {
-            "seed": given.seed,
-            "score": round(score, 3),
-            "outcomes": dict(totals),
-            "areas": by_area,
-            "mutants": rows,
-        }
+        by_area = {name: score([row for row in rows if row["area"] == name]) for name in files_of}
+        result = {"seed": given.seed, "before": before, **total, "areas": by_area, "mutants": rows}
         given.out.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n")
-    sys.exit(totals["survived"] > 0)
+    sys.exit("survived" in total["outcomes"])
 
 
 if __name__ == "__main__":

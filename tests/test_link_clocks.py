@@ -54,6 +54,12 @@ def test_pulses_taken_for_others_are_left_out() -> None:
     assert clock.drift == pytest.approx(DRIFT, abs=6 * clock.drift_std)
 
 
+def test_three_pulses_that_agree_are_enough() -> None:
+    own = np.array([1_200_000, 1_820_000, 1_940_000, 7_810_000, 9_710_000])
+    clock = fit_to_pulses(own, own + np.array([100, 100, 100, 253, -8]))
+    assert (clock.offset_us, clock.drift, clock.pairs) == (pytest.approx(100.0), pytest.approx(0.0, abs=1e-12), 3)
+
+
 def test_round_trips_give_it_to_within_their_way() -> None:
     rng = np.random.default_rng(1)
     sent = 7_000_000_000 + np.arange(100) * 300_000
