@@ -424,6 +424,7 @@ def main() -> None:
             finally:
                 workers.put(worker)
             row = {key: value for key, value in asdict(mutant).items() if key not in ("function", "code")}
+            cause = re.sub(r"(?<![\w.])(/[\w.-]+){2,}/", "", cause)  # folders of this machine
             row = explained(row | {"outcome": outcome, "cause": cause}, config.get("equivalent", []))
             rows.append(row)
             change = f"{mutant.module}:{mutant.line} {mutant.before}  ->  {mutant.after}"
