@@ -16,14 +16,13 @@ from io_samples import SIZE, make_events, write_text
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import Format, open_recording, read_encoder_csv
 from amiwarp.io.json_files import read_toml
-from amiwarp.io.json_lines import read_lines
 from amiwarp.io.regular_file import check_regular
+from amiwarp.io.sealed_json import read_journal
 from amiwarp.io.text import read_calib
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.sequences import open_pictures
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.studies.chart.charts import Charts
-from amiwarp.studies.stability.report import load as load_cells
 
 
 def fifo(path: Path) -> Path:
@@ -89,9 +88,7 @@ def test_films_are_regular_files(tmp_path, place):
         open_pictures(place(tmp_path / "film.mp4"), fps=25.0)
 
 
-@pytest.mark.parametrize(
-    "read", [Charts.load, lambda path: list(read_lines(path)), lambda path: load_cells(path.parent)]
-)
+@pytest.mark.parametrize("read", [Charts.load, lambda path: list(read_journal(path, dict, []))])
 def test_results_that_a_run_continues_are_regular_files(tmp_path, read):
     fifo(tmp_path / "a.json")
     with pytest.raises(AmiwarpError, match=r"a\.json: (.*: )?is a named pipe"):
