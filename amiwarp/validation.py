@@ -367,7 +367,7 @@ def _fits_path(value: Any) -> bool:
 _CHECKS: dict[Any, tuple[Callable[[Any], bool], str]] = {
     bool: (lambda value: isinstance(value, bool | np.bool_), "True or False"),
     types.NoneType: (lambda value: value is None, "None"),
-    **dict.fromkeys((os.PathLike, Path), (_fits_path, "a path")),
+    **dict.fromkeys((os.PathLike, Path), (_fits_path, "a path without null bytes")),
     np.ndarray: (_fits_array, "a NumPy array of numbers without masked values"),
     collections.abc.Callable: (callable, "a function"),
     collections.abc.Iterable: (lambda value: np.iterable(value) and not isinstance(value, str), "an iterable"),

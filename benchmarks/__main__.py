@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.kernels.cpu_threads import cpu_threads
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.studies.machine_info import processor
 from benchmarks import report
 from benchmarks.cases import CASES, SCENES, Case

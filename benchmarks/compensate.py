@@ -37,12 +37,12 @@ import warp as wp
 
 from amiwarp.compensation.piece_buffers import PIECE
 from amiwarp.compensation.recordings import BlockCompensator, compensate
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.events.checks import inside_image
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.chunks import in_order
-from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, Model
 from amiwarp.optics.prism import Prism

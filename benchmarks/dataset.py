@@ -30,8 +30,8 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
+from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.io.sealed_json import read_journal
-from amiwarp.kernels.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.kernels.quiet_start import start_quietly
 from amiwarp.simulation.engine import Engine
 from amiwarp.studies.cluster import ANY_GPU

@@ -29,8 +29,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels.cpu_threads import cpu_threads
 
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 

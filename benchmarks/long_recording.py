@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 
 from amiwarp.calib.result import Calibration
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.events.events import Events
 from amiwarp.imaging.metrics import model_error
 from amiwarp.io import open_recording
-from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.studies.machine_info import processor

@@ -29,12 +29,12 @@ from scipy.spatial.transform import Rotation
 
 from amiwarp.calib import calibrate
 from amiwarp.calib.parameters import RATES
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.choices import Vote
 from amiwarp.imaging.warped_image import iwe
-from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.exact_model import ExactModel

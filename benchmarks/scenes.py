@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import truth_model
-from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism, apex_from_deflection

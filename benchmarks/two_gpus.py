@@ -32,8 +32,8 @@ import numpy as np
 import warp as wp
 
 from amiwarp.compensation.recordings import compensate
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.io import open_recording
-from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.kernels.quiet_start import start_quietly
 from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, run_jobs, start_workers
 from amiwarp.studies.dataset import manifest

@@ -14,9 +14,9 @@ import typer
 from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, made_again, progress, report, table
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import make_folder, own_folder
-from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.studies.cluster import start_workers
 
 if TYPE_CHECKING:

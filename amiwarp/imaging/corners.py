@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 import warp as wp
 
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.checks import TIME_LIMIT, check_events, check_sensor
 from amiwarp.events.device_events import DeviceEvents, device_for, limits, wait
 from amiwarp.imaging.choices import CornerMethod
 from amiwarp.kernels import corners as kernels
-from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import choice, guarded, vector, whole

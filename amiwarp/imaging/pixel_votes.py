@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.imaging.device_events import LARGEST_WEIGHT
-from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.kernels.iwe import CPU_WIDTH, add_sums, read_sums
 from amiwarp.kernels.launch import RecordedLaunch, launch, launch_slices, run_together
 from amiwarp.kernels.pixel_votes import (

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.kernels.cpu_threads import cpu_threads
+from amiwarp.cpu_threads import cpu_threads
 
 Result = TypeVar("Result")
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.cpu_threads import cpu_threads
+from amiwarp.cpu_threads import cpu_threads
 
 _Job = tuple[Callable[[], object], "SimpleQueue[BaseException | None]"]
 """Function to run, and the queue that gets its error, or None."""

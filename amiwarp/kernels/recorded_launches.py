@@ -5,7 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.cpu_threads import cpu_threads
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.kernels.launch import SMALLEST_SLICE, run_together, slices
 
 BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks

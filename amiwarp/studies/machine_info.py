@@ -11,7 +11,7 @@ from pathlib import Path
 import warp as wp
 
 from amiwarp._version import __version__
-from amiwarp.kernels.cpu_threads import cpu_threads
+from amiwarp.cpu_threads import cpu_threads
 
 
 def processor() -> str:

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from amiwarp._version import __version__
+from amiwarp.cpu_threads import limited_cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import convert, open_recording
 from amiwarp.io.atomic_output import make_folder, put_in_place
 from amiwarp.io.json_files import LARGEST_INTEGER
-from amiwarp.kernels.cpu_threads import limited_cpu_threads
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.scene import Scene

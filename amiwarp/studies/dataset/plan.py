@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from amiwarp.cpu_threads import limited_cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import scratch_folder
-from amiwarp.kernels.cpu_threads import limited_cpu_threads
 from amiwarp.progress import Progress, silent
 from amiwarp.studies.cluster import ANY_GPU
 from amiwarp.studies.dataset.items import Item, list_items

@@ -11,9 +11,9 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import make_folder, scratch_folder
-from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.progress import Progress, silent
 from amiwarp.studies.cluster import ANY_GPU, Workers, gpu_count, run_jobs, single_worker, start_workers
 from amiwarp.studies.dataset.items import Item, list_items

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from amiwarp._version import __version__
+from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.json_files import fields_of, value_of
 from amiwarp.io.sealed_json import CellStore
-from amiwarp.kernels.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.kernels.launch import load_all, load_kernels
 from amiwarp.studies.cpu_kernels import EXACT_KERNELS
 from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition, RecordedStreams, Streams

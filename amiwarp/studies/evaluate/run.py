@@ -9,8 +9,8 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.io.atomic_output import check_output, make_folder, own_folder
-from amiwarp.kernels.cpu_threads import cpu_threads
 from amiwarp.progress import Progress, silent
 from amiwarp.studies.cluster import Workers, run_jobs, single_worker, start_workers
 from amiwarp.studies.dataset.run import worker_count
