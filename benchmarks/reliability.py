@@ -132,8 +132,9 @@ A line that begins with IN is a Python program."""
 SHORTER = ("record", "live", "dataset")
 """Commands whose file is valid, but may be shorter: they keep what was finished when they were killed."""
 
-CONTINUED = ("stability", "dataset", "evaluate")
-"""Commands that continue a stopped run if they are given again."""
+CONTINUED = ("dataset", "evaluate")
+"""Commands that continue a stopped run if they are given again, and end with the same files. With a limit of time, as
+here, ``stability`` adds to them."""
 
 
 def prepare(folder: Path) -> Path:
