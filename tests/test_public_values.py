@@ -116,6 +116,7 @@ def test_public_calls_return_or_say_what_is_wrong(call: PublicCall) -> None:
                 raise AssertionError(f"{call.label}({name}={shown(junk)}) ends in {type(error).__name__}") from error
             assert "\n" not in message
             assert len(message) < 1000
+            assert f"{name} is unknown" not in message
             if before is not None:
                 np.testing.assert_array_equal(junk, before)
 

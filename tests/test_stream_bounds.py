@@ -22,7 +22,7 @@ from amiwarp.compensation.streams import Compensated, Compensator, held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events
+from amiwarp.events.events import Events, EventSource
 from amiwarp.live.link.emulated_rotors import MOST_SEGMENTS, Motor, Played
 from amiwarp.live.link.emulator import MOST_OUT_BYTES, Controller, EmulatedFault
 from amiwarp.live.link.pseudo_terminal import RETRY_S, PseudoTerminal
@@ -360,7 +360,9 @@ def test_a_recording_that_cannot_be_read_ends_its_emulated_camera(tmp_path: Path
         raise AmiwarpError("recording.h5: damaged")
 
     rotor = Played(recording.encoder)
-    events = type("Damaged", (), {"size": (64, 48), "blocks": staticmethod(broken), "__len__": lambda _: 2000})()
+    events = type(
+        "Damaged", (EventSource,), {"size": (64, 48), "blocks": staticmethod(broken), "__len__": lambda _: 2000}
+    )()
     played = replace(recording, events=events)
     camera = EmulatedCamera(played, rotor, Controller(rotor), f"unix:{tmp_path}/c", world())
     with socket.socket(socket.AF_UNIX) as client:

@@ -128,6 +128,7 @@ def translate(
     >>> amiwarp.translate(stack, amiwarp.Prism(0.03)).events.size
     (32, 24)
     """
-    check_names(settings, [*inspect.signature(translation).parameters][5:], "translate: setting ")
+    known = inspect.signature(translation).parameters.keys() - inspect.signature(translate).parameters.keys()
+    check_names(settings, sorted(known), "translate: setting ")
     work = translation(source, prism, events=events, dataset=dataset, progress=progress, **settings)
     return work.run(progress=progress)
