@@ -752,7 +752,7 @@ def test_images_are_downloaded(inspector: Inspector, tmp_path: Path) -> None:
             assert picture.n_frames == (2 if kind is ImageKind.POLARITY else 1)
             first = images.after[0] if kind is ImageKind.POLARITY else images.after
             np.testing.assert_array_equal(np.asarray(picture), first)
-    with pytest.raises(AmiwarpError, match=r"\.png, \.tif, \.npy"):
+    with pytest.raises(AmiwarpError, match=r"\.png, \.tif or \.npy"):
         write_image(images, tmp_path / "image.jpg")
     with pytest.raises(AmiwarpError, match="no image of count before"):
         write_image(replace(images, kind=ImageKind.COUNT, before=None), tmp_path / "image.png", before=True)
