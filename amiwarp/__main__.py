@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from typing import Any
 
 from amiwarp.cli import INTERRUPTED, STOPPED, fail
 
-ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-"""Signals that end a command in the same way as Ctrl-C does."""
+ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+"""Signals that end a command: Ctrl-C, and those that end it in the same way."""
 
 
 def main() -> None:
@@ -30,18 +31,27 @@ def main() -> None:
             os._exit(INTERRUPTED)
 
 
+def _end_loading(number: int, frame: Any) -> None:
+    """End the process at a signal: nothing is open yet, and Python drops an exception that meets a finaliser."""
+    os.write(2, f"amiwarp: {STOPPED}\n".encode())
+    os._exit(INTERRUPTED)
+
+
 def _main() -> None:
     """Load the command line, which takes some time, and run the command."""
     try:
-        for number in ENDING:
-            if signal.getsignal(number) is signal.SIG_DFL:  # a signal that nohup ignores stays ignored
-                signal.signal(number, signal.default_int_handler)
+        # a signal that nohup ignores stays ignored
+        ending = [n for n in ENDING if signal.getsignal(n) in (signal.SIG_DFL, signal.default_int_handler)]
+        for number in ending:
+            signal.signal(number, _end_loading)
         if any(argument.endswith((".h5", ".hdf5")) and os.path.isfile(argument) for argument in sys.argv[1:]):
             from amiwarp.io.reading_process import start_ahead
 
             start_ahead("amiwarp.io.hdf5_server")  # loads HDF5 while this process loads the command
         from amiwarp.cli import app
 
+        for number in ending:
+            signal.signal(number, signal.default_int_handler)
         app.main()
     except KeyboardInterrupt:  # Ctrl-C during loading, or before or after a command
         fail(INTERRUPTED, STOPPED)

@@ -543,6 +543,23 @@ def test_interrupt_while_the_command_is_loaded_is_one_line() -> None:
     assert done.stderr == "amiwarp: interrupted; nothing was left half-written\n"
 
 
+def test_interrupt_inside_a_finaliser_while_the_command_is_loaded_is_one_line() -> None:
+    script = (
+        f"{INTERRUPTIBLE}; import sys, types; from amiwarp.__main__ import main\n"
+        "class Dropping:\n"
+        "    def __del__(self):\n"
+        "        signal.raise_signal(signal.SIGINT)\n"
+        "        for _ in range(10): pass\n"
+        "def find(name, path, target=None):\n"
+        "    if name == 'typer': Dropping()\n"
+        "sys.meta_path.insert(0, types.SimpleNamespace(find_spec=find)); sys.argv[1:] = ['info', '--help']; main()"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, text=True, capture_output=True, check=False)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "amiwarp: interrupted; nothing was left half-written\n"
+
+
 def test_interrupt_inside_a_finaliser_is_not_lost(place: Path) -> None:
     """Python drops exceptions raised inside a finaliser; the command must end nevertheless."""
     script = f"""

@@ -78,7 +78,7 @@ class KnownRecording:
         values = {"apex": prism.apex, "phase": self.model.phase, "clock_offset": self.encoder.clock_offset_us, **tilts}
         return Calibration(
             model_name="exact", camera=self.camera, prism=prism, parameters=values, uncertainty={}, free=(),
-            sharpness_name="variance", sharpness_before=math.nan, sharpness_after=math.nan, stages=(),
+            sharpness_name="variance", sharpness_before=0.0, sharpness_after=0.0, stages=(),
             events=len(self.events), seconds=0.0,
         )  # fmt: skip
 
