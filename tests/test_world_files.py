@@ -20,6 +20,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.io.input_files import inputs_in_use, inputs_noted
 from amiwarp.simulation.pictures import LUMINANCE, linear_luminance
 from amiwarp.simulation.worlds.mesh_files import load_mesh
+from amiwarp.simulation.worlds.scene import Sun
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.simulation.worlds.world_files import load_world
 
@@ -398,6 +399,13 @@ def test_trajectories_have_a_limit(tmp_path: Path) -> None:
     (tmp_path / "b.txt").write_text("0" + row + "#" * 1001 + "\n")
     with pytest.raises(AmiwarpError, match=r"b\.txt: line 2 is longer than 1000 characters"):
         Trajectory.from_file(tmp_path / "b.txt")
+
+
+def test_the_length_of_the_direction_of_the_sun_has_no_effect() -> None:
+    for length in (1e-300, 1.0, 1e200):
+        np.testing.assert_allclose(Sun((0.0, 3 * length, 4 * length)).direction, (0.0, 0.6, 0.8), rtol=0, atol=1e-12)
+    with pytest.raises(AmiwarpError, match="sun direction has length inf"):
+        Sun((1.7e308, 1.7e308, 1.7e308))
 
 
 def test_huge_poses_are_refused_without_warnings() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -123,9 +124,9 @@ class Sun:
 
     def __post_init__(self) -> None:
         direction = vector(self.direction, 3, "sun direction", real)
-        length = float(np.linalg.norm(direction))
-        if not length > 0.0:
-            raise AmiwarpError("sun direction has length 0; give the direction towards the sun")
+        length = math.hypot(*direction)
+        if not 0.0 < length < math.inf:
+            raise AmiwarpError(f"sun direction has length {length:.3g}; give the direction towards the sun")
         object.__setattr__(self, "direction", tuple(float(x) / length for x in direction))
         object.__setattr__(self, "intensity", real(self.intensity, "sun intensity", 0.0, 1e6))
 
