@@ -3,6 +3,7 @@
 import asyncio
 import json
 import math
+import signal
 import socket
 import sys
 import types
@@ -10,6 +11,7 @@ import urllib.request
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,6 +62,24 @@ def test_a_picture_without_a_window(files: Path, tmp_path: Path) -> None:
     assert picture.shape == (200, 400, 3)
     assert np.median(picture) < 60  # dark
     assert picture.std() > 10
+
+
+def test_an_interrupt_waits_until_vtk_has_drawn(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """VTK crashes if an exception leaves it half-drawn."""
+    look_from, closed = viewer_app.Scene.look_from, []
+
+    def interrupted(scene: viewer_app.Scene, *given: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        look_from(scene, *given)
+
+    monkeypatch.setattr(viewer_app.Scene, "look_from", interrupted)
+    close = viewer_app.Scene.close
+    monkeypatch.setattr(viewer_app.Scene, "close", lambda scene: closed.append(close(scene)))
+    inspector = Inspector(open_recording(files / "recording.h5"))
+    with pytest.raises(KeyboardInterrupt):
+        viewer_app.save_screenshot(inspector, tmp_path / "out.png", size=(400, 200))
+    assert closed == [None]
+    assert np.asarray(Image.open(tmp_path / "out.png")).shape[:2] == (200, 400)
 
 
 def test_window_model_and_axis(files: Path, tmp_path: Path) -> None:

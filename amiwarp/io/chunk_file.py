@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
@@ -22,6 +21,7 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.atomic_output import interrupts_later
 from amiwarp.io.chunks import CHUNK
 
 
@@ -60,7 +60,7 @@ class ChunkFile:
         self._turn = 0
         self._stopped = False
         with contextlib.ExitStack() as undo:
-            with _interrupts_later():
+            with interrupts_later():
                 self.output = _Output(path)
                 undo.callback(self.output.close)
                 # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
@@ -129,29 +129,6 @@ class ChunkFile:
         finally:
             self.output.close()
         self.check()
-
-
-@contextlib.contextmanager
-def _interrupts_later() -> Iterator[None]:
-    """Postpone Ctrl-C and signals that act like it to the end of the ``with`` block.
-
-    HDF5 calls :class:`_Output`. If an interrupt is raised there while HDF5 creates a file, it cannot close the file.
-    """
-    arrived: list[int] = []
-    numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {}
-    if threading.current_thread() is threading.main_thread():
-        for number in numbers:
-            if callable(handler := signal.getsignal(number)):
-                before[number] = handler
-                signal.signal(number, lambda number, _frame: arrived.append(number))
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        if arrived:
-            signal.raise_signal(arrived[0])
 
 
 class ChunkedColumn:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.atomic_output import check_output
+from amiwarp.io.atomic_output import check_output, interrupts_later
 from amiwarp.validation import guarded
 from amiwarp.viewer.choices import View
 from amiwarp.viewer.cloud_scene import Look, Scene
@@ -203,7 +203,8 @@ def save_screenshot(
     look = look or Look()
     if not math.isfinite(inspector.turn_us):
         look = look.for_clouds([RECORDED])
-    with closing(Scene(size)) as scene:
-        scene.show(inspector.show(), look)
+    clouds = inspector.show()
+    with interrupts_later(), closing(Scene(size)) as scene:  # VTK crashes if an exception leaves it half-drawn
+        scene.show(clouds, look)
         scene.look_from(view, look)
         scene.save(path)
