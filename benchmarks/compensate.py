@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from amiwarp.calib import Calibration
 from amiwarp.compensation.piece_buffers import PIECE
 from amiwarp.compensation.recordings import BlockCompensator, compensate
 from amiwarp.cpu_threads import cpu_threads
@@ -129,15 +130,13 @@ class Bare:
                     file.write(columns[name])
 
 
-class Calibrated:
-    """Stand-in for a calibration, with the attributes that the compensation needs."""
-
-    def __init__(self, name: str, phase: float = PHASE) -> None:
-        self.model_name, self.camera = name, CAMERA
-        self.model: Model = MODELS[name].from_prism(CAMERA, PRISM, phase)
-
-    def encoder_for(self, encoder: Encoder, _first: int, _last: int) -> Encoder:
-        return encoder
+def calibrated(name: str, phase: float = PHASE) -> Calibration:
+    """Return a calibration with the true parameters."""
+    size = {"apex": PRISM.apex} if name in ("exact", "ellipse") else {"deflection": PRISM.deflection}
+    return Calibration(
+        model_name=name, camera=CAMERA, prism=PRISM, parameters={**size, "phase": phase}, uncertainty={}, free=(),
+        sharpness_name="variance", sharpness_before=0.0, sharpness_after=0.0, stages=(), events=0, seconds=0.0,
+    )  # fmt: skip
 
 
 def seconds(work: Callable[[], Any]) -> float:
@@ -229,9 +228,9 @@ def peak_mib() -> float:
 
 
 def row(source: Path, name: str, device: str, repeats: int, columns: bool) -> dict[str, Any]:
-    folder, calibration = source.parent, Calibrated(name)
+    folder, calibration = source.parent, calibrated(name)
     result: dict[str, Any] = {"model": name, "device": device, "layout": "columns" if columns else "native"}
-    out = folder / "moved"
+    out = folder / ("moved" if columns else "moved.h5")
     times, copies, cpu = [], [], []
     bare = Bare(source) if columns else None
     recording = None if columns else open_recording(source)
@@ -250,7 +249,7 @@ def row(source: Path, name: str, device: str, repeats: int, columns: bool) -> di
         if bare:
             times.append(seconds(lambda: bare.compensate(out, mover)))
         else:
-            times.append(seconds(lambda: compensate(recording, calibration, out, device=device)))  # type: ignore[arg-type]
+            times.append(seconds(lambda: compensate(recording, calibration, out, device=device)))
         cpu.append(time.process_time() - began_cpu)
         result["peak_mib"] = peak_mib()
         copies.append(plain_copy(source, out, folder))
@@ -326,7 +325,7 @@ def main() -> None:
         return
     result = about(a.device) | {"rows": []}
     with tempfile.TemporaryDirectory(dir=a.folder) as folder:
-        source = Path(folder) / "recording"
+        source = Path(folder) / ("recording" if a.columns else "recording.h5")
         child = [sys.executable, "-m", "benchmarks.compensate", "--device", a.device, "--repeats", str(a.repeats)]
         child += ["--columns"] * a.columns
         make(source, a.events, a.columns)

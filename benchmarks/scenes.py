@@ -199,7 +199,7 @@ def file_scene(n: int) -> FileScene:
     """Write ``n`` events into a file; see :mod:`benchmarks.compensate`."""
     folder = Path(tempfile.mkdtemp())
     missing = tuple(name for name in FILTERS if importlib.util.find_spec(name) is None)
-    scene = FileScene(folder / "recording", n, missing)
+    scene = FileScene(folder / ("recording" if missing else "recording.h5"), n, missing)
     weakref.finalize(scene, shutil.rmtree, folder)
     compensate.make(scene.source, n, bool(missing))
     return scene

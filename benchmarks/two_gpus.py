@@ -84,7 +84,7 @@ class FileTask:
 
 def compensate_file(task: FileTask) -> int:
     """Compensate a file by the exact model; return its number of events."""
-    calibration: Any = file_benchmark.Calibrated("exact", task.phase)
+    calibration = file_benchmark.calibrated("exact", task.phase)
     return compensate(open_recording(task.source), calibration, task.out, device=task.device, overwrite=True).events
 
 
@@ -269,7 +269,7 @@ def error_px(name: str, place: Place, done: Done) -> float:
         compensate_file(task)
         recording = open_recording(task.source)
         n = len(recording.events)
-        model = file_benchmark.Calibrated("exact", task.phase).model
+        model = file_benchmark.calibrated("exact", task.phase).model
         found = file_benchmark.errors(
             "exact", model, recording.encoder, recording, task.source, task.out, n, task.phase
         )
