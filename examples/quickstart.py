@@ -15,5 +15,5 @@ apex = calibration.exact.parameters["apex"]
 print(f"{calibration.model_name} model; apex {math.degrees(apex):.3f} deg, true {math.degrees(true.apex):.3f} deg")
 print(f"sharpness {calibration.sharpness_before:.2f} -> {calibration.sharpness_after:.2f}")
 
-done = amiwarp.compensate(recording, calibration, "compensated.h5")
-print(f"{done.events} events at {done.mev_per_s:.1f} Mev/s into compensated.h5")
+done = amiwarp.compensate(recording, calibration, "from_python.h5")
+print(f"{done.events} events at {done.mev_per_s:.1f} Mev/s into from_python.h5")
