@@ -28,7 +28,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp.cpu_threads import cpu_threads
-from amiwarp.studies.machine_info import processor
+from amiwarp.studies.cluster import processor
 from benchmarks import report
 from benchmarks.cases import CASES, SCENES, Case
 from benchmarks.job import Job

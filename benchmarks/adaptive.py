@@ -33,17 +33,15 @@ from amiwarp.io.atomic_output import write_text
 from amiwarp.kernels import prism_view as sight
 from amiwarp.kernels.launch import launch
 from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_orbit, prism_path
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.device_camera import camera_params
+from amiwarp.optics.camera import Camera, camera_params
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting.figures import save
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scene import Scene
-from amiwarp.simulation.scenery import MapRing, place_scene, step_us
+from amiwarp.simulation.scenery import MapRing, Scene, place_scene, step_us
 from amiwarp.simulation.simulator import Simulation
+from amiwarp.studies.cluster import machine, versions
 from amiwarp.studies.demo import earth
-from amiwarp.studies.machine_info import machine, versions
 
 CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
 PRISM, SMALL, PHASE = Prism(math.radians(1.8)), Prism(math.radians(0.9)), 1.0

@@ -17,9 +17,8 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-from amiwarp.studies.stability.axes import AXES
-from amiwarp.studies.stability.cells import Cell, Store, run_cell
-from amiwarp.studies.stability.run import QUICK_METHODS, chosen, quick_axes, run
+from amiwarp.studies.stability.cells import QUICK_METHODS, Cell, Store, chosen, quick_axes, run, run_cell
+from amiwarp.studies.stability.conditions import AXES
 
 _started = multiprocessing.get_context("spawn").Value("i", 0)
 

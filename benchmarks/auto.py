@@ -25,8 +25,7 @@ from typing import Any
 import numpy as np
 
 from amiwarp.calib import Calibration, Settings
-from amiwarp.calib.selection.model_choice import calibrate_auto
-from amiwarp.calib.selection.smaller_models import Places, candidate_space, fit, linear_motions
+from amiwarp.calib.model_choice import Places, calibrate_auto, candidate_space, fit, linear_motions
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
@@ -36,7 +35,7 @@ from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import simulate
-from amiwarp.studies.machine_info import machine
+from amiwarp.studies.cluster import machine
 
 FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
 NOMINAL = 1.1

@@ -39,20 +39,18 @@ from amiwarp.brightness.event_pairs import SensorTiming
 from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
 from amiwarp.calib.parameters import RATES
-from amiwarp.calib.photometric.gauss_newton import GAUSS_NEWTON
-from amiwarp.calib.photometric.stage import PhotometricSettings
-from amiwarp.calib.preparation import prepare
-from amiwarp.calib.sharpness.search import STAGES
+from amiwarp.calib.settings import GAUSS_NEWTON, STAGES, PhotometricSettings
+from amiwarp.calib.single_model import prepare
+from amiwarp.choices import Sharpness
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording, Truth
-from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.metrics import edge_blur, model_error, truth_model
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 

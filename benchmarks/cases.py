@@ -12,8 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from amiwarp.calib.sharpness.search import STAGES
-from amiwarp.imaging.choices import Vote
+from amiwarp.calib.settings import STAGES
+from amiwarp.choices import Vote
 from benchmarks import libraries, ours, unmoved
 from benchmarks.job import Job
 from benchmarks.peers import image

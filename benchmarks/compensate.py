@@ -36,12 +36,10 @@ import numpy as np
 import warp as wp
 
 from amiwarp.calib import Calibration
-from amiwarp.compensation.piece_buffers import PIECE
-from amiwarp.compensation.recordings import BlockCompensator, compensate
+from amiwarp.compensation.recordings import PIECE, BlockCompensator, compensate
 from amiwarp.cpu_threads import cpu_threads
-from amiwarp.events.checks import inside_image
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
+from amiwarp.events.events import Events, inside_image
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.chunks import in_order
 from amiwarp.optics.camera import Camera
@@ -65,7 +63,7 @@ MOVED = {"x": np.float32, "y": np.float32, "t": np.int64, "p": np.uint8, "inside
 
 def half_a_second() -> Events:
     from amiwarp.simulation.motion import EncoderModel
-    from amiwarp.simulation.scene import Scene
+    from amiwarp.simulation.scenery import Scene
     from amiwarp.simulation.simulator import Simulation
 
     scene = Scene.from_picture(blocks_picture())
@@ -292,9 +290,7 @@ def errors(
 
 
 def about(device: str) -> dict[str, Any]:
-    from amiwarp.studies.machine_info import (
-        processor,  # imported here: imports of a row's process count towards its memory
-    )
+    from amiwarp.studies.cluster import processor
 
     wp.init()
     found = {"python": platform.python_version()}

@@ -30,13 +30,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.choices import CornerMethod
 from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.events.device_events import DeviceEvents
 from amiwarp.events.events import Events
-from amiwarp.imaging.choices import CornerMethod
 from amiwarp.imaging.corners import CornerDetector
 from amiwarp.io import open_recording
-from amiwarp.studies.machine_info import machine, versions
+from amiwarp.studies.cluster import machine, versions
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 import corner_reference

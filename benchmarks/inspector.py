@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from amiwarp.choices import Axis, Colour
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
@@ -35,13 +36,11 @@ from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
-from amiwarp.studies.machine_info import machine
-from amiwarp.viewer.choices import Axis, Colour
-from amiwarp.viewer.drawing import cloud_state, jpeg, scale_state
-from amiwarp.viewer.image_kinds import ImageKind, count_images, make_images
+from amiwarp.studies.cluster import machine
+from amiwarp.viewer.clouds import cloud_state, jpeg, scale_state
+from amiwarp.viewer.images import ImageKind, count_images, make_images, prepare
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.log_intensity import prepare
-from amiwarp.viewer.parameters import Selection
+from amiwarp.viewer.window import Selection
 
 WIDTH, HEIGHT = 640, 480
 """Width and height of the sensor [px]."""
@@ -56,7 +55,7 @@ import sys, time
 began, cpu = time.perf_counter(), time.process_time()
 from amiwarp.io import open_recording
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.parameters import Selection
+from amiwarp.viewer.window import Selection
 opened = Inspector(open_recording(sys.argv[1]), device=sys.argv[2])
 start, length = opened.first_window()
 opened.open(start, int(sys.argv[3]) or length)
@@ -175,7 +174,7 @@ def opening(path: Path, device: str, n: int, length_us: int) -> dict[str, Any]:
 def rates(path: Path, n: int) -> dict[str, Any]:
     """Measure the count of all events over time, and a curve of 1,000 bins at four zooms."""
     from amiwarp.io import open_recording
-    from amiwarp.viewer.event_rates import EventRates
+    from amiwarp.viewer.timeline import EventRates
 
     source = open_recording(path).events
     counted, began, cpu = EventRates(source), time.perf_counter(), time.process_time()

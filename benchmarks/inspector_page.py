@@ -20,10 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.studies.machine_info import machine
+from amiwarp.studies.cluster import machine
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.page_values import SETTABLE
-from amiwarp.viewer.panel import Panel
+from amiwarp.viewer.panel import SETTABLE, Panel
 from amiwarp.viewer.serve import serve
 from benchmarks.inspector import made, recorded
 

@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
 from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
-from amiwarp.optics.model_error import ModelError, predicted_error
+from amiwarp.optics.models import ModelError, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

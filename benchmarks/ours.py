@@ -12,15 +12,12 @@ import numpy as np
 import warp as wp
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.imaging.choices import Vote
-from amiwarp.imaging.device_events import TURNS, upload_events
-from amiwarp.imaging.device_image import Image
+from amiwarp.choices import Vote
+from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.metrics import PictureQuality, model_error, picture_quality
-from amiwarp.imaging.tile_votes import TileVotes
-from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.imaging.votes import TURNS, CanvasShape, Image, TileVotes, upload_events
 from amiwarp.optics.models import MODELS, Model
-from amiwarp.reconstruction.picture import Reconstruction
-from amiwarp.reconstruction.result import Picture
+from amiwarp.reconstruction.picture import Picture, Reconstruction
 from benchmarks import peers, truth
 from benchmarks.job import Job
 from benchmarks.libraries import Peer

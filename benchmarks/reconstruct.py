@@ -48,8 +48,7 @@ from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import Reconstruction, reconstruct
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scene import Scene
-from amiwarp.simulation.scenery import place_scene
+from amiwarp.simulation.scenery import Scene, place_scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 

@@ -29,17 +29,17 @@ from scipy.spatial.transform import Rotation
 
 from amiwarp.calib import calibrate
 from amiwarp.calib.parameters import RATES
+from amiwarp.choices import Vote
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.imaging.choices import Vote
-from amiwarp.imaging.warped_image import iwe
+from amiwarp.imaging.iwe import iwe
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
-from amiwarp.studies.machine_info import processor
+from amiwarp.studies.cluster import processor
 from benchmarks.truth import votes
 
 WIDTH, HEIGHT, LENGTH_US = 640, 480, 50_000

@@ -26,8 +26,7 @@ from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.motion import EncoderModel
-from amiwarp.simulation.scene import Scene
-from amiwarp.simulation.scenery import step_us
+from amiwarp.simulation.scenery import Scene, step_us
 from amiwarp.simulation.simulator import Simulation
 
 WIDTH, HEIGHT, FOV, INDEX = 640, 480, math.radians(60.0), 1.55

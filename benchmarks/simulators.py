@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.sequences import PictureStack
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.simulation.worlds.frame_truth import TruthRenderer
 from amiwarp.simulation.worlds.named import named_world
-from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.simulation.worlds.world import WorldScene
+from amiwarp.simulation.worlds.world_truth import TruthRenderer
 
 CONTRAST = 0.2
 """Contrast threshold of ON and OFF events [natural log intensity]."""

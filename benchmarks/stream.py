@@ -37,15 +37,14 @@ from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.packets import Packet
-from amiwarp.live.stream.session import Session
-from amiwarp.live.stream.status import IMAGE_US, SessionStatus
+from amiwarp.live.stream.session import IMAGE_US, Session, SessionStatus
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.circle_models import CircleModel
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import Model
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
-from amiwarp.studies.machine_info import machine
+from amiwarp.studies.cluster import machine
 
 PACKET, CAMERA, PRISM = 10_000, Camera.from_fov(640, 480, math.radians(60)), Prism(math.radians(1.0))
 MODELS: dict[str, Model] = {

@@ -49,9 +49,9 @@ from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.simulation.worlds.frame_truth import TruthRenderer
 from amiwarp.simulation.worlds.named.catalogue import named_world
-from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.simulation.worlds.world import WorldScene
+from amiwarp.simulation.worlds.world_truth import TruthRenderer
 from amiwarp.translation.translator import translation
 
 CAMERA = Camera.from_fov(160, 120, math.radians(60.0))

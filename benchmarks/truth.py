@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from amiwarp.imaging.choices import Vote
+from amiwarp.choices import Vote
 from benchmarks.scenes import MARGIN, PHASE, Array, EventScene, in_chunks
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

@@ -34,18 +34,15 @@ import warp as wp
 from amiwarp.compensation.recordings import compensate
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.io import open_recording
-from amiwarp.kernels.quiet_start import start_quietly
-from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, run_jobs, start_workers
-from amiwarp.studies.dataset import manifest
-from amiwarp.studies.dataset.items import Item, list_items
-from amiwarp.studies.dataset.making import simulation_of, write_recording
+from amiwarp.kernels.launch import start_quietly
+from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, machine, processor, run_jobs, start_workers, versions
+from amiwarp.studies.dataset import run
+from amiwarp.studies.dataset.items import Item, list_items, simulation_of, write_recording
 from amiwarp.studies.dataset.run import make_dataset
-from amiwarp.studies.dataset.sources import content_digest
-from amiwarp.studies.dataset.specification import load_specification
-from amiwarp.studies.machine_info import machine, processor, versions
-from amiwarp.studies.stability import run as run_cells
-from amiwarp.studies.stability.axes import AXES, Axis
+from amiwarp.studies.dataset.specification import content_digest, load_specification
+from amiwarp.studies.stability import cells as run_cells
 from amiwarp.studies.stability.cells import METHODS, Cell, Stored, run_cell
+from amiwarp.studies.stability.conditions import AXES, Axis
 from benchmarks import compensate as file_benchmark
 from benchmarks import simulate
 from benchmarks.dataset import RESULTS, leave_out_tables, write_inputs
@@ -170,7 +167,7 @@ def run_dataset(place: Place, scheduler: str, tasks: int) -> Done:
     seconds = time.perf_counter() - began
     if done.failed:
         raise SystemExit(f"recordings failed: {done.failed}")
-    items = json.loads((out / manifest.MANIFEST).read_text())["items"]
+    items = json.loads((out / run.MANIFEST).read_text())["items"]
     shutil.rmtree(out)
     return Done(seconds, done.events, {item["file"]: item["sha256"] for item in items})
 
@@ -336,7 +333,7 @@ def main() -> int:
     args = parser.parse_args()
     began = time.perf_counter()
     try:
-        manifest.require_pyarrow()
+        run.require_pyarrow()
     except ValueError:
         leave_out_tables()
     start_quietly()

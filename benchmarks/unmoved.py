@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.imaging.choices import Vote
-from amiwarp.imaging.device_image import Image
-from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.choices import Vote
+from amiwarp.imaging.iwe import Votes
+from amiwarp.imaging.votes import CanvasShape, Image
 from benchmarks import truth
 from benchmarks.job import Job
 from benchmarks.libraries import library

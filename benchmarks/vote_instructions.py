@@ -29,7 +29,7 @@ import warp as wp
 from amiwarp.kernels.camera import CameraParams, PinholeParams
 from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams
 from amiwarp.kernels.tiles import AT_ONCE, vote_tiles
-from amiwarp.studies.machine_info import versions
+from amiwarp.studies.cluster import versions
 
 RESULTS = Path(__file__).parent / "results" / "vote_instructions.json"
 MODELS = {"circle": CircleParams, "radial": RadialCircleParams, "exact": ExactParams}

@@ -24,7 +24,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.named import named_world
-from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.simulation.worlds.world import WorldScene
 
 CAMERA, PRISM = Camera.from_fov(320, 240, math.radians(60.0)), Prism(math.radians(1.0))
 SPACING_S = 1.0 / 60.0

@@ -24,11 +24,11 @@ from amiwarp.events.truth import EventTruth
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.engine import Engine
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.simulation.worlds.frame_truth import TruthRenderer
 from amiwarp.simulation.worlds.named import named_world
-from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.simulation.worlds.world import WorldScene
+from amiwarp.simulation.worlds.world_truth import TruthRenderer
 
 CAMERA, PRISM = Camera.from_fov(640, 480, math.radians(60.0)), Prism(math.radians(1.0))
 WIDE = math.radians(72.0)

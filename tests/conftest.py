@@ -13,7 +13,7 @@ import pytest
 import warp as wp
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism

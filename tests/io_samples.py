@@ -13,8 +13,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.camera import Camera, RadialTangential
 
 SIZE = (320, 240)
 CALIB = "200 201 150 110 -0.3 0.1 1e-4 -2e-4 0.01"

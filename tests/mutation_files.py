@@ -35,36 +35,30 @@ from PIL import Image
 
 from amiwarp.calib import Calibration
 from amiwarp.cli.info import describe
-from amiwarp.cli.inputs import read_camera
-from amiwarp.cli.rig import _read_speed
+from amiwarp.cli.options import _read_speed, read_camera
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import check_events
-from amiwarp.events.events import Events
+from amiwarp.events.events import Events, check_events
 from amiwarp.events.recording import Recording
 from amiwarp.events.sensors import ImuSamples
 from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels
 from amiwarp.io import RecordingWriter, open_recording, read_encoder_csv
 from amiwarp.io.sealed_json import append_line, sealed
 from amiwarp.io.text import read_calib
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.lens import Fisheye
+from amiwarp.optics.camera import Camera, Fisheye
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.sequences import _read_times, open_pictures
-from amiwarp.simulation.worlds.mesh_files import load_mesh
 from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.simulation.worlds.world_files import load_world
+from amiwarp.simulation.worlds.world_files import load_mesh, load_world
 from amiwarp.studies import stability
-from amiwarp.studies.dataset.items import list_items
-from amiwarp.studies.dataset.making import Made
-from amiwarp.studies.dataset.manifest import JOURNAL, Journal
+from amiwarp.studies.dataset.items import Made, list_items
+from amiwarp.studies.dataset.run import JOURNAL, Journal
 from amiwarp.studies.dataset.specification import load_specification
-from amiwarp.studies.evaluate.cells import Store
 from amiwarp.studies.evaluate.conditions import Condition, Stream
-from amiwarp.studies.evaluate.drawing import CHANCE
-from amiwarp.studies.evaluate.measures.edge_match import THRESHOLDS
-from amiwarp.studies.evaluate.report import section
+from amiwarp.studies.evaluate.measures import THRESHOLDS
+from amiwarp.studies.evaluate.report import CHANCE, section
 from amiwarp.studies.evaluate.results import QUICK, CellResult, encode_picture
+from amiwarp.studies.evaluate.run import Store
 
 MEMORY_KIB = 3 << 19
 """Largest memory that a check may take, 1.5 GiB [KiB]."""

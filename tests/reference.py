@@ -12,8 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.lens import Fisheye, RadialTangential
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
 
 Array = NDArray[np.float64]

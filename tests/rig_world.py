@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from amiwarp.live.link.emulator import PseudoTerminal
 from amiwarp.live.link.link import Link
 from amiwarp.live.link.protocol import Answer
-from amiwarp.live.link.pseudo_terminal import PseudoTerminal
 from amiwarp.live.stream.emulated import EmulatedCamera
 from amiwarp.live.stream.packets import Packet, Source
 from amiwarp.live.stream.session import Session

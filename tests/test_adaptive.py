@@ -14,9 +14,9 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.studies.stability.scenes import SceneKind, draw
+from amiwarp.studies.stability.conditions import SceneKind, draw
 
 WINDOW_US = 33_000
 CAMERA, PRISM, PHASE = Camera.from_fov(200, 150, math.radians(40.0)), Prism(math.radians(1.8)), 0.7

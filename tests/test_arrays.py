@@ -19,9 +19,7 @@ import amiwarp
 from amiwarp import validation
 from amiwarp.compensation.streams import Compensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_arrays import converted, import_array
-from amiwarp.events.device_events import DeviceEvents
-from amiwarp.events.device_source import DeviceMemoryEvents
+from amiwarp.events.device_events import DeviceEvents, DeviceMemoryEvents, converted, import_array
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events, MemoryEvents
@@ -30,7 +28,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.simulator import Simulation
 
 WIDTH, HEIGHT = 64, 48

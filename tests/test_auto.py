@@ -12,22 +12,24 @@ import pytest
 from conftest import COARSE
 from scipy.optimize import minimize
 
-from amiwarp.calib import Calibration, Settings
-from amiwarp.calib.selection import groundwork
-from amiwarp.calib.selection import model_choice as auto
-from amiwarp.calib.selection.groundwork import TILT, Groundwork
-from amiwarp.calib.selection.model_choice import calibrate_auto, compare_models, trial_for
-from amiwarp.calib.selection.smaller_models import (
+from amiwarp.calib import Calibration, Settings, model_choice
+from amiwarp.calib import model_choice as auto
+from amiwarp.calib.calibration_events import CalibrationEvents
+from amiwarp.calib.model_choice import (
+    CONVERSION_FACTOR,
     SAMPLED,
+    TILT,
+    Groundwork,
     Places,
+    calibrate_auto,
     candidate_space,
+    compare_models,
     encoder_noise,
     fit,
     linear_motions,
+    trial_for,
 )
-from amiwarp.calib.selection.trial import CONVERSION_FACTOR
-from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
-from amiwarp.calib.sharpness.held_out import split_turns
+from amiwarp.calib.sharpness import split_turns
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
@@ -191,13 +193,13 @@ def test_the_groundwork_of_the_sharpness_answer_serves_the_final_one(
 ) -> None:
     """It is laid once, during the photometric stage; laid again for the final answer, it gives the same choice."""
     laid: list[Groundwork] = []
-    parts = groundwork.lay_in_parts
+    parts = model_choice.lay_in_parts
 
     def recorded(*given: Any) -> Generator[None, None, Groundwork]:
         laid.append((yield from parts(*given)))
         return laid[-1]
 
-    for module in (auto, groundwork):
+    for module in (auto, model_choice):
         monkeypatch.setattr(module, "lay_in_parts", recorded)
     again = calibrate_auto(wide, BOTH)
     assert len(laid) == 1

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from amiwarp.compensation.piece_buffers import PIECE
+from amiwarp.choices import Vote
+from amiwarp.compensation.recordings import PIECE
 from amiwarp.events.events import Events
-from amiwarp.imaging.choices import Vote
 from benchmarks import __main__ as runner
 from benchmarks import cases, compensate, dataset, ours, report, scenes, truth
 from benchmarks.job import Job

@@ -11,22 +11,21 @@ from conftest import NOMINAL_PRISM, TRUE_PRISM
 
 from amiwarp import calib
 from amiwarp.calib import Calibration, Settings
-from amiwarp.calib.preparation import prepare
-from amiwarp.calib.prism_speed import estimate_rpm
-from amiwarp.calib.sharpness.search import PARTS
-from amiwarp.calib.space_setup import make_space
-from amiwarp.calib.thinning import RUN, thin
+from amiwarp.calib.calibration_events import RUN, thin
+from amiwarp.calib.first_guess import estimate_rpm
+from amiwarp.calib.parameters import make_space
+from amiwarp.calib.sharpness import PARTS
+from amiwarp.calib.single_model import prepare
+from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.io import open_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.displacement import wrap_angle
-from amiwarp.optics.model_error import predicted_error
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.sensor import SensorModel

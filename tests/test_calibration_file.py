@@ -10,9 +10,8 @@ import pytest
 
 from amiwarp.calib import Calibration
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.camera_json import camera_from_json, camera_to_json
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.lens import Fisheye, RadialTangential
+from amiwarp.io.camera_files import camera_from_json, camera_to_json
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
 
 
 def test_there_and_back(calibration: Calibration, tmp_path: Path) -> None:

@@ -11,10 +11,8 @@ import warp as wp
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.camera import CameraParams, solve_ray
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.device_camera import camera_params, fold_radius
+from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential, camera_params, fold_radius
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
 from amiwarp.optics.prism import Prism
 
 # as in the package's kernels; otherwise a GPU would fuse multiplications and additions in this module only

@@ -19,36 +19,37 @@ from typer.testing import CliRunner, Result
 import benchmarks.chart
 from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.presets import Preset, check, settings_from, settings_to, simplified
+from amiwarp.choices import Vote
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.imaging.choices import Vote
-from amiwarp.imaging.warped_image import iwe
+from amiwarp.imaging.iwe import iwe
 from amiwarp.io import open_recording, save_recording
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import RadialTangential
-from amiwarp.optics.model_error import predicted_error
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.plotting import figures
 from amiwarp.progress import silent
 from amiwarp.studies.chart import Charts, calibration, compensation
 from amiwarp.studies.chart.rows import (
+    KnownRecording,
     Row,
     Task,
     Timed,
     beaten_by,
+    exact_image,
+    exact_places,
     fastest_within,
     front,
     measure,
     most_accurate_within,
     near_front,
+    rms,
     slowness,
     told_apart,
 )
-from amiwarp.studies.chart.truth import KnownRecording, exact_image, exact_places, rms
 from benchmarks import libraries as peers
 
 
@@ -514,7 +515,7 @@ DRAWN = {
 def test_letters_do_not_overlap(
     name: str, known: KnownRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from amiwarp.studies.chart.drawing import draw
+    from amiwarp.studies.chart.charts import draw
 
     drawn: list[Any] = []
     monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure))

@@ -16,30 +16,26 @@ import pytest
 import amiwarp
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
 from amiwarp.calib.parameters import build_model
-from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.calib.presets import simplified
-from amiwarp.calib.sharpness.search import STAGES, Settings
+from amiwarp.calib.settings import STAGES, PhotometricSettings, Settings
+from amiwarp.choices import Axis, Colour, Fill, Layers, Sharpness, Tone, View, Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.imaging.choices import Layers, Sharpness, Vote
 from amiwarp.imaging.export import IweFiles, to_picture
-from amiwarp.imaging.sharpness_costs import SharpnessMeter, sharpness
-from amiwarp.imaging.warped_image import CanvasShape, iwe
+from amiwarp.imaging.iwe import iwe
+from amiwarp.imaging.sharpness import SharpnessMeter, sharpness
+from amiwarp.imaging.votes import CanvasShape
 from amiwarp.io.formats import Format, open_recording
-from amiwarp.live.stream.queue_policy import Policy
-from amiwarp.live.stream.queues import PacketQueue
+from amiwarp.live.stream.queues import PacketQueue, Policy
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism, apex_from_deflection, deflection_from_apex
-from amiwarp.reconstruction.choices import Fill, Tone
 from amiwarp.reconstruction.export import save_picture, tones
-from amiwarp.reconstruction.picture import Reconstruction
-from amiwarp.reconstruction.result import Picture
-from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.cloud_scene import Look
+from amiwarp.reconstruction.picture import Picture, Reconstruction
+from amiwarp.viewer.clouds import Look
 
 CAMERA = Camera.from_fov(8, 6, 1.0)
 EVENTS = Events.from_arrays([1, 2, 1, 2], [1, 2, 1, 2], [0, 10, 20, 30], [0, 1, 0, 1])
@@ -167,7 +163,7 @@ def test_simplified_names_its_models() -> None:
 
 
 def test_views_are_taken_by_name(tmp_path: Path) -> None:
-    from amiwarp.viewer.cloud_scene import CAMERA_DIRECTIONS
+    from amiwarp.viewer.clouds import CAMERA_DIRECTIONS
 
     assert set(CAMERA_DIRECTIONS) == {view.value for view in View}  # names and members select the same camera position
 

@@ -43,7 +43,7 @@ from amiwarp.cli import (
     view,
 )
 from amiwarp.cli.app import SUMMARIES, app
-from amiwarp.cli.inputs import number
+from amiwarp.cli.options import number
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 

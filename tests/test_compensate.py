@@ -25,25 +25,22 @@ from amiwarp.calib import Calibration
 from amiwarp.cli.app import app
 from amiwarp.compensation.recordings import compensate, compensate_events, compensated_blocks
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import inside_image
-from amiwarp.events.device_encoder import encoder_params
+from amiwarp.events.device_events import encoder_params
 from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.events import Events, MemoryEvents, inside_image
 from amiwarp.events.recording import Recording
+from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.metrics import edge_blur, truth_model
-from amiwarp.imaging.sharpness_costs import sharpness
-from amiwarp.imaging.warped_image import iwe
+from amiwarp.imaging.sharpness import sharpness
 from amiwarp.io import convert, open_recording, read_encoder_csv, save_recording
 from amiwarp.io.chunks import CHUNK
-from amiwarp.io.evt3_writer import Evt3Encoder
-from amiwarp.io.ros_messages import PACKET_DEFINITION
-from amiwarp.io.rosbag import opened_bag
-from amiwarp.kernels.encoder_angle import EncoderParams, theta_u32_at
+from amiwarp.io.prophesee import Evt3Encoder
+from amiwarp.io.ros import PACKET_DEFINITION, opened_bag
+from amiwarp.kernels.events import EncoderParams, theta_u32_at
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
 from amiwarp.optics.circle_models import CircleModel
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import Fisheye, RadialTangential
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide, Prism
 

@@ -14,10 +14,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events
-from amiwarp.imaging.warped_image import iwe
-from amiwarp.optics.camera import Camera
+from amiwarp.imaging.iwe import iwe
+from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 

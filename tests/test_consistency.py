@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.photometric.acceptance import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
-from amiwarp.calib.photometric.causes import CAUSES
-from amiwarp.calib.photometric.consistency import Consistency, Finding
-from amiwarp.calib.photometric.linear_fit import LinearFit
-from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.photometric.answer_search import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
+from amiwarp.calib.photometric.consistency import Consistency, Finding, LinearFit
+from amiwarp.calib.photometric.cost import CAUSES
+from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.simulator import simulate

@@ -13,9 +13,9 @@ from corner_reference import corners_of_dv_processing, table
 from numpy.typing import NDArray
 
 import amiwarp
+from amiwarp.choices import CornerMethod
 from amiwarp.events.events import Events
 from amiwarp.imaging import corners
-from amiwarp.imaging.choices import CornerMethod
 
 METHODS = list(CornerMethod)
 

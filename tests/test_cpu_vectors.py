@@ -10,19 +10,18 @@ import warp as wp
 from conftest import TRUE_PHASE, TRUE_PRISM
 
 from amiwarp.brightness.event_pairs import EventTable
-from amiwarp.brightness.multigrid import GridHierarchy
-from amiwarp.brightness.pair_ends import PairEnds
+from amiwarp.brightness.multigrid import GridHierarchy, Tiles
+from amiwarp.brightness.pair_positions import PairEnds
 from amiwarp.brightness.solver import BrightnessMap, Smoothness
-from amiwarp.brightness.tiles import Tiles
 from amiwarp.events.recording import Recording
 from amiwarp.kernels import conjugate_gradients as cg
-from amiwarp.kernels import multilevel, normal_equations
-from amiwarp.kernels.map_prior import Prior
-from amiwarp.kernels.recorded_launches import Program
-from amiwarp.kernels.residual_slopes import slope_between
+from amiwarp.kernels import equations_cuda, multilevel
+from amiwarp.kernels.conjugate_gradients import Prior
+from amiwarp.kernels.equations import slope_between
+from amiwarp.kernels.launch import Program
+from amiwarp.optics.camera import RadialTangential
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import RadialTangential
 
 SCALE = 2.0**-32
 
@@ -48,7 +47,7 @@ def placed(recording: Recording) -> BrightnessMap:
 @pytest.mark.parametrize("name", ["add_diagonal", "add_transpose", "add_product"])
 def test_sums_over_blocks_of_pairs(placed: BrightnessMap, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sums over blocks of pairs, as on a CPU, equal those over the sorted ends of pairs, as on CUDA."""
-    monkeypatch.setattr("amiwarp.kernels.recorded_launches.cpu_threads", lambda: 1)  # one thread writes to the sums
+    monkeypatch.setattr("amiwarp.kernels.launch.cpu_threads", lambda: 1)  # one thread writes to the sums
     weight, found = placed.residuals.weight, []
     vectors = {"add_diagonal": [], "add_transpose": [placed.residuals.values], "add_product": [placed._image]}[name]
     for equations in (placed._equations, PairEnds(placed.pairs, placed._atlas, placed._at.geometry)):
@@ -65,13 +64,13 @@ def test_residuals_over_blocks_of_pairs(placed: BrightnessMap) -> None:
     at, stride = placed._at, placed.pairs.arrays.stride
     weight, values, rest = (wp.zeros(stride, dtype=float, device="cpu") for _ in "wvr")
     given = [placed.pairs.arrays, placed._atlas, at.geometry]
-    wp.launch(normal_equations.weigh, placed.count, [*given, placed._image, placed._scale, 0], [weight, values],
+    wp.launch(equations_cuda.weigh, placed.count, [*given, placed._image, placed._scale, 0], [weight, values],
               device="cpu")  # fmt: skip
     n = placed.count
     np.testing.assert_allclose(placed.residuals.values.numpy()[:n], values.numpy()[:n], rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(placed.residuals.weight.numpy()[:n], weight.numpy()[:n], rtol=1e-5, atol=1e-5)
     assert not placed.residuals.weight.numpy()[n:].any()  # padding has no weight
-    wp.launch(normal_equations.subtract, n, [*given, placed._image, 0], [rest], device="cpu")
+    wp.launch(equations_cuda.subtract, n, [*given, placed._image, 0], [rest], device="cpu")
     other = wp.zeros(stride, dtype=float, device="cpu")
     placed._subtract(placed._image, other)
     np.testing.assert_allclose(other.numpy()[:n], rest.numpy()[:n], rtol=1e-5, atol=1e-5)

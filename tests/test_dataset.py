@@ -28,14 +28,21 @@ import amiwarp
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.sealed_json import append_line, create_journal, read_journal
-from amiwarp.kernels import quiet_start
+from amiwarp.kernels import launch
 from amiwarp.studies import cluster
 from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker
-from amiwarp.studies.dataset import items, sources, specification
-from amiwarp.studies.dataset.items import list_items
-from amiwarp.studies.dataset.making import simulation_of
-from amiwarp.studies.dataset.manifest import JOURNAL, MANIFEST, TABLE
-from amiwarp.studies.dataset.run import DatasetSummary, duration_text, make_dataset, threads_of_worker
+from amiwarp.studies.dataset import items, specification
+from amiwarp.studies.dataset import specification as sources
+from amiwarp.studies.dataset.items import list_items, simulation_of
+from amiwarp.studies.dataset.run import (
+    JOURNAL,
+    MANIFEST,
+    TABLE,
+    DatasetSummary,
+    duration_text,
+    make_dataset,
+    threads_of_worker,
+)
 from amiwarp.studies.dataset.specification import load_specification
 
 HEAD = 'format = "amiwarp-dataset-specification"\nversion = 1\n'
@@ -564,7 +571,7 @@ def test_recordings_are_those_of_the_simulator_on_each_device(place: Path, devic
 
 
 def test_each_local_worker_sees_one_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(quiet_start, "start_quietly", lambda: ["cpu", "cuda:0", "cuda:1"])
+    monkeypatch.setattr(launch, "start_quietly", lambda: ["cpu", "cuda:0", "cuda:1"])
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     assert cluster._visible_gpus() == ("0", "1")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")

@@ -15,25 +15,32 @@ from matplotlib.text import Text
 from PIL import Image
 from typer.testing import CliRunner
 
-from amiwarp.calib.selection.smaller_models import QUANTISATION_PX
+from amiwarp.calib.model_choice import QUANTISATION_PX
 from amiwarp.cli import design as command_line
 from amiwarp.cli.console import report
 from amiwarp.cli.options import Common, command
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.design import Design, Limits, Timing, design
-from amiwarp.studies.design.choice import ACROSS, LEAST_SWING
+from amiwarp.studies.design.choice import (
+    ACROSS,
+    LEAST_SWING,
+    QUARTER_SWING,
+    TILE,
+    filled,
+    headline,
+    measure,
+    orbit_of,
+    reasons,
+    tiles,
+)
 from amiwarp.studies.design.drawing import chart
-from amiwarp.studies.design.event_volume import TILE, filled, measure, tiles
-from amiwarp.studies.design.orbit_size import QUARTER_SWING, orbit_of
-from amiwarp.studies.design.recommendation import headline, reasons
 
 GLASS = Prism(0.0)
 SMALL = Camera.from_fov(64, 48, math.radians(10.0))

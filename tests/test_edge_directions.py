@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from amiwarp.imaging.device_image import Image
-from amiwarp.imaging.edge_directions import EDGE_SMOOTHING_PX, STRONG, edge_coherence
-from amiwarp.imaging.sharpness_costs import LEAST_PADDING
-from amiwarp.imaging.warped_image import CanvasShape
+from amiwarp.imaging.sharpness import EDGE_SMOOTHING_PX, LEAST_PADDING, STRONG, edge_coherence
+from amiwarp.imaging.votes import CanvasShape, Image
 
 INSET = 8
 

@@ -16,8 +16,7 @@ import pytest
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.live.link.clocks import WRAP
-from amiwarp.live.link.emulated_rotors import Motor, Played
-from amiwarp.live.link.emulator import MOST_RPM, Controller, EmulatedFault
+from amiwarp.live.link.emulator import MOST_RPM, Controller, EmulatedFault, Motor, Played, PseudoTerminal
 from amiwarp.live.link.protocol import (
     Answer,
     ControllerStatus,
@@ -33,7 +32,6 @@ from amiwarp.live.link.protocol import (
     Sync,
     encode,
 )
-from amiwarp.live.link.pseudo_terminal import PseudoTerminal
 
 S = 1_000_000
 LONG_S = 120.0

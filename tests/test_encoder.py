@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.encoder_speed import rpm_between
+from amiwarp.events.encoder import TWO_PI, Encoder, rpm_between
 from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.io import read_encoder_csv
 
@@ -328,7 +327,7 @@ def test_csv_refuses(tmp_path, text, message):
 
 
 def test_csv_has_a_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr("amiwarp.io.encoder_csv.MOST_ROWS", 5)
+    monkeypatch.setattr("amiwarp.io.encoder_files.MOST_ROWS", 5)
     path = tmp_path / "long.csv"
     path.write_text("t_us,angle_deg\n" + "".join(f"{k},{k}\n" for k in range(5)))
     assert len(read_encoder_csv(path).t) == 5

@@ -25,14 +25,26 @@ from amiwarp.io.sealed_json import sealed
 from amiwarp.progress import silent
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.evaluate import apex_speed, corners, fading, texture
-from amiwarp.studies.evaluate.cells import Job, Store, plan, run_job
-from amiwarp.studies.evaluate.conditions import DISCS, IDEAL, Condition, RecordedStreams, Stream, Streams
-from amiwarp.studies.evaluate.disc_target import DiscTarget, robust_spread
-from amiwarp.studies.evaluate.measures.density import density_variance, event_counts
-from amiwarp.studies.evaluate.measures.edge_match import Counts, best_f, binary_entropy, match
-from amiwarp.studies.evaluate.measures.true_edges import geometric_edges
-from amiwarp.studies.evaluate.registry import EVALUATIONS, load
-from amiwarp.studies.evaluate.report import refused, section, write
+from amiwarp.studies.evaluate.conditions import (
+    DISCS,
+    IDEAL,
+    Condition,
+    DiscTarget,
+    RecordedStreams,
+    Stream,
+    Streams,
+    robust_spread,
+)
+from amiwarp.studies.evaluate.measures import (
+    Counts,
+    best_f,
+    binary_entropy,
+    density_variance,
+    event_counts,
+    geometric_edges,
+    match,
+)
+from amiwarp.studies.evaluate.report import EVALUATIONS, load, refused, section, write
 from amiwarp.studies.evaluate.results import (
     QUICK,
     CellResult,
@@ -45,7 +57,7 @@ from amiwarp.studies.evaluate.results import (
     grouped,
     where_calibrated,
 )
-from amiwarp.studies.evaluate.run import _run
+from amiwarp.studies.evaluate.run import Job, Store, _run, plan, run_job
 
 SMALL = replace(QUICK, width=64, height=48, duration_s=0.1, seeds=1)
 
@@ -421,7 +433,7 @@ def test_damaged_cells_are_run_again_and_said(tmp_path: Path) -> None:
 
 
 def test_a_table_without_values_has_no_chart() -> None:
-    from amiwarp.studies.evaluate.drawing import draw
+    from amiwarp.studies.evaluate.report import draw
     from amiwarp.studies.evaluate.results import Chart
 
     empty = Table("t", "t", ("x", "y", "s"), [(1, None, "a")], chart=Chart("x", "y", "s"))

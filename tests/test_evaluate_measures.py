@@ -8,13 +8,18 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.studies.evaluate.blob_detector import PROPORTIONS, blob_keypoints
-from amiwarp.studies.evaluate.measures import niqe as naturalness
-from amiwarp.studies.evaluate.measures.flow_error import flow_error
-from amiwarp.studies.evaluate.measures.keypoints import detected_joints
-from amiwarp.studies.evaluate.measures.libraries import library
-from amiwarp.studies.evaluate.measures.masks import box_overlap, overlap
-from amiwarp.studies.evaluate.measures.pictures import displayed, fitted, similarity
+from amiwarp.studies.evaluate import measures as naturalness
+from amiwarp.studies.evaluate.measures import (
+    box_overlap,
+    detected_joints,
+    displayed,
+    fitted,
+    flow_error,
+    library,
+    overlap,
+    similarity,
+)
+from amiwarp.studies.evaluate.pose import PROPORTIONS, blob_keypoints
 
 
 def picture(shape: tuple[int, int] = (120, 160), seed: int = 0) -> NDArray[np.float64]:

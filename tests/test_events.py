@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import check_events
 from amiwarp.events.device_events import DeviceEvents, device_for
-from amiwarp.events.events import Events, EventSource, MemoryEvents, regroup
+from amiwarp.events.events import Events, EventSource, MemoryEvents, check_events, regroup
 from amiwarp.events.recording import Truth
 
 

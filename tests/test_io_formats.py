@@ -46,10 +46,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.io import convert, open_recording, read_encoder_triggers
 from amiwarp.io import file_scan as scan
-from amiwarp.io.evt_words import Evt2Decoder, Evt3Decoder, words_of
-from amiwarp.io.rosbag import read_packets
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.lens import RadialTangential
+from amiwarp.io.prophesee import Evt2Decoder, Evt3Decoder, words_of
+from amiwarp.io.ros import read_packets
+from amiwarp.optics.camera import Camera, RadialTangential
 
 EVENTS = make_events()
 NOTHING = np.zeros(0, np.uint8)

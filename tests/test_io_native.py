@@ -22,8 +22,7 @@ from amiwarp.events.recording import Recording, Truth
 from amiwarp.io import RecordingWriter, open_recording, save_recording
 from amiwarp.io.chunks import CHUNK, StoredColumn, checksum, decode, encode, in_order
 from amiwarp.kernels.checksum import Checksums
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.lens import Fisheye, RadialTangential
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
 
 SIZE = (320, 240)

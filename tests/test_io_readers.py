@@ -15,8 +15,7 @@ from amiwarp.events.events import Events, EventSource, MemoryEvents
 from amiwarp.io import ConversionSummary, Format, convert, detect_format, open_recording
 from amiwarp.io import file_scan as scan
 from amiwarp.io.output_formats import OutputFormat
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.prism import Prism
 
 EVENTS = make_events()

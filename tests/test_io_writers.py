@@ -27,9 +27,9 @@ from amiwarp.events.events import Events, EventSource, MemoryEvents
 from amiwarp.events.recording import Recording, Truth
 from amiwarp.io import convert, open_recording, save_recording
 from amiwarp.io.chunks import CHUNK, Codec
-from amiwarp.io.evt3_writer import Evt3Encoder
 from amiwarp.io.export import export
 from amiwarp.io.output_formats import OutputFormat, Rounding
+from amiwarp.io.prophesee import Evt3Encoder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 

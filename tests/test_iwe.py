@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 import warp as wp
 
+from amiwarp.choices import Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
-from amiwarp.imaging import pixel_votes
-from amiwarp.imaging.choices import Vote
-from amiwarp.imaging.device_events import upload_events
-from amiwarp.imaging.device_image import Image
-from amiwarp.imaging.warped_image import CanvasShape, Votes, iwe
-from amiwarp.imaging.word_votes import FIRST_BATCH
+from amiwarp.imaging import votes as pixel_votes
+from amiwarp.imaging.iwe import Votes, iwe
+from amiwarp.imaging.votes import FIRST_BATCH, CanvasShape, Image, upload_events
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from amiwarp.calib import Calibration
 from amiwarp.calib.presets import Preset
-from amiwarp.cli.inputs import read_camera
+from amiwarp.cli.options import read_camera
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.json_files import MOST_BYTES, read_json
 from amiwarp.optics.camera import Camera

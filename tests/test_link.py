@@ -19,17 +19,13 @@ from typer.testing import CliRunner
 from amiwarp.cli import motor as command
 from amiwarp.errors import AmiwarpError
 from amiwarp.live.link import follower as following
+from amiwarp.live.link import follower as updates
 from amiwarp.live.link import link as link_module
-from amiwarp.live.link import updates
 from amiwarp.live.link.clocks import WRAP
-from amiwarp.live.link.emulated_rotors import Motor
-from amiwarp.live.link.emulator import LASTING_FAULTS, Controller, EmulatedFault
-from amiwarp.live.link.follower import Follower
-from amiwarp.live.link.link import Link
-from amiwarp.live.link.port import open_port, usb_id
+from amiwarp.live.link.emulator import LASTING_FAULTS, Controller, EmulatedFault, Motor, PseudoTerminal
+from amiwarp.live.link.follower import Follower, LinkUpdate
+from amiwarp.live.link.link import Link, open_port, usb_id
 from amiwarp.live.link.protocol import Answer, ControllerStatus, FrameDecoder, Index, Message, Ping, Samples, encode
-from amiwarp.live.link.pseudo_terminal import PseudoTerminal
-from amiwarp.live.link.updates import LinkUpdate
 
 S = 1_000_000
 RPM = 720.0
@@ -490,7 +486,7 @@ def test_ports_by_usb_id_and_by_what_they_send(path: Path, tmp_path: Path, monke
                 return 0.0
             return 0.05 * next(listened)
 
-        monkeypatch.setattr("amiwarp.live.link.port.time", SimpleNamespace(monotonic=clock))
+        monkeypatch.setattr("amiwarp.live.link.link.time", SimpleNamespace(monotonic=clock))
         for where in ("16C0:0483", None):
             with Link(where) as link:
                 assert link.name == str(path)

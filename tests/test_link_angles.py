@@ -5,7 +5,7 @@ import math
 import pytest
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.live.link.angles import AngleTracker, EncoderFault, FaultReport
+from amiwarp.live.link.follower import AngleTracker, EncoderFault, FaultReport
 
 PER_TURN = 1000
 

@@ -22,8 +22,7 @@ from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.live_writer import MAX_WASTE_BYTES, LiveWriter
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.lens import RadialTangential
+from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
 
 SIZE = (320, 240)

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from amiwarp.brightness.event_pairs import SensorTiming
 from amiwarp.calib import Calibration, calibrate
+from amiwarp.calib.calibration_events import thin
+from amiwarp.calib.first_guess import estimate_rates
 from amiwarp.calib.parameters import RATES
-from amiwarp.calib.photometric.stage import PhotometricSettings
-from amiwarp.calib.rotation_estimate import estimate_rates
-from amiwarp.calib.thinning import thin
+from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
+from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.imaging.warped_image import iwe
 from amiwarp.io import open_recording
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
@@ -30,7 +30,7 @@ from amiwarp.optics.prism import FlatSide
 from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import linear_luminance
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation, simulate
 

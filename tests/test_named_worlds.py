@@ -12,24 +12,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import world_maps
+from amiwarp.kernels import world as world_maps
 from amiwarp.optics.camera import Camera
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.named import (
-    TRAJECTORIES,
-    WORLDS,
-    ball,
-    gait,
-    motion,
-    named_world,
-    room,
-    shapes,
-    textures,
-)
+from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS, ball, bodies, named_world, room
+from amiwarp.simulation.worlds.named import person as gait
 from amiwarp.simulation.worlds.renderer import MapRenderer, device_pose, pixel_rays, surfaces_at
-from amiwarp.simulation.worlds.scene import Mesh, World
 from amiwarp.simulation.worlds.trajectory import Trajectory
+from amiwarp.simulation.worlds.world import Mesh, World
 
 FOV = math.radians(60.0)
 ALL_ROUND = [Rotation.from_rotvec(v).as_matrix() for v in np.pi / 2 * np.array(
@@ -46,12 +37,12 @@ def volume(mesh: Mesh) -> float:
 @pytest.mark.parametrize(
     ("mesh", "expected"),
     [
-        (shapes.box((1, 2, 3), (5, 0, 1)), 6.0),
-        (shapes.cylinder(0.5, 2.0, sides=200), math.pi / 2.0),
-        (shapes.ellipsoid((1.0, 2.0, 3.0), sides=200, rings=100), 8.0 * math.pi),
-        (shapes.capsule(0.5, 2.0, sides=200, rings=50), math.pi / 2.0 + math.pi / 6.0),
-        (shapes.moved(shapes.box((1, 2, 3)), (1, 2, 3), turn_deg=30.0, axis=(1, 1, 0)), 6.0),
-        (shapes.tapered(shapes.box((1, 1, 3)), 0.5), 1.75),
+        (bodies.box((1, 2, 3), (5, 0, 1)), 6.0),
+        (bodies.cylinder(0.5, 2.0, sides=200), math.pi / 2.0),
+        (bodies.ellipsoid((1.0, 2.0, 3.0), sides=200, rings=100), 8.0 * math.pi),
+        (bodies.capsule(0.5, 2.0, sides=200, rings=50), math.pi / 2.0 + math.pi / 6.0),
+        (bodies.moved(bodies.box((1, 2, 3)), (1, 2, 3), turn_deg=30.0, axis=(1, 1, 0)), 6.0),
+        (bodies.tapered(bodies.box((1, 1, 3)), 0.5), 1.75),
     ],
     ids=["box", "cylinder", "ellipsoid", "capsule", "moved box", "tapered box"],
 )
@@ -60,7 +51,7 @@ def test_solids_have_their_volume_and_face_outwards(mesh: Mesh, expected: float)
 
 
 @pytest.mark.parametrize(
-    "mesh", [shapes.panel((0, 0, 0), (0, 2, 0), (1, 0, 0)), shapes.box((1, 2, 3)), shapes.gable_roof((3, 2, 1))]
+    "mesh", [bodies.panel((0, 0, 0), (0, 2, 0), (1, 0, 0)), bodies.box((1, 2, 3)), bodies.gable_roof((3, 2, 1))]
 )
 def test_textures_are_not_mirrored(mesh: Mesh) -> None:
     """Seen from outside, each triangle turns on the texture as it does in space."""
@@ -71,7 +62,7 @@ def test_textures_are_not_mirrored(mesh: Mesh) -> None:
 
 def test_a_grating_changes_towards_its_angle() -> None:
     for angle in (0.0, 30.0, 90.0, 135.0):
-        inside = textures.grating(angle, 6.0, size=240)[20:-20, 20:-20].astype(np.float64)
+        inside = bodies.grating(angle, 6.0, size=240)[20:-20, 20:-20].astype(np.float64)
         by_row, by_column = np.gradient(inside)
         towards = np.array([math.cos(math.radians(angle)), -math.sin(math.radians(angle))])  # columns, rows
         across = towards[::-1] * (1.0, -1.0)
@@ -80,7 +71,7 @@ def test_a_grating_changes_towards_its_angle() -> None:
 
 
 def test_fractal_noise_repeats() -> None:
-    noise = textures.fractal(np.random.default_rng(0), 128, 256)
+    noise = bodies.fractal(np.random.default_rng(0), 128, 256)
     inner = np.abs(np.diff(noise, axis=1)).mean()
     assert abs(noise.mean()) < 1e-9
     assert noise.std() == pytest.approx(1.0)
@@ -99,7 +90,7 @@ def test_size_and_reflectances(name: str) -> None:
     for body in world.bodies:
         texture = body.material.texture
         if texture is not None and body.material.emission == 0.0:
-            assert textures.DARKEST - 1e-6 <= texture.min() <= texture.max() <= textures.BRIGHTEST + 1e-6
+            assert bodies.DARKEST - 1e-6 <= texture.min() <= texture.max() <= bodies.BRIGHTEST + 1e-6
         assert body.category
         assert not np.isnan(np.asarray(body.mesh.uv)).any()
 
@@ -187,7 +178,7 @@ def test_wrong_arguments(arguments: tuple[Any, ...], message: str) -> None:
 
 def motion_of(kind: str, name: str = "room") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Displacements [m] and turns [rad] of a camera against their means, 40 s at 100 per second."""
-    trajectory = motion.camera_trajectory(room.VIEW, kind, 40.0, np.random.default_rng(3))
+    trajectory = bodies.camera_trajectory(room.VIEW, kind, 40.0, np.random.default_rng(3))
     rotation, position = trajectory.poses(np.arange(4000) / 100.0)
     turns = Rotation.from_matrix(rotation[0].T @ rotation).as_rotvec()
     return position - position.mean(axis=0), turns - turns.mean(axis=0)
@@ -199,7 +190,7 @@ def test_a_still_camera_rests(name: str) -> None:
 
 
 def test_a_hand_shakes_slowly() -> None:
-    for values, amplitude in zip(motion_of("handheld"), (motion.SHAKE_M, math.radians(motion.SHAKE_DEG)), strict=True):
+    for values, amplitude in zip(motion_of("handheld"), (bodies.SHAKE_M, math.radians(bodies.SHAKE_DEG)), strict=True):
         assert 0.7 * amplitude < np.abs(values).max() < 2.2 * amplitude
         power = np.abs(np.fft.rfft(values * np.hanning(len(values))[:, None], axis=0)) ** 2
         frequency = np.fft.rfftfreq(len(values), 0.01)

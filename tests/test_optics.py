@@ -12,16 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential, camera_params, pinhole_params
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
-from amiwarp.optics.device_camera import camera_params, pinhole_params
 from amiwarp.optics.displacement import compensate_by_each, wrap_angle
 from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import Fisheye, RadialTangential
-from amiwarp.optics.model_error import predicted_error
-from amiwarp.optics.models import MODELS, Model
+from amiwarp.optics.models import MODELS, Model, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection, deflection_from_apex
 
 ATOL = 1e-3  # px, the documented limit; docs/explanation/optics.md has the measured values

@@ -8,12 +8,10 @@ import numpy as np
 import reference
 from hypothesis import HealthCheck, assume, given, settings
 
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import Distortion, Fisheye, RadialTangential
-from amiwarp.optics.model_error import predicted_error
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection, deflection_from_apex
 
 ATOL = 1e-3  # px, the documented limit for float32

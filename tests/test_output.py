@@ -30,6 +30,7 @@ from typer.testing import CliRunner, Result
 
 import amiwarp
 from amiwarp.calib import Calibration
+from amiwarp.choices import Layers
 from amiwarp.cli.app import SUMMARIES, app
 from amiwarp.cli.options import NO_FILE, OUTPUT, OUTPUT_FOLDER
 from amiwarp.errors import AmiwarpError
@@ -37,7 +38,6 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.events.truth import MAPS, FrameTruth, MemoryFrames, Poses
-from amiwarp.imaging.choices import Layers
 from amiwarp.imaging.export import IweFiles
 from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
 from amiwarp.io import atomic_output as output

@@ -7,10 +7,18 @@ import gc
 import numpy as np
 import pytest
 
-from amiwarp.compensation import pointers
-from amiwarp.compensation.packet_copy import PIECE, PacketCopier
-from amiwarp.compensation.pinned_pool import POOL_SIZE, PinnedPool
-from amiwarp.compensation.pointers import FindPointers, address, fastest, listed_pointers, pointers_in_place
+from amiwarp.compensation import packet_copy
+from amiwarp.compensation.packet_copy import (
+    PIECE,
+    POOL_SIZE,
+    FindPointers,
+    PacketCopier,
+    PinnedPool,
+    address,
+    fastest,
+    listed_pointers,
+    pointers_in_place,
+)
 from amiwarp.events.events import Events
 
 WAYS = pytest.mark.parametrize("find_pointers", [pointers_in_place, listed_pointers])
@@ -55,7 +63,7 @@ def test_a_step_back_in_a_packet_is_found(find_pointers: FindPointers, at: int) 
 
 def test_an_unknown_layout_of_numpy_is_served_by_its_public_interface(monkeypatch: pytest.MonkeyPatch) -> None:
     assert fastest() is pointers_in_place
-    monkeypatch.setattr(pointers, "layout_is_known", lambda: False)
+    monkeypatch.setattr(packet_copy, "layout_is_known", lambda: False)
     assert fastest() is listed_pointers
 
 

@@ -15,22 +15,18 @@ from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
-from amiwarp.brightness.residuals import Residuals
-from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap
-from amiwarp.brightness.tiles import Tiles
+from amiwarp.brightness.multigrid import Tiles
+from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap, Residuals
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.photometric.events_ahead import EventsAhead
-from amiwarp.calib.photometric.gauss_newton import Slopes, iterate
-from amiwarp.calib.photometric.pair_collection import van_der_corput
-from amiwarp.calib.photometric.scene_tiles import TILE, choose_tiles, near_tiles, one_tile
-from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.calibration_events import EventsAhead
+from amiwarp.calib.photometric.cost import TILE, Slopes, choose_tiles, iterate, near_tiles, one_tile, van_der_corput
+from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.imaging.device_image import Image
 from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.imaging.warped_image import CanvasShape
+from amiwarp.imaging.votes import CanvasShape, Image
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import FlatSide, Prism

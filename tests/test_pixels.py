@@ -27,7 +27,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import linear_luminance
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import simulate
 

@@ -17,9 +17,8 @@ from public_calls import CAMERA, RECORDING, REFUSED, PublicCall, public_calls, w
 
 import amiwarp
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import TIME_LIMIT, check_events
 from amiwarp.events.encoder import LARGEST_ANGLE, Encoder
-from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.events import TIME_LIMIT, Events, MemoryEvents, check_events
 from amiwarp.io import RecordingWriter, open_recording
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.optics.camera import LARGEST_FOCAL, Camera

@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from amiwarp.brightness.event_pairs import EventTable
 from amiwarp.calib.result import Calibration
+from amiwarp.choices import Fill, Tone
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
@@ -28,13 +29,17 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
-from amiwarp.reconstruction.choices import Fill, Tone
 from amiwarp.reconstruction.export import save_film, save_picture, save_video, tones
-from amiwarp.reconstruction.known import nodes_near, without_small_holes, without_small_regions
-from amiwarp.reconstruction.picture import Reconstruction, reconstruct
-from amiwarp.reconstruction.result import Picture
+from amiwarp.reconstruction.picture import (
+    Picture,
+    Reconstruction,
+    nodes_near,
+    reconstruct,
+    without_small_holes,
+    without_small_regions,
+)
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 

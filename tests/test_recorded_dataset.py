@@ -13,7 +13,7 @@ import pytest
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.io.copying import save_recording
+from amiwarp.io.native_writer import save_recording
 from amiwarp.io.recorded_dataset import RecordedDataset
 
 COUNTS = (3, 1, 4, 0, 5)

@@ -10,12 +10,12 @@ from conftest import COARSE, TRUE_PRISM
 
 from amiwarp.calib import calibrate
 from amiwarp.calib.checks import check_pulses, check_texture
-from amiwarp.calib.photometric.acceptance import judge_optimum
-from amiwarp.calib.preparation import prepare
-from amiwarp.calib.prism_speed import encoder_turns_per_period
-from amiwarp.calib.selection.trial import LARGEST_MOTION_PX, in_pixels
-from amiwarp.calib.sharpness.search import Settings
-from amiwarp.cli.inputs import interval, number
+from amiwarp.calib.first_guess import encoder_turns_per_period
+from amiwarp.calib.model_choice import LARGEST_MOTION_PX, in_pixels
+from amiwarp.calib.photometric.answer_search import judge_optimum
+from amiwarp.calib.settings import Settings
+from amiwarp.calib.single_model import prepare
+from amiwarp.cli.options import interval, number
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.events import Events, MemoryEvents

@@ -15,8 +15,8 @@ from io_samples import SIZE, make_events, write_text
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import Format, open_recording, read_encoder_csv
+from amiwarp.io.input_files import check_regular
 from amiwarp.io.json_files import read_toml
-from amiwarp.io.regular_file import check_regular
 from amiwarp.io.sealed_json import read_journal
 from amiwarp.io.text import read_calib
 from amiwarp.simulation.pictures import read_picture

@@ -11,15 +11,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from amiwarp.cli.rig import SensorOptions
+from amiwarp.cli.options import SensorOptions
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
-from amiwarp.kernels import event_generation, photoreceptor
+from amiwarp.kernels import pixels
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation, simulate
 
@@ -153,13 +153,13 @@ def test_filter_computed_ahead_gives_the_same_events(monkeypatch: pytest.MonkeyP
     sensor = SensorModel(cutoff_hz=300.0, shot_noise_hz=30.0, leak_hz=5.0, leak_jitter_fraction=0.2)
     simulation = seen_through_prism(sensor, motion=PrismMotion(-720.0, tilt=(0.02, 0.01)))
     ahead, _ = events_of(simulation)
-    monkeypatch.setattr(photoreceptor, "run_filtered_pixels_ahead", photoreceptor.run_filtered_pixels)
+    monkeypatch.setattr(pixels, "run_filtered_pixels_ahead", pixels.run_filtered_pixels)
     same_events(ahead, events_of(simulation)[0])
 
 
 def test_without_a_cutoff_the_kernels_have_no_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     assert SensorModel(cutoff_hz=None) == SensorModel()
-    monkeypatch.delattr(photoreceptor, "run_filtered_pixels_ahead")
+    monkeypatch.delattr(pixels, "run_filtered_pixels_ahead")
     events_of(seen_through_prism(SensorModel()))
 
 
@@ -180,7 +180,7 @@ def test_chunks_and_room_do_not_matter_with_everything_on(
 ) -> None:
     simulation = seen_through_prism(EVERYTHING, device)
     whole, points = events_of(simulation)
-    monkeypatch.setattr("amiwarp.simulation.key_buffer.EVENTS_PER_PIXEL", 1)  # runs out of room and starts over
+    monkeypatch.setattr("amiwarp.simulation.engine.EVENTS_PER_PIXEL", 1)  # runs out of room and starts over
     parts, part_points = events_of(simulation, chunk_us)
     same_events(whole, parts)
     np.testing.assert_array_equal(points, part_points)
@@ -363,7 +363,7 @@ def test_causes_of_noise_are_kept(device: str) -> None:
     simulation = Simulation(scene, CAMERA, WIDE, 0.2, motion=PrismMotion(0.0), sensor=sensor, device=device)
     cause = np.concatenate([block.arrays.cause.numpy() for block in Engine(simulation).run()])
     counts = np.bincount(cause, minlength=4) / (64 * 48 * 0.2)  # per pixel and second
-    assert counts[int(event_generation.SIGNAL)] == 0.0
-    assert counts[int(event_generation.LEAK)] > 50.0
-    assert counts[int(event_generation.SHOT_NOISE)] > 5.0
-    assert counts[int(event_generation.HOT_PIXEL)] == pytest.approx(0.1 * 62.0, rel=0.2)
+    assert counts[int(pixels.SIGNAL)] == 0.0
+    assert counts[int(pixels.LEAK)] > 50.0
+    assert counts[int(pixels.SHOT_NOISE)] > 5.0
+    assert counts[int(pixels.HOT_PIXEL)] == pytest.approx(0.1 * 62.0, rel=0.2)

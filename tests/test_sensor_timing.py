@@ -8,11 +8,10 @@ import pytest
 import warp as wp
 
 from amiwarp.brightness.event_pairs import EventTable
-from amiwarp.brightness.slow_pixels import THRESHOLD, darkness, set_lags
-from amiwarp.brightness.solver import BrightnessMap
-from amiwarp.brightness.tiles import Tiles
+from amiwarp.brightness.multigrid import Tiles
+from amiwarp.brightness.solver import THRESHOLD, BrightnessMap, darkness, set_lags
 from amiwarp.calib import Calibration, Settings, calibrate
-from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.imaging.metrics import model_error
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.studies.stability import Condition, make

@@ -15,8 +15,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.viewer.message_filter import Check, number
-from amiwarp.viewer.serve import Session, serve
+from amiwarp.viewer.serve import Check, Session, number, serve
 
 pytest.importorskip("trame_client")
 TOKEN = "s3cret & more"

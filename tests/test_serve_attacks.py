@@ -30,12 +30,9 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import serve as server_module
-from amiwarp.viewer.frames import MOST_IN_FLIGHT
-from amiwarp.viewer.host_names import HostNames, address, is_local, reachable, warning
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.message_filter import MOST_BYTES, MessageFilter
-from amiwarp.viewer.page_values import SETTABLE
-from amiwarp.viewer.serve import serve
+from amiwarp.viewer.panel import MOST_IN_FLIGHT, SETTABLE
+from amiwarp.viewer.serve import MOST_BYTES, HostNames, MessageFilter, address, is_local, reachable, serve, warning
 
 pytest.importorskip("trame_client")
 

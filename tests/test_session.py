@@ -29,13 +29,11 @@ from amiwarp.io.live_writer import LiveWriter
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream import session as session_module
 from amiwarp.live.stream import sources
-from amiwarp.live.stream.background_worker import BackgroundWorker
 from amiwarp.live.stream.emulated import LEAD_US, EmulatedCamera
 from amiwarp.live.stream.packets import Packet, make_packet
-from amiwarp.live.stream.queue_policy import Policy
-from amiwarp.live.stream.session import Session
-from amiwarp.live.stream.source_opening import open_source
-from amiwarp.live.stream.status import SessionStatus
+from amiwarp.live.stream.queues import BackgroundWorker, Policy
+from amiwarp.live.stream.session import Session, SessionStatus
+from amiwarp.live.stream.sources import open_source
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
@@ -80,10 +78,8 @@ def world() -> Callable[[], int]:
 
 def ran(folder: Path, recording: Recording, faults: tuple[str, ...] = ()) -> Ran:
     """Play the recording with an emulated rig through a session, which writes both files."""
-    from amiwarp.live.link.emulated_rotors import Played
-    from amiwarp.live.link.emulator import Controller, EmulatedFault
+    from amiwarp.live.link.emulator import Controller, EmulatedFault, Played, PseudoTerminal
     from amiwarp.live.link.link import Link
-    from amiwarp.live.link.pseudo_terminal import PseudoTerminal
 
     assert recording.encoder is not None
     rotor = Played(recording.encoder)
@@ -186,8 +182,7 @@ def test_a_fault_loses_nothing_and_is_told(tmp_path: Path, fault: str, said: str
 
 def test_an_emulated_camera_sees_the_pulses_of_a_controller_that_was_reset(tmp_path: Path) -> None:
     """After a reset, the controller counts its pulses from 0."""
-    from amiwarp.live.link.emulated_rotors import Played
-    from amiwarp.live.link.emulator import Controller, EmulatedFault
+    from amiwarp.live.link.emulator import Controller, EmulatedFault, Played
 
     recording, clock = points(1000, 0.1), World()
     assert recording.encoder is not None
@@ -208,8 +203,7 @@ def test_an_emulated_camera_sees_the_pulses_of_a_controller_that_was_reset(tmp_p
 
 @TURNING
 def test_an_emulated_camera_loses_nothing_where_its_client_is_slow(tmp_path: Path) -> None:
-    from amiwarp.live.link.emulated_rotors import Played
-    from amiwarp.live.link.emulator import Controller
+    from amiwarp.live.link.emulator import Controller, Played
 
     recording, now_us = points(3_000_000, 0.3), world()
     assert recording.encoder is not None

@@ -5,10 +5,10 @@ import pytest
 import warp as wp
 from scipy import ndimage
 
+from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.choices import Sharpness
-from amiwarp.imaging.sharpness_costs import PAPER_ETA, SharpnessMeter, gaussian, sharpness
-from amiwarp.imaging.warped_image import CanvasShape
+from amiwarp.imaging.sharpness import PAPER_ETA, SharpnessMeter, gaussian, sharpness
+from amiwarp.imaging.votes import CanvasShape
 
 
 @pytest.fixture

@@ -15,16 +15,14 @@ from scipy.spatial.transform import Rotation
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
-from amiwarp.kernels import event_generation as kernels
 from amiwarp.kernels import launch as launching
-from amiwarp.optics.camera import Camera
+from amiwarp.kernels import pixels as kernels
+from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import DARK, Placement, linear_luminance, log_map, place_picture, read_picture
-from amiwarp.simulation.scene import Scene
-from amiwarp.simulation.scenery import step_us
+from amiwarp.simulation.scenery import Scene, step_us
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation, simulate
 
@@ -175,8 +173,8 @@ def test_chunks_do_not_matter(device: str, chunk_us: int) -> None:
 
 def test_threads_and_room_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     many = base().run()
-    monkeypatch.setattr("amiwarp.simulation.key_buffer.CPU_RUN", 100)
-    monkeypatch.setattr("amiwarp.simulation.key_buffer.EVENTS_PER_PIXEL", 1)  # too small, so the run is repeated
+    monkeypatch.setattr("amiwarp.simulation.engine.CPU_RUN", 100)
+    monkeypatch.setattr("amiwarp.simulation.engine.EVENTS_PER_PIXEL", 1)  # too small, so the run is repeated
     monkeypatch.setattr(launching, "cpu_threads", lambda: 1)
     assert same(many, base().run())
 

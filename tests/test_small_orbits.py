@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from amiwarp.brightness.tiles import Tiles
+from amiwarp.brightness.multigrid import Tiles
 from amiwarp.calib import calibrate
-from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.optics.camera import Camera

@@ -8,14 +8,14 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from amiwarp.calib import calibrate
-from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 

@@ -14,10 +14,9 @@ from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import model_error
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.studies.stability import AXES, Condition, Outcome, chosen, identity, make, quick_axes, run, sensible
-from amiwarp.studies.stability.cells import Store, best_fit
-from amiwarp.studies.stability.run import conditions
-from amiwarp.studies.stability.scenes import SceneKind, draw
+from amiwarp.studies.stability import AXES, Condition, Outcome, cells, chosen, identity, make, quick_axes, sensible
+from amiwarp.studies.stability.cells import Store, best_fit, conditions
+from amiwarp.studies.stability.conditions import SceneKind, draw
 
 SMALL = Condition(width=160, height=120, turns=3.0)
 
@@ -170,10 +169,10 @@ def test_cells_are_kept_and_only_what_misses_is_run(tmp_path: Path) -> None:
     assert [m.name for m in methods] == ["default", "paper", "sharpness"]
     calls: list[tuple[str, float]] = []
     with ThreadPoolExecutor(1) as pool:
-        some = run(small, 1, methods[:1], Store(tmp_path), pool, progress=lambda *a: calls.append(a))
+        some = cells(small, 1, methods[:1], Store(tmp_path), pool, progress=lambda *a: calls.append(a))
         assert calls == [("1 of 2 cells", 0.5), ("2 of 2 cells", 1.0)]
-        every = run(small, 1, methods, Store(tmp_path), pool)
-        again = run(small, 1, methods, Store(tmp_path), pool, progress=lambda *a: calls.append(a))
+        every = cells(small, 1, methods, Store(tmp_path), pool)
+        again = cells(small, 1, methods, Store(tmp_path), pool, progress=lambda *a: calls.append(a))
     assert len(calls) == 2
     name = identity(methods[0])
     for a, b, c in zip(some, every, again, strict=True):

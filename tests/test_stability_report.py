@@ -37,7 +37,7 @@ from amiwarp.studies.stability import (
 )
 from amiwarp.studies.stability import Result as Found
 from amiwarp.studies.stability.figures import OVERVIEW, _overview, _page, draw
-from amiwarp.studies.stability.points import Rate, most_common_message, value_label
+from amiwarp.studies.stability.report import Rate, most_common_message, value_label
 
 METHOD = {m.name: m for m in METHODS}
 NOISE = Axis("background noise", "noise", (0.0, 0.25, 0.5, 0.8), "of all events")

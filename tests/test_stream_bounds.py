@@ -23,24 +23,28 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events, EventSource
-from amiwarp.live.link.emulated_rotors import MOST_SEGMENTS, Motor, Played
-from amiwarp.live.link.emulator import MOST_OUT_BYTES, Controller, EmulatedFault
-from amiwarp.live.link.pseudo_terminal import RETRY_S, PseudoTerminal
-from amiwarp.live.link.updates import LinkUpdate
+from amiwarp.live.link.emulator import (
+    MOST_OUT_BYTES,
+    MOST_SEGMENTS,
+    RETRY_S,
+    Controller,
+    EmulatedFault,
+    Motor,
+    Played,
+    PseudoTerminal,
+)
+from amiwarp.live.link.follower import LinkUpdate
+from amiwarp.live.stream import adaptive as speed_module
 from amiwarp.live.stream import phase_check as watch_module
 from amiwarp.live.stream import recent_events as ring_module
-from amiwarp.live.stream import speed_control as speed_module
-from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
-from amiwarp.live.stream.background_worker import BackgroundWorker
+from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orbit
 from amiwarp.live.stream.emulated import EmulatedCamera
 from amiwarp.live.stream.packets import Packet, encode_hello, make_packet
 from amiwarp.live.stream.phase_check import PhaseCheck
-from amiwarp.live.stream.queue_policy import Policy
-from amiwarp.live.stream.queues import PacketQueue
+from amiwarp.live.stream.queues import BackgroundWorker, PacketQueue, Policy
 from amiwarp.live.stream.recent_events import RecentEvents
 from amiwarp.live.stream.session import Session
-from amiwarp.live.stream.socket_sinks import MOST_CLIENTS, PACKET_OVERHEAD, REST_S, PipeSink, SocketSink
-from amiwarp.live.stream.speed_control import SpeedKeeper
+from amiwarp.live.stream.sockets import MOST_CLIENTS, PACKET_OVERHEAD, REST_S, PipeSink, SocketSink
 
 MOST = 1 << 20
 """Bound of the queues here [bytes]."""
@@ -167,7 +171,7 @@ class Flood(Made):
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sessions whose queues are small."""
-    monkeypatch.setattr("amiwarp.live.stream.consumers.BackgroundWorker", partial(BackgroundWorker, MOST))
+    monkeypatch.setattr("amiwarp.live.stream.session.BackgroundWorker", partial(BackgroundWorker, MOST))
     monkeypatch.setattr("amiwarp.live.stream.session.PacketQueue", partial(PacketQueue, most_bytes=MOST))
 
 
@@ -286,7 +290,7 @@ def test_a_window_that_never_ends_is_bounded(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_samples_that_wait_for_the_cameras_clock_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """A controller that sends without end while the camera sends nothing."""
-    monkeypatch.setattr("amiwarp.live.stream.encoder_feed.MOST_WAITING", 1000)
+    monkeypatch.setattr("amiwarp.live.stream.camera_clock.MOST_WAITING", 1000)
     said: list[str] = []
 
     class Sending:
@@ -476,7 +480,7 @@ def test_a_pipe_whose_reader_takes_nothing_can_be_ended() -> None:
 
 
 def test_descriptors_above_a_thousand_can_be_waited_for() -> None:
-    from amiwarp.live.stream.connections import ready
+    from amiwarp.live.stream.sockets import ready
 
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     ours, theirs = socket.socketpair()

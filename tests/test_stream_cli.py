@@ -27,16 +27,16 @@ from typer.testing import CliRunner
 
 from amiwarp.calib.result import Calibration
 from amiwarp.cli.app import app
-from amiwarp.cli.streams import describe
+from amiwarp.cli.live import describe
 from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording, save_recording
-from amiwarp.live.stream.connections import close_listener, listen
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
-from amiwarp.live.stream.status import SessionStatus
+from amiwarp.live.stream.session import SessionStatus
+from amiwarp.live.stream.sockets import close_listener, listen
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 
@@ -66,7 +66,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-PATIENT = "import amiwarp.live.stream.socket_sinks as sockets; sockets.DRAIN_S = 120.0; "
+PATIENT = "import amiwarp.live.stream.sockets as sockets; sockets.DRAIN_S = 120.0; "
 """Code placed before a command that serves packets: at the end it waits longer for slow receivers."""
 
 
@@ -258,9 +258,7 @@ def test_a_rig_as_three_commands(folder: Path, tmp_path: Path) -> None:
 
 def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The motor starts from rest. Random events exceed the allowed event rate, so the speed is reduced."""
-    from amiwarp.live.link.emulated_rotors import Motor
-    from amiwarp.live.link.emulator import Controller
-    from amiwarp.live.link.pseudo_terminal import PseudoTerminal
+    from amiwarp.live.link.emulator import Controller, Motor, PseudoTerminal
 
     motor = Motor()
     monkeypatch.setattr("amiwarp.live.link.link.ANSWER_S", LONG_S)

@@ -9,9 +9,8 @@ import pytest
 from mutation_frames import CAMERA, mutated_serial, mutated_stream, packed, read_serial, read_stream
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.live.link.follower import Follower
+from amiwarp.live.link.follower import MOST_UPDATES, Follower
 from amiwarp.live.link.protocol import LONGEST, ControllerStatus, FrameDecoder, Samples, Sync, encode
-from amiwarp.live.link.updates import MOST_UPDATES
 from amiwarp.live.stream.packets import HEADER, HELLO, LONGEST_HELLO, MAGIC, Hello, PacketDecoder
 
 SEEDS = 300

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
-from amiwarp.live.stream.event_sorter import EventSorter
 from amiwarp.live.stream.packets import (
     ENCODER,
     HEADER,
@@ -33,8 +32,8 @@ from amiwarp.live.stream.packets import (
     encode_hello,
     encode_triggers,
 )
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.lens import Fisheye, RadialTangential
+from amiwarp.live.stream.queues import EventSorter
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
 
 CAMERAS = (

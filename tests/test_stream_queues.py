@@ -10,8 +10,7 @@ import pytest
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.live.stream.packets import Packet
-from amiwarp.live.stream.queue_policy import Policy
-from amiwarp.live.stream.queues import PacketQueue
+from amiwarp.live.stream.queues import PacketQueue, Policy
 
 
 def packet(first: int, n: int) -> Packet:

@@ -18,8 +18,8 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream import cameras, connections, sources
-from amiwarp.live.stream import socket_sinks as sockets
+from amiwarp.live.stream import cameras, sockets, sources
+from amiwarp.live.stream import sockets as connections
 from amiwarp.live.stream.packets import (
     HEADER,
     End,
@@ -33,9 +33,8 @@ from amiwarp.live.stream.packets import (
     encode_hello,
     encode_triggers,
 )
-from amiwarp.live.stream.socket_sinks import PipeSink, SocketSink, open_sink
-from amiwarp.live.stream.source_opening import open_source
-from amiwarp.live.stream.sources import FileSource, StreamSource
+from amiwarp.live.stream.sockets import PipeSink, SocketSink, open_sink
+from amiwarp.live.stream.sources import FileSource, StreamSource, open_source
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 
@@ -222,8 +221,8 @@ def test_standard_input_and_output(tmp_path):
         sink.send(encode_events(events))
     script = (
         "from amiwarp.live.stream.packets import encode_events, encode_hello\n"
-        "from amiwarp.live.stream.socket_sinks import open_sink\n"
-        "from amiwarp.live.stream.source_opening import open_source\n"
+        "from amiwarp.live.stream.sockets import open_sink\n"
+        "from amiwarp.live.stream.sources import open_source\n"
         "source = open_source('-')\n"
         "with open_sink('-', encode_hello(*source.size, source.camera, source.prism)) as sink:\n"
         "    for packet in source.packets():\n"

@@ -24,20 +24,18 @@ from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
 from amiwarp.io import save_recording
 from amiwarp.live.stream import recent_events as ring_module
-from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
-from amiwarp.live.stream.forwarding import Forward
+from amiwarp.live.stream.adaptive import WINDOW_US, SpeedController, SpeedKeeper, prism_orbit
 from amiwarp.live.stream.packets import EncoderSamples, Packet, PacketDecoder
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.recent_events import SECONDS, RecentEvents, followed
-from amiwarp.live.stream.source_opening import open_source
-from amiwarp.live.stream.sources import FileSource
-from amiwarp.live.stream.speed_control import WINDOW_US, SpeedKeeper
+from amiwarp.live.stream.sockets import Forward
+from amiwarp.live.stream.sources import FileSource, open_source
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.live_source import LiveSource
+from amiwarp.viewer.jobs import LiveSource
 
 CAMERA, PRISM = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(2.0))
 BIAS_DEG = 3.5

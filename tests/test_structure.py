@@ -136,7 +136,7 @@ def test_a_module_can_be_imported_under_another_name() -> None:
     for path in MODULES:
         if name_of(path) != "amiwarp.__main__":
             assert isinstance(importlib.import_module(name_of(path)), ModuleType)
-    import amiwarp.imaging.warped_image as images
+    import amiwarp.imaging.iwe as images
 
     assert images.iwe is amiwarp.iwe
 
@@ -216,39 +216,37 @@ OPEN_NO_FILE = {
 OPENED_OTHERWISE = {
     "amiwarp.io.input_files: open(path, 'rb')": "the way that all take",
     # Functions of the reading process. ReadingProcess.send has checked and noted the path.
-    "amiwarp.io.aedat: aedat.Decoder(path)": "reading process",
-    "amiwarp.io.aedat_sensors: aedat.Decoder(path)": "reading process",
+    "amiwarp.io.aedat4: aedat.Decoder(path)": "reading process",
     "amiwarp.io.event_stream: es.Decoder(path, 0)": "reading process",
     "amiwarp.io.prophesee: evt.Decoder(path, WIDEST, 'evt3')": "reading process",
-    "amiwarp.io.hdf5_row_server: h5py.File(path, 'r')": "reading process",
-    "amiwarp.io.hdf5_sensors: h5py.File(path, 'r')": "reading process",
+    "amiwarp.io.hdf5_server: h5py.File(path, 'r')": "reading process",
     "amiwarp.io.hdf5_server: h5py.File(path, 'r', rdcc_nbytes=CACHE_BYTES)": "reading process",
     "amiwarp.io.hdf5_server: h5py.File(h5py.h5f.open(os.fsencode(path), how, fapl=access))": "reading process",
     "amiwarp.io.hdf5_server: h5py.h5f.open(os.fsencode(path), how, fapl=access)": "reading process",
     "amiwarp.io.hdf5_server: open(path, 'rb')": "reading process",
-    "amiwarp.io.rosbag: open(path, 'rb')": "reading process",
-    "amiwarp.io.rosbag: bag.open()": "reading process",
+    "amiwarp.io.ros: open(path, 'rb')": "reading process",
+    "amiwarp.io.ros: bag.open()": "reading process",
     # Files of the system and of the package.
     "amiwarp.io.atomic_output: Path('/proc/sys/kernel/random/boot_id').read_text()": "system",
     "amiwarp.io.reading_server: open('/proc/self/statm')": "system",
     "amiwarp.io.reading_server: open(f'/proc/self/fdinfo/{number}')": "system",
-    "amiwarp.studies.machine_info: info.read_text()": "system",
-    "amiwarp.live.stream.source_opening: open(0, 'rb', buffering=0, closefd=False)": "standard input",
-    "amiwarp.viewer.page_files: path.read_text(encoding='utf-8')": "file of the package",
-    "amiwarp.viewer.page_files: (FOLDER / 'page.html').read_text(encoding='utf-8')": "file of the package",
+    "amiwarp.studies.cluster: info.read_text()": "system",
+    "amiwarp.live.stream.sources: open(0, 'rb', buffering=0, closefd=False)": "standard input",
+    "amiwarp.viewer.serve: path.read_text(encoding='utf-8')": "file of the package",
+    "amiwarp.viewer.serve: (FOLDER / 'page.html').read_text(encoding='utf-8')": "file of the package",
     # Unfinished files of this process, or of a child of it.
     "amiwarp.imaging.export: open(part, 'r+b')": "own file",
     "amiwarp.io.atomic_output: open(path, 'r+b')": "lock file",
     "amiwarp.io.live_writer: open(self.part, 'r+b')": "own file",
-    "amiwarp.io.npz_writer: (folder / name).open('rb')": "own file",
+    "amiwarp.io.npz: (folder / name).open('rb')": "own file",
     "amiwarp.plotting.clouds: np.load(picture)": "own file",
     "amiwarp.plotting.clouds: np.load(points)": "own file",
-    "amiwarp.viewer.downloads: path.read_bytes()": "own file",
+    "amiwarp.viewer.exports: path.read_bytes()": "own file",
     # What is no file.
     "amiwarp.io.text: np.loadtxt(kept, ndmin=2, comments=None, encoding='ascii')": "lines",
     "amiwarp.plotting.figures: Image.open(buffer)": "bytes",
-    "amiwarp.simulation.worlds.mesh_files: Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)": "bytes",
-    "amiwarp.simulation.worlds.mesh_files: trimesh.load(file, file_type=kind, resolver=files, force='scene', "
+    "amiwarp.simulation.worlds.world_files: Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)": "bytes",
+    "amiwarp.simulation.worlds.world_files: trimesh.load(file, file_type=kind, resolver=files, force='scene', "
     "process=False)": "open file",
     "amiwarp.studies.evaluate.results: Image.open(io.BytesIO(base64.b64decode(text, validate=True)), "
     "formats=['PNG'])": "bytes",

@@ -6,18 +6,15 @@ import numpy as np
 import pytest
 import warp as wp
 
+from amiwarp.choices import Vote
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
-from amiwarp.imaging.choices import Vote
-from amiwarp.imaging.device_events import upload_events
-from amiwarp.imaging.device_image import Image
-from amiwarp.imaging.tile_votes import TileVotes
-from amiwarp.imaging.warped_image import CanvasShape, Votes
-from amiwarp.optics.camera import Camera
+from amiwarp.imaging.iwe import Votes
+from amiwarp.imaging.votes import CanvasShape, Image, TileVotes, upload_events
+from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.circle_models import CircleModel
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.lens import RadialTangential
 from amiwarp.optics.models import Model
 from amiwarp.optics.prism import Prism
 

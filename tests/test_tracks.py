@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 import amiwarp
-from amiwarp.studies.evaluate.measures import tracks as measures
-from amiwarp.studies.evaluate.measures.tracks import Tracks
+from amiwarp.studies.evaluate import measures
+from amiwarp.studies.evaluate.measures import Tracks
 
 
 def two_lines(step_us: int = 1000, count: int = 50) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -20,21 +20,20 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording, Truth
 from amiwarp.events.truth import MemoryMasks
-from amiwarp.io.copying import save_recording
 from amiwarp.io.formats import open_recording
+from amiwarp.io.native_writer import save_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.sequences import PictureStack, open_pictures
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.translation.camera_motion import find_motion
 from amiwarp.translation.datasets import SACCADE_US, SACCADES_PX, DataSet, open_mvsec, saccades
-from amiwarp.translation.event_pictures import READ_US, EventPictures
 from amiwarp.translation.inputs import translator_input
-from amiwarp.translation.interpolation import Interpolation, MotionPictures, PicturePair
+from amiwarp.translation.pictures_between import READ_US, EventPictures, Interpolation, MotionPictures, PicturePair
+from amiwarp.translation.reconstructed_pictures import find_motion
 from amiwarp.translation.translator import translate, translation
 
 WEDGE = Prism(math.radians(1.0))

@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.cli.app import app
-from amiwarp.cli.inputs import NominalPrismOptions
+from amiwarp.cli.options import NominalPrismOptions
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording, save_recording
-from amiwarp.io.camera_attributes import prism_attributes, read_prism
+from amiwarp.io.camera_files import prism_attributes, read_prism
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
 from amiwarp.simulation.simulator import simulate

@@ -9,8 +9,7 @@ from hypothesis import assume, event, example, given, settings
 from hypothesis import strategies as st
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.unwrapping import UnwrapError
+from amiwarp.events.encoder import TWO_PI, Encoder, UnwrapError
 from amiwarp.io import read_encoder_csv
 
 

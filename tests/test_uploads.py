@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from amiwarp.calib.sharpness.calibration_events import CalibrationEvents
+from amiwarp.calib.calibration_events import CalibrationEvents
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
-from amiwarp.imaging.device_events import LARGEST_WEIGHT, TURNS, upload_events
-from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.imaging.iwe import Votes
+from amiwarp.imaging.votes import LARGEST_WEIGHT, TURNS, CanvasShape, upload_events
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism

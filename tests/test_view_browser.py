@@ -24,13 +24,12 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.simulator import simulate
-from amiwarp.viewer import jobs, page_exports, selected_calibration
-from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer import exports, jobs
+from amiwarp.viewer import jobs as selected_calibration
+from amiwarp.viewer.inspector import Inspector, Library
+from amiwarp.viewer.jobs import LiveFigures, LiveSource, estimate_phase
 from amiwarp.viewer.layout import KEYS
-from amiwarp.viewer.library import Library
-from amiwarp.viewer.live_source import LiveFigures, LiveSource
-from amiwarp.viewer.page_values import SETTABLE
-from amiwarp.viewer.phase_estimate import estimate_phase
+from amiwarp.viewer.panel import SETTABLE
 
 pytest.importorskip("trame_client")
 APEX_DEG, NOMINAL_DEG, RPM, PHASE = 1.0, 1.2, 720.0, 2.0
@@ -478,7 +477,7 @@ def test_downloads_leave_no_file_on_the_server(
 
     folder = recording.events.path.parent  # type: ignore[attr-defined]
     before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
-    monkeypatch.setattr(page_exports, "FRAMES", 4)
+    monkeypatch.setattr(exports, "FRAMES", 4)
     with Image.open(download(page, "picture", tmp_path)) as picture:
         assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
     left, top, right, bottom = region(page)

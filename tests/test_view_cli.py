@@ -28,8 +28,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import app as viewer_app
 from amiwarp.viewer.app import BROWSERS, has_display, open_window
-from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.library import Library
+from amiwarp.viewer.inspector import Inspector, Library
 
 
 @pytest.fixture(scope="module")

@@ -15,34 +15,33 @@ import pytest
 from PIL import Image
 
 from amiwarp.calib import Settings
+from amiwarp.choices import Axis, Colour, Sharpness, View
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.imaging.background_activity import find_background_activity
-from amiwarp.imaging.choices import Sharpness
-from amiwarp.imaging.sharpness_costs import random_variance, relative_variance, sharpness
-from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.imaging.corners import find_background_activity
+from amiwarp.imaging.iwe import Votes
+from amiwarp.imaging.sharpness import random_variance, relative_variance, sharpness
+from amiwarp.imaging.votes import CanvasShape
 from amiwarp.io import open_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import reconstruct
 from amiwarp.simulation.simulator import simulate
-from amiwarp.viewer import downloads, event_rates, log_intensity, selected_part
+from amiwarp.viewer import exports, timeline
+from amiwarp.viewer import images as log_intensity
+from amiwarp.viewer import images as selected_part
 from amiwarp.viewer import inspector as viewer
-from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.downloads import as_bytes, write_events, write_image
-from amiwarp.viewer.event_rates import EventRates
-from amiwarp.viewer.image_kinds import ImageKind, Scale, make_images
-from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.page_values import events_text
-from amiwarp.viewer.parameters import Knobs, Selection, Source
-from amiwarp.viewer.phase_estimate import estimate_phase
-from amiwarp.viewer.selected_calibration import calibrate_selected, cost_surface, scope_text
-from amiwarp.viewer.suggestion import suggest_region
-from amiwarp.viewer.updates import Updates
+from amiwarp.viewer.exports import as_bytes, write_events, write_image
+from amiwarp.viewer.images import ImageKind, Scale, make_images
+from amiwarp.viewer.inspector import Inspector, suggest_region
+from amiwarp.viewer.jobs import calibrate_selected, cost_surface, estimate_phase, scope_text
+from amiwarp.viewer.panel import Updates, events_text
+from amiwarp.viewer.timeline import EventRates
 from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
+from amiwarp.viewer.window import Knobs, Selection, Source
 
 TRUE = Prism(math.radians(1.0))
 
@@ -457,7 +456,7 @@ def expected_rates(events: Events, edges: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(event_rates, "MOST_BINS", 4096)
+    monkeypatch.setattr(timeline, "MOST_BINS", 4096)
     events = random_events(50_000, 16, 16)
     rates = EventRates(MemoryEvents(events, 16, 16))
     assert rates.share == 0.0
@@ -480,7 +479,7 @@ def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
     exact = rates.curve(40_000, 41_000, 200)
     assert len(exact.on) == 200
     np.testing.assert_array_equal(exact.on, expected_rates(events, exact.edges_us)[0])
-    monkeypatch.setattr(event_rates, "MOST_EXACT", 10)
+    monkeypatch.setattr(timeline, "MOST_EXACT", 10)
     coarse = rates.curve(40_000, 41_000, 200)
     assert 30 < len(coarse.on) < 60
     np.testing.assert_allclose(coarse.off[1:-1], expected_rates(events, coarse.edges_us)[1][1:-1])
@@ -700,7 +699,7 @@ def test_the_events_of_the_window_are_downloaded(
     inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, compensated: bool, most_events: int
 ) -> None:
     monkeypatch.setattr(viewer, "MOST_EVENTS", most_events)
-    monkeypatch.setattr(downloads, "BLOCK", 10_000)
+    monkeypatch.setattr(exports, "BLOCK", 10_000)
     region, (start, length) = (20, 10, 140, 110), inspector.first_window()
     inspector.open(start, length, Selection(1, region))
     path = tmp_path / "events.h5"
@@ -731,7 +730,7 @@ def test_the_noise_filter_of_a_download_does_not_restart_at_its_blocks(
     expected = inspector.loaded.events
     assert 0.2 * inspector.loaded.span.count < len(expected) < 0.95 * inspector.loaded.span.count
     monkeypatch.setattr(viewer, "MOST_EVENTS", 6400)
-    monkeypatch.setattr(downloads, "BLOCK", 500)
+    monkeypatch.setattr(exports, "BLOCK", 500)
     thinned = Inspector(inspector.recording)
     thinned.open(*window, Selection(noise_us=300))
     assert write_events(thinned, tmp_path / "events.h5", compensated=False) == len(expected)

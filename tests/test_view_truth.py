@@ -12,6 +12,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 from typer.testing import CliRunner
 
+from amiwarp.choices import Axis, Colour, View
 from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
@@ -19,16 +20,11 @@ from amiwarp.events.recording import Recording, Truth
 from amiwarp.events.truth import Cause, WorldLabels
 from amiwarp.io import open_recording, save_recording
 from amiwarp.viewer import inspector as viewer
-from amiwarp.viewer import window_loading
-from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.cloud_scene import Look, Scene
-from amiwarp.viewer.colouring import colours_of
-from amiwarp.viewer.drawing import event_text
-from amiwarp.viewer.drawn_truth import colours_on_offer, truth_text
+from amiwarp.viewer import window
+from amiwarp.viewer.clouds import CAUSE_COLOURS, GREY, Look, Scene, colours_of, event_text, legend_of
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.page_values import initial_state
-from amiwarp.viewer.parameters import Selection
-from amiwarp.viewer.truth_colours import CAUSE_COLOURS, GREY, legend_of
+from amiwarp.viewer.panel import initial_state
+from amiwarp.viewer.window import Selection, colours_on_offer, truth_text
 
 COUNT, SIZE = 6000, (40, 30)
 WITHOUT = [Colour.POLARITY, Colour.ANGLE, Colour.TIME, Colour.DENSITY, Colour.RESIDUAL]
@@ -105,7 +101,7 @@ def test_each_drawn_event_has_its_own_truth(
     check(inspector)
     save_recording(tmp_path / "box.h5", recording)
     monkeypatch.setattr(viewer, "MOST_EVENTS", 1280)
-    monkeypatch.setattr(window_loading, "MOST_POINTS", 200)
+    monkeypatch.setattr(window, "MOST_POINTS", 200)
     for each in (recording, open_recording(tmp_path / "box.h5")):
         thinned = Inspector(each)
         thinned.open(10_000, 45_000, some)

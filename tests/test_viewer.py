@@ -14,25 +14,23 @@ from scipy.ndimage import gaussian_filter
 from amiwarp.calib import Calibration
 from amiwarp.calib.bad_pixels import MaskedEventSource
 from amiwarp.calib.parameters import build_model
+from amiwarp.choices import Axis, Colour, View
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.imaging.warped_image import iwe
+from amiwarp.imaging.iwe import iwe
 from amiwarp.io import open_recording, save_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
-from amiwarp.viewer import window_loading
-from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.cloud_scene import Look, Scene
-from amiwarp.viewer.colouring import WIDEST_PX, axis_range, colours_of, residual, third_axis
-from amiwarp.viewer.drawing import orbit_lines
+from amiwarp.viewer import window
+from amiwarp.viewer.clouds import WIDEST_PX, Look, Scene, axis_range, colours_of, orbit_lines, residual, third_axis
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.parameters import Knobs, Selection
 from amiwarp.viewer.timeline import read_span
+from amiwarp.viewer.window import Knobs, Selection
 
 TRUE = Prism(math.radians(1.0))
 PICTURES = Path(__file__).parent / "pictures"
@@ -145,7 +143,7 @@ def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recordin
 
 
 def test_points_are_thinned_evenly(inspector: Inspector, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(window_loading, "MOST_POINTS", 1000)
+    monkeypatch.setattr(window, "MOST_POINTS", 1000)
     shown = inspector.show()
     assert len(shown.events) == len(shown.after) == 1000
     parts = np.histogram(shown.events.t, 4, (shown.span.start_us, shown.span.start_us + shown.span.length_us))[0]

@@ -19,10 +19,9 @@ from scipy.spatial.transform import Rotation
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.input_files import inputs_in_use, inputs_noted
 from amiwarp.simulation.pictures import LUMINANCE, linear_luminance
-from amiwarp.simulation.worlds.mesh_files import load_mesh
-from amiwarp.simulation.worlds.scene import Sun
 from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.simulation.worlds.world_files import load_world
+from amiwarp.simulation.worlds.world import Sun
+from amiwarp.simulation.worlds.world_files import load_mesh, load_world
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "world-files.md"
 EXAMPLE = re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.S)[0]

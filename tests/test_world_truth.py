@@ -24,8 +24,8 @@ from amiwarp.cli.app import app
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import MAPS
 from amiwarp.io.chunks import CHUNK
-from amiwarp.simulation.worlds import open_world
-from amiwarp.simulation.worlds.recorded_truth import chosen_instants
+from amiwarp.simulation.worlds import world_files
+from amiwarp.simulation.worlds.world_truth import chosen_instants
 
 ROOT = Path(__file__).parents[1]
 SIZE = (64, 48)
@@ -81,8 +81,8 @@ def named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
             raise AmiwarpError(f"world {name!r} or trajectory {trajectory!r} is unknown")
         return stub_world(seed, name)
 
-    monkeypatch.setattr(open_world, "named_world", named_world)
-    monkeypatch.setattr(open_world, "load_world", lambda path: (stub_world(name=Path(path).stem)[0], None))
+    monkeypatch.setattr(world_files, "named_world", named_world)
+    monkeypatch.setattr(world_files, "load_world", lambda path: (stub_world(name=Path(path).stem)[0], None))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -131,7 +131,7 @@ def same_poses(a: amiwarp.Poses, b: amiwarp.Poses) -> None:
 
 
 def test_codes_of_causes_are_those_of_the_kernels() -> None:
-    from amiwarp.kernels import event_generation as kernels
+    from amiwarp.kernels import pixels as kernels
 
     assert [cause.code for cause in amiwarp.Cause] == [int(getattr(kernels, cause.name)) for cause in amiwarp.Cause]
 

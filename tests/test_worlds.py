@@ -14,16 +14,14 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.engine import Engine
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.frame_truth import TruthRenderer
-from amiwarp.simulation.worlds.map_ring import WorldMapRing
-from amiwarp.simulation.worlds.renderer import pixel_rays, surfaces_at
-from amiwarp.simulation.worlds.scene import Body, Lamp, Material, Mesh, Sky, Sun, World
+from amiwarp.simulation.worlds.renderer import WorldMapRing, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
-from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.simulation.worlds.world import Body, Lamp, Material, Mesh, Sky, Sun, World, WorldScene
+from amiwarp.simulation.worlds.world_truth import TruthRenderer
 from tests import reference
 
 CAMERA = Camera.from_fov(64, 48, math.radians(60.0))

@@ -14,15 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from amiwarp.events.device_encoder import encoder_params
-from amiwarp.events.device_events import join, time_span
+from amiwarp.events.device_events import encoder_params, join, time_span
 from amiwarp.kernels import pairs as kernels
+from amiwarp.kernels.equations import HELD, Pairs, split_by_time
+from amiwarp.kernels.equations_cpu import BLOCK
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.map_positions import find_places
-from amiwarp.kernels.pair_chains import BLOCK
-from amiwarp.kernels.photometric import HELD, Pairs
-from amiwarp.kernels.square_sums import split_by_time
-from amiwarp.optics.device_camera import pinhole_params
+from amiwarp.optics.camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
 from amiwarp.validation import guarded
 

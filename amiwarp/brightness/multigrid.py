@@ -5,6 +5,8 @@ Corrections are computed on coarser and coarser grids, which transport brightnes
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +14,14 @@ import warp as wp
 
 from amiwarp.kernels import multilevel as k
 from amiwarp.kernels.conjugate_gradients import gather
-from amiwarp.kernels.launch import SMALLEST_SLICE
-from amiwarp.kernels.recorded_launches import BLOCK_DIM
+from amiwarp.kernels.launch import BLOCK_DIM, SMALLEST_SLICE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    import numpy as np
+    from numpy.typing import NDArray
+
 
 COARSEST = 6
 """Smallest number of rows or columns of a grid; coarser grids are not made."""
@@ -98,3 +103,30 @@ class GridHierarchy:
             )
         inputs = [self._correction[0], *self.shapes[0], diagonal, residual]
         program.add(k.prolong_to_finest, len(out), inputs, [out])
+
+
+# Tiles of the brightness map.
+
+
+@dataclass(frozen=True, slots=True)
+class Tiles:
+    """Rectangular parts of the map, all of the same size, with nodes ``1 / density`` px apart."""
+
+    origin: NDArray[np.float32]
+    """Pixel coordinates (x, y) of each tile's first node [px], shape (tiles, 2)."""
+    rows: int
+    """Number of rows of nodes per tile."""
+    columns: int
+    """Number of columns of nodes per tile."""
+    density: float = 2.0
+    """Map nodes per pixel along each axis."""
+
+    @property
+    def nodes(self) -> int:
+        """Total number of map nodes."""
+        return len(self.origin) * self.rows * self.columns
+
+    def at_density(self, density: float) -> Tiles:
+        """Return tiles of the same place and size with another number of nodes per pixel along each axis."""
+        rows, columns = (math.ceil((n - 1) * density / self.density) + 1 for n in (self.rows, self.columns))
+        return replace(self, rows=rows, columns=columns, density=density)

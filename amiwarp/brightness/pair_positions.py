@@ -7,20 +7,138 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from amiwarp.brightness.pair_chains import FEW_BLOCKS, PairChains
-from amiwarp.brightness.pair_ends import PairEnds
+from amiwarp.kernels import equations_cpu, equations_cuda
 from amiwarp.kernels import map_positions as kernels
-from amiwarp.kernels.launch import RepeatedLaunches
+from amiwarp.kernels.equations import Geometry, slope_between, slope_of_changes
+from amiwarp.kernels.equations_cpu import BLOCK, Chains, make_chains, weigh_chains
+from amiwarp.kernels.equations_cuda import Ends, add_ends, list_ends, take_fractions
+from amiwarp.kernels.launch import RepeatedLaunches, launch
 from amiwarp.kernels.pairs import keep_nodes
-from amiwarp.kernels.photometric import Geometry
-from amiwarp.kernels.residual_slopes import slope_between, slope_of_changes
+from amiwarp.optics.camera import pinhole_params
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.device_camera import pinhole_params
 from amiwarp.optics.displacement import model_camera
 
 if TYPE_CHECKING:
     from amiwarp.brightness.event_pairs import PairSet
     from amiwarp.optics.models import Model
+
+
+# Chains of event pairs on a CPU: positions that successive pairs share are stored once.
+
+FEW_BLOCKS = 256
+"""Smallest number of blocks of pairs for which a second CPU thread is used."""
+
+
+class PairChains:
+    """Positions of pairs on a map in chains, and sums over the pairs' weighted equations on a CPU.
+
+    The sums have a slice for each thread.
+    """
+
+    kernels = equations_cpu
+    """Kernels over all equations."""
+
+    def __init__(self, pairs: PairSet, atlas: Any, geometry: Any) -> None:
+        """Allocate the arrays for ``pairs`` on the map of ``atlas``, whose positions ``geometry`` will hold."""
+        self._pairs, self._atlas, self._geometry = pairs.arrays, atlas, geometry
+        stride, device = pairs.arrays.stride, pairs.device
+        self.threads = stride // int(BLOCK)
+        """Number of threads of the kernels, each for a block of pairs."""
+        self.arrays = Chains()
+        """Columns of the positions: the kernels' struct ``Chains``."""
+        for name, dtype in (("cell", int), ("x", float), ("y", float), ("weight", float)):
+            setattr(self.arrays, name, wp.empty(2 * stride, dtype=dtype, device=device))
+        self.arrays.count = wp.empty(self.threads, dtype=int, device=device)
+        self.arrays.end = wp.empty(stride, dtype=wp.uint8, device=device)
+
+    def take_positions(self) -> None:
+        """Take the present positions, and join pairs that begin where the pair before them ends."""
+        inputs = [self._geometry.cell, self._geometry.part, self._geometry.stride]
+        launch(make_chains, self.threads, inputs, [self.arrays], device="cpu", smallest=FEW_BLOCKS)
+
+    @property
+    def inputs(self) -> list[Any]:
+        """First inputs of the kernels that compute a value for each equation."""
+        return [self._pairs, self._atlas, self._geometry, self.arrays]
+
+    def add_product(self, program: Any, weight: Any, vector: Any, slices: list[Any]) -> None:
+        """Add to ``program``: slices += Aᵀ W A vector, for equations A with weights W."""
+        self._add(program, equations_cpu.apply_normal, [weight, vector], slices)
+
+    def add_transpose(self, program: Any, weight: Any, residual: Any, slices: list[Any]) -> None:
+        """Add to ``program``: slices += Aᵀ W residual."""
+        self._add(program, equations_cpu.apply_transpose, [weight, residual], slices)
+
+    def add_diagonal(self, program: Any, weight: Any, slices: list[Any]) -> None:
+        """Add to ``program``: slices += diag(Aᵀ W A). Later products must have the same weights."""
+        program.add(weigh_chains, self.threads, [weight], [self.arrays], smallest=FEW_BLOCKS)
+        self._add(program, equations_cpu.add_diagonal, [weight], slices)
+
+    def _add(self, program: Any, kernel: Any, vectors: list[Any], slices: list[Any]) -> None:
+        inputs = [self._pairs, self._atlas, self.arrays, *vectors]
+        program.add_slices(kernel, self.threads, inputs, slices, smallest=FEW_BLOCKS)
+
+
+# Ends of event pairs on CUDA in the order of the map, so that neighbouring threads add to the same nodes.
+
+
+class PairEnds:
+    """Positions of both ends of pairs in the order of the map, and sums over the pairs' weighted equations on CUDA.
+
+    Its methods are those of :class:`amiwarp.brightness.pair_positions.PairChains`.
+    """
+
+    kernels = equations_cuda
+    """Kernels over all equations."""
+
+    def __init__(self, pairs: PairSet, atlas: Any, geometry: Any) -> None:
+        """Allocate the arrays for ``pairs`` on the map of ``atlas``, whose positions ``geometry`` will hold."""
+        self._pairs, self._atlas, self._geometry = pairs.arrays, atlas, geometry
+        self._nodes = int(atlas.rows * atlas.columns * (atlas.origin.size // 2))
+        self.threads, stride = len(pairs), pairs.arrays.stride
+        """Number of threads of the kernels, each for a pair."""
+        self._device, self._launch = pairs.device, RepeatedLaunches(pairs.device)
+        self.arrays = Ends()
+        """Columns of the ends: the kernels' struct ``Ends``."""
+        self.arrays.part = wp.empty(2 * stride, dtype=wp.vec2, device=self._device)
+        self.arrays.order, self.arrays.cell = (wp.empty(4 * stride, dtype=int, device=self._device) for _ in "oc")
+        self._flow = wp.empty(stride, dtype=float, device=self._device)
+
+    def take_positions(self) -> None:
+        """Take the present positions, and sort them."""
+        ends, nodes = 2 * self._geometry.stride, self._nodes
+        inputs, outputs = [self._geometry, self.threads, nodes], [self.arrays.cell, self.arrays.order]
+        self._launch(list_ends, ends, inputs, outputs)
+        wp.utils.radix_sort_pairs(*outputs, ends, end_bit=nodes.bit_length())
+        self._launch(take_fractions, ends, [self._geometry], [self.arrays])
+
+    @property
+    def inputs(self) -> list[Any]:
+        """First inputs of the kernels that compute a value for each equation."""
+        return [self._pairs, self._atlas, self._geometry]
+
+    def add_product(self, program: Any, weight: Any, vector: Any, slices: list[Any]) -> None:
+        """Add to ``program``: slices += Aᵀ W A vector, for equations A with weights W."""
+        program.add(equations_cuda.find_flows, self.threads, [*self.inputs, weight, vector], [self._flow, *slices])
+        self._add(program, self._flow, slices)
+
+    def add_transpose(self, program: Any, weight: Any, residual: Any, slices: list[Any]) -> None:
+        """Add to ``program``: slices += Aᵀ W residual."""
+        inputs = [self._pairs, self._atlas, weight, residual]
+        program.add(equations_cuda.weigh_residuals, self.threads, inputs, [self._flow, *slices])
+        self._add(program, self._flow, slices)
+
+    def add_diagonal(self, program: Any, weight: Any, slices: list[Any]) -> None:
+        """Add to ``program``: slices += diag(Aᵀ W A)."""
+        if self._atlas.with_leak or self._atlas.with_off:
+            inputs = [self._pairs, self._atlas, weight]
+            program.add(equations_cuda.add_sensor_diagonal, self.threads, inputs, slices)
+        self._add(program, weight, slices, squared=1)
+
+    def _add(self, program: Any, values: Any, slices: list[Any], squared: int = 0) -> None:
+        stride = self._geometry.stride
+        inputs = [self.arrays, stride, self._atlas.columns, values, squared]
+        program.add(add_ends, 2 * stride, inputs, slices)
 
 
 class PairPositions:

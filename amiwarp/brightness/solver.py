@@ -7,6 +7,7 @@ L. L is in units of the ON threshold. See ``docs/explanation/photometric.md``.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -15,25 +16,194 @@ import numpy as np
 import warp as wp
 
 from amiwarp.brightness.multigrid import GridHierarchy
-from amiwarp.brightness.pair_chains import FEW_BLOCKS
-from amiwarp.brightness.pair_positions import PairPositions
-from amiwarp.brightness.residuals import Residuals
+from amiwarp.brightness.pair_positions import FEW_BLOCKS, PairPositions
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import conjugate_gradients as cg
-from amiwarp.kernels.conjugate_gradients import add_multiple, dot, gather, gather_diagonal, sum_seen
-from amiwarp.kernels.launch import RepeatedLaunches, slice_count
-from amiwarp.kernels.map_prior import EXTRA, Prior, link
-from amiwarp.kernels.photometric import Atlas
-from amiwarp.kernels.recorded_launches import BLOCK_DIM, Program
+from amiwarp.kernels import slow_pixels as slow_kernels
+from amiwarp.kernels.conjugate_gradients import (
+    CPU_WIDTH,
+    EXTRA,
+    Prior,
+    add_multiple,
+    dot,
+    gather,
+    gather_diagonal,
+    link,
+    sum_seen,
+)
+from amiwarp.kernels.equations import (
+    HELD,
+    MOST_ROWS,
+    Atlas,
+    add_clusters,
+    find_squares,
+    find_starts,
+    magnitudes,
+    sum_costs,
+    sum_products,
+    sum_square_products,
+    sum_squares,
+)
+from amiwarp.kernels.launch import BLOCK_DIM, Program, RepeatedLaunches, launch, slice_count, start_read
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.displacement import model_camera
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from amiwarp.brightness.event_pairs import PairSet
-    from amiwarp.brightness.tiles import Tiles
+    from amiwarp.brightness.multigrid import Tiles
     from amiwarp.optics.models import Model
+
+
+# Statistics of the residuals of a map's equations, computed on the device: mean cost, sums, median.
+
+CHUNKS = 8
+"""Smallest number of chunks of a vector for which a second CPU thread is used."""
+SUM_COPIES = 64
+"""Number of copies of each tile's sum on a GPU."""
+
+
+class Residuals:
+    """Residuals of the equations of ``pairs`` [thresholds] and the equations' weights.
+
+    A pair off the map has the residual NaN.
+    """
+
+    def __init__(self, pairs: PairSet, tiles: int) -> None:
+        self.pairs, self.tiles, self.device, self.count = pairs, tiles, wp.get_device(pairs.device), len(pairs)
+        n = pairs.arrays.stride
+        self.values, self.weight = (wp.zeros(n, dtype=float, device=self.device) for _ in "vw")
+        self._width = int(CPU_WIDTH) if self.device.is_cpu else 1
+        self._launch = RepeatedLaunches(self.device)
+
+    def start_mean_cost(self, scale: float, *, missing: float = math.nan, held: bool = False) -> Callable[[], float]:
+        """Start to compute the mean Cauchy cost of the residuals, and return a function that waits for it.
+
+        That is log(1 + (r / ``scale``)²) for the residuals r of all pairs or the held-out ones. ``held``: whether only
+        held-out pairs count. ``missing``: residual of pairs off the map; NaN excludes these pairs.
+        """
+        threads, parts = self._sum_shape
+        partial = self._doubles(2, parts)
+        inputs = [self.values, self.pairs.arrays.on, int(HELD) * held, self.count, scale, missing, self._width]
+        self._launch(sum_costs, threads, inputs, [partial], smallest=CHUNKS)
+        sums = start_read(partial)
+
+        def result() -> float:
+            total, number = sums().sum(axis=1)
+            return float(total / number) if number else math.nan
+
+        return result
+
+    def start_products(self, factors: list[tuple[Any, Any]]) -> Callable[[], NDArray[np.float64]]:
+        """Start to sum a · b · weight over the pairs, for each (a, b) on the device.
+
+        Return a function that waits for the sums.
+        """
+        threads, parts = self._sum_shape
+        partial = self._doubles(len(factors), parts)
+        for k, (a, b) in enumerate(factors):
+            inputs = [a, b, self.weight, self.count, self._width]
+            self._launch(sum_products, threads, inputs, [partial[k]], smallest=CHUNKS)
+        sums = start_read(partial)
+        return lambda: np.asarray(sums().sum(axis=1))
+
+    def start_clusters(self, slopes: list[Any]) -> Callable[[], NDArray[np.float64]]:
+        """Start to sum slope · weight · residual over clusters of neighbouring pairs.
+
+        Return a function that waits for the sums, shape (slopes, clusters).
+        """
+        size = self.tiles if self.tiles > 1 else 1 << 20
+        rows = []
+        for slope in slopes:
+            # on a GPU, many threads would wait for each other to add to the few sums of the tiles
+            copies = SUM_COPIES if self.device.is_cuda and self.tiles > 1 else 1
+            sums = wp.zeros((2, size * copies), dtype=wp.int64, device=self.device)
+            inputs = [self.pairs.arrays, self.tiles, copies, slope, self.weight, self.values, 0, sums]
+            # one CPU thread only: several would add to the same sums
+            wp.launch(add_clusters, self.count, inputs=inputs, device=self.device)
+            # the sums of one tile are too large for page-locked memory
+            rows.append(start_read(sums) if self.tiles > 1 else sums.numpy)
+
+        def result() -> NDArray[np.float64]:
+            both = [row().reshape(2, size, -1).sum(axis=2) for row in rows]
+            return np.array([total[number > 0] / 2.0**32 for total, number in both])
+
+        return result
+
+    def products_by_square(
+        self, factors: list[Any], side: int, columns: int, rows: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return sums of a · b · weight over the pairs of each square of pixels, for all a and b of ``factors``.
+
+        The factors are on the device. The squares have ``side`` pixels along each axis; there are ``columns`` x
+        ``rows`` of them. Those without pairs are left out, and so are pairs for which any factor is NaN. Return the
+        sums, shape (squares, factors, factors), and the numbers of the squares, row by row, shape (squares,).
+        """
+        n, squares = self.count, columns * rows
+        values = wp.empty((len(factors), n), dtype=float, device=self.device)
+        for k, factor in enumerate(factors):
+            wp.copy(values[k], factor, count=n)
+        square, order = (wp.empty(2 * n, dtype=int, device=self.device) for _ in "so")
+        launch(
+            find_squares, n, [self.pairs.arrays, values, side, columns, squares], [square, order], device=self.device
+        )
+        wp.utils.radix_sort_pairs(square, order, n, end_bit=squares.bit_length())
+        starts = wp.empty(squares + 1, dtype=int, device=self.device)
+        launch(find_starts, squares + 1, [square, n], [starts], device=self.device)
+        upper = np.triu_indices(len(factors))
+        sums = self._doubles(squares, len(upper[0]))
+        inputs = [values, self.weight, order, starts]
+        if self.device.is_cpu and len(factors) <= MOST_ROWS:
+            launch(sum_squares, squares, inputs, [sums], device="cpu", smallest=CHUNKS)
+        else:
+            lanes = 1 if self.device.is_cpu else 32
+            inputs += [*(wp.array(k, dtype=int, device=self.device) for k in upper), lanes]
+            launch(sum_square_products, lanes * sums.size, inputs, [sums], device=self.device, smallest=CHUNKS)
+        used = np.flatnonzero(np.diff(starts.numpy()))
+        found = np.empty((len(used), len(factors), len(factors)))
+        found[:, upper[0], upper[1]] = found[:, upper[1], upper[0]] = sums.numpy()[used]
+        return found, used
+
+    def median(self) -> float:
+        """Return the median absolute residual; NaN if there is none."""
+        return self.start_median(self.count)()
+
+    def start_median(self, n: int) -> Callable[[], float]:
+        """Start to compute the median absolute residual of the first ``n`` pairs, NaN if there is none.
+
+        Return a function that waits for it.
+        """
+        if self.device.is_cpu:
+            values = np.abs(self.values.numpy()[:n])
+            values = values[np.isfinite(values)]
+            found = float(np.median(values)) if len(values) else math.nan
+            return lambda: found
+        keys, order = (wp.empty(2 * n, dtype=t, device=self.device) for t in (float, int))
+        number = wp.zeros(1, dtype=int, device=self.device)
+        wp.launch(magnitudes, n, inputs=[self.values, 0, keys, number], device=self.device)
+        wp.utils.radix_sort_pairs(keys, order, n)
+
+        def result() -> float:
+            known = int(number.numpy()[0])
+            return float(keys[(known - 1) // 2 : known // 2 + 1].numpy().mean()) if known else math.nan
+
+        return result
+
+    @cached_property
+    def _sum_shape(self) -> tuple[int, int]:
+        """Numbers of threads and of partial sums for a sum over all pairs."""
+        if self.device.is_cpu:
+            threads = -(-self.count // self._width)
+            return threads, threads
+        blocks = -(-self.count // BLOCK_DIM)  # block sums need whole blocks
+        return blocks * BLOCK_DIM, blocks
+
+    def _doubles(self, *shape: int) -> Any:
+        return wp.empty(shape, dtype=wp.float64, device=self.device)
+
 
 FEW_CHUNKS = 16
 """Smallest number of chunks of the unknowns for which a second CPU thread is used. Fewer take less time than the
@@ -62,7 +232,7 @@ class Smoothness:
 class BrightnessMap:
     """Brightness map for a set of pairs of events, and its solver. Owns its buffers; a solve starts from the last map.
 
-    Repeated launches are recorded once (:class:`amiwarp.kernels.recorded_launches.Program`). No values are copied to
+    Repeated launches are recorded once (:class:`amiwarp.kernels.launch.Program`). No values are copied to
     the host between launches.
     """
 
@@ -368,3 +538,82 @@ class _ConjugateGradients:
 
     def _add(self, program: Any, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
         program.add(kernel, self._map._threads, [*inputs, self._map._width], outputs, smallest=FEW_CHUNKS)
+
+
+# Pixels with slow photoreceptors: their events come late and from a smaller orbit, the more so the darker they are.
+#
+# A photoreceptor is modelled as a first-order low-pass filter whose rate is proportional to the light (Delbruck and
+# Mead, ISCAS 1994). At an angular speed ω, a filter with time constant τ sees a circular orbit rotated by atan(ω τ) and
+# contracted by cos(atan(ω τ)), exactly so where the brightness is linear over the orbit. What the filter's output
+# differs from that elsewhere is computed along the prism's path and moved to the right side of the equations.
+
+SAMPLED = 1 << 13
+"""Smallest number of pairs whose brightness gives the median of all; all are used if there are fewer."""
+THRESHOLD = 0.25
+"""Assumed ON threshold [log intensity], which turns the map's brightness into light. Data sheets state 0.1 to 0.4."""
+
+
+def darkness(brightness: BrightnessMap, model: Model, *, ahead: float = 0.0) -> tuple[Any, float]:
+    """Return the time constant at each event, relative to that at the median brightness of all, and that brightness.
+
+    Parameters
+    ----------
+    brightness : BrightnessMap
+        Solved map.
+    model : Model
+        Model with the phase at which the map was solved.
+    ahead : float, default 0.0
+        Angle by which the prism is ahead of that phase, because the events come late [rad].
+
+    Returns
+    -------
+    relative : warp.array
+        Relative time constants at the first and the second event of each pair, shape (2, n) padded to (2, m).
+    middle : float
+        Median brightness [ON thresholds].
+    """
+    pairs, device = brightness.pairs, brightness.device
+    pixels = slow_kernels.Photoreceptor()
+    pixels.ahead = ahead
+
+    def compute(every: int, columns: int) -> Any:
+        out = wp.empty((2, columns), dtype=float, device=device)
+        inputs = [*brightness.path_arguments(model), pixels, every]
+        launch(slow_kernels.find_time_constants, -(-len(pairs) // every), inputs, [out], device=device)
+        return out
+
+    every = max(1, len(pairs) // SAMPLED)
+    pixels.middle = float(np.nanmedian(compute(every, -(-len(pairs) // every)).numpy()))
+    pixels.threshold = THRESHOLD
+    return compute(1, pairs.arrays.stride), pixels.middle
+
+
+def set_lags(brightness: BrightnessMap, model: Model, turn: float, *, with_offsets: bool) -> None:
+    """Give the pairs the lags of slow pixels, relative to the mean lag, which remains part of the phase.
+
+    Parameters
+    ----------
+    brightness : BrightnessMap
+        Solved map, whose pairs have lags (:meth:`PairSet.clear_lags`).
+    model : Model
+        Model with the phase at which the map was solved.
+    turn : float
+        Angle by which the prism turns within the time constant at median brightness [rad].
+    with_offsets : bool
+        Whether to compute what the filter's output differs from the brightness on the contracted orbit. The map must
+        have been solved with lags.
+    """
+    pairs, ahead = brightness.pairs, math.atan(turn)
+    relative, middle = darkness(brightness, model, ahead=ahead if with_offsets else 0.0)
+    lag = np.arctan(turn * relative.numpy()[:, : len(pairs)])
+    factor = np.cos(lag) * np.exp(1j * (ahead - lag))
+    values = np.zeros((4, pairs.arrays.stride), np.float32)
+    values[0] = values[2] = 1.0
+    values[0::2, : len(pairs)], values[1::2, : len(pairs)] = factor.real, factor.imag
+    pairs.arrays.lag.assign(values.ravel())
+    pairs.arrays.offset.zero_()
+    if with_offsets:
+        filtering = slow_kernels.Photoreceptor()
+        filtering.threshold, filtering.middle, filtering.turn, filtering.ahead = THRESHOLD, middle, turn, ahead
+        inputs = [*brightness.path_arguments(model), filtering]
+        launch(slow_kernels.find_offsets, len(pairs), inputs, [pairs.arrays.offset], device=brightness.device)

@@ -2,6 +2,6 @@
 
 from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.result import Calibration
-from amiwarp.calib.sharpness.search import Settings
+from amiwarp.calib.settings import Settings
 
 __all__ = ["Calibration", "Settings", "calibrate"]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any
 
+from amiwarp.calib.model_choice import calibrate_auto
 from amiwarp.calib.result import Calibration
-from amiwarp.calib.selection.model_choice import calibrate_auto
-from amiwarp.calib.sharpness.search import AUTO, Settings
+from amiwarp.calib.settings import AUTO, Settings
 from amiwarp.calib.single_model import calibrate_model
 from amiwarp.events.recording import Recording
 from amiwarp.progress import Progress

@@ -9,7 +9,7 @@ import numpy as np
 
 from amiwarp.calib.parameters import size_name
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.edge_directions import edge_coherence
+from amiwarp.imaging.sharpness import edge_coherence
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from amiwarp.calib.bad_pixels import BadPixelSummary
     from amiwarp.events.encoder import Encoder
-    from amiwarp.imaging.device_image import Image
+    from amiwarp.imaging.votes import Image
     from amiwarp.optics.prism import Prism
 
 FEWEST_EVENTS = 2000

@@ -6,13 +6,17 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.validation import guarded, one_of
+
+if TYPE_CHECKING:
+    pass
+
 
 GLOBAL_ALGORITHMS = (
     "GN_DIRECT",
@@ -253,3 +257,6 @@ def _optimiser(
         )  # fmt: skip
         optimiser.set_local_optimizer(local)
     return optimiser
+
+
+# Share of a calibration that is finished, for progress messages.

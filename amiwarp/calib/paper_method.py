@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.calib.nlopt_solver import best_of
-from amiwarp.calib.preparation import prepare
-from amiwarp.calib.result import Calibration
-from amiwarp.calib.sharpness.search import STAGES, Settings
-from amiwarp.calib.summaries import StageSummary
+from amiwarp.calib.result import Calibration, StageSummary
+from amiwarp.calib.settings import STAGES, Settings
+from amiwarp.calib.single_model import prepare
+from amiwarp.choices import Sharpness
 from amiwarp.events.events import MemoryEvents
-from amiwarp.imaging.choices import Sharpness
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.nlopt_solver import SearchStage
-    from amiwarp.calib.sharpness.search import Search
+    from amiwarp.calib.sharpness import Search
     from amiwarp.events.recording import Recording
     from amiwarp.progress import Progress
 

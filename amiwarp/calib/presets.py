@@ -12,7 +12,7 @@ import numpy as np
 
 from amiwarp.calib import Settings
 from amiwarp.calib.parameters import EXACT_PARAMETERS, size_name
-from amiwarp.calib.photometric.stage import PhotometricSettings
+from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
 from amiwarp.io.input_files import errors_name

@@ -10,20 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amiwarp.choices import Sharpness
 from amiwarp.cli.console import choose_device, progress, report, table
-from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, interval, number, span
-from amiwarp.cli.options import OUTPUT, Common
+from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, interval, number, span
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import MemoryEvents
-from amiwarp.imaging.choices import Sharpness
 from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import check_output
 from amiwarp.io.output_formats import check_ending
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
-    from amiwarp.calib.photometric.stage import PhotometricSettings
-    from amiwarp.calib.summaries import ModelCandidate, ModelChoice
+    from amiwarp.calib.result import ModelCandidate, ModelChoice
+    from amiwarp.calib.settings import PhotometricSettings
     from amiwarp.events.recording import Recording
 
 EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.png"
@@ -354,7 +353,7 @@ def _exact(ladder: ModelChoice) -> list[str]:
 
 def _held_out(r: ModelCandidate) -> tuple[str, ...]:
     """Return a model's results on held-out turns as text; empty if it was not measured."""
-    from amiwarp.calib.selection.trial import in_pixels
+    from amiwarp.calib.model_choice import in_pixels
 
     if r.seen_px is None:
         return ("",) * 4

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amiwarp.choices import Layers
 from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.convert import EncoderOptions, Format, HdfCodec, Round, format_notes
-from amiwarp.cli.inputs import Topic
-from amiwarp.cli.options import OUTPUT, Common
+from amiwarp.cli.options import OUTPUT, Common, Topic
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.choices import Layers
 from amiwarp.io import open_recording
 from amiwarp.io.chunks import Codec
 

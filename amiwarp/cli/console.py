@@ -24,7 +24,7 @@ def choose_device(name: str | None) -> str:
 
     Raises :class:`AmiwarpError` if the named device is not available.
     """
-    from amiwarp.kernels.quiet_start import start_quietly
+    from amiwarp.kernels.launch import start_quietly
 
     known = start_quietly()
     chosen = name or ("cuda:0" if "cuda:0" in known else "cpu")

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from amiwarp.cli.console import progress, report
-from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, Topic
-from amiwarp.cli.options import OUTPUT, Common
+from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, Topic
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import convert, open_recording, read_encoder_csv, read_encoder_triggers
 from amiwarp.io.chunks import Codec

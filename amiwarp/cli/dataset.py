@@ -77,7 +77,7 @@ def run(
 
 def _default_device() -> str:
     """Return all GPUs, or the CPU."""
-    from amiwarp.kernels.quiet_start import start_quietly
+    from amiwarp.kernels.launch import start_quietly
     from amiwarp.studies.cluster import ANY_GPU, gpu_count
 
     return ANY_GPU if gpu_count(start_quietly()) else "cpu"

@@ -38,7 +38,7 @@ def run(
     began = time.perf_counter()
     device = choose_device(common.device)
     with progress("starting") as advance:
-        from amiwarp.cli.rig import parse_size
+        from amiwarp.cli.options import parse_size
         from amiwarp.io.atomic_output import own_folder
         from amiwarp.studies.demo import Demo, run_demo
 

@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.cli.console import choose_device, plain, progress, report, table
-from amiwarp.cli.inputs import CameraOptions, numbers
-from amiwarp.cli.options import OUTPUT_FOLDER, Common
-from amiwarp.cli.rig import parse_size
+from amiwarp.cli.options import OUTPUT_FOLDER, CameraOptions, Common, numbers, parse_size
 from amiwarp.io.atomic_output import check_output, make_folder, write_text
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
@@ -141,7 +139,7 @@ def run(
     seen = _camera(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
-    from amiwarp.simulation.scene import Scene
+    from amiwarp.simulation.scenery import Scene
     from amiwarp.simulation.sensor import SensorModel
     from amiwarp.studies.demo import earth
     from amiwarp.studies.design import design
@@ -177,7 +175,7 @@ def _list(text: str, name: str) -> tuple[float, ...]:
 
 def summary(design: Design) -> dict[str, Any]:
     """Return all results of the study for JSON, with angles in degrees."""
-    from amiwarp.studies.design.recommendation import headline, reasons
+    from amiwarp.studies.design.choice import headline, reasons
 
     camera, volume = design.camera, design.volume
     return {
@@ -240,7 +238,7 @@ def _csv(rows: list[dict[str, Any]]) -> str:
 
 def lines(design: Design, files: dict[str, str]) -> list[Any]:
     """Return the results as tables and lines of text."""
-    from amiwarp.studies.design.recommendation import degrees, headline, rate, reasons
+    from amiwarp.studies.design.choice import degrees, headline, rate, reasons
 
     rows = [
         (degrees(c.orbit.apex), f"{c.rpm:g}", rate(c.events_per_s), f"{c.orbit.radius:.1f} px", f"{c.error_px:.3f} px",

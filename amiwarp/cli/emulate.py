@@ -14,20 +14,18 @@ import typer
 
 from amiwarp.cli import say
 from amiwarp.cli.console import report
+from amiwarp.cli.live import stopped_by_interrupt
 from amiwarp.cli.options import NO_FILE, Common
-from amiwarp.cli.streams import stopped_by_interrupt
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.link.emulated_rotors import Motor, Played
-from amiwarp.live.link.emulator import Controller, EmulatedFault
-from amiwarp.live.link.pseudo_terminal import PseudoTerminal
+from amiwarp.live.link.emulator import Controller, EmulatedFault, Motor, Played, PseudoTerminal
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from amiwarp.events.recording import Recording
-    from amiwarp.live.link.emulated_rotors import Rotor
+    from amiwarp.live.link.emulator import Rotor
     from amiwarp.live.stream.emulated import EmulatedCamera
 
 EXAMPLE = "amiwarp emulate --link ./prism --rpm 720 --fault slip@5 --fault unplug@10+2"

@@ -11,15 +11,14 @@ import numpy as np
 import typer
 
 from amiwarp.cli.console import progress, report, table
-from amiwarp.cli.inputs import Topic
-from amiwarp.cli.options import Common
-from amiwarp.events.encoder_speed import rpm_between
+from amiwarp.cli.options import Common, Topic
+from amiwarp.events.encoder import rpm_between
 from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.sensors import mean_rate
 from amiwarp.events.truth import Cause
 from amiwarp.io import open_recording
-from amiwarp.io.camera_json import camera_to_json
-from amiwarp.io.conversion import GAP_INTERVALS
+from amiwarp.io.camera_files import camera_to_json
+from amiwarp.io.export import GAP_INTERVALS
 from amiwarp.io.file_scan import head_only
 from amiwarp.optics.prism import Prism
 

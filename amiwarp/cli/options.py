@@ -4,15 +4,217 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
+from amiwarp.choices import Seeing
+from amiwarp.errors import AmiwarpError
 from amiwarp.io import atomic_output as output
-from amiwarp.io.regular_file import check_regular
+from amiwarp.io.camera_files import camera_from_json
+from amiwarp.io.input_files import check_regular, errors_name, text_lines
+from amiwarp.io.json_files import read_json
+from amiwarp.io.output_formats import check_ending
+from amiwarp.io.text import read_calib
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
+from amiwarp.simulation.motion import EncoderModel, PrismMotion
+
+if TYPE_CHECKING:
+    from amiwarp.events.recording import Recording
+    from amiwarp.simulation.sensor import SensorModel
+    from amiwarp.simulation.simulator import Simulation
+    from amiwarp.simulation.worlds.world import WorldScene
+
+
+# Options and texts of the command line, converted to cameras, prisms and numbers with units.
+
+Topic = Annotated[
+    str | None, typer.Option(help="Topic of a ROS bag, or camera of an HDF5 file, if the file holds several.")
+]
+"""Option that chooses among several streams of events."""
+
+_CAMERA = "Camera"
+_PRISM = "Prism"
+_SENSOR = "Sensor"
+_ENCODER = "Encoder"
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """Options for the camera. They override the camera in the recording."""
+
+    fov_deg: Annotated[
+        float | None,
+        typer.Option(help="Horizontal field of view of an ideal pinhole camera (deg).", rich_help_panel=_CAMERA),
+    ] = None
+    camera: Annotated[
+        Path | None,
+        typer.Option(
+            help="Camera intrinsics: JSON (width, height, fx, fy, cx, cy, distortion), a calibration file, or "
+            "calib.txt (fx fy cx cy k1 k2 p1 p2 k3).",
+            rich_help_panel=_CAMERA,
+        ),
+    ] = None
+
+    def build(self, width: int, height: int, *, fixed: bool = True) -> Camera | None:
+        """Return the camera that the options describe, or None if no option is given.
+
+        ``width`` and ``height`` are the size of the events [px]. Raises :class:`AmiwarpError` if that size is ``fixed``
+        and the camera file has another one.
+        """
+        if self.camera is not None and self.fov_deg is not None:
+            raise AmiwarpError("--fov-deg and --camera both describe the camera; give one of them")
+        if self.fov_deg is not None:
+            return Camera.from_fov(width, height, math.radians(self.fov_deg))
+        if self.camera is None:
+            return None
+        camera = read_camera(self.camera, width, height)
+        if fixed and (camera.width, camera.height) != (width, height):
+            sizes = f"{camera.width}x{camera.height} px, the events are {width}x{height} px"
+            raise AmiwarpError(f"{self.camera}: the intrinsics are for {sizes}; give the intrinsics of this camera")
+        return camera
+
+
+def read_camera(path: Path, width: int, height: int) -> Camera:
+    """Read a camera from a JSON file, a calibration file or ``calib.txt``.
+
+    ``width`` and ``height`` [px] are used for ``calib.txt`` only, which holds no size. Raises :class:`AmiwarpError`
+    naming file and field.
+    """
+    if path.suffix.lower() != ".json":
+        return read_calib(path, width, height)
+    data = read_json(path, "a camera")
+    with errors_name(path, lambda: "is not a camera file"):
+        return camera_from_json(data["camera"], "camera") if "camera" in data else camera_from_json(data)
+
+
+@dataclass(frozen=True)
+class NominalPrismOptions:
+    """Options for the prism as its data sheet describes it."""
+
+    nominal_apex_deg: Annotated[
+        float | None, typer.Option(help="Apex angle from the prism's data sheet (deg).", rich_help_panel=_PRISM)
+    ] = None
+    index: Annotated[float | None, typer.Option(help="Refractive index of the prism.", rich_help_panel=_PRISM)] = None
+    flat_side: Annotated[
+        FlatSide | None, typer.Option(help="Direction that the prism's flat face points to.", rich_help_panel=_PRISM)
+    ] = None
+
+    def build(self, known: NominalPrism | None) -> NominalPrism | None:
+        """Return the nominal prism ``known`` with the values that options give; None if neither exists.
+
+        The apex stays unknown if neither ``known`` nor the options hold one.
+        """
+        given = {"index": self.index, "flat_side": self.flat_side}
+        changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        prism = replace(known or UnsizedPrism(), **changes)
+        if self.nominal_apex_deg is not None:
+            return UnsizedPrism(prism.index, prism.flat_side).with_apex(math.radians(self.nominal_apex_deg))
+        return prism if changes else known
+
+
+def complete(recording: Recording, camera: CameraOptions, prism: NominalPrismOptions | None = None) -> Recording:
+    """Return the recording with the camera and the prism that the options give.
+
+    Options override the recording. Values without an option stay as recorded.
+    """
+    changes: dict[str, Any] = {"camera": camera.build(*recording.events.size) or recording.camera}
+    if prism is not None:
+        changes["prism"] = prism.build(recording.prism)
+    return replace(recording, **changes)
+
+
+SCALES = {
+    "deg": math.pi / 180.0,
+    "rad": 1.0,
+    "us": 1.0,
+    "ms": 1e3,
+    "rpm": 1.0,
+    "deg/s": math.pi / 180.0,
+    "rad/s": 1.0,
+    "deg/s2": math.pi / 180.0,
+    "rad/s2": 1.0,
+    "px": 1.0,
+}
+"""Unit suffixes of values on the command line and their factors to [rad, us, 1/min, rad/s, rad/s2, px]."""
+FORMS = {
+    "rad": (("deg", "rad"), "1.2deg or 0.02rad"),
+    "us": (("us", "ms"), "250us or 0.25ms"),
+    "1/min": (("rpm",), "720rpm"),
+    "rad/s": (("deg/s", "rad/s"), "30deg/s or 0.5rad/s"),
+    "rad/s2": (("deg/s2", "rad/s2"), "30deg/s2 or 0.5rad/s2"),
+    "px": (("px",), "554px"),
+    "1": ((), "1.5168"),
+}
+"""Accepted suffixes of a parameter in each unit, and an example for error messages."""
+
+
+def number(text: str, unit: str, name: str) -> float:
+    """Convert a text such as ``1.2deg`` to a value in ``unit``. Angles other than 0 need a suffix.
+
+    ``unit`` is one of ``amiwarp.calib.parameters.UNITS``; ``name`` is the option for error messages. Raises
+    :class:`AmiwarpError` if the text is not such a value.
+    """
+    form, suffix = FORMS[unit][1], _suffix(text, unit)
+    try:
+        value = float(text.strip().removesuffix(suffix))
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or (value and unit.startswith("rad") and not suffix):
+        raise AmiwarpError(f"{name}: {text!r} is not a value; write it like {form}")
+    return value * SCALES.get(suffix, 1.0)
+
+
+def interval(text: str, unit: str, name: str) -> tuple[float, float]:
+    """Convert ``LOW:HIGH`` such as ``-10:10deg`` to two values. LOW takes the suffix of HIGH if it has none.
+
+    ``unit`` and ``name`` as for :func:`number`. Raises :class:`AmiwarpError` if the text is not an interval.
+    """
+    low, colon, high = text.partition(":")
+    if not colon:
+        raise AmiwarpError(
+            f"{name}: {text!r} has no colon; write LOW:HIGH, for example 0:{FORMS[unit][1].partition(' ')[0]}"
+        )
+    shared = "" if _suffix(low, unit) else _suffix(high, unit)
+    return number(low.strip() + shared, unit, name), number(high, unit, name)
+
+
+def _suffix(text: str, unit: str) -> str:
+    return next((k for k in FORMS[unit][0] if text.strip().endswith(k)), "")
+
+
+def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
+    """Convert ``count`` values separated by commas. Raises :class:`AmiwarpError` for another number of values."""
+    try:
+        values = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise AmiwarpError(f"{name}: {text!r} is not {count} numbers separated by commas")
+    return values
+
+
+def span(text: str, first: int, last: int) -> tuple[int, int]:
+    """Convert ``START:END`` [s after ``first``] to times on the clock of ``first`` and ``last`` [us].
+
+    START defaults to ``first``, END to just after ``last``. Raises :class:`AmiwarpError` if the text is not a time
+    span.
+    """
+    start, colon, end = text.partition(":")
+    try:
+        low = first + round(float(start) * 1e6) if start.strip() else first
+        high = first + round(float(end) * 1e6) if end.strip() else last + 1
+    except (ValueError, OverflowError):
+        low, high = 0, 0
+    if not colon or not low < high:
+        raise AmiwarpError(f"--window {text!r} is not a time span; write START:END in seconds, for example 0.5:2")
+    return low, high
+
 
 OUTPUT = "output"
 """Mark in ``Annotated`` of an option that names a file to write. Paths without a mark are files to read."""
@@ -106,3 +308,298 @@ def _option_parameters(group: type) -> list[inspect.Parameter]:
         )
         for f in fields(group)
     ]
+
+
+# Options for simulated recordings: camera, prism, motion of the prism, encoder and sensor.
+
+MOST_SPEEDS = 1_000_000
+"""Largest number of rows of a table of speeds."""
+
+
+@dataclass(frozen=True)
+class RigOptions:
+    """Options for the camera and the prism of a simulation."""
+
+    size: Annotated[
+        str | None,
+        typer.Option(
+            help="Size of the camera's image (px). Default: 640x480; for 'amiwarp translate', its pictures' size.",
+            metavar="WIDTHxHEIGHT",
+            rich_help_panel=_CAMERA,
+        ),
+    ] = None
+    fov_deg: Annotated[
+        float | None,
+        typer.Option(
+            help="Horizontal field of view (deg). Default: 60 if --camera is not given.", rich_help_panel=_CAMERA
+        ),
+    ] = None
+    camera: Annotated[
+        Path | None,
+        typer.Option(help="Camera intrinsics: JSON (including the size) or calib.txt.", rich_help_panel=_CAMERA),
+    ] = None
+    apex_deg: Annotated[float, typer.Option(help="True apex angle of the prism (deg).", rich_help_panel=_PRISM)] = 1.0
+    nominal_apex_deg: Annotated[
+        float | None,
+        typer.Option(
+            help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.",
+            rich_help_panel=_PRISM,
+        ),
+    ] = None
+    index: Annotated[float, typer.Option(help="Refractive index of the prism.", rich_help_panel=_PRISM)] = 1.5168
+    flat_side: Annotated[
+        FlatSide, typer.Option(help="Side that the prism's flat face is on.", rich_help_panel=_PRISM)
+    ] = FlatSide.SCENE
+    rpm: Annotated[
+        float, typer.Option(help="Speed of the prism (turns/min); negative: backwards.", rich_help_panel=_PRISM)
+    ] = 720.0
+    speed: Annotated[
+        Path | None,
+        typer.Option(
+            help="Speed over time, instead of --rpm: CSV with 'seconds,rpm' on each line.", rich_help_panel=_PRISM
+        ),
+    ] = None
+    phase_deg: Annotated[
+        float, typer.Option(help="Azimuth of the prism at encoder angle 0 (deg).", rich_help_panel=_PRISM)
+    ] = 0.0
+    tilt_deg: Annotated[
+        str,
+        typer.Option(
+            help="Tilt of the prism's rotation axis about the camera's x and y axes (deg).",
+            metavar="X,Y",
+            rich_help_panel=_PRISM,
+        ),
+    ] = "0,0"
+
+    def build_camera(self, default: tuple[int, int] = (640, 480)) -> Camera:
+        """Return the camera. ``default`` is the size of its image [px] if no option gives one."""
+        width, height = default if self.size is None else parse_size(self.size)
+        if self.camera is None:
+            return Camera.from_fov(width, height, math.radians(60.0 if self.fov_deg is None else self.fov_deg))
+        if self.fov_deg is not None:
+            raise AmiwarpError("--fov-deg and --camera both describe the camera; give one of them")
+        return read_camera(self.camera, width, height)
+
+    def build_prism(self) -> Prism:
+        """Return the prism with its true parameters."""
+        return Prism(math.radians(self.apex_deg), self.index, self.flat_side)
+
+    def build_nominal(self) -> Prism:
+        """Return the nominal prism that is stored with the recording."""
+        nominal = self.apex_deg if self.nominal_apex_deg is None else self.nominal_apex_deg
+        return replace(self.build_prism(), apex=math.radians(nominal))
+
+    def build_motion(self) -> PrismMotion:
+        """Return the prism's motion: speed, phase and tilt."""
+        x, y = (math.radians(v) for v in numbers(self.tilt_deg, 2, "--tilt-deg"))
+        rpm: Any = self.rpm if self.speed is None else _read_speed(self.speed)
+        return PrismMotion(rpm, math.radians(self.phase_deg), (x, y))
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """Convert a size such as ``640x480``. Raises :class:`AmiwarpError` if the text is not a size."""
+    width, x, height = text.partition("x")
+    if not (x and width.isdigit() and height.isdigit()):
+        raise AmiwarpError(f"--size {text!r} is not a size; write it like 640x480")
+    return int(width), int(height)
+
+
+def _read_speed(path: Path) -> list[tuple[float, ...]]:
+    rows = []
+    for number, line in text_lines(path):
+        if line.strip() and not line.startswith("#"):
+            rows.append(numbers(line, 2, f"{path}: line {number}"))
+        if len(rows) > MOST_SPEEDS:
+            raise AmiwarpError(f"{path}: has over {MOST_SPEEDS} speeds; give fewer, which are interpolated")
+    return rows
+
+
+def _sensor(text: str) -> Any:
+    return typer.Option(help=text, rich_help_panel=_SENSOR)
+
+
+@dataclass(frozen=True)
+class SensorOptions:
+    """Options for the sensor's imperfections. Defaults are those of ``amiwarp.SensorModel``."""
+
+    ideal: Annotated[
+        bool,
+        typer.Option("--ideal", help="Simulate a sensor without noise, mismatch and latency.", rich_help_panel=_SENSOR),
+    ] = False
+    sensor: Annotated[
+        str | None,
+        _sensor("Known camera whose sensor is simulated: dvxplorer, davis346 or gen4. Other options change it."),
+    ] = None
+    contrast_on: Annotated[float | None, _sensor("ON threshold: rise of log intensity.")] = None
+    contrast_off: Annotated[float | None, _sensor("OFF threshold: fall of log intensity.")] = None
+    mismatch: Annotated[float | None, _sensor("Relative standard deviation of the thresholds between pixels.")] = None
+    refractory_us: Annotated[float | None, _sensor("Refractory period (us).")] = None
+    latency_us: Annotated[float | None, _sensor("Mean latency of the time stamps (us).")] = None
+    latency_jitter_us: Annotated[float | None, _sensor("Standard deviation of the latency (us).")] = None
+    leak_hz: Annotated[float | None, _sensor("Rate of leak events per pixel (1/s).")] = None
+    shot_noise_hz: Annotated[float | None, _sensor("Rate of random events per pixel (1/s).")] = None
+    hot_fraction: Annotated[float | None, _sensor("Fraction of hot pixels (0 to 1).")] = None
+    hot_hz: Annotated[float | None, _sensor("Additional event rate of a hot pixel (1/s).")] = None
+    cutoff_hz: Annotated[
+        float | None,
+        _sensor("Bandwidth of the photoreceptor at white (Hz), proportional to the light; 0: unlimited."),
+    ] = None
+    shot_noise_dark: Annotated[
+        float | None, _sensor("Rate of random events in the dark, relative to that at white (1 or more).")
+    ] = None
+    leak_jitter_fraction: Annotated[
+        float | None, _sensor("Relative standard deviation of the time between leak events.")
+    ] = None
+    noise_rate_cov_decades: Annotated[
+        float | None, _sensor("Spread of leak and random-event rates between pixels (standard deviation of log10).")
+    ] = None
+    row_us: Annotated[
+        float | None, _sensor("Time to read out a row (us), one row after the other; 0: events are read out at once.")
+    ] = None
+    bus_rate_mev_s: Annotated[
+        float | None, _sensor("Largest rate that the bus transmits (million events/s); 0: unlimited.")
+    ] = None
+    bus_queue: Annotated[float | None, _sensor("Number of events that wait for the bus; further events are lost.")] = (
+        None
+    )
+
+    def build(self) -> SensorModel:
+        """Return the sensor model that the options describe."""
+        from amiwarp.simulation.sensor import SensorModel
+
+        if self.ideal and self.sensor is not None:
+            raise AmiwarpError("--ideal and --sensor both describe the sensor; give one of them")
+        given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
+        ideal, preset = given.pop("ideal"), given.pop("sensor", None)
+        sensor = SensorModel.preset(preset) if preset is not None else SensorModel()
+        return replace(SensorModel.ideal() if ideal else sensor, **given)
+
+
+def _encoder(text: str) -> Any:
+    return typer.Option(help=text, rich_help_panel=_ENCODER)
+
+
+@dataclass(frozen=True)
+class EncoderModelOptions:
+    """Options for the encoder's imperfections. Defaults are those of ``amiwarp.EncoderModel``."""
+
+    counts_per_turn: Annotated[int | None, _encoder("Counts per turn; 0: no rounding to counts.")] = None
+    rate_hz: Annotated[float | None, _encoder("Sample rate (Hz).")] = None
+    jitter_us: Annotated[float | None, _encoder("Standard deviation of the sample times (us).")] = None
+    clock_offset_us: Annotated[
+        float | None, _encoder("Encoder clock minus camera clock (us); stored in the ground truth only.")
+    ] = None
+    dropouts_hz: Annotated[float | None, _encoder("Rate of drop-outs (1/s).")] = None
+    dropout_us: Annotated[float | None, _encoder("Length of a drop-out, during which all samples are lost (us).")] = (
+        None
+    )
+
+    def build(self) -> EncoderModel:
+        """Return the encoder model that the options describe."""
+        given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
+        if self.counts_per_turn == 0:
+            given["counts_per_turn"] = None
+        return EncoderModel(**given)
+
+
+# Command-line options for simulated worlds: world, camera trajectory, and ground truth to record and draw.
+
+_WORLD = "World"
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """Options of a simulation in a three-dimensional world instead of a picture."""
+
+    world: Annotated[
+        str | None,
+        typer.Option(
+            help="Simulate a 3-D world instead of a picture: room, desk, corridor, street, ball, person, or a world "
+            "file (.toml, .json).",
+            metavar="NAME|FILE",
+            rich_help_panel=_WORLD,
+        ),
+    ] = None
+    trajectory: Annotated[
+        str | None,
+        typer.Option(
+            help="Camera motion in the world: still, handheld, fast, or a file of poses (.txt in TUM format, .csv). "
+            "Default: the trajectory in the world file, or handheld for a named world.",
+            metavar="NAME|FILE",
+            rich_help_panel=_WORLD,
+        ),
+    ] = None
+    no_prism: Annotated[
+        bool,
+        typer.Option(
+            "--no-prism",
+            help="Simulate the same scene, sensor and seed with a plain event camera without a prism. The recording "
+            "then has no encoder.",
+            rich_help_panel=_WORLD,
+        ),
+    ] = False
+    seeing: Annotated[
+        Seeing | None,
+        typer.Option(
+            help="How the light of each pixel is computed: maps (look-up in pre-rendered pictures of the world) or "
+            "rays (ray casting through the prism: exact, but slow on a CPU). Default: maps.",
+            rich_help_panel=_WORLD,
+        ),
+    ] = None
+    motion_px: Annotated[
+        float | None,
+        typer.Option(
+            help="Largest motion of the image between two renderings of the world, 0.01 to 2 (px). A smaller value is "
+            "more accurate and slower. Default: 0.5.",
+            rich_help_panel=_WORLD,
+        ),
+    ] = None
+    truth_hz: Annotated[
+        float | None,
+        typer.Option(
+            help="Rate at which depth, normals, instances, optical flow and intensity of all pixels are recorded "
+            "(1/s). Default: not recorded.",
+            rich_help_panel=_WORLD,
+        ),
+    ] = None
+    preview: Annotated[
+        Path | None,
+        typer.Option(
+            help="Figure to write (.png): the view of the camera in the middle of the recording, with and without the "
+            "prism, with depth and optical flow.",
+            metavar="<path>",
+            rich_help_panel=_WORLD,
+        ),
+        OUTPUT,
+    ] = None
+
+    def check(self) -> None:
+        """Raise :class:`AmiwarpError` if a given option does not apply, or two options are incompatible."""
+        given = {"--trajectory": self.trajectory, "--seeing": self.seeing, "--motion-px": self.motion_px,
+                 "--truth-hz": self.truth_hz, "--preview": self.preview}  # fmt: skip
+        if self.world is None:
+            for name, value in given.items():
+                if value is not None:
+                    raise AmiwarpError(f"{name} applies to a world; give --world, or remove {name}")
+        if self.motion_px is not None and self.seeing is Seeing.RAYS:
+            raise AmiwarpError("--motion-px applies to maps; give --seeing maps, or remove --motion-px")
+        if self.preview is not None:
+            check_ending(self.preview, "previews are written", [".png"])
+
+    def build_scene(self, duration_s: float, *, seed: int, blur: float) -> WorldScene:
+        """Return the world and the camera's trajectory. ``blur``: standard deviation of the optical blur [px]."""
+        from amiwarp.simulation.worlds.world import WorldScene
+        from amiwarp.simulation.worlds.world_files import open_world
+
+        world, trajectory = open_world(self.world or "", self.trajectory, seed=seed, duration_s=duration_s)
+        given = {name: value for name in ("seeing", "motion_px") if (value := getattr(self, name)) is not None}
+        return WorldScene(world, trajectory, blur=blur, **given)
+
+    def draw_preview(self, simulation: Simulation) -> None:
+        """Write the preview figure if ``--preview`` is given."""
+        if self.preview is None:
+            return
+        from amiwarp.plotting.figures import draw_preview
+        from amiwarp.simulation.worlds.world_truth import TruthRenderer
+
+        draw_preview(self.preview, TruthRenderer(simulation).at(simulation.duration_us // 2))

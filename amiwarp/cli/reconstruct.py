@@ -10,18 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amiwarp.choices import CONTRAST, Fill, Tone
 from amiwarp.cli.console import choose_device, progress, report
-from amiwarp.cli.inputs import numbers
-from amiwarp.cli.options import OUTPUT, Common
+from amiwarp.cli.options import OUTPUT, Common, numbers
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.progress import Progress
-from amiwarp.reconstruction.choices import CONTRAST, Fill, Tone
 
 if TYPE_CHECKING:
-    from amiwarp.reconstruction.picture import Reconstruction
-    from amiwarp.reconstruction.result import Picture
+    from amiwarp.reconstruction.picture import Picture, Reconstruction
 
 EXAMPLE = "amiwarp reconstruct recording.h5 picture.png --calibration calibration.json --turns 1"
 

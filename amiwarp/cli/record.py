@@ -9,9 +9,8 @@ from typing import Annotated
 import typer
 
 from amiwarp.cli.console import report
-from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions
-from amiwarp.cli.options import OUTPUT, Common
-from amiwarp.cli.streams import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt, summary
+from amiwarp.cli.live import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt, summary
+from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.live.stream.camera_clock import clock_offset
 

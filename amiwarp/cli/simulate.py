@@ -11,18 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.cli.console import choose_device, progress, report
-from amiwarp.cli.inputs import numbers
-from amiwarp.cli.options import OUTPUT, Common
-from amiwarp.cli.rig import EncoderModelOptions, RigOptions, SensorOptions
-from amiwarp.cli.worlds import WorldOptions
+from amiwarp.cli.options import OUTPUT, Common, EncoderModelOptions, RigOptions, SensorOptions, WorldOptions, numbers
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.simulation.motion import CameraMotion
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.scene import Scene
+    from amiwarp.simulation.scenery import Scene
     from amiwarp.simulation.simulator import Simulation
-    from amiwarp.simulation.worlds.world_scene import WorldScene
+    from amiwarp.simulation.worlds.world import WorldScene
 
 EXAMPLE = "amiwarp simulate recording.h5 --picture photo.jpg --duration 0.5 --apex-deg 1 --rpm 720"
 
@@ -109,7 +106,7 @@ def _scene(
     picture: Path | None, world: WorldOptions, scene: SceneOptions, duration: float, seed: int
 ) -> Scene | WorldScene:
     """Return the scene of the simulation: a picture or a world."""
-    from amiwarp.simulation.scene import Scene
+    from amiwarp.simulation.scenery import Scene
 
     if picture is not None:
         return Scene.from_picture(picture, fov=scene.fov, blur=scene.blur_px)

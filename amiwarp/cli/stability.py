@@ -165,7 +165,7 @@ def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
 
 
 def _about(cells: Sequence[Stored]) -> dict[str, Any]:
-    from amiwarp.studies.machine_info import versions
+    from amiwarp.studies.cluster import versions
 
     machines = sorted({r.machine for c in cells for r in c.results.values() if r.machine})
     return {"date": time.strftime("%Y-%m-%d"), "machine": ", ".join(machines), "versions": versions(())}

@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 
 from amiwarp.cli.console import choose_device, progress
-from amiwarp.cli.options import OUTPUT, Common
-from amiwarp.cli.rig import EncoderModelOptions, RigOptions, SensorOptions
+from amiwarp.cli.options import OUTPUT, Common, EncoderModelOptions, RigOptions, SensorOptions
 from amiwarp.cli.simulate import write
 
 EXAMPLE = "amiwarp translate video.mp4 recording.h5 --apex-deg 1 --rpm 720"
@@ -65,7 +64,7 @@ def run(
     """
     from amiwarp.translation.datasets import DataSet
     from amiwarp.translation.inputs import translator_input
-    from amiwarp.translation.interpolation import Interpolation
+    from amiwarp.translation.pictures_between import Interpolation
     from amiwarp.translation.translator import translation
     from amiwarp.validation import choice
 

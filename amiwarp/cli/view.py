@@ -11,22 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from amiwarp.choices import Axis, Colour, View
 from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
-from amiwarp.cli.inputs import CameraOptions, NominalPrismOptions, complete, span
-from amiwarp.cli.options import OUTPUT, Common
-from amiwarp.cli.rig import parse_size
-from amiwarp.cli.streams import SourceOptions, check_angles
+from amiwarp.cli.live import SourceOptions, check_angles
+from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, parse_size, span
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.io.output_formats import check_ending
-from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.host_names import warning
+from amiwarp.viewer.serve import warning
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
-    from amiwarp.viewer.inspector import Inspector
-    from amiwarp.viewer.library import Library
+    from amiwarp.viewer.inspector import Inspector, Library
 
 EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
 
@@ -75,9 +72,9 @@ class ScreenshotOptions:
         Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
         """
         from amiwarp.viewer.app import save_screenshot
-        from amiwarp.viewer.cloud_scene import Look
-        from amiwarp.viewer.page_values import notes
-        from amiwarp.viewer.phase_estimate import estimate_phase
+        from amiwarp.viewer.clouds import Look
+        from amiwarp.viewer.jobs import estimate_phase
+        from amiwarp.viewer.panel import notes
 
         check_ending(path, "pictures are written", [".png"])
         third = self.axis or (Axis.ANGLE if inspector.has_encoder or inspector.knobs.rpm else Axis.TIME)
@@ -118,9 +115,8 @@ class StreamOptions:
             yield None
             return
         from amiwarp.live.stream.recent_events import RecentEvents, followed
-        from amiwarp.live.stream.reconnecting_source import SOCKETS
-        from amiwarp.live.stream.source_opening import open_source
-        from amiwarp.viewer.live_source import LiveSource
+        from amiwarp.live.stream.sources import SOCKETS, open_source
+        from amiwarp.viewer.jobs import LiveSource
 
         messages: list[str] = []
 
@@ -236,8 +232,7 @@ def run(
     common: Common,
 ) -> None:
     """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
-    from amiwarp.viewer.inspector import Inspector
-    from amiwarp.viewer.library import Library
+    from amiwarp.viewer.inspector import Inspector, Library
 
     device = choose_device(common.device)
     with stream.follow(str(recording)) as latest:

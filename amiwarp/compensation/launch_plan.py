@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from amiwarp.events.device_encoder import azimuths
+from amiwarp.events.device_events import azimuths
 from amiwarp.kernels import compensation as kernels
 from amiwarp.kernels.launch import launch, load, specialised
-from amiwarp.optics.device_camera import camera_params, pinhole_params
+from amiwarp.optics.camera import camera_params, pinhole_params
 
 if TYPE_CHECKING:
     from amiwarp.events.device_events import DeviceEvents

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
@@ -15,22 +16,19 @@ import numpy as np
 import warp as wp
 
 from amiwarp.compensation.launch_plan import LaunchPlan
-from amiwarp.compensation.piece_buffers import PIECE, GpuPieces
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import check_sensor
-from amiwarp.events.device_encoder import encoder_params
-from amiwarp.events.device_events import DeviceEvents, check_order, device_for, limits, wait
-from amiwarp.events.events import Events
+from amiwarp.events.device_events import DeviceEvents, check_order, device_for, encoder_params, limits, wait
+from amiwarp.events.events import Events, check_sensor
 from amiwarp.io import RecordingWriter
 from amiwarp.io.atomic_output import check_output
-from amiwarp.io.chunks import Codec, compile_checksums, in_order
-from amiwarp.io.conversion import bag_of, left_out
-from amiwarp.io.export import export
+from amiwarp.io.chunks import CHUNK, Codec, compile_checksums, in_order
+from amiwarp.io.export import bag_of, export, left_out
 from amiwarp.io.native_reader import NativeEvents
 from amiwarp.io.native_writer import FlaggedEvents
 from amiwarp.io.output_formats import OutputFormat, Rounding, check_codec, check_rounding, output_format
-from amiwarp.kernels.event_arrays import join_columns
-from amiwarp.kernels.launch import launch
+from amiwarp.kernels.compensation import Columns
+from amiwarp.kernels.events import join_columns
+from amiwarp.kernels.launch import RecordedLaunch, launch
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded
 
@@ -42,6 +40,94 @@ if TYPE_CHECKING:
     from amiwarp.events.events import EventSource
     from amiwarp.events.recording import MetadataValue, Recording
     from amiwarp.optics.models import Model
+
+
+# Compensation of pieces of events on a GPU, through page-locked buffers that threads share.
+
+GIVEN = {"x": wp.uint16, "y": wp.uint16, "t": wp.int64}
+FOUND = {"out_x": wp.float32, "out_y": wp.float32, "inside": wp.uint8}
+BUFFERS = 3
+"""Number of pieces that threads process on the GPU at a time. Page-locking the memory of a piece takes 5 ms."""
+PIECE = 4 * CHUNK
+"""Number of events that a thread reads, compensates and writes at a time. With fewer, threads wait more often for
+Python's lock; more events need more memory."""
+
+
+class PieceBuffers:
+    """Page-locked memory and memory on a GPU for one piece of events."""
+
+    def __init__(self, room: int, plan: LaunchPlan, encoder: Any, device: Any) -> None:
+        """Allocate memory for ``room`` events."""
+        self.room, self._plan, self._encoder, self._device = room, plan, encoder, device
+        self._done = wp.Event(device)
+        self._columns, self._locked = Columns(), {}
+        for name, dtype in (GIVEN | FOUND).items():
+            setattr(self._columns, name, wp.empty(room, dtype=dtype, device=device))
+            self._locked[name] = wp.empty(room, dtype=dtype, device="cpu", pinned=True)
+        self._host = {name: array.numpy() for name, array in self._locked.items()}
+        self._launches: dict[bool, RecordedLaunch] = {}
+
+    def put(self, events: Events) -> None:
+        """Copy events to the page-locked memory."""
+        for name in GIVEN:
+            self._host[name][: len(events)] = getattr(events, name)
+
+    def start(self, n: int, outside: bool) -> None:
+        """Start the compensation of ``n`` events. ``outside``: whether events may lie outside the sensor."""
+        for name in GIVEN:
+            wp.copy(getattr(self._columns, name), self._locked[name], count=n)
+        if outside not in self._launches:
+            inputs = self._plan.inputs(self._encoder, self._columns, outside=outside)
+            self._launches[outside] = RecordedLaunch(self._plan.kernel, inputs, [], device=self._device)
+        self._launches[outside](0, n)
+        for name in FOUND:
+            wp.copy(self._locked[name], getattr(self._columns, name), count=n)
+        self._device.stream.record_event(self._done)
+
+    def take(self, found: list[NDArray[Any]]) -> None:
+        """Wait for the GPU, and store x and y [px] and 1 for each event inside the image in arrays."""
+        wp.synchronize_event(self._done)
+        for name, values in zip(FOUND, found, strict=True):
+            values[:] = self._host[name][: len(values)]
+
+
+class GpuPieces:
+    """Compensation of pieces of events on a GPU. Any thread may call it."""
+
+    def __init__(self, plan: LaunchPlan, encoder: Any, device: Any) -> None:
+        self._plan, self._encoder, self._device = plan, encoder, device
+        self._free = threading.Semaphore(BUFFERS)
+        self._idle: list[PieceBuffers] = []
+        self.one_thread = threading.Lock()
+        """Lock for launches and copies, because Warp's bookkeeping on CUDA allows one thread at a time."""
+
+    def __call__(self, events: Events) -> list[NDArray[Any]]:
+        """Return compensated x and y [px] and 1 for each event inside the image, shape ``(n,)``."""
+        n, outside = len(events), self._plan.any_outside(int(events.x.max()), int(events.y.max()))
+        found = [np.empty(n, wp.dtype_to_numpy(dtype)) for dtype in FOUND.values()]
+        for first in range(0, n, PIECE):
+            self._run(events[first : first + PIECE], outside, [a[first : first + PIECE] for a in found])
+        return found
+
+    def _run(self, events: Events, outside: bool, found: list[NDArray[Any]]) -> None:
+        with self._free:
+            buffers = self._buffers(len(events))
+            buffers.put(events)
+            with self.one_thread:
+                buffers.start(len(events), outside)
+            buffers.take(found)
+            self._idle.append(buffers)
+
+    def _buffers(self, n: int) -> PieceBuffers:
+        """Return idle or new buffers for ``n`` events; idle ones that are too small are dropped."""
+        with self.one_thread:
+            while self._idle:
+                buffers = self._idle.pop()
+                if buffers.room >= n:
+                    return buffers
+            # a power of two, so that blocks of growing size seldom need new buffers
+            return PieceBuffers(1 << (n - 1).bit_length(), self._plan, self._encoder, self._device)
+
 
 DEFAULT_BLOCK = 1 << 20
 """Number of events per block if the caller does not give one."""

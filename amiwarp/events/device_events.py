@@ -2,20 +2,208 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import bisect
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import checks
-from amiwarp.events.checks import TIME_LIMIT
-from amiwarp.events.device_arrays import event_column, positive
-from amiwarp.events.events import Events
-from amiwarp.kernels import event_arrays as kernels
-from amiwarp.validation import guarded, instance
+from amiwarp.events import events as checks
+from amiwarp.events.events import (
+    COARSE_TIMES,
+    DEFAULT_BLOCK,
+    FRACTION_OF_US,
+    TIME_LIMIT,
+    TIME_UNITS,
+    Events,
+    EventSource,
+    as_coordinate,
+    as_polarity,
+    as_times,
+    check_events,
+    largest_exact_time,
+    regroup,
+)
+from amiwarp.kernels import events as kernels
+from amiwarp.kernels.events import EncoderParams
+from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.validation import guarded, instance, on_gpu, one_of, whole
+
+if TYPE_CHECKING:
+    from amiwarp.events.encoder import Encoder
+
+
+# Arrays of any library as Warp arrays, through DLPack: without a copy if the type allows, else with a checked copy.
+
+HOST: dict[str, Callable[[str, Any, str], Any]] = {
+    "x": lambda name, values, _: as_coordinate(name, values),
+    "y": lambda name, values, _: as_coordinate(name, values),
+    "t": lambda _, values, unit: as_times(values, unit=unit),
+    "p": lambda _, values, __: as_polarity(values),
+}
+"""Conversion of each column of events in host memory, from its name, its values and the unit of times."""
+
+
+def event_column(name: str, values: Any, device: Any, t_unit: str) -> Any:
+    """Return the column ``x``, ``y``, ``t`` or ``p`` of events as a contiguous Warp array of the type that it needs.
+
+    ``device``: where to put it; None for where the values are. ``t_unit``: unit of times, in ``TIME_UNITS``.
+    """
+    if on_gpu(values):
+        found = converted(name, import_array(values, f"events' {name}"), t_unit)
+    else:
+        host = np.require(HOST[name](name, values, t_unit), requirements=["C", "A"])
+        found = wp.array(host, dtype=wp.dtype_from_numpy(host.dtype), device="cpu", copy=False)
+    return found if device is None else found.to(device)
+
+
+def import_array(values: Any, what: str) -> Any:
+    """Return a contiguous Warp array of the values; truth values become uint8.
+
+    The array that owns the memory is kept alive. Work on it that its library has not finished yet is awaited by Warp's
+    current stream, as DLPack says. Raises :class:`AmiwarpError` if the values cannot be read so.
+    """
+    try:
+        found = values if isinstance(values, wp.array) else wp.from_dlpack(values)
+    except Exception as error:  # every library has its own
+        raise AmiwarpError(f"{what} cannot be read through DLPack: {error}") from error
+    found = found if found.is_contiguous or not found.size else found.contiguous()
+    found = found.view(wp.uint8) if found.dtype is wp.bool else found
+    if not wp.types.type_is_scalar(found.dtype):
+        raise AmiwarpError(f"{what} has values of type {wp.types.type_repr(found.dtype)}; expected numbers")
+    return found
+
+
+def converted(name: str, values: Any, t_unit: str = "us") -> Any:
+    """Return a column in the type that events need, as a checked copy if it has another type."""
+    integers = wp.types.type_is_int(values.dtype)
+    if name == "t":
+        return _times(values, TIME_UNITS[one_of(t_unit, TIME_UNITS, "t_unit")], integers)
+    if name == "p":
+        if values.dtype is wp.uint8:
+            return values  # the caller checks that it is 0 or 1
+        return _checked(kernels.mark_positive, values, wp.float64, wp.uint8, "p holds NaN; expected 1 for ON, else 0")
+    if values.dtype in (wp.uint16, wp.float32):
+        return values
+    if integers:
+        what = f"{name} holds a coordinate outside 0 .. 65535 px"
+        return _checked(kernels.narrow_integers, values, wp.int64, wp.uint16, what)
+    what = f"{name} holds a coordinate that float32 cannot hold; drop that event"
+    return _checked(kernels.narrow_floats, values, wp.float64, wp.float32, what)
+
+
+def positive(values: Any) -> Any:
+    """Return polarities as uint8: 1 if positive, else 0."""
+    return _checked(kernels.mark_positive, values, wp.float64, wp.uint8, "p holds NaN")
+
+
+def _times(values: Any, scale: float, integers: bool) -> Any:
+    """Return times as int64 [us], checked as by :func:`amiwarp.events.events.as_times`."""
+    if scale == 1.0 and integers:
+        if values.dtype is wp.uint64:
+            return _checked(kernels.narrow_times, values, wp.uint64, wp.int64, "t is beyond 2**62 us of 0")
+        return cast(values, wp.int64)
+    dtype = np.dtype(wp.dtype_to_numpy(values.dtype))
+    what = {
+        3: "t is not finite or beyond 2**62 us of 0",
+        2: f"t holds fractions: {FRACTION_OF_US}",
+        1: f"t reaches beyond {largest_exact_time(dtype):g} us, and {dtype} {COARSE_TIMES}",
+    }
+    inputs = [scale, largest_exact_time(dtype)]
+    return _checked(kernels.round_times, values, wp.float64, wp.int64, what, inputs)
+
+
+def cast(values: Any, dtype: Any) -> Any:
+    """Return the values in another type, without a copy if they have it."""
+    if values.dtype is dtype:
+        return values
+    out = wp.empty(values.shape, dtype=dtype, device=values.device)
+    if values.size:
+        wp.utils.array_cast(values, out)
+    return out
+
+
+def _checked(
+    kernel: Any, values: Any, wide: Any, dtype: Any, what: str | dict[int, str], inputs: Sequence[float] = ()
+) -> Any:
+    """Return a converted copy. Raises :class:`AmiwarpError` if the kernel finds a bad value.
+
+    ``what``: what is wrong, by the kernel's number of the fault if it finds several. ``inputs``: more inputs of the
+    kernel.
+    """
+    if values.ndim != 1:  # the caller names the shapes
+        return wp.empty(values.shape, dtype=dtype, device=values.device)
+    out, bad = wp.empty(values.shape, dtype=dtype, device=values.device), wp.zeros(1, dtype=int, device=values.device)
+    wp.launch(kernel, len(values), inputs=[cast(values, wide), *inputs], outputs=[out, bad], device=values.device)
+    fault = int(bad.numpy()[0])
+    if fault:
+        raise AmiwarpError(f"events' {what if isinstance(what, str) else what[fault]}")
+    return out
+
+
+# Encoder parameters on a device, for kernels.
+
+
+@lru_cache(maxsize=4)
+def azimuths(device: str) -> wp.array:
+    """Return cosine and sine of 65,536 angles of a turn, interleaved, float32.
+
+    They are computed by NumPy in float64, so that every device has the same bits.
+    """
+    angle = np.arange(1 << 16) * (2.0 * math.pi / (1 << 16))
+    table = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
+    return wp.array(table.ravel(), dtype=float, device=device)
+
+
+def encoder_params(encoder: Encoder, t_first: int, t_last: int, device: Any) -> EncoderParams:
+    """Return the encoder's samples around a span of event times [us] as parameters of the device function ``angle_at``.
+
+    Raises :class:`AmiwarpError` if the encoder does not cover that span.
+    """
+    encoder.angle_at(np.array([t_first, t_last], np.int64))
+    origin, start, angle, slope = encoder_pieces(encoder, t_first, t_last)
+    # a bucket of samples lasts 2**shift us, at most the mean interval between samples
+    shift = max(int(start[-1]) // start.size, 1).bit_length() - 1
+    edges = np.arange((int(start[-1]) >> shift) + 1, dtype=np.int64) << shift
+    first = np.append(np.searchsorted(start, edges, side="right") - 1, start.size - 1)
+    p = EncoderParams()
+    p.origin, p.shift = origin, shift
+    p.first = wp.array(first.astype(np.int32), dtype=int, device=device)
+    pieces = np.stack([start, angle.view(np.int64), slope.view(np.int64)])
+    rows = wp.array(pieces, dtype=wp.int64, device=device)  # one copy to the device instead of three
+    p.start, p.angle, p.slope = rows[0], rows[1].view(wp.uint64), rows[2].view(wp.uint64)
+    return p
+
+
+def encoder_pieces(encoder: Encoder, t_first: int, t_last: int) -> tuple[int, Any, Any, Any]:
+    """Return origin, starts, angles and slopes of :class:`EncoderParams`.
+
+    The encoder must cover the span of event times.
+    """
+    # The clock offset is split into its whole and its fractional part. A piece starts at the first whole event time
+    # at or after its sample.
+    whole = math.floor(encoder.clock_offset_us)
+    begins = encoder.t - whole
+    low = min(max(int(np.searchsorted(begins, t_first, side="right")) - 1, 0), begins.size - 2)
+    high = min(max(int(np.searchsorted(begins, t_last, side="right")), low + 1), begins.size - 1)
+    turns = encoder.angle[low : high + 1] / (2.0 * math.pi)
+    slope = np.diff(turns) / np.diff(encoder.t[low : high + 1])
+    origin = int(begins[low])
+    angle = _wrapped(turns[:-1] + slope * (encoder.clock_offset_us - whole))
+    return origin, begins[low:high] - origin, angle, _wrapped(slope)
+
+
+def _wrapped(turns: Any) -> Any:
+    """Return turns without their whole part as uint64, in units of 2**-64 turn."""
+    part = np.maximum(turns - np.floor(turns + 0.5), -0.5)
+    return np.ldexp(part, 64).astype(np.int64).view(np.uint64)
+
 
 THREADS = 1 << 15
 """Number of CUDA threads that look for the limits of events."""
@@ -250,3 +438,133 @@ def wait(device: Any) -> None:
     """
     if device.is_cuda:
         wp.synchronize_stream(device)
+
+
+# A source of events that are held on a device.
+
+
+@guarded
+class DeviceMemoryEvents(EventSource):
+    """Source of events that are held on a device, for recordings.
+
+    Every function that takes a recording takes one with this source. :func:`reconstruct` reads the events on the
+    device. All others read copies in NumPy arrays, which the methods of :class:`EventSource` return here.
+
+    Parameters
+    ----------
+    events : DeviceEvents
+        The events, sorted by time.
+    width, height : int
+        Sensor size [px].
+
+    Raises
+    ------
+    AmiwarpError
+        If an event lies outside the frame or is out of order, or if the size is not in 1 .. 65536 px.
+
+    Examples
+    --------
+    >>> events = amiwarp.DeviceEvents.from_arrays(x=[1, 2, 3], y=[0, 0, 0], t=[0, 10, 20], p=[1, 0, 1])
+    >>> source = amiwarp.DeviceMemoryEvents(events, width=4, height=4)
+    >>> source.between_on_device(5, 20).x.numpy().tolist()
+    [2]
+    """
+
+    def __init__(self, events: DeviceEvents, width: int, height: int) -> None:
+        instance(events, DeviceEvents, "events on a device")
+        width, height = (whole(size, "frame size", 1, LARGEST_SIZE, " pixels") for size in (width, height))
+        if len(events):
+            _, _, right, bottom, _, decreases = limits(events)
+            if right >= width or bottom >= height or decreases:  # the check on the host names the event
+                check_events(events.to_host(), width, height, where="events on a device", allow_nan=True)
+        self._events = events
+        self._size = (width, height)
+
+    def __len__(self) -> int:
+        return len(self._events)
+
+    @property
+    def t_first(self) -> int:
+        return self._events.t_first
+
+    @property
+    def t_last(self) -> int:
+        return self._events.t_last
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self._size
+
+    @property
+    def device(self) -> Any:
+        """The device that holds the events, a ``warp.Device``."""
+        return self._events.device
+
+    def slice(self, start: int, stop: int) -> Events:
+        return self.slice_on_device(start, stop).to_host()
+
+    def slice_on_device(self, start: int, stop: int) -> DeviceEvents:
+        """Return the events with ``start <= index < stop``, as views on the device.
+
+        Parameters
+        ----------
+        start, stop : int
+            First index, and index after the last. Both are clipped to the existing events.
+
+        Returns
+        -------
+        DeviceEvents
+            The events.
+        """
+        return self._events[max(start, 0) : max(stop, 0)]
+
+    def find(self, t: int) -> int:
+        times = self._events.t
+        return bisect.bisect_left(range(len(self)), t, key=lambda index: int(times[index : index + 1].numpy()[0]))
+
+    def between(self, t_start: int, t_end: int) -> Events:
+        return self.between_on_device(t_start, t_end).to_host()
+
+    def between_on_device(self, t_start: int, t_end: int) -> DeviceEvents:
+        """Return the events with ``t_start <= t < t_end``, as views on the device.
+
+        Parameters
+        ----------
+        t_start, t_end : int
+            Start and end of the window [us].
+
+        Returns
+        -------
+        DeviceEvents
+            The events.
+        """
+        return self._events[self.find(t_start) : self.find(t_end)]
+
+    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+        chunks = (self.slice(start, start + DEFAULT_BLOCK) for start in range(0, len(self), DEFAULT_BLOCK))
+        return regroup(chunks, count=count, duration_us=duration_us)
+
+
+class DeviceValues:
+    """Array on a device with one row per event, which slices copy to NumPy arrays (:class:`EventValues`)."""
+
+    def __init__(self, values: wp.array) -> None:
+        self._values = values
+
+    def __getitem__(self, which: slice, /) -> NDArray[Any]:
+        start, stop, _ = which.indices(len(self._values))
+        return np.asarray(part(self._values, start, stop).numpy())
+
+
+def device_of(source: EventSource, device: Any) -> Any:
+    """Return the device to compute on, as :func:`device_for` does for events."""
+    if isinstance(source, DeviceMemoryEvents):
+        return device_for(source.slice_on_device(0, len(source)), device)
+    return wp.get_device("cpu" if device is None else device)
+
+
+def read_between(source: EventSource, t_start: int, t_end: int) -> Events | DeviceEvents:
+    """Return the events of a time window [us] where they are: on the device, or in NumPy arrays."""
+    if isinstance(source, DeviceMemoryEvents):
+        return source.between_on_device(t_start, t_end)
+    return source.between(t_start, t_end)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import as_times
 from amiwarp.events.encoder import TWO_PI, Encoder
+from amiwarp.events.events import as_times
 from amiwarp.validation import array, guarded, real, whole
 
 RESTART_US = 1

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import as_times
-from amiwarp.events.events import EventSource
+from amiwarp.events.events import EventSource, as_times
 from amiwarp.events.sensors import ImageStore, ImuSamples
 from amiwarp.events.truth import EventTruth, EventValues, FrameStore, KnownStore, PoseStore, WorldLabels
 from amiwarp.validation import array, guarded

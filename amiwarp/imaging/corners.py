@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 import warp as wp
 
+from amiwarp.choices import CornerMethod
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import TIME_LIMIT, check_events, check_sensor
 from amiwarp.events.device_events import DeviceEvents, device_for, limits, wait
-from amiwarp.imaging.choices import CornerMethod
+from amiwarp.events.events import TIME_LIMIT, Events, check_events, check_sensor
 from amiwarp.kernels import corners as kernels
-from amiwarp.kernels.launch import launch
+from amiwarp.kernels import events as event_kernels
+from amiwarp.kernels.launch import launch, load
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import choice, guarded, vector, whole
+from amiwarp.validation import choice, guarded, instance, vector, whole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.events.events import Events
 
 REDUNDANT_US = 50_000
 """Time after which an event of Arc* is no longer redundant [us], from the paper."""
@@ -298,3 +298,59 @@ def _columns(events: DeviceEvents) -> Any:
     columns = kernels.Columns()
     columns.x, columns.y, columns.t, columns.p = events.x, events.y, events.t, events.p
     return columns
+
+
+# Background activity: events that no earlier event at a neighbouring pixel supports.
+
+SUPPORT_US = 10_000
+"""Default time within which a neighbour supports an event [us]."""
+
+
+@guarded
+def find_background_activity(
+    events: Events, size: tuple[int, int], *, window_us: int = SUPPORT_US
+) -> NDArray[np.bool_]:
+    """Find the events that are probably noise, because no neighbouring pixel fired shortly before.
+
+    Parameters
+    ----------
+    events : Events
+        Events from a sensor, sorted by time.
+    size : tuple of int
+        Sensor size (width, height) [px].
+    window_us : int, optional
+        Longest time since an event at one of the eight neighbours [us], at least 1. Polarities are not compared.
+
+    Returns
+    -------
+    ndarray
+        Whether each event is background activity, bool, shape ``(n,)``.
+
+    Raises
+    ------
+    AmiwarpError
+        If the events are compensated, out of order or outside the sensor, or ``window_us`` is below 1.
+
+    Notes
+    -----
+    Source: Delbruck, "Frame-free dynamic digital vision", 2008. The first event of an edge at each place has no support
+    and is removed too. A single CPU thread passes over the events in their order.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[3, 4, 9], y=[3, 3, 9], t=[0, 500, 900], p=[1, 1, 0])
+    >>> amiwarp.find_background_activity(events, (16, 16), window_us=1000)
+    array([ True, False,  True])
+    """
+    instance(events, Events, "events")
+    check_sensor(events)
+    width, height = (int(side) for side in vector(size, 2, "size of the sensor", _side))
+    window_us = whole(window_us, "window_us", 1, TIME_LIMIT, " us")
+    check_events(events, width, height, where="events")
+    columns = [wp.array(np.ascontiguousarray(c), device="cpu", copy=False) for c in (events.x, events.y, events.t)]
+    latest = wp.full((width + 2) * (height + 2), wp.int64(event_kernels.NEVER), dtype=wp.int64, device="cpu")
+    background = wp.empty(len(events), dtype=wp.bool, device="cpu")
+    load(event_kernels.mark_background, wp.get_device("cpu"))
+    inputs = [*columns, window_us, width + 2, latest]
+    wp.launch(event_kernels.mark_background, 1, inputs, [background], device="cpu")
+    return np.asarray(background.numpy(), np.bool_)

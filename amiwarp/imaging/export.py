@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.choices import Layers
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.choices import Layers
+from amiwarp.imaging.iwe import PIECE, Votes
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
-from amiwarp.imaging.warped_image import PIECE, CanvasShape, Votes
+from amiwarp.imaging.votes import CanvasShape
 from amiwarp.io.atomic_output import NewFile, allocate, check_output
 from amiwarp.io.output_formats import check_ending
 from amiwarp.validation import choice

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
-from amiwarp.imaging.choices import Sharpness
-from amiwarp.imaging.sharpness_costs import sharpness
-from amiwarp.imaging.warped_image import iwe
+from amiwarp.imaging.iwe import iwe
+from amiwarp.imaging.sharpness import sharpness
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.model_error import ModelError, predicted_error
+from amiwarp.optics.models import ModelError, predicted_error
 from amiwarp.optics.prism import Prism
 from amiwarp.validation import guarded
 

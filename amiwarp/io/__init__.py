@@ -3,12 +3,10 @@
 :func:`open_recording` reads every format. :class:`RecordingWriter` writes the native format.
 """
 
-from amiwarp.io.conversion import ConversionSummary, convert
-from amiwarp.io.copying import save_recording
-from amiwarp.io.encoder_csv import read_encoder_csv
+from amiwarp.io.encoder_files import read_encoder_csv, read_encoder_triggers
+from amiwarp.io.export import ConversionSummary, convert
 from amiwarp.io.formats import Format, detect_format, open_recording
-from amiwarp.io.native_writer import RecordingWriter
-from amiwarp.io.trigger_encoder import read_encoder_triggers
+from amiwarp.io.native_writer import RecordingWriter, save_recording
 
 __all__ = [
     "ConversionSummary",

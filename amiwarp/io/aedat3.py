@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.file_scan import FileEvents, Packet, only_counted
 from amiwarp.io.input_files import errors_name, open_input
-from amiwarp.io.sensor_streams import only_counted
 
 MAGIC = b"#!AER-DAT3.1"
 HEADER_END = b"#!END-HEADER\r\n"

@@ -27,8 +27,7 @@ from types import TracebackType
 from typing import IO
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import inputs_in_use, inputs_noted, note_output, same_file
-from amiwarp.io.regular_file import KINDS
+from amiwarp.io.input_files import KINDS, inputs_in_use, inputs_noted, note_output, same_file
 
 UNFINISHED = re.compile(r"\.(?:.+\.)?(?P<owner>(?P<system>[0-9a-f]{12})-[0-9a-f]{8})(?:-[0-9a-f]{8})?\.part")
 """Pattern of the names of unfinished files and of lock files, with the running system and the lock of their owner."""

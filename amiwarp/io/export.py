@@ -1,23 +1,45 @@
-"""Writing of events in formats other than the native one, in constant memory and completely or not at all."""
+"""Writing of recordings in formats other than the native one, and conversion between formats."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import SENSOR_DTYPE
-from amiwarp.events.events import Events, EventSource
-from amiwarp.io.atomic_output import NewFile
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import SENSOR_DTYPE, Events, EventSource
+from amiwarp.io.atomic_output import NewFile, check_output
 from amiwarp.io.chunks import Codec
+from amiwarp.io.file_scan import RECORDS, FileEvents
+from amiwarp.io.formats import open_recording
 from amiwarp.io.input_files import errors_name
-from amiwarp.io.output_formats import LIMITS, Bag, Limits, Outline, OutputFormat, Rounding
+from amiwarp.io.native_writer import RecordingWriter, copy_events
+from amiwarp.io.output_formats import (
+    LIMITS,
+    Bag,
+    Limits,
+    Outline,
+    OutputFormat,
+    Rounding,
+    check_codec,
+    check_rounding,
+    output_format,
+)
+from amiwarp.optics.camera import Camera
 from amiwarp.progress import Progress
-from amiwarp.validation import whole
+from amiwarp.validation import guarded, whole
+
+if TYPE_CHECKING:
+    from amiwarp.events.recording import Recording
+    from amiwarp.optics.prism import NominalPrism
+
+
+# Writing of events in formats other than the native one, in constant memory and completely or not at all.
 
 Writer: TypeAlias = Callable[[Path, Iterable[Events], Outline], None]
 """Function that writes all events into a new file."""
@@ -128,15 +150,254 @@ def _writer(chosen: OutputFormat) -> Writer:
     """Return the function that writes a format."""
     # Each writer is imported on use, because its library takes time to load.
     if chosen is OutputFormat.DSEC:
-        from amiwarp.io.dsec_writer import write_dsec as writer
+        from amiwarp.io.native_writer import write_dsec as writer
     elif chosen is OutputFormat.EVT3:
-        from amiwarp.io.evt3_writer import write_evt3 as writer
+        from amiwarp.io.prophesee import write_evt3 as writer
     elif chosen is OutputFormat.AEDAT4:
-        from amiwarp.io.aedat4_writer import write_aedat4 as writer
+        from amiwarp.io.aedat4 import write_aedat4 as writer
     elif chosen is OutputFormat.NPZ:
-        from amiwarp.io.npz_writer import write_npz as writer
+        from amiwarp.io.npz import write_npz as writer
     elif chosen is OutputFormat.TEXT:
-        from amiwarp.io.text_writer import write_text as writer
+        from amiwarp.io.text import write_text as writer
     else:
-        from amiwarp.io.ros2_writer import write_ros2 as writer
+        from amiwarp.io.ros import write_ros2 as writer
     return writer
+
+
+# Conversion of a recording from any format to the native one or to others.
+
+GAP_INTERVALS = 5
+"""Number of median sample intervals above which the time between two encoder samples is reported as a gap."""
+
+
+SOURCE_NAMES = ("source_name", "source_format")
+"""Metadata that name the recording that was converted."""
+
+
+@guarded
+@dataclass(frozen=True, slots=True)
+class ConversionSummary:
+    """Summary of the conversion of a recording.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[1, 2], y=[0, 0], t=[0, 10], p=[1, 0])
+    >>> amiwarp.save_recording("in.h5", amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4)))
+    >>> summary = amiwarp.convert("in.h5", "out.h5")
+    >>> summary.events, summary.width, summary.encoder_covers
+    (2, 4, None)
+    """
+
+    events: int
+    """Number of events that were written."""
+    t_first: int | None
+    """Time of the first event [us], or None without events."""
+    t_last: int | None
+    """Time of the last event [us], or None without events."""
+    width: int
+    """Width of the sensor [px]."""
+    height: int
+    """Height of the sensor [px]."""
+    repairs: dict[str, int]
+    """Number of repairs and other findings while reading, by name of the finding."""
+    encoder_covers: bool | None
+    """Whether the encoder has an angle for every event, or None without an encoder."""
+    encoder_gaps: tuple[tuple[int, int], ...]
+    """Gaps in the encoder samples: the times of the samples before and after each gap [us]."""
+    index_slip: float | None
+    """Largest angle error at an index pulse [rad], or None without pulses. A value above one count means that counts
+    were lost."""
+    format: OutputFormat
+    """Format that was written."""
+    left_out: tuple[str, ...]
+    """Parts of the recording that the format does not hold, such as ``"encoder"``. Empty for the native format."""
+    rounding: Rounding | None = None
+    """How coordinates were rounded to whole pixels, or None if they were not."""
+    dropped: int = 0
+    """Number of events that were not written, because after rounding they are outside the image."""
+
+
+@guarded
+def convert(
+    source_path: str | os.PathLike[str],
+    out_path: str | os.PathLike[str],
+    *,
+    encoder: Encoder | None = None,
+    camera: Camera | None = None,
+    prism: NominalPrism | None = None,
+    topic: str | None = None,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+    format: OutputFormat | str | None = None,
+    codec: Codec | str = Codec.BLOSC,
+    rounding: Rounding | str | None = None,
+    seed: int = 0,
+) -> ConversionSummary:
+    """Convert a recording to the native format or to another one, in constant memory.
+
+    Only the native format holds the encoder, the camera, the prism, the ground truth, the IMU samples, the frames and
+    the metadata. All formats keep x, y, t and p of every event exactly, with two exceptions for compensated events:
+    text holds their coordinates to 1e-6 px, and formats of whole pixels need ``rounding``. From a ROS 2 bag to a ROS 2
+    bag, the messages of all other topics are copied.
+
+    Parameters
+    ----------
+    source_path : str or path-like
+        The recording to read, in any format of :class:`Format`.
+    out_path : str or path-like
+        The file to write. Its extension gives the format: ``.h5`` or ``.hdf5`` (native), ``.raw`` (Prophesee EVT 3.0),
+        ``.aedat4``, ``.npz``, ``.txt``, and ``.mcap`` or ``.db3`` (ROS 2 bag).
+    encoder : Encoder, optional
+        Replaces the encoder of the file.
+    camera : Camera, optional
+        Replaces the camera of the file. Gives the sensor size if the file does not store it.
+    prism : Prism or UnsizedPrism, optional
+        Replaces the nominal prism of the file.
+    topic : str, optional
+        The topic or camera to read, if the input holds several, see :func:`open_recording`.
+    progress : callable, optional
+        Called with the name of the step and the finished fraction of the task, 0 to 1.
+    overwrite : bool, default False
+        Whether an existing output may be replaced.
+    format : OutputFormat or str, optional
+        The format to write, if not that of the extension. The layout of DSEC (``"dsec"``) needs it.
+    codec : Codec or str, default "blosc"
+        Compression of HDF5. Programs without HDF5's Blosc filter read ``"gzip"``.
+    rounding : Rounding or str, optional
+        How to round the coordinates of compensated events to whole pixels. Events outside the image after that are
+        dropped and counted.
+    seed : int, default 0
+        Seed of the random numbers of ``"dithered"``. The same events and seed give the same result.
+
+    Returns
+    -------
+    ConversionSummary
+        What was converted.
+
+    Raises
+    ------
+    AmiwarpError
+        If the input cannot be read or the output cannot be written, if both are the same file, if the output exists
+        without ``overwrite``, or if the format cannot hold the events. Then no output remains.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[1, 2], y=[0, 0], t=[0, 10], p=[1, 0])
+    >>> amiwarp.save_recording("in.h5", amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4)))
+    >>> amiwarp.convert("in.h5", "out.h5", prism=amiwarp.Prism(apex=0.03)).events
+    2
+    >>> amiwarp.convert("out.h5", "out.aedat4").left_out
+    ('prism',)
+
+    Compensated events get whole pixels for programs that need them:
+
+    >>> moved = amiwarp.Events.from_arrays(x=[1.3, 2.9], y=[0.0, 0.2], t=[0, 10], p=[1, 0])
+    >>> amiwarp.save_recording("moved.h5", amiwarp.Recording(amiwarp.MemoryEvents(moved, width=4, height=4)))
+    >>> amiwarp.convert("moved.h5", "moved.raw", rounding="nearest").events
+    2
+    """
+    out_path = Path(out_path)
+    check_output(out_path, overwrite=overwrite)
+    chosen = output_format(out_path, format)
+    codec = check_codec(out_path, codec, chosen)
+    rounding = check_rounding(out_path, rounding, chosen)
+    opened = open_recording(source_path, topic=topic)
+    recording = replace(
+        opened, encoder=encoder or opened.encoder, camera=camera or opened.camera, prism=prism or opened.prism
+    )
+    size = recording.events.size
+    if recording.camera is not None and not getattr(recording.events, "size_is_known", True):
+        size = recording.camera.width, recording.camera.height
+    dropped = 0
+    if chosen is OutputFormat.NATIVE:
+        _write_native(recording, out_path, size, codec, progress, overwrite)
+    else:
+        dropped = export(
+            recording.events, out_path, chosen, size, codec=codec, progress=progress, overwrite=overwrite,
+            rounding=rounding, seed=seed, bag=bag_of(recording),
+        )  # fmt: skip
+    return _summary(recording, size, chosen, rounding, dropped)
+
+
+def _write_native(
+    recording: Recording,
+    path: Path,
+    size: tuple[int, int],
+    codec: Codec,
+    progress: Progress | None,
+    overwrite: bool,
+) -> None:
+    """Write a native recording. Its metadata name the source."""
+    metadata = {name: value for name, value in recording.metadata.items() if name != "format"}
+    source = recording.name, recording.metadata["format"]
+    with RecordingWriter(
+        path,
+        width=size[0],
+        height=size[1],
+        camera=recording.camera,
+        prism=recording.prism,
+        encoder=recording.encoder,
+        truth_parameters=None if recording.truth is None else recording.truth.parameters,
+        truth_labels=None if recording.truth is None else recording.truth.labels,
+        metadata={**dict(zip(SOURCE_NAMES, source, strict=True)), **metadata},
+        overwrite=overwrite,
+        codec=codec,
+    ) as writer:
+        copy_events(recording, writer, size, progress)
+
+
+def _summary(
+    recording: Recording, size: tuple[int, int], chosen: OutputFormat, rounding: Rounding | None, dropped: int
+) -> ConversionSummary:
+    source, encoder = recording.events, recording.encoder
+    ends = (source.t_first, source.t_last) if len(source) else None
+    slip = np.zeros(0) if encoder is None else encoder.slip()
+    return ConversionSummary(
+        events=len(source) - dropped,
+        t_first=ends[0] if ends else None,
+        t_last=ends[1] if ends else None,
+        width=size[0],
+        height=size[1],
+        repairs=dict(getattr(source, "repairs", {})),
+        encoder_covers=None if encoder is None else ends is None or encoder.covers(*ends),
+        encoder_gaps=() if encoder is None else _gaps(encoder),
+        index_slip=float(np.abs(slip).max()) if slip.size else None,
+        format=chosen,
+        left_out=() if chosen is OutputFormat.NATIVE else left_out(recording, chosen),
+        rounding=rounding,
+        dropped=dropped,
+    )
+
+
+def bag_of(recording: Recording) -> Bag | None:
+    """Return the ROS 2 bag and the topic that a recording is read from, or None for other recordings."""
+    source, about = recording.events, recording.metadata
+    if not isinstance(source, FileEvents) or about.get("format") != "rosbag2":
+        return None
+    return Bag(source.path, str(about["topic"]))
+
+
+def left_out(recording: Recording, chosen: OutputFormat) -> tuple[str, ...]:
+    """Return what a recording has in addition to its events and a format other than the native one does not hold."""
+    known = {"format", *SOURCE_NAMES, *getattr(recording.events, "repairs", {}), "other_topics"}
+    from_bag = str(recording.metadata.get("format")).startswith("rosbag")
+    copied = chosen is OutputFormat.ROS2 and bag_of(recording) is not None
+    if copied:
+        known |= {"topic", *RECORDS}
+    found = {
+        "sensor size": not LIMITS[chosen].holds_size,
+        "encoder": recording.encoder is not None,
+        "camera": recording.camera is not None,
+        "prism": recording.prism is not None,
+        "ground truth": recording.truth is not None,
+        "IMU samples": recording.imu is not None and not copied,
+        "frames": recording.frames is not None and not copied,
+        "triggers": copied and bool(recording.metadata.get("triggers")),
+        "other topics": bool(recording.metadata.get("other_topics")) and from_bag and not copied,
+        "metadata": not set(recording.metadata) <= known,
+    }
+    return tuple(name for name, left in found.items() if left)
+
+
+def _gaps(encoder: Encoder) -> tuple[tuple[int, int], ...]:
+    return tuple(encoder.gaps(GAP_INTERVALS * float(np.median(np.diff(encoder.t)))))

@@ -10,10 +10,8 @@ from pathlib import Path
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.file_kinds import name_kind
-from amiwarp.io.input_files import errors_name, open_input
+from amiwarp.io.input_files import check_regular, errors_name, name_kind, open_input
 from amiwarp.io.nmnist import looks_like_bin
-from amiwarp.io.regular_file import check_regular
 from amiwarp.validation import choice, guarded
 
 

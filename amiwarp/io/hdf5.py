@@ -10,7 +10,8 @@ import math
 import os
 import threading
 import weakref
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
 from amiwarp.io.chunks import CHUNK, StoredColumn
+from amiwarp.io.file_scan import FileEvents, Packet, read_sensors
 from amiwarp.io.input_files import input_path
-from amiwarp.io.reading_process import ReadingProcess, borrow, give_back
+from amiwarp.io.reading_process import ReadingProcess, borrow, give_back, packets, run
 
 PIECE = 1 << 20
 """Number of elements that the reading process reads per request."""
@@ -152,3 +155,28 @@ def _close(handle: int, process: list[ReadingProcess]) -> None:
 def _give_back(process: list[ReadingProcess]) -> None:
     if process:
         give_back(process.pop())
+
+
+# Reader of HDF5 files that store one row per event: MVSEC's and Prophesee's. They are read from the beginning.
+
+READ = "amiwarp.io.hdf5_server:read_rows"
+"""Function of the reading process."""
+
+
+def open_rows(path: Path, layout: str, group: str) -> Recording:
+    """Open the events of a group, which :func:`amiwarp.io.hdf5_server.find_layout` has found."""
+    source = path.absolute()
+    about = run("amiwarp.io.hdf5_server:read_head", source, group)
+    events = FileEvents(path, partial(packets, READ, source, f"{group}/events"), size=_size(about["size"]))
+    imu, frames, notes = read_sensors(path, about["counts"], "hdf5_sensors", group)
+    metadata = {"format": layout, "topic": group, **about["counts"], **events.metadata, **notes}
+    return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
+
+
+def _size(given: list[int] | None) -> tuple[int, int] | None:
+    return None if given is None else (given[0], given[1])
+
+
+def trigger_packets(path: Path) -> Iterator[Packet]:
+    """Yield the edges of the external triggers in Prophesee's file."""
+    return packets(READ, path.absolute(), "EXT_TRIGGER/events", {})

@@ -10,18 +10,69 @@ import contextlib
 import ctypes
 import math
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import h5py  # noqa: TID253 - only the reading process imports this module
 import hdf5plugin  # noqa: F401, TID253 - its import registers the filters
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.chunks import BLOSC, CHUNK, FLETCHER32
-from amiwarp.io.hdf5_layouts import M3ED_COLUMNS, find_layout, m3ed_attributes
+from amiwarp.io.file_scan import microseconds, whole_pixels
 from amiwarp.io.native_layout import FORMAT
+from amiwarp.io.prophesee import Columns
 from amiwarp.io.reading_server import Reply, keep, kept
+
+# Layouts of other data sets' HDF5 files: M3ED, MVSEC and Prophesee's. Runs in the reading process.
+#
+# M3ED stores columns like amiwarp, in other groups. :mod:`amiwarp.io.hdf5_server` reads the others.
+
+Member = Callable[[Any, str], Any]
+"""Function that returns a member of a file by its name, or None, and refuses links."""
+
+SIDES = ("left", "right")
+
+
+def find_layout(file: Any, topic: str | None, member: Member) -> tuple[str, str]:
+    """Return the layout of a file, and the group of its events. ``topic`` chooses among several cameras."""
+    found = {f"prophesee/{side}": "m3ed" for side in SIDES if member(file, f"prophesee/{side}/t") is not None}
+    found |= {f"davis/{side}": "mvsec" for side in SIDES if member(file, f"davis/{side}/events") is not None}
+    found |= {"CD": "ecf"} if member(file, "CD/events") is not None else {}
+    listed = ", ".join(found)
+    if isinstance(member(file, "events"), h5py.Group) and not found:
+        found, listed = {"": "native"}, "none, as it holds one stream of events"
+    if not found:
+        names = ", ".join(list(file)[:20]) or "none"
+        raise AmiwarpError(f"HDF5 without a group 'events'; expected events/x, y, t, p; its groups are {names}")
+    if topic is not None and topic not in found:
+        raise AmiwarpError(f"has no events in '{topic}'; the choices for --topic are {listed}")
+    if topic is None and len(found) > 1:
+        remedy = "choose one with amiwarp convert --topic, in Python with topic="
+        raise AmiwarpError(f"holds the events of several cameras: {listed}; {remedy}")
+    chosen = next(iter(found)) if topic is None else topic
+    return found[chosen], chosen
+
+
+M3ED_COLUMNS = {**{f"events/{name}": name for name in "xytp"}, "ms_to_idx": "ms_map_idx"}
+"""Names of M3ED's datasets by those of the native layout."""
+
+
+def m3ed_attributes(file: Any, group: str, member: Member) -> dict[str, dict[str, Any]]:
+    """Return the camera of an M3ED file as attributes of the native layout."""
+    values = {}
+    for name, count in (("resolution", 2), ("intrinsics", 4), ("distortion_coeffs", 4)):
+        dataset = member(file, f"{group}/calib/{name}")
+        if dataset is None or dataset.shape != (count,) or dataset.dtype.kind not in "iuf":
+            return {}
+        values[name] = dataset[()].tolist()
+    size = dict(zip(("width", "height"), map(int, values["resolution"]), strict=True))
+    pinhole = dict(zip(("fx", "fy", "cx", "cy"), map(float, values["intrinsics"]), strict=True))
+    lens = {"distortion_model": "radial_tangential", "distortion": [*map(float, values["distortion_coeffs"]), 0.0]}
+    return {"/": size, "camera": {**size, **pinhole, **lens}}
+
 
 ATTRIBUTES = {
     "/": ("format", "format_version", "width", "height"),
@@ -354,3 +405,139 @@ def stored_places(dataset: Any, filters: list[Any], chunks: list[Any]) -> list[t
     if any(chunk.filter_mask for chunk in chunks):
         return None
     return [(chunk.byte_offset, chunk.size) for chunk in chunks]
+
+
+# Part of the reader of HDF5 files with one row per event that runs in the reading process.
+
+ECF = 0x8ECF
+"""Number of Prophesee's filter in HDF5."""
+
+PIECE = 1 << 17
+"""Number of rows that are read at once."""
+
+LARGEST_CHUNK = 1 << 28
+"""Largest chunk that is read [bytes]."""
+
+MVSEC_SIZE = (346, 260)
+"""Size of MVSEC's cameras [px]."""
+
+
+def read_head(path: str, group: str) -> Reply:
+    """Return the sensor size, or None, and the counts of other records, of a file of rows."""
+    with h5py.File(path, "r") as file:
+        if group != "CD":
+            others = {"frames": member(file, f"{group}/image_raw"), "imu_samples": member(file, f"{group}/imu")}
+            counts = {name: int(found.shape[0]) for name, found in others.items() if is_dataset(found)}
+            return {"size": MVSEC_SIZE, "counts": counts}, []
+        texts = [str(file.attrs[name])[:100] for name in ("geometry", "format") if name in file.attrs]
+        match = re.search(r"(\d+)x(\d+)", " ".join(texts)) or re.search(r"width=(\d+);.*height=(\d+)", " ".join(texts))
+        triggers = member(file, "EXT_TRIGGER/events")
+        counts = {"triggers": int(triggers.shape[0])} if is_dataset(triggers) and triggers.shape[0] else {}
+        return {"size": [int(match[1]), int(match[2])] if match else None, "counts": counts}, []
+
+
+def read_rows(notes: dict[str, int], path: str, name: str) -> Iterator[Columns]:
+    """Yield the rows of a dataset as columns: events of MVSEC or Prophesee, or triggers of Prophesee."""
+    with h5py.File(path, "r") as file:
+        dataset = member(file, name)
+        _check_rows(dataset, name, path)
+        notes["total"] = max(int(dataset.shape[0]), 1)
+        for start in range(0, dataset.shape[0], PIECE):
+            rows = dataset[start : start + PIECE]
+            notes["read"] = min(start + PIECE, dataset.shape[0])
+            if rows.dtype.fields is None:
+                x, y, t, p = rows.T
+                yield whole_pixels(x), whole_pixels(y), microseconds(t), (p > 0).astype(np.uint8)
+            elif name.startswith("EXT_TRIGGER"):
+                yield rows["id"], rows["id"] * 0, rows["t"], rows["p"]
+            else:
+                yield rows["x"], rows["y"], rows["t"], rows["p"]
+
+
+def is_dataset(found: Any) -> bool:
+    """Return whether a member of a file is a dataset with rows."""
+    return isinstance(found, h5py.Dataset) and found.ndim > 0
+
+
+def _check_rows(dataset: Any, name: str, path: str) -> None:
+    """Check that a dataset holds rows of events, and that all of it is in the file."""
+    if not is_dataset(dataset):
+        raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
+    wanted = ("p", "t", "id") if name.startswith("EXT_TRIGGER") else ("x", "y", "p", "t")
+    fields = dataset.dtype.fields
+    if dataset.ndim == 1 and fields is not None:
+        good = all(field in fields and fields[field][0].kind in "iub" for field in wanted)
+    else:
+        good = dataset.ndim == 2 and dataset.shape[1] == 4 and dataset.dtype.kind in "fiu"
+    if not good:
+        raise AmiwarpError(f"dataset '{name}' is {dataset.dtype} of shape {dataset.shape}; expected rows of x, y, t, p")
+    creation = dataset.id.get_create_plist()
+    codes = [creation.get_filter(at)[0] for at in range(creation.get_nfilters())]
+    if ECF in codes and not h5py.h5z.filter_avail(ECF):
+        raise AmiwarpError(
+            "is compressed with Prophesee's ECF codec, which is not installed; install the plugin hdf5_ecf, set "
+            "HDF5_PLUGIN_PATH to its folder, or convert the file to RAW with Metavision"
+        )
+    check_stored(dataset, name, path)
+
+
+def check_stored(dataset: Any, name: str, path: str) -> None:
+    """Check that the file holds all of a dataset, in chunks that fit into memory."""
+    if dataset.chunks is None:
+        plain_length(dataset, name, path)
+        return
+    chunks = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
+    if chunks != dataset.id.get_num_chunks():
+        raise AmiwarpError(f"dataset '{name}' declares {dataset.shape[0]} rows, which it does not hold; it is damaged")
+    if math.prod(dataset.chunks) * dataset.dtype.itemsize > LARGEST_CHUNK:
+        raise AmiwarpError(f"dataset '{name}' has chunks of over {LARGEST_CHUNK >> 20} MiB; store it in smaller ones")
+
+
+# Reader of the IMU samples and frames in MVSEC's HDF5 files. Runs in the reading process.
+#
+# A row of ``imu`` has the acceleration x, y, z [m/s^2] and the angular velocity x, y, z [rad/s], as the data set's
+# converter writes it. Times are in seconds.
+
+
+def read_imu(notes: dict[str, int], path: str, group: str) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield time [us], angular velocity [rad/s] and acceleration [m/s^2] of all samples."""
+    with h5py.File(path, "r") as file:
+        times, rows = _pair(file, path, f"{group}/imu")
+        if rows.shape[1:] != (6,) or rows.dtype.kind not in "fiu":
+            raise AmiwarpError(f"dataset '{group}/imu' is {rows.dtype} of shape {rows.shape}; expected six columns")
+        for start in range(0, len(times), PIECE):
+            values = rows[start : start + PIECE].astype(np.float64)
+            yield microseconds(times[start : start + PIECE]), *values[:, 3:].T, *values[:, :3].T
+
+
+def read_heads(notes: dict[str, int], path: str, group: str) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield time [us], width, height and bytes per pixel of each frame."""
+    with h5py.File(path, "r") as file:
+        times, images = _pair(file, path, f"{group}/image_raw")
+        if images.ndim != 3 or not all(images.shape) or images.dtype not in (np.uint8, np.uint16):
+            raise AmiwarpError(
+                f"dataset '{group}/image_raw' is {images.dtype} of shape {images.shape}; expected uint8 or uint16 of "
+                "shape (frames, height, width)"
+            )
+        count, height, width = images.shape
+        yield microseconds(times[()]), *(np.full(count, value) for value in (width, height, images.dtype.itemsize))
+
+
+def read_images(notes: dict[str, int], path: str, group: str) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield the bytes of each frame."""
+    with h5py.File(path, "r") as file:
+        for index in range(len(member(file, f"{group}/image_raw_ts"))):
+            image = np.ascontiguousarray(member(file, f"{group}/image_raw")[index])
+            yield (image.astype(image.dtype.newbyteorder("="), copy=False).reshape(-1).view(np.uint8),)
+
+
+def _pair(file: Any, path: str, name: str) -> tuple[Any, Any]:
+    """Return the dataset of the times and that of the values, after checking that the file holds all of both."""
+    times, values = member(file, f"{name}_ts"), member(file, name)
+    for dataset, shown in ((times, f"{name}_ts"), (values, name)):
+        if not is_dataset(dataset):
+            raise AmiwarpError(f"no dataset '{shown}'")
+        check_stored(dataset, shown, path)
+    if times.shape != values.shape[:1] or times.dtype.kind not in "fiu":
+        raise AmiwarpError(f"dataset '{name}_ts' is {times.dtype} of shape {times.shape} for {values.shape[0]} rows")
+    return times, values

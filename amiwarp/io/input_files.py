@@ -9,13 +9,44 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import stat
 import weakref
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from amiwarp.errors import WORD_HEAD, AmiwarpError, printable
-from amiwarp.io.regular_file import check_regular
+
+# Check that an input is a regular file. A pipe or a device could block its reader, or never end.
+
+KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a named pipe (FIFO)",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a character device",
+    stat.S_IFBLK: "a block device",
+}
+"""Names of the file types that are refused, used in messages."""
+
+
+def check_regular(path: Path) -> None:
+    """Check that ``path``, symbolic links followed, is a regular file, without opening it.
+
+    Raises
+    ------
+    AmiwarpError
+        If the file does not exist or cannot be reached, or is a folder, a named pipe, a socket or a device.
+    """
+    try:
+        kind = stat.S_IFMT(path.stat().st_mode)
+    except FileNotFoundError as error:
+        raise AmiwarpError(f"{path}: no such file") from error
+    except (OSError, ValueError) as error:
+        what = getattr(error, "strerror", None) or error
+        raise AmiwarpError(f"{path}: cannot be opened: {what}; give another file") from error
+    if kind != stat.S_IFREG:
+        raise AmiwarpError(f"{path}: is {KINDS.get(kind, 'not a regular file')}; give a regular file")
+
 
 LONGEST_LINE = 1000
 """Longest accepted line of a text file [characters]."""
@@ -155,3 +186,61 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
                     "per line"
                 )
             yield number, line.rstrip("\n")
+
+
+# Names of files that are no recordings, by their first bytes, and what to do with them.
+
+TABLE = "save x, y, t [us] and p from it as .npz"
+VIDEO = "make events of it with amiwarp translate"
+PICTURE = "make events of it with amiwarp simulate --picture"
+MATLAB = "save x, y, t [us] and p from it as .npz, or as text 't x y p'"
+CAPTURE = "give the events as the camera's software saves them"
+UNPACK = "unpack it first"
+
+SIGNATURES: tuple[tuple[int, bytes, str, str], ...] = (
+    # position, bytes, what the file is, what to do
+    (0, b"MATLAB 5.0 MAT-file", "a MATLAB 5 file", MATLAB),
+    (0, b"MATLAB 7.3 MAT-file", "a MATLAB 7.3 file", MATLAB),
+    (0, b"\x89PNG\r\n\x1a\n", "a PNG picture", PICTURE),
+    (0, b"\xff\xd8\xff", "a JPEG picture", PICTURE),
+    (0, b"GIF8", "a GIF picture", PICTURE),
+    (0, b"BM", "a BMP picture", PICTURE),
+    (0, b"II*\0", "a TIFF picture", PICTURE),
+    (0, b"MM\0*", "a TIFF picture", PICTURE),
+    (8, b"WEBP", "a WebP picture", PICTURE),
+    (4, b"ftyp", "an MP4 video", VIDEO),
+    (8, b"AVI ", "an AVI video", VIDEO),
+    (0, b"\x1aE\xdf\xa3", "a Matroska or WebM video", VIDEO),
+    (0, b"\x93NUMPY", "a NumPy array (.npy)", "save x, y, t [us] and p together with numpy.savez"),
+    (0, b"\x1f\x8b", "a gzip archive", UNPACK),
+    (0, b"BZh", "a bzip2 archive", UNPACK),
+    (0, b"\xfd7zXZ\0", "an xz archive", UNPACK),
+    (0, b"\x28\xb5\x2f\xfd", "a Zstandard archive", UNPACK),
+    (0, b"\x04\x22\x4d\x18", "an LZ4 archive", UNPACK),
+    (0, b"7z\xbc\xaf\x27\x1c", "a 7-Zip archive", UNPACK),
+    (0, b"Rar!\x1a\x07", "a RAR archive", UNPACK),
+    (257, b"ustar", "a tar archive", UNPACK),
+    (0, b"\xd4\xc3\xb2\xa1", "a pcap capture of network packets", CAPTURE),
+    (0, b"\xa1\xb2\xc3\xd4", "a pcap capture of network packets", CAPTURE),
+    (0, b"\x4d\x3c\xb2\xa1", "a pcap capture of network packets", CAPTURE),
+    (0, b"\n\r\r\n", "a pcapng capture of network packets", CAPTURE),
+    (0, b"PAR1", "a Parquet table", TABLE),
+    (0, b"ARROW1", "an Arrow table", TABLE),
+    (0, b"\x80\x04\x95", "a Python pickle", "save x, y, t [us] and p from it as .npz; pickles are never loaded"),
+    (0, b"#ROSBAG V1", "a ROS 1 bag of version 1", "run rosbag migrate and rosbag reindex"),
+    (0, b"%PDF", "a PDF document", "give a recording"),
+    (0, b"\x7fELF", "a program", "give a recording"),
+    (0, b"<?xml", "an XML document", "give a recording"),
+    (0, b"{", "a JSON document", "give a recording; a calibration goes to --calibration, a camera to --camera"),
+)
+"""Files that are often mistaken for recordings."""
+
+
+def name_kind(head: bytes) -> str | None:
+    """Return what a file is and what to do with it, from its first bytes, or None if it is unknown."""
+    for at, magic, what, remedy in SIGNATURES:
+        if head[at : at + len(magic)] == magic:
+            return f"is {what}; {remedy}"
+    if head.startswith(b"RIFF"):
+        return "is a RIFF file of sound or pictures; give a recording"
+    return None

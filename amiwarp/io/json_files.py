@@ -35,7 +35,7 @@ _TOO_DOTTED = re.compile(
 )
 """Pattern of dotted keys with more parts. Its quantifiers are possessive, so that the time is that of the length."""
 LARGEST_INTEGER = 2**62
-"""Largest accepted magnitude of a whole number, equal to :data:`amiwarp.events.checks.TIME_LIMIT`."""
+"""Largest accepted magnitude of a whole number, equal to :data:`amiwarp.events.events.TIME_LIMIT`."""
 
 
 def read_json(

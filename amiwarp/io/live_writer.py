@@ -22,16 +22,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import as_times, check_events
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
+from amiwarp.events.events import Events, as_times, check_events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.atomic_output import NewFile, allocate, check_output, link_new, put_in_place
 from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
-from amiwarp.io.copying import save_recording
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_layout import Columns, check_frame, check_lengths, make_dataset, ms_entries, write_header
 from amiwarp.io.native_reader import open_native
+from amiwarp.io.native_writer import save_recording
 from amiwarp.io.output_formats import check_native
 from amiwarp.optics.camera import Camera
 

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import contextlib
 import math
+import shutil
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, TypeAlias
@@ -23,10 +24,12 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import DEFAULT_BLOCK
+from amiwarp.events.events import DEFAULT_BLOCK, Events
 from amiwarp.events.recording import Recording
+from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.io.file_scan import FileEvents, Packet, microseconds, whole_pixels
 from amiwarp.io.input_files import errors_name, input_path, open_input
+from amiwarp.io.output_formats import Outline
 
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods that NumPy writes. Others are refused, because they may take any amount of memory."""
@@ -186,3 +189,36 @@ def _evimo_packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
         for length in _lengths(counts["t"], notes):
             t, xy, p = (_next(array, length) for array in arrays.values())
             yield xy[:, 0], xy[:, 1], microseconds(t.reshape(-1)), p.reshape(-1)
+
+
+# Writer of NumPy archives, which :func:`numpy.load` reads: the arrays x, y, t and p, and the numbers width and height.
+#
+# An archive holds one array after the other. The arrays therefore grow in temporary files next to the archive.
+
+COLUMNS = {"x": "<u2", "y": "<u2", "t": "<i8", "p": "|u1"}
+"""Types of the arrays. x and y of compensated events are float32."""
+
+
+def write_npz(part: Path, blocks: Iterable[Events], about: Outline) -> None:
+    """Write all events."""
+    columns, count = COLUMNS, 0
+    with scratch_folder(part.parent) as folder:
+        with contextlib.ExitStack() as opened:
+            files = {name: opened.enter_context((folder / name).open("wb")) for name in COLUMNS}
+            for events in blocks:
+                columns = COLUMNS if events.whole_pixels else {**COLUMNS, "x": "<f4", "y": "<f4"}
+                count += len(events)
+                for name, dtype in columns.items():
+                    files[name].write(np.ascontiguousarray(getattr(events, name), dtype).data)
+        with zipfile.ZipFile(part, "x") as archive:
+            for name, dtype in columns.items():
+                with (
+                    archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member,
+                    (folder / name).open("rb") as column,
+                ):
+                    header = {"descr": dtype, "fortran_order": False, "shape": (count,)}
+                    npy.write_array_header_1_0(member, header)
+                    shutil.copyfileobj(column, member, 1 << 20)
+            for name in ("width", "height"):
+                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w") as member:
+                    npy.write_array(member, np.array(getattr(about, name)))

@@ -1,24 +1,156 @@
-"""Readers of Prophesee's files: RAW with faery (EVT 2.0, 3.0) or NumPy (EVT 2.1), and DAT with NumPy."""
+"""Prophesee's files and words: RAW (EVT 2.0, 2.1, 3.0) is read and written, DAT is read."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import DEFAULT_BLOCK
+from amiwarp.events.events import DEFAULT_BLOCK, Events
 from amiwarp.events.recording import Recording
-from amiwarp.io.counters import last_word, nearest, unwrapped
-from amiwarp.io.evt_words import TIME_HIGH, Evt2Decoder, swap_halves, words_of
+from amiwarp.io.encoder_files import last_word, nearest, unwrapped
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name, open_input
+from amiwarp.io.output_formats import LONGEST_US, Outline
 from amiwarp.io.reading_process import packets
 from amiwarp.io.reading_server import noting_progress
+
+# Decoders of Prophesee's EVT words with NumPy: EVT 2.0, 2.1 and 3.0, for streams that arrive in pieces.
+#
+# The words are those of Prophesee's documentation of the formats. The decoder of RAW files (faery) reads whole files
+# only, and not EVT 2.1. Messages of ROS hold pieces of a stream.
+
+Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
+"""Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""
+
+TIME_HIGH, TRIGGER = 0x8, 0xA
+"""Types of words that all versions share."""
+
+
+def words_of(data: bytes | NDArray[np.uint8], version: str) -> NDArray[Any]:
+    """Return the whole words of some bytes: uint16 for EVT 3.0, uint32 for 2.0, uint64 for 2.1."""
+    dtype = np.dtype({"3": "<u2", "2": "<u4"}.get(version, "<u8"))
+    count = len(data) // dtype.itemsize
+    return np.frombuffer(data, dtype, count)
+
+
+def swap_halves(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Swap the 32-bit halves of EVT 2.1 words, as the IMX636 sends them (``endianness=legacy``)."""
+    return (words >> np.uint64(32)) | (words << np.uint64(32))
+
+
+def _latest(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return for each element the index of the last true element up to it, or -1."""
+    return np.maximum.accumulate(np.where(mask, np.arange(mask.size), -1))
+
+
+@dataclass(slots=True)
+class Evt2Decoder:
+    """Decoder of EVT 2.0 and 2.1. Events before the first time word have no time and are dropped."""
+
+    vectors: bool
+    """Whether the words are those of EVT 2.1, with 32 pixels each."""
+    high: int | None = None
+    """Last time word, unwrapped [64 us], or None."""
+
+    def decode(self, words: NDArray[Any]) -> tuple[Columns, Columns]:
+        """Return the events and the triggers of the words that follow those of the last call."""
+        head = (words >> np.uint64(32)).astype(np.int64) if self.vectors else words.astype(np.int64)
+        kind = head >> 28
+        is_high = kind == TIME_HIGH
+        highs = unwrapped(head[is_high] & 0xFFFFFFF, 28, self.high)
+        times = np.concatenate([[self.high or 0], highs])[np.cumsum(is_high)]
+        known = np.cumsum(is_high) > 0 if self.high is None else np.ones(head.size, np.bool_)
+        t = (times << 6) | (head >> 22) & 0x3F
+        if highs.size:
+            self.high = int(highs[-1])
+        events = known & (kind <= 1)
+        trigger = known & (kind == TRIGGER)
+        value = (words.astype(np.uint64) if self.vectors else head)[trigger] & 1
+        triggers = head[trigger] >> 8 & 0x1F, np.zeros(value.size, np.int64), t[trigger], value.astype(np.int64)
+        x, y, p = head[events] >> 11 & 0x7FF, head[events] & 0x7FF, kind[events]
+        if not self.vectors:
+            return (x, y, t[events], p), triggers
+        valid = (words[events] & np.uint64(0xFFFFFFFF)).astype("<u4").view(np.uint8)
+        which, bit = np.nonzero(np.unpackbits(valid, bitorder="little").reshape(-1, 32))
+        return (x[which] + bit, y[which], t[events][which], p[which]), triggers
+
+
+@dataclass(slots=True)
+class Evt3Decoder:
+    """Decoder of EVT 3.0, whose words change a state. Events before the first time word are dropped."""
+
+    high: int | None = None
+    """Last TIME_HIGH, unwrapped [4096 us], or None."""
+    state: dict[str, int] = field(default_factory=lambda: {"low": 0, "y": 0, "base": 0, "p": 0})
+    """Last time within TIME_HIGH [us], row, column of the next vector [px], and polarity of vectors."""
+
+    def decode(self, words: NDArray[np.uint16]) -> tuple[Columns, Columns]:
+        """Return the events and the triggers of the words that follow those of the last call."""
+        kind, load = (words >> 12).astype(np.int8), (words & 0xFFF).astype(np.int64)
+        t, known = self._times(kind, load)
+        y = self._filled("y", kind == 0x0, load & 0x7FF)
+        triggers = known & (kind == TRIGGER)
+        at = np.flatnonzero(triggers)
+        edges = load[at] >> 8, np.zeros(at.size, np.int64), t[at], load[at] & 1
+        vector = (kind == 0x4) | (kind == 0x5)
+        base, polarity = self._bases(kind, load, vector)
+        vectors = np.flatnonzero(vector & known)
+        mask = np.where(kind[vectors] == 0x4, load[vectors], load[vectors] & 0xFF).astype("<u2")
+        row, bit = np.nonzero(np.unpackbits(mask.view(np.uint8), bitorder="little").reshape(-1, 16))
+        count = (known & (kind == 0x2)).astype(np.int64)
+        count[vectors] = np.bincount(row, minlength=vectors.size)
+        which = np.repeat(np.arange(kind.size), count)
+        x, p = load[which] & 0x7FF, load[which] >> 11
+        of_vector = vector[which]
+        x[of_vector], p[of_vector] = base[vectors][row] + bit, polarity[vectors][row]
+        return (x, y[which], t[which], p), edges
+
+    def _times(self, kind: NDArray[Any], load: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the time of each word [us], and whether it is known."""
+        is_high = kind == TIME_HIGH
+        highs = unwrapped(load[is_high], 12, self.high)
+        before = highs[0] if self.high is None and highs.size else self.high or 0
+        all_highs = np.concatenate([[before], highs])
+        known = np.cumsum(is_high) > 0 if self.high is None else np.ones(kind.size, np.bool_)
+        # A new TIME_HIGH starts at its beginning, until the next TIME_LOW.
+        is_low = kind == 0x6
+        is_low[np.flatnonzero(is_high)[np.diff(all_highs) != 0]] = True
+        low = self._filled("low", is_low, np.where(is_high, 0, load))
+        if highs.size:
+            self.high = int(highs[-1])
+        return (all_highs[np.cumsum(is_high)] << 12) | low, known
+
+    def _filled(self, name: str, mask: NDArray[np.bool_], values: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the last masked value up to each word, starting from the state, and update the state."""
+        filled = np.concatenate([values, [self.state[name]]])[_latest(mask)]
+        if filled.size:
+            self.state[name] = int(filled[-1])
+        return filled
+
+    def _bases(
+        self, kind: NDArray[Any], load: NDArray[np.int64], vector: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the column of the first pixel and the polarity of each vector. A vector moves the base behind it."""
+        is_base = kind == 0x3
+        polarity = self._filled("p", is_base, load >> 11)
+        width = np.where(kind == 0x4, 12, 8) * vector
+        moved = np.cumsum(width) - width
+        start, latest = self.state["base"], _latest(is_base)
+        base = np.where(latest < 0, start + moved, (load & 0x7FF)[latest] + moved - moved[latest])
+        if base.size:
+            self.state["base"] = int(base[-1] + width[-1])
+        return base, polarity
+
+
+# Readers of Prophesee's files: RAW with faery (EVT 2.0, 3.0) or NumPy (EVT 2.1), and DAT with NumPy.
 
 EVT21_BLOCK = 1 << 16
 """Number of EVT 2.1 words that are decoded at once, with up to 32 events each."""
@@ -199,3 +331,91 @@ def _dat_packets(path: Path, offset: int, version: str, notes: dict[str, int]) -
             x = rest & ((1 << bits[0]) - 1)
             y = (rest >> y_shift) & ((1 << bits[1]) - 1)
             yield x, y, t, (rest >> p_shift) & 1
+
+
+# Encoder of events in Prophesee's EVT 3.0, and writer of RAW files with them.
+#
+# EVT 3.0 consists of 16-bit words that set the state of the decoder: upper and lower 12 bits of the time, row, and
+# column with polarity. The last one is an event. A word is written if its value changes. The format is described at
+# https://docs.prophesee.ai/stable/data/encoding_formats/evt3.html. faery's encoder is not used, because it loses gaps
+# of more than 16.8 s, the range of the 24 bits of the time.
+
+ADDR_Y, ADDR_X, TIME_LOW, TIME_HIGH_WORD = 0x0000, 0x2000, 0x6000, 0x8000
+"""Types of the words, in their upper four bits."""
+
+LOW_BITS = 12
+"""Bits of the time in each of the two words."""
+
+STOPS = (0x000, 0x7FF, 0xFFF)
+"""Values that the upper bits of the time never skip. Decoders take other large steps for a step back or for a wrap."""
+
+
+def origin_of(about: Outline) -> int:
+    """Return the time at which the clock of EVT 3.0 starts [us]: 0, or the first event if that is very late."""
+    return 0 if about.t_last <= LONGEST_US else about.t_first
+
+
+class Evt3Encoder:
+    """Encoder of events that follow one another in time, from ``origin`` [us] on."""
+
+    def __init__(self, origin: int) -> None:
+        self._origin = origin
+        self._last: tuple[int, int, int] | None = None  # upper bits of the time, time, row
+
+    def encode(self, events: Events, *, self_contained: bool = False) -> NDArray[np.uint16]:
+        """Return the words of some events, at least one. Self-contained words begin with time and row."""
+        t = events.t - self._origin
+        high, y = t >> LOW_BITS, events.y
+        begins = self_contained or self._last is None
+        last_high, last_t, last_y = self._last or (0, 0, 0)
+        words = np.empty((len(events), 4), np.uint16)
+        used = np.ones((len(events), 4), np.bool_)
+        for at, values, last in ((0, high, last_high), (1, t, last_t), (2, y, last_y)):
+            np.not_equal(values[1:], values[:-1], out=used[1:, at])
+            used[0, at] = begins or values[0] != last
+        words[:, 0] = TIME_HIGH_WORD | (high & 0xFFF)
+        words[:, 1] = TIME_LOW | (t & 0xFFF)
+        words[:, 2] = ADDR_Y | y
+        words[:, 3] = ADDR_X | (events.p.astype(np.uint16) << 11) | events.x
+        self._last = int(high[-1]), int(t[-1]), int(y[-1])
+        return _with_stops(words[used], used, np.concatenate([[last_high], high]))
+
+
+def _with_stops(words: NDArray[np.uint16], used: NDArray[np.bool_], high: NDArray[np.int64]) -> NDArray[np.uint16]:
+    """Insert words for the stops that the upper bits of the time skip before an event."""
+    steps = np.flatnonzero(np.diff(high) > 1)
+    stops = [_stops_between(int(high[at]), int(high[at + 1])) for at in steps]
+    skipped = [(at, values) for at, values in zip(steps.tolist(), stops, strict=True) if values.size]
+    if not skipped:
+        return words
+    first_word = np.concatenate([[0], np.cumsum(used.sum(axis=1))])
+    places = np.concatenate([np.full(values.size, first_word[at]) for at, values in skipped])
+    return np.insert(words, places, np.concatenate([TIME_HIGH_WORD | values for _, values in skipped]))
+
+
+def _stops_between(low: int, high: int) -> NDArray[np.uint16]:
+    """Return the stops above ``low`` and below ``high``, in order, modulo 4096."""
+    turns = np.arange(low >> LOW_BITS, (high >> LOW_BITS) + 1) << LOW_BITS
+    stops = (turns[:, None] + np.array(STOPS)).ravel()
+    return (stops[(stops > low) & (stops < high)] & 0xFFF).astype(np.uint16)
+
+
+def write_evt3(part: Path, blocks: Iterable[Events], about: Outline) -> None:
+    """Write all events into a RAW file. Its header has the lines that Prophesee's own programs need."""
+    size = f"height={about.height};width={about.width}"
+    origin = origin_of(about)
+    header = [
+        "camera_integrator_name Prophesee",
+        "evt 3.0",
+        f"format EVT3;{size}",
+        f"geometry {about.width}x{about.height}",
+        "plugin_integrator_name Prophesee",
+        "plugin_name hal_plugin_prophesee",
+        *([f"t0 {origin}"] if origin else []),
+        "end",
+    ]
+    encoder = Evt3Encoder(origin)
+    with part.open("xb") as file:
+        file.write("".join(f"% {line}\n" for line in header).encode())
+        for events in blocks:
+            file.write(encoder.encode(events).astype("<u2").data)

@@ -9,7 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.vector_code import load_float, load_int, load_word, store_float, store_int
+from amiwarp.kernels.conjugate_gradients import block_sum
+from amiwarp.kernels.native_code import load_float, load_int, load_word, store_float, store_int
 from amiwarp.kernels.votes import Canvas, events_of
 from amiwarp.kernels.word_votes import Cells
 
@@ -344,3 +345,129 @@ def smooth_and_sum(taps: int) -> Any:
         sums[block] = sum_of(total, terms, wp.min(width, frame.columns - block_column(frame, block, width)))
 
     return smooth_and_sum
+
+
+# Sharpness of an image of warped events on CUDA: the votes smoothed, and sums over the smoothed image.
+
+
+@cache
+def smooth_votes(taps: int) -> Any:
+    """Return the kernel that smooths an image of votes along its rows, one pixel per thread.
+
+    Its pixels [events] are those of :func:`amiwarp.kernels.iwe.smooth_few` for the image that the votes make.
+    """
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def smooth_votes(
+        votes: wp.array(dtype=wp.int64), weights: wp.array(dtype=float), frame: Frame, start: int,
+        out: wp.array(dtype=float),
+    ):  # fmt: skip
+        at = block_start(frame, start + wp.tid(), 1, 1)
+        total = weights[0] * events_of(votes[at])
+        for tap in range(1, wp.static(taps)):
+            total = total + weights[tap] * (events_of(votes[at - tap]) + events_of(votes[at + tap]))
+        out[at] = total
+
+    return smooth_votes
+
+
+@cache
+def smooth_and_add(taps: int) -> Any:
+    """Return the kernel that smooths an image along its columns and sums it and its squares, one pixel per thread.
+
+    A layer has ``threads`` threads, a whole number of blocks. Each block gives one sum. The smoothed image is not
+    stored.
+    """
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
+    def smooth_and_add(
+        image: wp.array(dtype=float), weights: wp.array(dtype=float), frame: Frame, threads: int, start: int,
+        sums: wp.array(dtype=wp.vec2d),
+    ):  # fmt: skip
+        thread = start + wp.tid()
+        pixel = thread % threads
+        h = float(0.0)
+        if pixel < frame.rows * frame.columns:
+            row = thread / threads * frame.layer + pixel / frame.columns * frame.stride
+            at = frame.first + row + pixel % frame.columns
+            h = weights[0] * image[at]
+            for tap in range(1, wp.static(taps)):
+                h = h + weights[tap] * (image[at - tap * frame.stride] + image[at + tap * frame.stride])
+        value = wp.float64(h)
+        both = wp.vec2d(block_sum(value), block_sum(value * value))
+        if thread % wp.block_dim() == 0:
+            sums[thread / wp.block_dim()] = both
+
+    return smooth_and_add
+
+
+@wp.kernel(module="unique", module_options=OPTIONS)
+def gather_sums(sums: wp.array2d(dtype=wp.vec2d), out: wp.array(dtype=wp.vec2d)):
+    """Add up the partial sums in each row, one block of threads per row."""
+    row = wp.tid() / wp.block_dim()
+    first = wp.tid() % wp.block_dim()
+    total = wp.vec2d(wp.float64(0.0), wp.float64(0.0))
+    for k in range(first, sums.shape[1], wp.block_dim()):
+        total += sums[row, k]
+    both = wp.vec2d(block_sum(total[0]), block_sum(total[1]))
+    if first == 0:
+        out[row] = both
+
+
+# Directions of the edges in an image: sums over its squared gradients.
+
+SEGMENT = wp.constant(32)  # number of pixels of a row that one thread processes
+
+
+@wp.func
+def segments_of(frame: Frame, inset: int) -> int:
+    """Return the number of segments of a row. Pixels within ``inset`` of the image's border are left out."""
+    return (frame.columns - 2 * inset + SEGMENT - 1) / SEGMENT
+
+
+@wp.func
+def first_column(frame: Frame, inset: int, thread: int) -> int:
+    """Return the column at which the segment of a thread begins."""
+    return inset + (thread % segments_of(frame, inset)) * SEGMENT
+
+
+@wp.func
+def gradient(image: wp.array(dtype=float), frame: Frame, layers: int, at: int) -> wp.vec2:
+    """Return twice the gradient of the sum of all layers, by central differences."""
+    total = wp.vec2(0.0, 0.0)
+    for layer in range(layers):
+        i = at + layer * frame.layer
+        total += wp.vec2(image[i + 1] - image[i - 1], image[i + frame.stride] - image[i - frame.stride])
+    return total
+
+
+@wp.kernel
+def find_largest(
+    image: wp.array(dtype=float), frame: Frame, layers: int, inset: int, start: int, largest: wp.array(dtype=float)
+):
+    """Find the largest squared gradient of each segment of a row."""
+    thread = start + wp.tid()
+    row = frame.first + (inset + thread / segments_of(frame, inset)) * frame.stride
+    first = first_column(frame, inset, thread)
+    found = float(0.0)
+    for column in range(first, wp.min(first + SEGMENT, frame.columns - inset)):
+        found = wp.max(found, wp.length_sq(gradient(image, frame, layers, row + column)))
+    largest[thread] = found
+
+
+@wp.kernel
+def sum_directions(
+    image: wp.array(dtype=float), frame: Frame, layers: int, inset: int, limit: float, start: int,
+    sums: wp.array(dtype=wp.vec3d),
+):  # fmt: skip
+    """Sum g², g² cos 2φ and g² sin 2φ over each segment of a row, for gradients (g, φ) with g² above ``limit``."""
+    thread = start + wp.tid()
+    row = frame.first + (inset + thread / segments_of(frame, inset)) * frame.stride
+    first = first_column(frame, inset, thread)
+    total = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
+    for column in range(first, wp.min(first + SEGMENT, frame.columns - inset)):
+        g = gradient(image, frame, layers, row + column)
+        if wp.length_sq(g) > limit:
+            x, y = wp.float64(g[0]), wp.float64(g[1])
+            total += wp.vec3d(x * x + y * y, x * x - y * y, wp.float64(2.0) * x * y)
+    sums[thread] = total

@@ -1,11 +1,12 @@
-"""Kernel launches: a single launch on CUDA, slices on a thread pool on the CPU.
+"""Kernel launches: single ones, slices on a thread pool, recorded programs, and page-locked memory for results."""
 
-Warp itself runs each CPU launch on one thread.
-"""
-
+import contextlib
 import os
+import sys
+import tempfile
+import weakref
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from itertools import pairwise, takewhile
@@ -14,8 +15,13 @@ from threading import Lock, Thread, main_thread
 from typing import Any
 
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.cpu_threads import cpu_threads
+
+# Kernel launches: a single launch on CUDA, slices on a thread pool on the CPU.
+#
+# Warp itself runs each CPU launch on one thread.
 
 _Job = tuple[Callable[[], object], "SimpleQueue[BaseException | None]"]
 """Function to run, and the queue that gets its error, or None."""
@@ -279,3 +285,163 @@ class RepeatedLaunches:
 def slice_count(device: Any) -> int:
     """Return the number of slices of a launch on ``device``."""
     return cpu_threads() if wp.get_device(device).is_cpu else 1
+
+
+# Programs of launches that run repeatedly on the same arrays: a CUDA graph, or recorded CPU slices.
+
+BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks
+FEW_LAUNCHES = 6  # launches that take less time than the capture of a graph
+MOST_RUNS = 6  # runs that one CUDA graph may hold: launching a graph takes longer than a few small kernels
+
+
+class Program:
+    """Sequence of kernel launches that can be run many times.
+
+    Arrays and numbers are those passed to :meth:`add`. A value that changes between runs must be stored in an array.
+    """
+
+    def __init__(self, device: Any) -> None:
+        self.device = wp.get_device(device)
+        self._stages: list[list[Any]] = []
+        self._graphs: dict[int, Any] = {}
+
+    def add(
+        self,
+        kernel: Any,
+        n: int,
+        inputs: Sequence[Any],
+        outputs: Sequence[Any],
+        *,
+        smallest: int = SMALLEST_SLICE,
+    ) -> None:
+        """Append a kernel over ``range(n)`` whose last input is ``start: int``.
+
+        See :func:`amiwarp.kernels.launch.launch`. On CUDA the range is rounded up to whole blocks.
+        """
+        if n == 0:
+            return
+        if not self.device.is_cpu:
+            self._stages.append([self._record(kernel, -(-n // BLOCK_DIM) * BLOCK_DIM, [*inputs, 0], outputs)])
+            return
+        ranges = slices(n, cpu_threads(), smallest)
+        self._stages.append([self._record(kernel, b - a, [*inputs, a], outputs) for a, b in ranges])
+
+    def add_slices(
+        self, kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[Any], *, smallest: int = SMALLEST_SLICE
+    ) -> None:
+        """Append a kernel as :meth:`add` does, but give each slice of its threads an output.
+
+        Slice k writes ``outputs[k]``. On CUDA there is one slice with ``n`` threads, which writes ``outputs[0]``.
+        """
+        if n == 0:
+            return
+        ranges = slices(n, len(outputs), smallest) if self.device.is_cpu else [(0, n)]
+        jobs = zip(ranges, outputs, strict=False)
+        self._stages.append([self._record(kernel, b - a, [*inputs, a], [out]) for (a, b), out in jobs])
+
+    def _record(self, kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[Any]) -> Any:
+        """Load the kernel and return a function that repeats its launch."""
+        kernel.module.load(self.device, block_dim=1 if self.device.is_cpu else BLOCK_DIM)
+        recorded = wp.launch(
+            kernel, dim=n, inputs=list(inputs), outputs=list(outputs), device=self.device, block_dim=BLOCK_DIM,
+            record_cmd=True,
+        )  # fmt: skip
+        return recorded.launch
+
+    def launch(self) -> None:
+        """Run all stages once, in the order in which they were added."""
+        for stage in self._stages:
+            run_together(stage)
+
+    def run(self, times: int = 1) -> None:
+        """Run all stages ``times`` times; more than a few launches on CUDA run as graphs."""
+        if self.device.is_cpu or times * len(self._stages) <= FEW_LAUNCHES:
+            for _ in range(times):
+                self.launch()
+            return
+        runs = max(n for n in range(1, MOST_RUNS + 1) if times % n == 0)
+        graph = self._graph(runs)
+        for _ in range(times // runs):
+            wp.capture_launch(graph)
+
+    def _graph(self, runs: int) -> Any:
+        """Return the CUDA graph of a number of runs. The first call captures it."""
+        if runs not in self._graphs:
+            with wp.ScopedCapture(self.device) as capture:
+                for _ in range(runs):
+                    self.launch()
+            self._graphs[runs] = capture.graph
+        return self._graphs[runs]
+
+
+# Small page-locked arrays that are used again: locking memory takes up to two milliseconds.
+
+_idle: defaultdict[tuple[tuple[int, ...], Any, str], list[wp.array]] = defaultdict(list)
+
+
+def page_locked(owner: object, shape: tuple[int, ...], dtype: Any, device: Any) -> wp.array:
+    """Return a page-locked array with undefined values, which another owner may get once ``owner`` is deleted.
+
+    Only ``device`` may write to it, on Warp's stream, so that what an earlier owner left there comes first. Keep no
+    reference to it beyond ``owner``.
+    """
+    idle = _idle[shape, dtype, str(device)]
+    try:
+        array = idle.pop()
+    except IndexError:
+        array = wp.empty(shape, dtype=dtype, device="cpu", pinned=True)
+    weakref.finalize(owner, idle.append, array).atexit = False
+    return array
+
+
+def start_read(array: wp.array) -> Callable[[], NDArray[Any]]:
+    """Start to copy a small contiguous array of numbers to the host. Return a function that waits and returns a copy.
+
+    It does not wait for what is launched later.
+    """
+    if array.device.is_cpu:
+        found = array.numpy().copy()
+        return lambda: found
+    size = array.size * wp.types.type_size_in_bytes(array.dtype)
+
+    def result() -> NDArray[Any]:
+        wp.synchronize_event(copied)
+        values: NDArray[Any] = host.numpy()[:size].view(wp.dtype_to_numpy(array.dtype))
+        return values.reshape(array.shape).copy()
+
+    # sizes are powers of two, so that arrays of other sizes can use the memory, too
+    host = page_locked(result, (1 << (size - 1).bit_length(),), wp.uint8, array.device)
+    wp.copy(host, wp.array(ptr=array.ptr, dtype=wp.uint8, shape=size, device=array.device), count=size)
+    copied = array.device.stream.record_event()
+    return result
+
+
+# Start of Warp without the warning of a missing GPU driver.
+
+NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
+"""Warning of Warp on machines without a GPU, which is no news there."""
+
+
+def start_quietly() -> list[str]:
+    """Initialise Warp and return the names of its devices."""
+    with _without(NO_DRIVER):
+        wp.init()
+    return [device.alias for device in wp.get_devices()]
+
+
+@contextlib.contextmanager
+def _without(line: str) -> Iterator[None]:
+    """Print what native code writes to stderr, except for one expected line."""
+    sys.stderr.flush()
+    original = os.dup(2)
+    with tempfile.TemporaryFile() as caught:
+        os.dup2(caught.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(original, 2)
+            os.close(original)
+            caught.seek(0)
+            for text in caught.read().decode(errors="replace").splitlines():
+                if line not in text:
+                    print(text, file=sys.stderr, flush=True)

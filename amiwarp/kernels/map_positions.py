@@ -5,11 +5,10 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import NAN, CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
-from amiwarp.kernels.pair_chains import BLOCK, interpolate
-from amiwarp.kernels.photometric import Atlas, Geometry, Pairs
-from amiwarp.kernels.plain_models import is_plain, plain
-from amiwarp.kernels.refraction import compensate, displace
-from amiwarp.kernels.vector_code import load_float, load_int, load_uint16, store_float, store_int
+from amiwarp.kernels.equations import Atlas, Geometry, Pairs
+from amiwarp.kernels.equations_cpu import BLOCK, interpolate
+from amiwarp.kernels.native_code import load_float, load_int, load_uint16, store_float, store_int
+from amiwarp.kernels.refraction import compensate, displace, is_plain, plain
 
 wp.set_module_options({"enable_backward": False})
 

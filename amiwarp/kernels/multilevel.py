@@ -6,10 +6,9 @@ near each other, so that brightness would propagate across the map only slowly w
 
 import warp as wp
 
-from amiwarp.kernels.conjugate_gradients import add_fixed
-from amiwarp.kernels.map_prior import Prior
-from amiwarp.kernels.photometric import Atlas, Geometry, bilinear, fraction, fractions_of
-from amiwarp.kernels.shared_memory import wait_for_block
+from amiwarp.kernels.conjugate_gradients import Prior, add_fixed
+from amiwarp.kernels.equations import Atlas, Geometry, bilinear, fraction, fractions_of
+from amiwarp.kernels.native_code import wait_for_block
 
 wp.set_module_options({"enable_backward": False})
 

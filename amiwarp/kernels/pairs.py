@@ -7,8 +7,8 @@ counted and written.
 
 import warp as wp
 
-from amiwarp.kernels.encoder_angle import THETA_U32_RAD, EncoderParams, piece_at
-from amiwarp.kernels.photometric import HELD, QUIET, Pairs
+from amiwarp.kernels.equations import HELD, QUIET, Pairs
+from amiwarp.kernels.events import THETA_U32_RAD, EncoderParams, piece_at
 
 wp.set_module_options({"enable_backward": False})
 

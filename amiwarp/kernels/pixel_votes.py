@@ -13,9 +13,7 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, undo_camera_rotation
-from amiwarp.kernels.plain_models import is_plain, plain
-from amiwarp.kernels.refraction import displace
-from amiwarp.kernels.vector_code import (
+from amiwarp.kernels.native_code import (
     add_word_pairs,
     copy_bytes,
     copy_floats,
@@ -27,6 +25,7 @@ from amiwarp.kernels.vector_code import (
     store_float,
     store_int,
 )
+from amiwarp.kernels.refraction import displace, is_plain, plain
 from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, rotate_azimuth
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

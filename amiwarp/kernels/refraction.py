@@ -16,8 +16,10 @@ from amiwarp.kernels.camera import (
     invalid_pixel,
     pixel_to_ray,
     ray_to_pixel,
+    rotate,
+    rotate_by_deflection,
+    sine_versine,
 )
-from amiwarp.kernels.rotations import rotate, rotate_by_deflection, sine_versine
 
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -368,3 +370,43 @@ def fit_harmonics(
         table[row, col, k] = mean[k] / n
         table[row, col, 2 + k] = c[k] * (2.0 / n)
         table[row, col, 4 + k] = s[k] * (2.0 / n)
+
+
+# Optical models without their rare cases, for loops that CPUs vectorise.
+#
+# LLVM vectorises a loop with a branch by computing both of its sides. So a loop over a plain model costs less: half,
+# for the exact model.
+
+
+@wp.func
+def is_plain(model: Any) -> int:
+    """Return 1 if :func:`plain` of the model is the same model."""
+    return 1
+
+
+@wp.func
+def is_plain(model: ExactParams) -> int:
+    """Return 1 if :func:`plain` of the model is the same model."""
+    return (1 - model.tilted) * model.flat_to_scene
+
+
+@wp.func
+def plain(model: Any):
+    """Return the model itself, which has no rare case."""
+    return model
+
+
+@wp.func
+def plain(model: ExactParams) -> ExactParams:
+    """Return the exact model of a prism that is not tilted and has its flat face to the scene."""
+    m = ExactParams()
+    m.sin_apex = model.sin_apex
+    m.cos_apex = model.cos_apex
+    m.index2 = model.index2
+    m.phase = model.phase
+    m.phase_cos = model.phase_cos
+    m.phase_sin = model.phase_sin
+    m.axis = model.axis
+    m.flat_to_scene = 1
+    m.tilted = 0
+    return m

@@ -1,7 +1,7 @@
-"""Equations of slow pixels, for :mod:`amiwarp.brightness.slow_pixels`.
+"""Equations of slow pixels, for :mod:`amiwarp.brightness.solver`.
 
 A photoreceptor is a first-order low-pass filter whose rate is proportional to the light, as in
-:mod:`amiwarp.kernels.photoreceptor`. An event tells the filter's output, not the brightness at the event.
+:mod:`amiwarp.kernels.pixels`. An event tells the filter's output, not the brightness at the event.
 """
 
 from typing import Any
@@ -9,9 +9,9 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import NAN, CameraParams
+from amiwarp.kernels.equations import Atlas, Pairs, interpolated
 from amiwarp.kernels.map_positions import contracted_position, event_azimuth, lag_of, node_at, turned
-from amiwarp.kernels.photometric import Atlas, Pairs, interpolated
-from amiwarp.kernels.photoreceptor import filter_level
+from amiwarp.kernels.pixels import filter_level
 from amiwarp.kernels.refraction import compensate
 
 wp.set_module_options({"enable_backward": False})

@@ -2,7 +2,7 @@
 
 A block of threads takes a chunk of one tile's events and a few candidates (parameter sets): it reads each event once
 for all of them. Votes outside the window around the tile go directly to the image. Used by
-:mod:`amiwarp.imaging.tile_votes`.
+:mod:`amiwarp.imaging.votes`.
 """
 
 from typing import Any
@@ -10,10 +10,9 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
-from amiwarp.kernels.encoder_angle import THETA_U16_RAD
+from amiwarp.kernels.events import THETA_U16_RAD
+from amiwarp.kernels.native_code import add_to_word, get_word, load_uint32, set_word, wait_for_block, window
 from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams, displace
-from amiwarp.kernels.shared_memory import add_to_word, get_word, set_word, wait_for_block, window
-from amiwarp.kernels.vector_code import load_uint32
 from amiwarp.kernels.votes import Canvas, dither_offset, events_of
 
 # Fast math is on: these sums need not equal those of a CPU bit for bit.

@@ -6,7 +6,7 @@ sums fx, fy and b of x, y and x y in the cell [1/256]. They give the sums of the
 bit-identical on every run.
 
 A word overflows after 1,023 events. Either each carry out of a field is added exactly to 64-bit totals at once; or,
-faster, words are emptied in time and checked afterwards: see :mod:`amiwarp.imaging.word_votes`.
+faster, words are emptied in time and checked afterwards: see :mod:`amiwarp.imaging.votes`.
 """
 
 from typing import Any
@@ -14,8 +14,8 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, undo_camera_rotation
+from amiwarp.kernels.native_code import load_float, load_uint8, load_uint16
 from amiwarp.kernels.refraction import displace
-from amiwarp.kernels.vector_code import load_float, load_uint8, load_uint16
 from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, rotate_azimuth
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

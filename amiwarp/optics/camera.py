@@ -3,14 +3,88 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
+import warp as wp
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.lens import Distortion
+from amiwarp.kernels import camera as kernels
 from amiwarp.validation import INT64, array, guarded, real, shown, whole
+
+# Models of lens distortion.
+
+LARGEST_COEFFICIENT = 1e6
+"""Largest accepted magnitude of a distortion coefficient. The coefficients of long lenses reach thousands."""
+
+
+@guarded
+@dataclass(frozen=True, slots=True)
+class RadialTangential:
+    """OpenCV's radial-tangential distortion. The coefficients are in OpenCV's order.
+
+    Examples
+    --------
+    >>> amiwarp.RadialTangential(k1=-0.3, k2=0.1)
+    RadialTangential(k1=-0.3, k2=0.1, p1=0.0, p2=0.0, k3=0.0)
+    """
+
+    k1: float = 0.0
+    """Radial coefficient of r²."""
+    k2: float = 0.0
+    """Radial coefficient of r⁴."""
+    p1: float = 0.0
+    """First tangential coefficient."""
+    p2: float = 0.0
+    """Second tangential coefficient."""
+    k3: float = 0.0
+    """Radial coefficient of r⁶."""
+
+    def __post_init__(self) -> None:
+        _check_coefficients(self)
+
+
+@guarded
+@dataclass(frozen=True, slots=True)
+class Fisheye:
+    """OpenCV's fisheye (equidistant) distortion.
+
+    Examples
+    --------
+    >>> amiwarp.Fisheye(k1=0.02)
+    Fisheye(k1=0.02, k2=0.0, k3=0.0, k4=0.0)
+    """
+
+    k1: float = 0.0
+    """Coefficient of θ³, with θ the angle between the ray and the optical axis."""
+    k2: float = 0.0
+    """Coefficient of θ⁵."""
+    k3: float = 0.0
+    """Coefficient of θ⁷."""
+    k4: float = 0.0
+    """Coefficient of θ⁹."""
+
+    def __post_init__(self) -> None:
+        _check_coefficients(self)
+
+
+Distortion = RadialTangential | Fisheye
+
+DISTORTIONS: dict[str, type[RadialTangential] | type[Fisheye]] = {
+    "radial_tangential": RadialTangential,
+    "fisheye": Fisheye,
+}
+"""Distortion classes by their names in files and streams. The fields of a class are in the files' order."""
+
+
+def _check_coefficients(lens: Distortion) -> None:
+    for field in fields(lens):
+        what = f"camera distortion {field.name}"
+        value = real(getattr(lens, field.name), what, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
+        object.__setattr__(lens, field.name, value)
+
 
 LARGEST_SIZE = 65536
 """Largest width and height of a sensor [px], because columns and rows of events are uint16."""
@@ -179,7 +253,6 @@ def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) ->
 
     from amiwarp.kernels import camera as kernels
     from amiwarp.kernels.launch import launch
-    from amiwarp.optics.device_camera import camera_params
 
     given, wanted = ({2: wp.vec2, 3: wp.vec3}[size] for size in sizes)
     if isinstance(rows, wp.array):
@@ -194,3 +267,52 @@ def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) ->
         raise AmiwarpError(f"array has shape {rows.shape}; give (n, {sizes[0]})")
     result = _run(kernel_name, camera, wp.array(rows.astype(np.float32), dtype=given, device="cpu"), sizes)
     return result.numpy().astype(rows.dtype if np.issubdtype(rows.dtype, np.floating) else np.float32, copy=False)
+
+
+# Camera parameters on a device, for kernels.
+
+
+@lru_cache(maxsize=16)
+def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
+    """Return the camera's parameters on ``device``, with a table of bearing vectors if the lens distorts."""
+    c = kernels.CameraParams()
+    c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
+    c.width, c.height = camera.width, camera.height
+    c.kind, c.limit = int(kernels.PINHOLE), 1.0e30
+    d = camera.distortion
+    if d is None:
+        c.rays = wp.empty((0, 0), dtype=wp.vec3, device=device)
+        return c
+    if isinstance(d, RadialTangential):
+        coefficients = (d.k1, d.k2, d.p1, d.p2, d.k3)
+        c.kind, c.limit = int(kernels.RADIAL_TANGENTIAL), fold_radius(d.k1, d.k2, d.k3, largest=100.0)
+    elif isinstance(d, Fisheye):
+        coefficients = (d.k1, d.k2, d.k3, d.k4, 0.0)
+        c.kind, c.limit = int(kernels.FISHEYE), fold_radius(d.k1, d.k2, d.k3, d.k4, largest=0.999 * math.pi / 2)
+    c.k = type(c.k)(*coefficients)
+    rays = wp.empty((camera.height, camera.width), dtype=wp.vec3, device=device)
+    wp.launch(kernels.fill_rays, dim=rays.shape, inputs=[c], outputs=[rays], device=device)
+    c.rays = rays
+    return c
+
+
+@lru_cache(maxsize=16)
+def pinhole_params(camera: Camera) -> kernels.PinholeParams | None:
+    """Return the camera's parameters for kernels without a distortion branch, or None if the lens distorts."""
+    if camera.distortion is not None:
+        return None
+    c = kernels.PinholeParams()
+    c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
+    c.inverse_fx, c.inverse_fy = 1.0 / camera.fx, 1.0 / camera.fy
+    return c
+
+
+def fold_radius(*k: float, largest: float) -> float:
+    """Return the radius up to which the distorted radius r(1 + k1 r² + k2 r⁴ + …) increases with r.
+
+    It is the first root of the slope, or ``largest`` if there is none below. The polynomial in 1/r² is monic, so a last
+    coefficient of zero causes no division by zero.
+    """
+    roots = np.roots([1.0, *((2 * i + 3) * value for i, value in enumerate(k))])
+    real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
+    return min(largest, 1.0 / math.sqrt(real.max())) if len(real) else largest

@@ -12,8 +12,7 @@ import warp as wp
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import refraction as kernels
 from amiwarp.kernels.launch import RecordedLaunch, launch
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.device_camera import camera_params
+from amiwarp.optics.camera import Camera, camera_params
 from amiwarp.validation import array
 
 if TYPE_CHECKING:

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.choices import CONTRAST, Tone
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.export import encode_image
 from amiwarp.io.atomic_output import NewFile, check_output
 from amiwarp.io.output_formats import check_ending
-from amiwarp.reconstruction.choices import CONTRAST, Tone
 from amiwarp.validation import choice
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.reconstruction.result import Picture
+    from amiwarp.reconstruction.picture import Picture
 
 DARK, BRIGHT = 0.5, 99.5
 """Percentiles of intensity over the known pixels that are shown black and white."""

@@ -10,33 +10,26 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet
+from amiwarp.brightness.multigrid import Tiles
 from amiwarp.brightness.solver import BrightnessMap, Smoothness
-from amiwarp.brightness.tiles import Tiles
+from amiwarp.choices import Fill
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import TIME_LIMIT
-from amiwarp.events.device_source import DeviceMemoryEvents, device_of, read_between
-from amiwarp.events.encoder_speed import turn_between
-from amiwarp.kernels.page_locked import start_read
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.reconstruction.choices import Fill
-from amiwarp.reconstruction.result import Picture, upload_picture
-from amiwarp.reconstruction.rounds import SCALES, solve_rounds
-from amiwarp.reconstruction.window import (
-    CHOICE_STEPS,
-    SMOOTHNESS,
-    choice_square,
-    map_tile,
-    off_excess_by_counts,
-    settled_span,
-    start_lowest_weight,
-)
+from amiwarp.events.device_events import DeviceMemoryEvents, device_of, read_between, wait
+from amiwarp.events.encoder import TWO_PI, turn_between
+from amiwarp.events.events import TIME_LIMIT
+from amiwarp.kernels import known_nodes as kernels
+from amiwarp.kernels.known_nodes import drop_small_regions, exponentiate, find_large_regions
+from amiwarp.kernels.launch import launch, load, start_read
+from amiwarp.optics.camera_rotation import CameraRotation, border
 from amiwarp.validation import choice, guarded, real, whole
 
 if TYPE_CHECKING:
@@ -44,8 +37,317 @@ if TYPE_CHECKING:
 
     from amiwarp.calib.result import Calibration
     from amiwarp.events.encoder import Encoder
+    from amiwarp.events.events import EventSource
     from amiwarp.events.recording import Recording
     from amiwarp.optics.models import Model
+
+
+# Decision which nodes of a brightness map the events determine.
+
+LEAST_COVERAGE = 0.5
+"""Smallest sum of equation weights at a node that counts as known."""
+HOLDS_SCALE, LEAST_AGREEMENT = 0.25, 0.4
+"""Residual [thresholds] at which an equation gets half weight, and smallest ratio of the sum of these weights to the
+sum of full weights at a known node.
+
+A node is known only if enough of the equations around it hold.
+"""
+SMALLEST_REGION = 12
+"""Smallest number of pixels of a connected known region, at most 16; smaller regions are noise."""
+LARGEST_HOLE = 4
+"""Largest hole of unknown pixels inside a known region that is marked as known [px], because equations surround the
+hole."""
+
+
+def known_nodes(solver: BrightnessMap) -> wp.array:
+    """Return 1 for the nodes that events determine, else 0: uint8, shape (rows, columns), on the device.
+
+    These are nodes with enough equations, most of which hold.
+    """
+    hold, everything = (solver.coverage_on_device(scale) for scale in (HOLDS_SCALE, 1e6))
+    known = wp.empty((solver.tiles.rows, solver.tiles.columns), dtype=wp.uint8, device=solver.device)
+    inputs = [hold, everything, LEAST_COVERAGE, LEAST_AGREEMENT]
+    launch(kernels.mark_known, known.size, inputs, [known.flatten()], device=solver.device)
+    return without_small_holes(without_small_regions(known))
+
+
+def nodes_near(known: wp.array, by: int) -> wp.array:
+    """Return 1 for the nodes at most ``by`` steps from known ones, else 0, shape (nodes,); all 1 if none is known.
+
+    Steps go along rows and columns.
+    """
+    found = wp.zeros(1, dtype=int, device=known.device)
+    launch(kernels.find_marked, known.size, [known.flatten()], [found], device=known.device)
+    out = wp.empty(known.size, dtype=wp.uint8, device=known.device)
+    launch(kernels.widen, known.size, [known, found, by], [out], device=known.device)
+    return out
+
+
+def without_small_regions(known: wp.array) -> wp.array:
+    """Return the mask without connected regions of fewer than :data:`SMALLEST_REGION` pixels."""
+    return _without_small(known, 1, SMALLEST_REGION)
+
+
+def without_small_holes(known: wp.array) -> wp.array:
+    """Return the mask with holes of up to :data:`LARGEST_HOLE` pixels filled."""
+    return _without_small(known, 0, LARGEST_HOLE + 1)
+
+
+def _without_small(mask: wp.array, value: int, least: int) -> wp.array:
+    """Return the mask without regions of ``value`` that have fewer than ``least`` pixels."""
+    if mask.device.is_cuda:
+        out = wp.empty_like(mask)
+        launch(drop_small_regions, mask.size, [mask, value, least], [out], device=mask.device)
+        return out
+    large = np.zeros(mask.shape, np.uint8)
+    arrays = [wp.array(array, device="cpu", copy=False) for array in (mask.numpy() ^ np.uint8(1 - value), large)]
+    load(find_large_regions, mask.device)
+    wp.launch(find_large_regions, 1, [arrays[0], least, arrays[1]], device="cpu")
+    return wp.array(large ^ np.uint8(1 - value), device="cpu", copy=False)
+
+
+# Rounds of robust weights that solve for the map of a picture.
+
+SCALES = (1.0, 0.5, 0.5)
+"""Residual at which an equation gets half weight, in each round of Cauchy weights [thresholds]."""
+STEPS = 24
+"""Number of conjugate-gradient steps in each round of Cauchy weights."""
+NOISE_DISTANCE = 2
+"""Distance from known pixels beyond which pairs of events are excluded as noise [px]."""
+
+
+def solve_rounds(
+    solver: BrightnessMap, pair_count: int, last: Picture | None
+) -> tuple[Callable[[], float], Callable[[], NDArray[np.bool_]]]:
+    """Solve for the map. Return functions that wait for the median residual and for the known nodes.
+
+    The known nodes have shape (rows, columns). A GPU still works when this returns. ``last`` is the picture of the
+    previous window, from which the solution starts.
+    """
+    nodes = solver.tiles.nodes
+    if last is not None:
+        unknowns = last.to_host().unknowns.copy()
+        unknowns[nodes:] = solver.unknowns[nodes:]
+        solver.unknowns = unknowns
+    solver.solve(*SCALES[0 if last is None else 1 : -1], steps=STEPS)
+    residual = solver.residuals.start_median(pair_count)
+    covered = known_nodes(solver)
+    solver.keep(nodes_near(covered, NOISE_DISTANCE))
+    solver.solve(SCALES[-1], steps=STEPS)
+    return residual, lambda: covered.numpy().view(np.bool_)
+
+
+# Properties of one time window: time, size of the map, smoothness, ratio of the thresholds.
+
+LARGEST_MARGIN = 0.5
+"""Largest margin of the map on each side of the image, relative to the image's width."""
+SMOOTHNESS = (0.004, 0.02, 0.1, 0.5)
+"""Candidate weights of the smoothness prior, ascending; held-out equations choose among them."""
+TIE = 1.05
+"""Ratio of costs of held-out equations up to which the larger weight is chosen. Converged maps nearly tie."""
+CHOICE_STEPS = 12
+"""Number of conjugate-gradient steps in each round with which the weights are compared. In 28 windows of 12 recordings,
+8, 12, 16 and 24 steps chose the same."""
+CHOICE_SQUARES = (64, 96)
+"""Sides of the square of pixels in which the smoothness is chosen [px]."""
+CHOICE_EVENTS = 24_000
+"""Number of events that suffices for the choice in the smaller square."""
+STILL_WINDOW_US = 100_000
+"""Default length of a time window if the prism does not turn [us]."""
+
+
+def settled_span(source: EventSource, turn_us: float | None, length_us: int | None) -> tuple[int, int]:
+    """Return start and length [us] of a time window without the beginning of the recording, if it is long enough.
+
+    There, the reference of a pixel is unknown until its first event. ``turn_us``: duration of a turn [us], None if the
+    prism does not turn. ``length_us``: length of the window, by default a turn.
+    """
+    beginning = round(turn_us or STILL_WINDOW_US)
+    length = length_us or beginning
+    first, last = source.t_first, source.t_last
+    return max(first, min(first + beginning, last + 1 - length)), length
+
+
+def map_tile(model: Model, camera_rotation: CameraRotation, length_us: int) -> tuple[int, int, Tiles]:
+    """Return the map's margin left of and above the image (columns, rows), and the map of all that pixels see.
+
+    ``camera_rotation`` is the rotation about the window's middle. ``length_us`` is the window's length [us].
+    """
+    camera = model.camera
+    margin = np.max(np.abs(border_displacements(model)), axis=0) + camera_rotation.reach(camera, length_us * 0.5e-6)
+    limit = LARGEST_MARGIN * camera.width
+    left, top = (math.ceil(min(float(m), limit)) + 2 for m in margin)
+    origin = np.array([[-left, -top]], np.float32)
+    return left, top, Tiles(origin, camera.height + 2 * top, camera.width + 2 * left, 1.0)
+
+
+def border_displacements(model: Model) -> NDArray[np.float64]:
+    """Return the displacements of the image's border by the prism over one turn [px], shape (n, 2)."""
+    xy = border(model.camera)
+    theta = np.arange(24) * (TWO_PI / 24)
+    at = np.repeat(xy, 24, axis=0)
+    moved = model.compensate_points(at.astype(np.float32), np.tile(theta, len(xy)))
+    away = np.asarray(moved, np.float64) - at
+    return away[np.isfinite(away).all(axis=1)]
+
+
+def choice_square(count: NDArray[np.int32]) -> tuple[int, int, int]:
+    """Return first column, first row and side of the square of pixels in which the smoothness is chosen.
+
+    It is the square with the most events, of the smallest side with enough events. ``count``: events per pixel, shape
+    ``(height, width)``.
+    """
+    for side in CHOICE_SQUARES:
+        rows = [count[k : k + side].sum(axis=0, dtype=count.dtype) for k in range(0, count.shape[0], side)]
+        cells = np.add.reduceat(rows, np.arange(0, count.shape[1], side), axis=1)
+        row, column = np.unravel_index(int(cells.argmax()), cells.shape)
+        if cells.max() >= CHOICE_EVENTS:
+            break
+    return int(column) * side, int(row) * side, side
+
+
+def start_lowest_weight(start_cost: Callable[[float], Callable[[], float]]) -> Callable[[], float]:
+    """Start to find the largest weight of :data:`SMOOTHNESS` whose cost is nearly the lowest; see :data:`TIE`.
+
+    ``start_cost`` starts to compute the cost of a weight and returns a function that waits for it. Return a function
+    that waits for the weight. The cost falls and then rises with the weight. So the two middle weights show on which
+    side the lowest cost is.
+    """
+    weakest, weak, strong, strongest = SMOOTHNESS
+    waiting = start_cost(weak), start_cost(strong)
+
+    def result() -> float:
+        weak_cost, strong_cost = (cost() for cost in waiting)
+        if strong_cost <= TIE * weak_cost:
+            return strongest if start_cost(strongest)() <= TIE * min(weak_cost, strong_cost) else strong
+        return weak if weak_cost <= TIE * start_cost(weakest)() else weakest
+
+    return result
+
+
+def off_excess_by_counts(source: EventSource, turn_us: float | None, start_us: int, length_us: int) -> float:
+    """Return the ratio of the OFF to the ON threshold, minus 1, from event counts over whole turns near the window.
+
+    After a whole turn, a pixel is back at its brightness. So the number of ON events times the ON threshold equals the
+    number of OFF events times the OFF threshold. This does not hold in the first turn of a recording: before a pixel
+    fires, its reference is not the brightness that an event left. So later turns are counted; in a recording of less
+    than two turns, the first event of each pixel is not counted.
+    """
+    first, last = source.t_first, source.t_last
+    if turn_us is None or last - first < turn_us:
+        return 0.0
+    turns = (last - first) / turn_us
+    length = max(1, math.floor(min(length_us / turn_us, turns - 1.0))) * turn_us
+    start = min(max(start_us, first + turn_us), last - length)
+    settled = start >= first + turn_us
+    events = read_between(source, round(start if settled else first), round(start + length))
+    t, x, y, p = (v if isinstance(v, np.ndarray) else v.numpy() for v in (events.t, events.x, events.y, events.p))
+    if not settled:
+        counted = t >= start
+        counted[first_of_each_pixel(x, y, source.size[0])] = False
+        p = p[counted]
+    on = int(p.sum())
+    return float(np.clip(on / max(len(p) - on, 1) - 1.0, -0.7, 2.0)) if len(p) >= 1000 else 0.0
+
+
+def first_of_each_pixel(x: NDArray[Any], y: NDArray[Any], width: int) -> NDArray[np.int64]:
+    """Return the index of the first event of each pixel that fires, for events in time order, shape (pixels,)."""
+    index: NDArray[np.int64] = np.unique(y.astype(np.int64) * width + x, return_index=True)[1]
+    return index
+
+
+# Reconstructed picture of a scene.
+
+ARRAYS = ("log", "known", "unknowns")
+"""Names of the arrays of a picture."""
+
+
+@guarded
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """Picture of the scene over a time window, without the prism.
+
+    Its arrays are NumPy arrays, or Warp arrays on a device if the events are there (:class:`DeviceMemoryEvents`).
+    PyTorch, CuPy and JAX read Warp arrays through DLPack without a copy.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> picture = amiwarp.Picture(
+    ...     log=np.array([[0.0, 2.0]], np.float32), known=np.array([[True, True]]), start_us=0, length_us=1000, pairs=2,
+    ...     off_excess=0.0, smoothness=0.02, residual=0.1, hot=0, seconds=0.0, unknowns=np.zeros(2, np.float32))
+    >>> picture.intensity(0.5).round(2)
+    array([[1.  , 2.72]], dtype=float32)
+    """
+
+    log: Any
+    """Log intensity in units of the ON threshold, median 0, float32, shape (height, width); NaN where it is not filled.
+
+    Events determine it up to one constant per connected region of :attr:`known`; the fill joins the regions.
+    """
+    known: Any
+    """Whether events determine the pixel, bool, shape (height, width)."""
+    start_us: int
+    """Start of the time window [us]."""
+    length_us: int
+    """Length of the time window [us]."""
+    pairs: int
+    """Number of equations from pairs of two events."""
+    off_excess: float
+    """Assumed ratio of the OFF to the ON threshold, minus 1."""
+    smoothness: float
+    """Weight of the smoothness prior, chosen by equations that were held out of the fit."""
+    residual: float
+    """Median absolute residual of the equations [ON thresholds]. Near 1, the optical model or the motion is wrong."""
+    hot: int
+    """Number of hot pixels that were excluded."""
+    seconds: float
+    """Computing time of the picture [s]."""
+    unknowns: Any = field(repr=False)
+    """Solution of the whole map with its margin, flattened, followed by the sensor's unknowns, float32, shape (n,). The
+    next window can start from it."""
+
+    def to_host(self) -> Picture:
+        """Return the picture in NumPy arrays: copies from a GPU, views on a CPU.
+
+        Returns
+        -------
+        Picture
+            The picture; this one if its arrays are NumPy arrays.
+        """
+        if not isinstance(self.log, wp.array):
+            return self
+        return replace(self, **{name: getattr(self, name).numpy() for name in ARRAYS})
+
+    def intensity(self, contrast: float = 0.25) -> Any:
+        """Return relative linear intensity, 1 at the median.
+
+        Parameters
+        ----------
+        contrast : float, optional
+            ON threshold [log intensity].
+
+        Returns
+        -------
+        ndarray or warp.array
+            Intensity, float32, shape ``(height, width)``; NaN where the picture is not filled. It is where the picture
+            is.
+        """
+        contrast = real(contrast, "contrast", 0.0, 10.0)
+        if isinstance(self.log, wp.array):
+            out = wp.empty_like(self.log)
+            wp.launch(exponentiate, out.shape, inputs=[self.log, contrast], outputs=[out], device=out.device)
+            wait(out.device)
+            return out
+        return np.exp(np.float32(contrast) * self.log)
+
+
+def upload_picture(picture: Picture, device: Any) -> Picture:
+    """Return the picture in Warp arrays on a device."""
+    found = replace(picture, **{name: wp.array(getattr(picture, name), device=device) for name in ARRAYS})
+    wait(found.log.device)
+    return found
+
 
 WEAK_WEIGHT = 0.03
 """Weight of the equations from silence and from the window's ends, relative to pairs of events. Held-out pairs are

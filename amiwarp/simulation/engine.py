@@ -12,29 +12,197 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from amiwarp.choices import Seeing
+from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import NAMES, DeviceEvents, wait
 from amiwarp.events.events import Events
 from amiwarp.events.truth import EventTruth
-from amiwarp.kernels import event_generation as kernels
-from amiwarp.kernels import event_keys, photoreceptor, prism_view, readout, world_events
+from amiwarp.kernels import event_keys, launch, pixels, prism_view
+from amiwarp.kernels import event_keys as readout
 from amiwarp.kernels import launch as launching
-from amiwarp.optics.device_camera import camera_params
+from amiwarp.optics.camera import camera_params
 from amiwarp.optics.displacement import wrap_angle
 from amiwarp.optics.exact_model import ExactModel, axis_rotation
-from amiwarp.simulation.key_buffer import KeyBuffer
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.readout import Readout
 from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step_us
-from amiwarp.simulation.worlds.choices import Seeing
 from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.map_ring import WorldMapRing
-from amiwarp.simulation.worlds.motion import flicker_interval_s
+from amiwarp.simulation.worlds.renderer import WorldMapRing, flicker_interval_s
 from amiwarp.simulation.worlds.sight import WorldSight, image_speed
-from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.simulation.worlds.world import WorldScene
 
 if TYPE_CHECKING:
     from amiwarp.simulation.sensor import SensorModel
     from amiwarp.simulation.simulator import Simulation
+
+
+# Buffer on the device for the events that pixels generate, as sortable keys.
+
+CPU_RUN = 8192
+"""Number of consecutive pixels per task of a CPU thread."""
+
+CUDA_SEGMENTS = 1024
+"""Number of event buffers on CUDA; buffer k gets the events of pixels k, k + 1024, k + 2048, …"""
+
+CACHE_LINE = 64
+"""Distance between the event counters of CPU threads in memory [bytes].
+
+Threads whose counters share a cache line would slow each other down.
+"""
+
+EVENTS_PER_PIXEL = 128
+"""Initial capacity of the event buffer of a chunk [events per pixel]. The buffer grows if necessary."""
+
+
+class KeyBuffer:
+    """Buffer for the event keys of a chunk, in segments of pixels. The buffer grows if a chunk has more events."""
+
+    def __init__(self, count: int, device: Any) -> None:
+        """Allocate the buffer for ``count`` pixels."""
+        self._pixels, self._device = count, device
+        self._segments = -(-count // CPU_RUN) if device.is_cpu else min(CUDA_SEGMENTS, count)
+        self._sink = pixels.Sink()
+        self._sink.run = CPU_RUN if device.is_cpu else 1
+        columns = CACHE_LINE // 4 if device.is_cpu else 1
+        self._sink.count = wp.zeros((self._segments, columns), dtype=int, device=device)
+        self._reserve(EVENTS_PER_PIXEL * -(-count // self._segments))
+
+    def _reserve(self, capacity: int) -> None:
+        """Allocate room for ``capacity`` keys per segment."""
+        self._capacity = capacity
+        self._sink.keys = wp.empty((self._segments, capacity), dtype=wp.int64, device=self._device)
+
+    def run(self, kernel: Any, inputs: list[Any], state: list[wp.array], carry: wp.array) -> wp.array:
+        """Simulate the pixels over a chunk and return the keys of their events, unsorted, with ``carry`` appended.
+
+        The kernel gets the ``inputs``, then the pixels' ``state``. The array has twice the needed length, because
+        sorting on CUDA needs scratch memory behind the keys.
+        """
+        before = [wp.clone(array) for array in state]
+        while True:
+            self._sink.count.zero_()
+            self._launch(kernel, [*inputs, *state])
+            counts = self._sink.count.numpy()[:, 0]
+            if counts.max() <= self._capacity:
+                return self._pack(counts, carry)
+            # the buffer was too small: run again from the same state
+            for array, copy in zip(state, before, strict=True):
+                wp.copy(array, copy)
+            self._reserve(int(counts.max()) * 5 // 4)
+
+    def _pack(self, counts: NDArray[np.int32], carry: wp.array) -> wp.array:
+        """Join the segments' keys and ``carry`` without gaps."""
+        ends = np.cumsum(counts, dtype=np.int64)
+        n = int(ends[-1]) + len(carry)
+        keys = wp.empty(2 * n, dtype=wp.int64, device=self._device)
+        if self._device.is_cpu:
+            rows = self._sink.keys.numpy()
+            parts = [row[:count] for row, count in zip(rows, counts.tolist(), strict=True)]
+            np.concatenate([*parts, carry.numpy()], out=keys.numpy()[:n])
+            return keys
+        offset = wp.array((ends - counts).astype(np.int32), dtype=int, device=self._device)
+        wp.launch(event_keys.pack, dim=(self._segments, int(counts.max())), inputs=[self._sink, offset, keys],
+                  device=self._device)  # fmt: skip
+        if len(carry):
+            wp.copy(keys, carry, dest_offset=int(ends[-1]))
+        return keys
+
+    def _launch(self, kernel: Any, inputs: list[Any]) -> None:
+        """Launch the kernel that simulates the pixels, for all pixels."""
+
+        def run(start: int, stop: int) -> None:
+            wp.launch(kernel, dim=stop - start, inputs=[*inputs, start, self._sink], device=self._device)
+
+        if not self._device.is_cpu:
+            run(0, self._pixels)
+            return
+        starts = range(0, self._pixels, CPU_RUN)
+        list(launching.pool().map(run, starts, [min(start + CPU_RUN, self._pixels) for start in starts]))
+
+
+# Readout of the simulated sensor: sequential readout of rows, and a bus with a queue that limits the event rate.
+
+LONGEST_SCAN_US = 10_000.0
+"""Longest allowed time to read all rows [us]. The integer keys of events can store a delay of up to 32 ms."""
+
+
+class Readout:
+    """Readout of one simulated sensor. Only the state of the bus is kept between blocks of events."""
+
+    def __init__(self, simulation: Simulation, device: Any) -> None:
+        """Set up the readout; raise :class:`AmiwarpError` if reading all rows takes too long."""
+        sensor, camera = simulation.sensor, simulation.camera
+        scan_us = sensor.row_us * camera.height
+        if scan_us > LONGEST_SCAN_US:
+            raise AmiwarpError(
+                f"sensor row_us = {sensor.row_us} makes a scan of {camera.height} rows take {scan_us:.0f} us; "
+                f"the limit is {LONGEST_SCAN_US:.0f} us; give a smaller row_us"
+            )
+        self._device, self._width = device, camera.width
+        self._duration_us = simulation.duration_us
+        self._row_ps = round(sensor.row_us * 1e6)
+        self._scan_ps = self._row_ps * camera.height
+        self._bus = event_keys.Bus()
+        self._bus.event_ps = round(1e6 / sensor.bus_rate_mev_s) if sensor.bus_rate_mev_s else 0
+        self._bus.longest_ps = round(sensor.bus_queue) * int(self._bus.event_ps)
+        self._bus.row = camera.width if self._row_ps else 0
+        self._free = wp.zeros(1, dtype=wp.int64, device="cpu")
+
+    @property
+    def scans_rows(self) -> bool:
+        """Whether the sensor reads rows one after the other, instead of every event at once."""
+        return self._row_ps > 0
+
+    @property
+    def limits_rate(self) -> bool:
+        """Whether the bus limits the event rate."""
+        return int(self._bus.event_ps) > 0
+
+    def stamp_rows(self, keys: wp.array, count: int, shift: int, origin_us: int) -> None:
+        """Replace the times of the first ``count`` keys by the times at which their rows are read.
+
+        ``shift``: bit position of the time in a key; ``origin_us``: time of tick 0 of the keys [us].
+        """
+        if not self.scans_rows or not count:
+            return
+        scan = event_keys.RowScan()
+        scan.row_ps, scan.scan_ps, scan.origin = self._row_ps, self._scan_ps, origin_us
+        scan.width, scan.shift = self._width, shift
+        launch.launch(event_keys.stamp_rows, count, [scan, keys], [], device=self._device)
+
+    def read(self, keys: wp.array, shift: int, origin_us: int) -> tuple[wp.array, wp.array | None]:
+        """Return the keys of the events that are read out, and their time stamps [us].
+
+        The time stamps are None if the keys already hold them.
+
+        A row scan reads one event per pixel: later events of the pixel in the same scan are lost. Events that do not
+        fit into the queue of the bus are lost, too.
+        """
+        if not len(keys) or not (self.scans_rows or self.limits_rate):
+            return keys, None
+        values = keys.numpy()
+        if self.scans_rows:
+            of_pixel = values >> int(pixels.LOW_BITS)
+            values = values[np.diff(of_pixel, prepend=of_pixel[0] - 1) != 0]
+        stamps = None
+        if self.limits_rate:
+            stamp = self._transmit(values, shift, origin_us)
+            kept = (stamp >= 0) & (stamp < self._duration_us)
+            values = values[kept]
+            stamps = wp.array(stamp[kept], dtype=wp.int64, device=self._device)
+        return wp.array(values, dtype=wp.int64, device=self._device), stamps
+
+    def _transmit(self, keys: NDArray[np.int64], shift: int, origin_us: int) -> NDArray[np.int64]:
+        """Return the time at which the bus transmits each event [us]; -1 for events that do not fit into the queue."""
+        t = keys >> shift
+        pixel = ((keys - (t << shift)) >> int(pixels.LOW_BITS)).astype(np.int32)
+        stamp = wp.empty(len(keys), dtype=wp.int64, device="cpu")
+        arrays = [wp.array(t + origin_us, dtype=wp.int64, device="cpu"), wp.array(pixel, dtype=int, device="cpu")]
+        launch.load(event_keys.queue_events, wp.get_device("cpu"))
+        wp.launch(
+            event_keys.queue_events, dim=1, inputs=[self._bus, *arrays, self._free], outputs=[stamp], device="cpu"
+        )
+        return np.asarray(stamp.numpy())
+
 
 FRAMES_PER_CHUNK = 8
 """Largest number of pictures of a sequence that one chunk of simulated time contains."""
@@ -127,7 +295,7 @@ class Engine:
             if scene.frames.interval_us is not None:
                 longest_chunk = FRAMES_PER_CHUNK * scene.frames.interval_us
         self._chunk_steps = self._steps_per_chunk(chunk_us, longest_chunk)
-        self._margin = int(kernels.LARGEST_LAG) // (int(kernels.TICKS) * self._step) + 2
+        self._margin = int(pixels.LARGEST_LAG) // (int(pixels.TICKS) * self._step) + 2
         self._axis = axis_rotation(*simulation.motion.tilt)
         self._sensor = sensor_params(simulation.sensor, self._step)
         self._view = prism_view.View()
@@ -140,7 +308,7 @@ class Engine:
         sensor = simulation.sensor
         self._filters = bool(sensor.cutoff_hz or (sensor.leak_hz and sensor.leak_jitter_fraction))
         self._readout = Readout(simulation, self._device)
-        self._state = [wp.empty(self._pixels, dtype=kernels.Pixel, device=self._device)]
+        self._state = [wp.empty(self._pixels, dtype=pixels.Pixel, device=self._device)]
         self._buffer = KeyBuffer(self._pixels, self._device)
         self._nothing: wp.array = wp.empty(0, dtype=wp.int64, device=self._device)
         self._carry = self._nothing
@@ -196,9 +364,9 @@ class Engine:
             )
         steps.angle = self._upload(wrap_angle(angle))
         steps.turn = self._upload(np.diff(angle, append=2.0 * angle[-1] - angle[-2]))
-        steps.per_tick = 1.0 / (self._step * int(kernels.TICKS))
-        steps.shift = int(kernels.LOW_BITS) + (self._pixels - 1).bit_length()
-        steps.margin, steps.count, steps.ticks = margin, count, self._step * int(kernels.TICKS)
+        steps.per_tick = 1.0 / (self._step * int(pixels.TICKS))
+        steps.shift = int(pixels.LOW_BITS) + (self._pixels - 1).bit_length()
+        steps.margin, steps.count, steps.ticks = margin, count, self._step * int(pixels.TICKS)
         return steps
 
     def _fill_maps(
@@ -222,11 +390,11 @@ class Engine:
     def _kernel(self) -> Any:
         """Return the kernel that simulates the pixels over a chunk."""
         if self._maps is None:
-            return world_events.run_filtered_world_pixels if self._filters else world_events.run_world_pixels
+            return pixels.run_filtered_world_pixels if self._filters else pixels.run_world_pixels
         if self._filters:
             ahead = self._device.is_cpu
-            return photoreceptor.run_filtered_pixels_ahead if ahead else photoreceptor.run_filtered_pixels
-        return kernels.run_pixels_ahead if self._device.is_cpu else kernels.run_pixels
+            return pixels.run_filtered_pixels_ahead if ahead else pixels.run_filtered_pixels
+        return pixels.run_pixels_ahead if self._device.is_cpu else pixels.run_pixels
 
     def _seen(self, steps: Any, ahead: int, count: int) -> Any:
         """Return the kernels' input that describes what pixels see: the maps, or the luminance at each instant.
@@ -244,7 +412,7 @@ class Engine:
     def _start_pixels(self, steps: Any) -> None:
         """Set the initial state of every pixel."""
         inputs = [self._seen(steps, 0, 1), steps, self._sensor, self._simulation.seed, 0, *self._state]
-        kernel = kernels.start_pixels if self._maps is not None else world_events.start_world_pixels
+        kernel = pixels.start_pixels if self._maps is not None else pixels.start_world_pixels
         wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
         if self._filters:  # at the start, the photoreceptors have settled to the light of the scene
             levels = np.ascontiguousarray(self._state[0].numpy()["level"])
@@ -277,7 +445,7 @@ class Engine:
             values.sort()
             return int(np.searchsorted(values, limit))
         # without a row scan, no two events of a pixel share a microsecond: bits below the pixel's need no sorting
-        lowest = int(readout.LAG_BIT) if self._readout.scans_rows else int(kernels.LOW_BITS)
+        lowest = int(readout.LAG_BIT) if self._readout.scans_rows else int(pixels.LOW_BITS)
         order = wp.empty(2 * total, dtype=wp.int32, device=self._device)
         wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=top)
         found = wp.empty(1, dtype=int, device=self._device)
@@ -317,8 +485,8 @@ def instants_in_blocks(table: NDArray[Any]) -> NDArray[np.float32]:
 
 def sensor_params(sensor: SensorModel, step: int) -> Any:
     """Return the sensor's parameters in the kernels' units: ticks of 1/16 us, and time steps of ``step`` [us]."""
-    ticks = float(kernels.TICKS)
-    s = kernels.SensorParams()
+    ticks = float(pixels.TICKS)
+    s = pixels.SensorParams()
     s.on, s.off, s.mismatch = sensor.contrast_on, sensor.contrast_off, sensor.mismatch
     s.leak = sensor.leak_hz * step * 1e-6
     s.leak_jitter = sensor.leak_jitter_fraction

@@ -1,10 +1,12 @@
-"""View of the simulated camera: placement of the picture, speed of the image, and maps of pictures on the device."""
+"""The scene in front of a simulated camera: pictures, their placement, and the maps in which pixels look them up."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import warp as wp
@@ -13,14 +15,151 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import prism_view
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.device_camera import camera_params
+from amiwarp.optics.camera import camera_params
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.simulation.map_slots import MapSlots
-from amiwarp.simulation.pictures import Placement, log_map, place_picture
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.pictures import Placement, linear_luminance, log_map, place_picture, read_picture
+from amiwarp.validation import guarded, real
 
 if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
+
+
+# Device memory for the maps of a simulation: pictures of the scene in which pixels look up their light.
+
+
+class MapSlots:
+    """Arrays that are divided into slots for maps, and grow if all slots are taken.
+
+    Slot k of an array begins at index ``k * texels``.
+    """
+
+    def __init__(self, texels: int, *dtypes: Any, device: Any) -> None:
+        """Make one empty array of each type in ``dtypes``. A slot has ``texels`` elements."""
+        self._texels, self._free = texels, list[int]()
+        self.arrays = [wp.empty(0, dtype=dtype, device=device) for dtype in dtypes]
+        """Arrays of all slots. :meth:`take` replaces the arrays when they have to grow."""
+
+    def take(self) -> int:
+        """Return the number of a free slot. If no slot is free, double the number of slots."""
+        if not self._free:
+            held = len(self.arrays[0]) // self._texels
+            slots = 2 * held or 1
+            for k, array in enumerate(self.arrays):
+                self.arrays[k] = wp.empty(slots * self._texels, dtype=array.dtype, device=array.device)
+                wp.copy(self.arrays[k], array, count=len(array))
+            self._free.extend(range(held, slots))
+        return self._free.pop()
+
+    def give_back(self, slot: int) -> None:
+        """Make a slot available again."""
+        self._free.append(slot)
+
+
+# The scene in front of a simulated camera: pictures, which may change with time.
+
+
+class Frames(Protocol):
+    """Pictures with times, which are read one after the other (protocol)."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of each picture [px]."""
+
+    @property
+    def interval_us(self) -> float | None:
+        """Typical time between pictures [us]; None for a still picture."""
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Yield times and pictures.
+
+        Yields
+        ------
+        tuple
+            Time [us], increasing, the first no later than 0; and linear luminance, float32, shape ``(height, width)``.
+        """
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Still:
+    """Single picture that never changes."""
+
+    light: NDArray[np.float32]
+    """Linear luminance of the picture, shape (height, width); white is 1."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture [px]."""
+        return self.light.shape[1], self.light.shape[0]
+
+    @property
+    def interval_us(self) -> None:
+        """Time between pictures: None, because there is only one picture."""
+        return None
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Yield the picture at time 0."""
+        yield 0, self.light
+
+
+@guarded
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Scene in front of the camera: pictures on a plane at infinity.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> amiwarp.Scene.from_picture(np.ones((48, 64), np.float32)).frames.size
+    (64, 48)
+    """
+
+    frames: Frames
+    """Pictures of the scene, in order of time."""
+    fov: float | None = None
+    """Horizontal field of view of the picture [rad]. Beyond its edges the picture is mirrored.
+
+    None: the picture is just large enough to cover everything that the camera sees through the turning prism.
+    """
+    blur: float = 0.5
+    """Standard deviation of the optical blur [sensor px], which includes the pixel's aperture."""
+
+    def __post_init__(self) -> None:
+        if self.fov is not None:
+            below = math.nextafter(math.pi, 0.0)
+            hint = " rad, 0 .. 180 deg; is it given in degrees?"
+            object.__setattr__(self, "fov", real(self.fov, "scene fov", 1e-9, below, hint))
+        object.__setattr__(self, "blur", real(self.blur, "scene blur", 0.0, 20.0, " px"))
+
+    @classmethod
+    def from_picture(cls, picture: str | Path | NDArray[Any], *, fov: float | None = None, blur: float = 0.5) -> Scene:
+        """Make a still scene from a picture.
+
+        Parameters
+        ----------
+        picture : str, Path or ndarray
+            Picture file, or pixel values of shape ``(height, width)`` or ``(height, width, 3)``. uint8 and uint16
+            values are sRGB-encoded; floating values are linear, with white at 1.
+        fov : float, optional
+            Horizontal field of view of the picture [rad]. By default the picture is just large enough to cover
+            everything that the camera sees through the turning prism.
+        blur : float, optional
+            Standard deviation of the optical blur [sensor px].
+
+        Returns
+        -------
+        Scene
+            The scene.
+
+        Raises
+        ------
+        AmiwarpError
+            If the picture cannot be read, or has another shape or type.
+        """
+        light = read_picture(picture) if isinstance(picture, str | Path) else linear_luminance(picture)
+        return cls(Still(light), fov, blur)
+
+
+# View of the simulated camera: placement of the picture, speed of the image, and maps of pictures on the device.
 
 LARGEST_MOTION = 0.5
 """Largest motion of the image in a time step of the simulation [px]."""
@@ -250,3 +389,60 @@ def log_view(simulation: Simulation) -> NDArray[np.float32]:
     inputs = [view, wp.mat33(*placement.to_texel().ravel().tolist())]
     launch(prism_view.see_without_prism, len(out), inputs, [out], device=device)
     return np.asarray(out.numpy().reshape(camera.height, camera.width))
+
+
+# Pixels of a simulation whose scene is known: pictures of other people's recordings do not show everything.
+
+
+@runtime_checkable
+class PartlyKnown(Protocol):
+    """Pictures (:class:`amiwarp.Frames`) parts of which are guessed."""
+
+    def take_known(self) -> list[tuple[int, NDArray[np.bool_]]]:
+        """Return, and forget, the masks of the pictures read so far.
+
+        Each is the time from which it holds [us], rising, and whether each pixel of the pictures is known, shape
+        (height, width).
+        """
+
+
+class KnownPixels:
+    """Masks of the pixels whose scene is known, without the prism. They are taken from the pictures while these run."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        """Find the pixel of the pictures that each pixel of the camera sees."""
+        scene = simulation.scene
+        self._frames = scene.frames if isinstance(scene, Scene) and isinstance(scene.frames, PartlyKnown) else None
+        self._duration_us = simulation.duration_us
+        self._last: NDArray[np.bool_] | None = None
+        if self._frames is not None:
+            self._rows, self._columns, self._inside = picture_pixels(simulation)
+
+    def take(self) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+        """Yield time [us] and mask of each change since the last call, shape (height, width)."""
+        for t, known in [] if self._frames is None else self._frames.take_known():
+            mask = self._inside & known[self._rows, self._columns]
+            if t <= self._duration_us and (self._last is None or (mask != self._last).any()):
+                self._last = mask
+                yield t, mask
+
+
+def picture_pixels(simulation: Simulation) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return row and column of the picture that each pixel of the camera sees without the prism, and if it is inside.
+
+    Each has the shape (height, width) of the camera. Rows and columns outside the picture are those nearest to it.
+    """
+    camera, place, scene = simulation.camera, place_scene(simulation), simulation.scene
+    assert isinstance(scene, Scene)
+    width, height = scene.frames.size
+    y, x = np.mgrid[: camera.height, : camera.width]
+    rays = np.asarray(camera.pixels_to_rays(np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)))
+    ahead = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.0)
+    rays = np.where(ahead[:, None], rays, (0.0, 0.0, 1.0))
+    left, top, right, bottom = place.box
+    column = left + (rays[:, 0] / rays[:, 2] - place.left) * place.pitch[0] * (right - left) / place.width
+    row = top + (rays[:, 1] / rays[:, 2] - place.top) * place.pitch[1] * (bottom - top) / place.height
+    inside = ahead & (column >= 0.0) & (column < width) & (row >= 0.0) & (row < height)
+    rows, columns = (np.clip(v, 0, n - 1).astype(np.int64) for v, n in ((row, height), (column, width)))
+    shape = (camera.height, camera.width)
+    return rows.reshape(shape), columns.reshape(shape), inside.reshape(shape)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.checks import TIME_LIMIT
+from amiwarp.events.events import TIME_LIMIT
 from amiwarp.io.input_files import errors_name, input_path, open_input, register_reader
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.simulation.pictures import MOST_PIXELS, linear_luminance, read_picture, srgb_to_linear

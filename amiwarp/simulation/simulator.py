@@ -2,36 +2,108 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.events.events import Events
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_events import NAMES, DeviceEvents, DeviceMemoryEvents, DeviceValues, join, wait
+from amiwarp.events.events import Events, EventSource, MemoryEvents
 from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.events.truth import EventTruth
 from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
-from amiwarp.simulation.collected_events import CollectedEvents
 from amiwarp.simulation.engine import DeviceBlock, Engine
-from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.simulation.parameters import check_values, true_parameters
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.worlds.recorded_truth import RecordedTruth, chosen_instants
-from amiwarp.simulation.worlds.world_scene import WorldScene
-from amiwarp.validation import guarded
+from amiwarp.simulation.worlds.world import WorldScene
+from amiwarp.simulation.worlds.world_truth import RecordedTruth, chosen_instants
+from amiwarp.validation import guarded, instance, real, whole
 
 if TYPE_CHECKING:
     import warp as wp
 
-    from amiwarp.events.device_events import DeviceEvents
     from amiwarp.events.encoder import Encoder
+    from amiwarp.events.truth import EventValues
+
+
+# Values of a simulation: their checks, and the true parameters that they mean.
+
+
+def check_values(simulation: Simulation) -> None:
+    """Raise :class:`AmiwarpError` if a value is of another class or out of range."""
+    if not isinstance(simulation.scene, WorldScene):
+        instance(simulation.scene, Scene, "simulation's scene")
+    kinds: dict[str, type] = {"camera": Camera, "prism": Prism, "motion": PrismMotion, "sensor": SensorModel,
+             "camera_motion": CameraMotion}  # fmt: skip
+    if simulation.encoder_model is not None:
+        kinds["encoder_model"] = EncoderModel
+    for name, kind in kinds.items():
+        instance(getattr(simulation, name), kind, f"simulation's {name}")
+    real(simulation.duration_s, "duration_s", 1e-3, LONGEST_S, " s")
+    if simulation.camera.width * simulation.camera.height > 1 << 22:
+        given = f"{simulation.camera.width}x{simulation.camera.height}"
+        raise AmiwarpError(f"camera of {given} has more than 4194304 pixels; give a smaller camera")
+    whole(simulation.seed, "seed", 0, (1 << 31) - 1)
+
+
+def true_parameters(simulation: Simulation) -> dict[str, float]:
+    """Return the true values by the names that calibration uses, and those of the sensor."""
+    constant = simulation.camera_motion.constant and not (
+        isinstance(simulation.scene, WorldScene) and simulation.scene.trajectory.moves
+    )  # a trajectory has no constant angular velocity
+    rates = np.asarray(simulation.camera_motion.rates) if constant else np.full(3, np.nan)
+    omega = dict(zip(("omega_x", "omega_y", "omega_z"), rates.ravel()[-3:].tolist(), strict=True))
+    clock = {} if simulation.encoder_model is None else {"clock_offset_us": simulation.encoder_model.clock_offset_us}
+    return {
+        "apex": simulation.prism.apex,
+        "index": simulation.prism.index,
+        "phase": simulation.motion.phase,
+        **clock,
+        "tilt_x": simulation.motion.tilt[0],
+        "tilt_y": simulation.motion.tilt[1],
+        **{name: value for name, value in omega.items() if math.isfinite(value)},
+        **asdict(simulation.sensor),
+    }
+
+
+# Events of a simulation and their ground truth, collected in the memory of the host or of the device.
+
+
+class CollectedEvents:
+    """Columns of successive blocks of events and of their ground truth."""
+
+    def __init__(self, *, on_device: bool) -> None:
+        """Prepare to collect events on the device that simulates them, or on the host."""
+        self._on_device = on_device
+        self._parts: dict[str, list[Any]] = {}
+
+    def add(self, block: DeviceBlock) -> None:
+        """Add a block. In a world, call this method before the engine simulates the next chunk."""
+        for name, values in block.columns().items():
+            self._parts.setdefault(name, []).append(values if self._on_device else values.numpy())
+
+    def take(self, width: int, height: int) -> tuple[EventSource, dict[str, EventValues]]:
+        """Return a source of all events, and their ground truth by the names of :class:`EventTruth`.
+
+        The blocks of a column are released once they are joined, so that only one column is held twice.
+        """
+        unite = join if self._on_device else np.concatenate
+        found = {name: unite(self._parts.pop(name)) for name in list(self._parts)}
+        events = [found.pop(name) for name in NAMES]
+        if not self._on_device:
+            return MemoryEvents(Events(*events), width, height), found
+        source = DeviceMemoryEvents(DeviceEvents(*events), width, height)
+        wait(source.device)
+        return source, {name: DeviceValues(values) for name, values in found.items()}
 
 
 @guarded

@@ -7,16 +7,25 @@ import functools
 import importlib
 import logging
 import os
+import platform
+import re
 import signal
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import warp as wp
+
+from amiwarp._version import __version__
+from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
+
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -88,7 +97,7 @@ def start_workers(command: str, extra: str, scheduler: str | None, count: int, d
 
 def _visible_gpus() -> tuple[str, ...]:
     """Return the GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
-    from amiwarp.kernels.quiet_start import start_quietly
+    from amiwarp.kernels.launch import start_quietly
 
     given = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     count = gpu_count(start_quietly())
@@ -106,7 +115,7 @@ def _prepare(gpus: tuple[str, ...], local: bool, dask_worker: Any) -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus[int(dask_worker.name) % len(gpus)]
     if local:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from amiwarp.kernels.quiet_start import start_quietly
+    from amiwarp.kernels.launch import start_quietly
 
     start_quietly()
 
@@ -134,3 +143,30 @@ def run_jobs(
     finally:
         for future in waiting:
             future.cancel()
+
+
+# Description of the machine of a measurement: processor or GPU, and versions of the relevant packages.
+
+
+def processor() -> str:
+    """Return the name of this machine's CPU."""
+    info = Path("/proc/cpuinfo")
+    found = re.search(r"^model name\s*: (.*)$", info.read_text(), re.M) if info.exists() else None
+    return (found.group(1) if found else platform.processor() or platform.machine()).strip()
+
+
+def machine(device: str) -> str:
+    """Return the name of the GPU; for ``cpu`` the name of the CPU, with the number of cores that may be used."""
+    there = wp.get_device(device)
+    return str(there.name) if there.is_cuda else f"{cpu_threads()} cores of {processor()}"
+
+
+def versions(packages: Sequence[str]) -> dict[str, str]:
+    """Return the versions of amiwarp, of Python, and of those ``packages`` that are installed, by name."""
+    out = {"amiwarp": __version__, "python": platform.python_version()}
+    for name in packages:
+        try:
+            out[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return out

@@ -1,7 +1,4 @@
-"""Demo: a recording is simulated from a picture, calibrated, compensated and reconstructed.
-
-The calibration starts without a guess of the phase.
-"""
+"""Demo: a recording is simulated from a picture, calibrated, compensated and reconstructed."""
 
 from __future__ import annotations
 
@@ -17,32 +14,86 @@ import numpy as np
 
 from amiwarp.brightness.event_pairs import SensorTiming
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.photometric.stage import PhotometricSettings
-from amiwarp.calib.thinning import thin
+from amiwarp.calib.calibration_events import thin
+from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.imaging import metrics
+from amiwarp.imaging.sharpness import gaussian
 from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import check_output, make_folder
+from amiwarp.kernels.camera import PinholeParams
+from amiwarp.kernels.checksum import compute_checksums
+from amiwarp.kernels.compensation import compensate_blocks
+from amiwarp.kernels.conjugate_gradients import descend, link
+from amiwarp.kernels.equations import find_squares, sum_costs
+from amiwarp.kernels.equations_cpu import apply_normal, make_chains
+from amiwarp.kernels.iwe import CPU_WIDTH, find_largest, read_sums, smooth, smooth_and_sum
+from amiwarp.kernels.known_nodes import find_large_regions, mark_known
 from amiwarp.kernels.launch import load_ahead
+from amiwarp.kernels.map_positions import find_places, place_blocks
+from amiwarp.kernels.multilevel import prolong
+from amiwarp.kernels.pairs import mark_spans
+from amiwarp.kernels.pixel_votes import vote_event_blocks, vote_point_blocks
+from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams, compensate_points
+from amiwarp.kernels.slow_pixels import find_time_constants
+from amiwarp.kernels.votes import turn_events
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting.clouds import Renderer
 from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.export import save_picture
-from amiwarp.reconstruction.picture import Reconstruction
-from amiwarp.reconstruction.result import Picture
+from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.studies.cpu_kernels import EXACT_KERNELS, FIGURE_KERNELS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.events.recording import Recording
     from amiwarp.optics.exact_model import ExactModel
+
+
+# Kernels that the steps after a simulation need on a CPU, to be compiled before they are needed.
+#
+# Each is followed by the structs of its generic arguments. The other kernels of its module are compiled with it.
+
+EXACT_KERNELS = (
+    (turn_events,),
+    (vote_event_blocks, ExactParams, PinholeParams),
+    (read_sums,),
+    *((smooth_and_sum(len(gaussian(sigma))),) for sigma in (2.0, 1.0)),  # coarse and fine images of a calibration
+    (smooth(int(CPU_WIDTH)),),
+    (find_largest,),
+    (mark_spans,),
+    (find_places, ExactParams, PinholeParams),
+    (place_blocks, ExactParams),
+    (make_chains,),
+    (apply_normal,),
+    (descend,),
+    (sum_costs,),
+    (find_time_constants, ExactParams),
+    (find_squares,),
+    (compensate_blocks, ExactParams, PinholeParams),
+    (compute_checksums,),
+    (link,),
+    (prolong,),
+    (mark_known,),
+    (find_large_regions,),
+)
+"""Kernels of calibration, compensation and reconstruction by the exact model, in the order of their use."""
+FIGURE_KERNELS = (
+    *((compensate_points, struct) for struct in (CircleParams, RadialCircleParams)),
+    (vote_point_blocks,),
+)
+"""Kernels of the demo's figure and of its comparison of simpler models."""
+
+
+# Demo: a recording is simulated from a picture, calibrated, compensated and reconstructed.
+#
+# The calibration starts without a guess of the phase.
 
 APEX, PHASE = math.radians(1.0), math.radians(126.0)
 """True apex angle and true phase of the simulated prism [rad]."""

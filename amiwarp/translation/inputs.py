@@ -15,7 +15,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.progress import Progress
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import read_picture
-from amiwarp.simulation.scene import Still
+from amiwarp.simulation.scenery import Still
 from amiwarp.simulation.sequences import (
     PICTURE_SUFFIXES,
     PictureFolder,
@@ -24,7 +24,6 @@ from amiwarp.simulation.sequences import (
     VideoFile,
     open_pictures,
 )
-from amiwarp.translation.camera_motion import Window, find_motion, motion_of
 from amiwarp.translation.datasets import (
     SACCADE_US,
     SACCADES_PX,
@@ -34,13 +33,19 @@ from amiwarp.translation.datasets import (
     saccade_rates,
     saccades,
 )
-from amiwarp.translation.event_pictures import EventPictures
-from amiwarp.translation.interpolation import Interpolation, MotionPictures
-from amiwarp.translation.reconstructed_pictures import ReconstructedPictures
-from amiwarp.translation.rectified import RectifiedPictures, centred, is_centred
+from amiwarp.translation.pictures_between import EventPictures, Interpolation, MotionPictures
+from amiwarp.translation.reconstructed_pictures import (
+    ReconstructedPictures,
+    RectifiedPictures,
+    Window,
+    centred,
+    find_motion,
+    is_centred,
+    motion_of,
+)
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.scene import Frames
+    from amiwarp.simulation.scenery import Frames
 
 DEFAULT_FOV = math.radians(60.0)
 """Default horizontal field of view of the camera [rad]."""

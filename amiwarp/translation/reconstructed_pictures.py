@@ -1,28 +1,258 @@
-"""Fast pictures from events alone: a brightness map for each time window, moved as the camera turns."""
+"""Fast pictures from events alone: brightness maps of time windows, moved as the camera turns."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.choices import CONTRAST, Sharpness, Vote
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
+from amiwarp.imaging.iwe import Votes
+from amiwarp.imaging.sharpness import SharpnessMeter
+from amiwarp.imaging.votes import CanvasShape, upload_events
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
-from amiwarp.reconstruction.choices import CONTRAST
+from amiwarp.progress import Progress
 from amiwarp.reconstruction.picture import Reconstruction
-from amiwarp.translation.camera_motion import LEAST_PX, Window, still_encoder
-from amiwarp.translation.interpolation import light_of
-from amiwarp.translation.optical_flow import warped
-from amiwarp.translation.rectified import centred, looking, pixel_grid
+from amiwarp.simulation.motion import CameraMotion
+from amiwarp.translation.pictures_between import light_of, warped
 
 if TYPE_CHECKING:
+    from amiwarp.events.events import Events
     from amiwarp.events.recording import Recording
-    from amiwarp.optics.camera import Camera
-    from amiwarp.simulation.motion import CameraMotion
+    from amiwarp.translation.pictures_between import EventPictures
+
+
+# Pictures of a camera with lens distortion or an off-centre axis, as a centred pinhole camera sees them.
+
+
+def centred(camera: Camera) -> Camera:
+    """Return the pinhole camera of the same size and horizontal field of view, with its axis in the middle."""
+    return Camera.from_fov(camera.width, camera.height, camera.fov)
+
+
+def is_centred(camera: Camera) -> bool:
+    """Whether :func:`centred` changes nothing, up to a hundredth of a pixel."""
+    same, names = centred(camera), ("fx", "fy", "cx", "cy")
+    return camera.distortion is None and all(abs(getattr(camera, n) - getattr(same, n)) < 0.01 for n in names)
+
+
+def pixel_grid(camera: Camera) -> NDArray[np.float64]:
+    """Return all pixels of a camera, row by row [px], shape (n, 2)."""
+    x, y = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    return np.stack([x, y], axis=2).reshape(-1, 2).astype(np.float64)
+
+
+def looking(
+    camera: Camera, rays: NDArray[np.float64], shape: tuple[int, ...]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return where rays meet the image of a camera, for one ray per pixel of an image of ``shape`` (height, width).
+
+    The first array is the offset from each pixel [px], shape (height, width, 2); the second tells whether the ray meets
+    the image.
+    """
+    rows, columns = np.indices(shape)
+    xy = np.asarray(camera.rays_to_pixels(rays), np.float64).reshape(*shape, 2)
+    inside = (xy >= -0.5).all(axis=2) & (xy[..., 0] < camera.width - 0.5) & (xy[..., 1] < camera.height - 0.5)
+    return np.nan_to_num(xy - np.stack([columns, rows], axis=2)).astype(np.float32), inside
+
+
+class RectifiedPictures:
+    """Pictures as a centred pinhole camera without distortion sees them (:class:`amiwarp.Frames`)."""
+
+    def __init__(self, pictures: EventPictures, camera: Camera) -> None:
+        """``camera``: the camera that took the pictures."""
+        self._pictures = pictures
+        rays = np.asarray(centred(camera).pixels_to_rays(pixel_grid(camera)))
+        self._offset, self._inside = looking(camera, rays, (camera.height, camera.width))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of each picture [px]."""
+        return self._pictures.size
+
+    @property
+    def interval_us(self) -> float:
+        """Smallest time between two pictures [us]."""
+        return self._pictures.interval_us
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Yield time [us] and linear luminance, shape (height, width)."""
+        for t, light in self._pictures.read():
+            yield t, np.maximum(warped(light, self._offset), np.float32(0.0))
+
+    def take_known(self) -> list[tuple[int, NDArray[np.bool_]]]:
+        """Return, and forget, the masks of the pictures read so far."""
+        taken = self._pictures.take_known()
+        return [(t, (warped(mask.astype(np.float32), self._offset) > 0.5) & self._inside) for t, mask in taken]
+
+
+# Rotation of a plain event camera over time, by contrast maximisation in successive windows.
+
+MOTION_PX = 6.0
+"""Wanted motion of the image in a window [px]: enough for each pixel to see several parts of the scene."""
+WINDOW_US = (10_000, 250_000)
+"""Shortest and longest window [us]."""
+FIRST_US = 40_000
+"""Length of the first window [us]."""
+MOST_EVENTS = 30_000
+"""Largest number of events per window whose sharpness is measured; more are thinned evenly."""
+LEAST_EVENTS = 200
+"""Smallest number of events in a window from which a motion is found."""
+LEAST_PX = 1.0
+"""Motion of the image in a window below which the next search starts from all directions, and nothing is known [px]."""
+STARTS_PX = (2.0, 5.0, 10.0)
+"""Motions of the image in a window that are tried in eight directions [px]."""
+SMOOTHING_PX = COARSE_PX, FINE_PX = 2.0, 1.0
+"""Standard deviations of the Gaussians that smooth the image of warped events [px]."""
+TOLERANCE_PX = 0.02
+"""A search ends when its steps move the image by less than this in the window [px]."""
+EVALUATIONS = 120
+"""Largest number of images of warped events per search."""
+BEST = 2
+"""Number of starts that are refined."""
+PAD = 16
+"""Border of the image of warped events [px]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A time window and the camera's angular velocity in it."""
+
+    start_us: int
+    """Start [us]."""
+    length_us: int
+    """Length [us]."""
+    rates: tuple[float, float, float]
+    """Angular velocity of the camera at the middle [rad/s]."""
+    acceleration: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Angular acceleration of the camera [rad/s²]."""
+
+    @property
+    def rotation(self) -> CameraRotation:
+        """Rotation of the camera about the middle."""
+        return CameraRotation(self.rates, self.acceleration, self.middle_us)
+
+    def moves_px(self, camera: Camera) -> float:
+        """Return the motion of the image in the window [px]."""
+        x, y, z = self.rates
+        speed = math.hypot(camera.fy * x, camera.fx * y) + 0.25 * camera.width * abs(z)
+        return speed * self.length_us * 1e-6
+
+    @property
+    def middle_us(self) -> int:
+        """Middle [us]."""
+        return self.start_us + self.length_us // 2
+
+
+def still_encoder(t_first: int, t_last: int) -> Encoder:
+    """Return the encoder of a prism that does not turn; with an apex of 0 it stands for no prism."""
+    return Encoder(np.array([t_first - 1_000_000, t_last + 1_000_000], np.int64), np.zeros(2))
+
+
+def find_motion(
+    recording: Recording, camera: Camera, *, device: Any = "cpu", progress: Progress | None = None
+) -> list[Window]:
+    """Return the angular velocity of the camera in windows that overlap by half, from the first event to the last.
+
+    The windows are as long as the image takes to move by :data:`MOTION_PX`. An angular velocity of 0 means that none
+    was found.
+    """
+    first, last = recording.events.t_first, recording.events.t_last
+    search = _Search(camera, device)
+    windows: list[Window] = []
+    start, length = first, min(FIRST_US, max(last - first, 1))
+    while not windows or start < last - windows[-1].length_us // 2:
+        events = recording.events.between(start, start + length)
+        last_rates = windows[-1].rates if windows and windows[-1].moves_px(camera) > LEAST_PX else None
+        window = Window(start, length, search.run(events, start, length, last_rates))
+        speed = window.moves_px(camera) / length  # px per microsecond
+        length = round(float(np.clip(MOTION_PX / max(speed, 1e-9), *WINDOW_US)))
+        small = window.moves_px(camera) < 2.0 * LEAST_PX
+        if not windows and small and length >= 2 * window.length_us and last - first > window.length_us:
+            continue  # the first window was too short to find a motion
+        windows.append(window)
+        start += window.length_us // 2
+        if progress is not None:
+            progress("finding the motion", min(1.0, (start - first) / max(last - first, 1)))
+    return _with_acceleration(windows)
+
+
+def _with_acceleration(windows: list[Window]) -> list[Window]:
+    """Return the windows with the change of the angular velocity between those before and after."""
+    if len(windows) < 2:
+        return windows
+    t = np.array([window.middle_us for window in windows]) * 1e-6
+    change = np.gradient(np.array([window.rates for window in windows]), t - t[0], axis=0)
+    return [replace(w, acceleration=(x, y, z)) for w, (x, y, z) in zip(windows, change.tolist(), strict=True)]
+
+
+def motion_of(windows: list[Window]) -> CameraMotion:
+    """Return the rotation through all windows; time 0 is the start of the first."""
+    origin = windows[0].start_us
+    rows = [((w.middle_us - origin) * 1e-6, *w.rates) for w in windows]
+    return CameraMotion(np.array([*rows, *[(t + 1.0, *rates) for t, *rates in rows[-1:]]]))
+
+
+class _Search:
+    """Contrast maximisation over the angular velocity in one window."""
+
+    def __init__(self, camera: Camera, device: Any) -> None:
+        self._camera, self._device = camera, device
+        self._model = ExactModel(camera, Prism(0.0))
+        canvas = CanvasShape(camera.width, camera.height, PAD, 1.0, False, Vote.BILINEAR)
+        self._votes = Votes(canvas, device)
+        self._meters = {s: SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=s, device=device) for s in SMOOTHING_PX}
+
+    def run(
+        self, events: Events, start: int, length: int, last: tuple[float, float, float] | None
+    ) -> tuple[float, float, float]:
+        """Return the angular velocity [rad/s] for which the image of warped events is sharpest."""
+        from scipy.optimize import minimize
+
+        if len(events) < LEAST_EVENTS:
+            return (0.0, 0.0, 0.0)
+        middle = start + length // 2
+        thinned = events[:: -(-len(events) // MOST_EVENTS)]
+        arrays = upload_events(thinned, still_encoder(start, start + length), self._device, middle_us=middle)
+        unit = 1e6 / (self._camera.fx * length)  # moves the image by one pixel in the window
+
+        def cost(rates: NDArray[np.float64], smoothing: float = FINE_PX) -> float:
+            x, y, z = (unit * rates).tolist()
+            meter = self._meters[smoothing]
+            self._votes.clear()
+            self._votes.add_events(self._model, arrays, camera_rotation=CameraRotation((x, y, z), middle_us=middle))
+            self._votes.read(meter.image)
+            return -meter.measure()
+
+        starts = self._starts() if last is None else []
+        starts += [np.zeros(3), *([] if last is None else [np.array(last) / unit])]
+        starts.sort(key=lambda rates: cost(rates, COARSE_PX))
+        simplex = np.vstack([np.zeros(3), 1.5 * np.eye(3)])
+        limits = {"xatol": TOLERANCE_PX, "fatol": 0.0, "maxfev": EVALUATIONS}
+        runs: list[Any] = []
+        for at in starts[:BEST]:
+            options: Any = {"initial_simplex": at + simplex, **limits}
+            runs.append(minimize(cost, at, method="Nelder-Mead", options=options))
+        x, y, z = (unit * min(runs, key=lambda run: float(run.fun)).x).tolist()
+        return x, y, z
+
+    @staticmethod
+    def _starts() -> list[NDArray[np.float64]]:
+        angles = np.arange(8) * (math.tau / 8)
+        return [size * np.array([np.cos(a), np.sin(a), 0.0]) for size in STARTS_PX for a in angles]
+
+
+# Fast pictures from events alone: a brightness map for each time window, moved as the camera turns.
 
 MEDIAN_LIGHT = 0.2
 """Luminance of the median of each picture, relative to white: events say nothing about it."""

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 from amiwarp.errors import AmiwarpError
 from amiwarp.progress import Progress
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.sequences import Pictures
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.translation.datasets import DataSet
 from amiwarp.translation.inputs import TranslatorInput, translator_input, with_camera
-from amiwarp.translation.interpolation import Interpolation
+from amiwarp.translation.pictures_between import Interpolation
 from amiwarp.validation import check_names, choice, guarded
 
 if TYPE_CHECKING:

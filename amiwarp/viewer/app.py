@@ -21,16 +21,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from amiwarp.choices import View
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import check_output, interrupts_later
 from amiwarp.validation import guarded
-from amiwarp.viewer.choices import View
-from amiwarp.viewer.cloud_scene import Look, Scene
-from amiwarp.viewer.comparison import RECORDED
-from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.library import Library
-from amiwarp.viewer.page_values import SETTABLE
-from amiwarp.viewer.panel import Panel
+from amiwarp.viewer.clouds import Look, Scene
+from amiwarp.viewer.inspector import Inspector, Library
+from amiwarp.viewer.panel import RECORDED, SETTABLE, Panel
 from amiwarp.viewer.serve import serve
 
 if TYPE_CHECKING:
@@ -185,7 +182,7 @@ def view(
         given = f"{recording.name}: view shows a recording in a notebook"
         raise AmiwarpError(f"{given}; elsewhere, run in a shell: amiwarp view FILE") from error
 
-    from amiwarp.kernels.quiet_start import start_quietly
+    from amiwarp.kernels.launch import start_quietly
 
     start_quietly()
     Inspector(recording, calibration, device=device)  # raises errors in the cell, before the page is served

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
@@ -14,27 +15,139 @@ import numpy as np
 from amiwarp.calib.bad_pixels import strange_pixels, stretch
 from amiwarp.calib.parameters import build_model, nominal
 from amiwarp.calib.result import Calibration, constant_speed
+from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder_speed import turn_between
+from amiwarp.events.encoder import turn_between
 from amiwarp.events.recording import Recording
-from amiwarp.imaging.choices import Sharpness
+from amiwarp.imaging.export import PERCENTILE
+from amiwarp.imaging.sharpness import random_variance
 from amiwarp.optics.camera import Camera
-from amiwarp.reconstruction.window import border_displacements
-from amiwarp.viewer import parameters
-from amiwarp.viewer.imager import MeasuredImage, WindowImager
-from amiwarp.viewer.parameters import CURVE_HALF_WIDTH, Knobs, Selection, Source
-from amiwarp.viewer.suggestion import Suggestion, suggest_region
+from amiwarp.reconstruction.picture import border_displacements
+from amiwarp.viewer import window
 from amiwarp.viewer.timeline import Span, read_span
-from amiwarp.viewer.window import DisplayedWindow, LoadedWindow, WindowAngles
-from amiwarp.viewer.window_loading import load_window, margin, upload
+from amiwarp.viewer.window import (
+    CURVE_HALF_WIDTH,
+    SMOOTHING_PX,
+    DisplayedWindow,
+    Knobs,
+    LoadedWindow,
+    MeasuredImage,
+    Selection,
+    Source,
+    WindowAngles,
+    WindowImager,
+    load_window,
+    margin,
+    upload,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.events import Events
-    from amiwarp.imaging.device_events import UploadedEvents
+    from amiwarp.imaging.votes import UploadedEvents
     from amiwarp.optics.models import Model
+    from amiwarp.viewer.window import Region
+
+
+# Region of the image that the inspector shows first: where compensation gains most sharpness.
+
+WIDEST, NARROWEST = 120, 60
+"""Largest width of a suggested region, and its width on a small sensor or if there are very many events [px]."""
+CLEAR_EVENTS = 50_000
+"""Number of events above which a narrower region is suggested, because so many points hide each other in the cloud."""
+LEAST_SIGMA = 5.0
+"""Smallest gain of variance over mean, in standard deviations of that of random events, that shows an effect."""
+NEARLY_BEST = 0.5
+"""Share of the largest gain of variance from which a region is a candidate. The candidate whose sharpness gains the
+largest factor is chosen.
+
+The variance grows with the square of the number of events, so that nearly empty regions are no candidates.
+"""
+LEAST_SHARE = 0.8
+"""Smallest ratio of the number of recorded events to that of compensated events in a candidate: its edges do not come
+from outside."""
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """Suggested region of the image."""
+
+    region: Region
+    """Left, top, right and bottom [px]; right and bottom are exclusive."""
+    gains: bool
+    """Whether compensation with the current parameters sharpens the region. Otherwise, the region has most structure.
+    """
+
+
+def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32], *, margin: int = 0) -> Suggestion:
+    """Return the region in which compensation gains most sharpness.
+
+    If it gains nothing anywhere, return the region of the recorded image that has most structure. ``before`` and
+    ``after`` are images of the same events as recorded and compensated [events per pixel], shape ``(height, width)``.
+    ``margin``: distance that the region keeps from the border of the image if it can [px]. If it is the radius of the
+    orbit, no events of the region were outside of the image during a part of the turn.
+    """
+    rows, columns = before.shape
+    width = min(columns, WIDEST, max(columns // 3, NARROWEST))
+    while True:
+        height = min(rows, max(1, round(width * min(rows / columns, 1.0))))
+        left, top, gains = _best_box(before, after, width, height, margin)
+        events = float(before[top : top + height, left : left + width].sum())
+        if events <= CLEAR_EVENTS or width <= NARROWEST:
+            return Suggestion((left, top, left + width, top + height), gains)
+        width = max(NARROWEST, min(width - 1, int(width * (CLEAR_EVENTS / events) ** 0.5)))
+
+
+def _best_box(
+    before: NDArray[np.float32], after: NDArray[np.float32], width: int, height: int, margin: int
+) -> tuple[int, int, bool]:
+    """Return left and top of the best box of a size, and whether compensation sharpens it."""
+    mean, over_mean = _of_boxes(before, width, height)
+    mean_after, over_mean_after = _of_boxes(after, width, height)
+    noise = random_variance(SMOOTHING_PX)
+    # the variance of random events stays in the divisor, so that a region without structure has no arbitrary factor
+    factor = (over_mean_after - noise) / mean_after / (np.maximum(over_mean, noise) / mean)
+    variance = mean_after * over_mean_after - mean * over_mean
+    variance = np.where(mean >= LEAST_SHARE * mean_after, variance, 0.0)
+    inner = _inner(variance.shape, margin)
+    gains = bool((over_mean_after - over_mean)[inner].max() > LEAST_SIGMA * noise * (2.0 / (width * height)) ** 0.5)
+    if not gains:
+        variance = factor = mean * over_mean
+    candidates = np.full(variance.shape, -np.inf)
+    candidates[inner] = np.where(variance[inner] >= NEARLY_BEST * variance[inner].max(), factor[inner], -np.inf)
+    top, left = np.unravel_index(int(np.argmax(candidates)), candidates.shape)
+    return int(left), int(top), gains
+
+
+def _inner(shape: tuple[int, ...], margin: int) -> tuple[slice, ...]:
+    """Return the part of an array without a margin on each side, at least its middle."""
+    margins = (min(margin, (n - 1) // 2) for n in shape)
+    return tuple(slice(m, n - m) for m, n in zip(margins, shape, strict=True))
+
+
+def _of_boxes(image: NDArray[np.float32], width: int, height: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return mean, and variance over mean, of all boxes in a smoothed image, indexed by top and left.
+
+    Counts are limited, so that hot pixels are not taken for structure.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    positive = image[image > 0.0]
+    limit = float(np.percentile(positive, PERCENTILE)) if positive.size else 1.0
+    smoothed = gaussian_filter(np.minimum(image, limit).astype(np.float64), SMOOTHING_PX, mode="constant")
+    mean, square = (_box_means(values, width, height) for values in (smoothed, smoothed**2))
+    mean = np.maximum(mean, 1e-6)
+    return mean, np.maximum(square / mean - mean, 0.0)
+
+
+def _box_means(values: NDArray[np.float64], width: int, height: int) -> NDArray[np.float64]:
+    """Return the mean over each box that lies in the image, indexed by top and left."""
+    sums = np.pad(values, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+    both = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    return np.asarray(both / (width * height), np.float64)
+
 
 MOST_EVENTS = 2_000_000
 """Largest number of events in the image of a window. Of a fuller window, evenly spaced runs are read."""
@@ -75,7 +188,7 @@ class Inspector:
         no_speed = recording.encoder is None and calibration is None
         self.notes = (NO_ENCODER,) * no_speed + (NO_CAMERA,) * (recording.camera is None)
         """What is missing to compensate the prism's motion, one sentence each."""
-        self.sources = parameters.first_sources(recording)
+        self.sources = window.first_sources(recording)
         """Where the value of each parameter, and the camera, come from."""
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
@@ -181,17 +294,17 @@ class Inspector:
             )
         self.prism, self.recording = calibration.prism, replace(self.recording, camera=calibration.camera)
         self.set(self.knobs_of(calibration))
-        self.sources |= parameters.calibrated_sources(calibration, self.sources)
+        self.sources |= window.calibrated_sources(calibration, self.sources)
         self._found = self.knobs, calibration
 
     def knobs_of(self, calibration: Calibration) -> Knobs:
         """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
-        return parameters.calibrated_knobs(calibration, offset_us=self._recorded_offset_us, zero_us=self.zero_us)
+        return window.calibrated_knobs(calibration, offset_us=self._recorded_offset_us, zero_us=self.zero_us)
 
     @property
     def truth(self) -> Knobs | None:
         """Known parameters of a simulated recording; None if the recording has no ground truth of its prism."""
-        return parameters.true_knobs(self.recording, rpm=self.knobs.rpm)
+        return window.true_knobs(self.recording, rpm=self.knobs.rpm)
 
     def take_truth(self) -> None:
         """Set the parameters to the known truth. Raises :class:`AmiwarpError` if the recording has none."""
@@ -206,7 +319,7 @@ class Inspector:
         if self._found is not None and self._found[0] == self.knobs:
             return self._found[1]
         k, w = self.knobs, self.loaded
-        kept = parameters.kept_values(k, self._values(k), has_encoder=self.has_encoder)
+        kept = window.kept_values(k, self._values(k), has_encoder=self.has_encoder)
         before, after = self._unmoved(w), self._measured(w, k)
         return Calibration(
             model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
@@ -393,3 +506,37 @@ class Inspector:
         if not w.unmoved:
             w.unmoved.append(self._measured(w, None))
         return w.unmoved[0]
+
+
+# Recordings that a page can open: the files in one folder.
+
+SUFFIXES = {
+    ".aedat", ".aedat2", ".aedat4", ".bag", ".bin", ".csv", ".dat", ".db3", ".es", ".h5", ".hdf5", ".mcap", ".npz",
+    ".raw", ".txt",
+}  # fmt: skip
+"""Suffixes of files that may be recordings."""
+MOST_FILES = 200
+"""Largest number of files that are listed."""
+
+
+class Library:
+    """Files in a folder that a page may open. The page names a file, never a folder."""
+
+    def __init__(self, folder: Path, open_file: Callable[[Path], Inspector]) -> None:
+        self.folder, self._open_file = folder.resolve(), open_file
+
+    def files(self) -> list[list[str]]:
+        """Return names and sizes of the files, in the order of their names."""
+        found = sorted(path for path in self.folder.iterdir() if self._is_recording(path))
+        return [[path.name, f"{path.stat().st_size / 1e6:,.1f} MB"] for path in found[:MOST_FILES]]
+
+    def open(self, name: str) -> Inspector:
+        """Open a file of the folder. Raises :class:`AmiwarpError` for any other name, or if it is no recording."""
+        if name not in [file for file, _ in self.files()]:
+            raise AmiwarpError(f"{name!r}: is no recording in {self.folder}; choose one from the list")
+        return self._open_file(self.folder / name)
+
+    def _is_recording(self, path: Path) -> bool:
+        """Return whether a file looks like a recording, and lies in the folder even if it is a link."""
+        visible = path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+        return visible and path.is_file() and path.resolve().parent == self.folder

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from amiwarp.viewer.choices import View
-from amiwarp.viewer.page_files import read_template
+from amiwarp.choices import View
+from amiwarp.viewer.serve import read_template
 
 UNITS = {
     "apex": math.radians(1.0), "phase": math.radians(1.0), "clock_offset": 1.0, "tilt_x": math.radians(1.0),

@@ -1,8 +1,4 @@
-"""Page of the inspector: passes input from the browser to the inspector, and the inspector's results to the browser.
-
-Each browser tab has one panel with its own inspector and state. Slow work runs in threads. If a slider moves several
-times meanwhile, only its last position is used. What waits for an update is marked on the page.
-"""
+"""Page of the inspector: passes input from the browser to the inspector, and the inspector's results to the browser."""
 
 from __future__ import annotations
 
@@ -16,24 +12,720 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
-from amiwarp.viewer.comparison import Comparison
-from amiwarp.viewer.frames import wait_until_page_keeps_up
-from amiwarp.viewer.jobs import CalibrationJob, Playback
-from amiwarp.viewer.layout import NAMES, SLIDERS, UNITS, template
-from amiwarp.viewer.live_source import LiveSource
-from amiwarp.viewer.page_calls import PageCalls
-from amiwarp.viewer.page_exports import Exports
-from amiwarp.viewer.page_files import use_page
-from amiwarp.viewer.page_history import PageHistory
-from amiwarp.viewer.page_values import CLIENT_ONLY, initial_state, notes, source_state
-from amiwarp.viewer.parameters import Selection
-from amiwarp.viewer.rate_view import RateView
-from amiwarp.viewer.updates import Updates
+from amiwarp.optics.models import MODELS
+from amiwarp.viewer.clouds import (
+    NO_ORBIT,
+    cloud_state,
+    difference_state,
+    event_text,
+    float_bytes,
+    jpeg,
+    orbit_lines,
+    scale_state,
+    whole_image,
+)
+from amiwarp.viewer.exports import Exports, export_state
+from amiwarp.viewer.images import ImageKind, ShownImages, count_images, make_images, prepare
+from amiwarp.viewer.inspector import NO_ENCODER
+from amiwarp.viewer.jobs import CalibrationJob, LiveSource, Playback, estimate_phase, scope_text
+from amiwarp.viewer.layout import KEYS, NAMES, SCOPES, SLIDERS, SPEEDS, TOOLS, UNITS, VIEWS, template
+from amiwarp.viewer.serve import Check, finite, flag, number, one_of, use_page
+from amiwarp.viewer.timeline import EventRates
+from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
+from amiwarp.viewer.window import Selection, Source, colours_on_offer, truth_text
 
 if TYPE_CHECKING:
-    from amiwarp.viewer.inspector import Inspector
-    from amiwarp.viewer.library import Library
+    from numpy.typing import NDArray
+
+    from amiwarp.viewer.inspector import Inspector, Library
+    from amiwarp.viewer.window import DisplayedWindow, Knobs
+
+
+# Limit of the updates of one page to the rate at which the page takes them.
+
+MOST_IN_FLIGHT = 8
+"""Largest number of messages to the page that are unsent; while more are waiting, nothing is computed."""
+WAIT_S = 0.02
+"""Interval between two checks of the number of unsent messages [s]."""
+
+
+async def wait_until_page_keeps_up(server: Any) -> None:
+    """Wait until at most :data:`MOST_IN_FLIGHT` messages to the page are unsent."""
+    while _in_flight(server) > MOST_IN_FLIGHT:
+        await asyncio.sleep(WAIT_S)
+
+
+def _in_flight(server: Any) -> int:
+    return 0 if server.protocol is None else int(server.protocol.network_monitor.pending)
+
+
+# Parameters that the left cloud and image of a page can show: those kept as B, calibrated ones and the known truth.
+
+AGAINST = {
+    "recorded": "as recorded", "B": "compensated with B", "found": "compensated with the result",
+    "truth": "compensated with the known truth",
+}  # fmt: skip
+"""What the left cloud and image can show: name, and title."""
+
+
+RECORDED = "events as recorded"
+"""Title of the only cloud, if there is no motion to compensate."""
+
+
+class Comparison:
+    """Comparison of the current parameters of a page (A) with others."""
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel = panel
+        self.b: Knobs | None = None
+        """Parameters that were kept as B."""
+
+    @property
+    def choices(self) -> list[list[str]]:
+        """Names and titles of what the left cloud can show now."""
+        return [[name, title] for name, title in AGAINST.items() if name == "recorded" or self._knobs(name) is not None]
+
+    @property
+    def knobs(self) -> Knobs | None:
+        """Parameters that the left cloud shows; None for the recorded events."""
+        return self._knobs(self._panel.state.against)
+
+    @property
+    def title(self) -> str:
+        """Title of the left cloud."""
+        return AGAINST["recorded" if self.knobs is None else self._panel.state.against]
+
+    def keep_b(self) -> None:
+        """Keep the current parameters as B, and show them on the left."""
+        self.show_b(self._panel.inspector.knobs)
+
+    def swap_b(self) -> None:
+        """Exchange the current parameters and B."""
+        panel = self._panel
+        if self.b is not None:
+            now, knobs = panel.inspector.knobs, self.b
+            with panel.errors_shown("knobs"):
+                panel.inspector.set(knobs)
+                self.show_b(now)
+            panel.knobs_taken()
+
+    def compare_found(self) -> None:
+        """Show the result of the calibration on the left."""
+        if self._panel.calibration_job.found is not None:
+            self._panel.state.against = "found"
+            self._panel.request("knobs")
+
+    def show_b(self, knobs: Knobs | None) -> None:
+        """Show parameters on the left as B; None for the recorded events."""
+        self.b = knobs
+        text = "" if knobs is None else (
+            f"{knobs.model}, apex {math.degrees(knobs.apex):.4g}°, phase {math.degrees(knobs.phase):.4g}°"
+        )  # fmt: skip
+        against = "recorded" if knobs is None else "B"
+        self._panel.state.update({"has_b": knobs is not None, "b_text": text, "against": against})
+        self._panel.request("knobs")
+
+    def _knobs(self, name: str) -> Knobs | None:
+        inspector, found = self._panel.inspector, self._panel.calibration_job.found
+        if name == "found":
+            return None if found is None else inspector.knobs_of(found)
+        return {"B": self.b, "truth": inspector.truth}.get(name)
+
+
+# Values of the page's state: what the page may set, its state at the start, and texts.
+
+SETTABLE: dict[str, Check] = {
+    **dict.fromkeys(NAMES, number()), "point_size": number(1.0, 20.0), "opacity": number(0.0, 1.0),
+    "speed": one_of(*SPEEDS), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
+    "colour": one_of(*(each.value for each in Colour)), "axis": one_of(*(each.value for each in Axis)),
+    "kind": one_of(*(each.value for each in ImageKind)), "against": one_of(*AGAINST), "scope": one_of(*SCOPES),
+    "message": one_of(""),
+    **dict.fromkeys(("hide_hot", "noise_filter", "dark", "overlaid", "orbit_shown", "help_shown", "open_shown", "loop",
+                     "difference"),
+                    flag),
+}  # fmt: skip
+"""State variables that the page may set directly, with the check of their values. The page changes all others through
+calls."""
+CLIENT_ONLY = ("hover", "hover_region", "measured", "tool")
+"""State variables that the browser keeps to itself."""
+NO_SCALE = {"bar": "", "ticks": [], "title": ""}
+"""Scale of an image before the first update."""
+
+
+def initial_state(inspector: Inspector) -> dict[str, Any]:
+    """Return the page's state at the start, without the events' window and the prism's parameters."""
+    recording = inspector.recording
+    return {
+        **source_state(inspector), **NO_ORBIT, "trame__title": f"amiwarp: {recording.name}",
+        "trame_error_report_msg": "", "name": recording.name,
+        "size": list(recording.events.size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
+        "notes": notes(inspector), "has_encoder": inspector.has_encoder, "models": list(MODELS),
+        "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "truths": truths(inspector),
+        "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth), **export_state(),
+        "open_shown": False, "playing": False, "speed": 0.1, "speeds": list(SPEEDS), "loop": False, "polarity": "both",
+        "hide_hot": False, "noise_filter": False, "noise_ms": 2.0, "region_kind": "whole",
+        "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
+        "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
+        "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
+        "views": [list(each) for each in VIEWS], "tool": "region", "tools": [list(each) for each in TOOLS],
+        "hover": "", "hover_region": "", "measured": "", "orbit_shown": True, "help_shown": False,
+        "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
+        "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
+        "rate_on": b"", "rate_off": b"", "rate_note": "",
+        "picked_text": "",
+        "overview": "", "before": "", "after": "", "kind": ImageKind.COUNT.value,
+        "kinds": [each.value for each in ImageKind], "image_note": "", "image_slow": False, "image_scale": NO_SCALE,
+        "after_scale": NO_SCALE, "difference": False, "against_title": "",
+        "against_choices": [], "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
+        "curve_mark": 0.0, "against": "recorded", "has_b": False, "b_text": "", "busy": "", "calibrating": False,
+        "progress": 0, "found": "", "surface": None, "scope": SCOPES[0], "scopes": list(SCOPES), "calibrate_on": "",
+    }  # fmt: skip
+
+
+def source_state(inspector: Inspector) -> dict[str, Any]:
+    """Return the state variables that depend on the events; they change in a live stream."""
+    source = inspector.recording.events
+    whole_ms = (source.t_last - source.t_first + 1) * 1e-3
+    return {"whole_ms": whole_ms, "rate_span": [0.0, whole_ms]}
+
+
+def truths(inspector: Inspector) -> dict[str, float | None]:
+    """Return the known true parameters in the page's units; None for an unknown one."""
+    known = inspector.truth
+    return {n: None if known is None else round(getattr(known, n) / scale, 4) for n, scale in UNITS.items()}
+
+
+def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:
+    """Return the sharpness of the images as text, with the gain if there are two images."""
+    before, after = shown.sharpness_before, shown.sharpness_after
+    if not compensated:
+        return f"{before:.3f}"
+    gain = f" (×{after / before:.2f})" if before > 1e-3 and after > 0.0 else ""
+    return f"{before:.3f} → {after:.3f}{gain}"
+
+
+def events_text(shown: DisplayedWindow) -> str:
+    """Return the numbers of events of the window, of those that were read, in the selection and drawn."""
+    total, read, drawn = shown.span.count, len(shown.span.events), len(shown.events)
+    thinned = "" if read == total else f", {read:,} of them read"
+    selected = "" if shown.selected == read else f", {shown.selected:,} selected"
+    return f"{total:,} events{thinned}{selected}, {'all' if drawn == shown.selected else f'{drawn:,}'} drawn"
+
+
+def notes(inspector: Inspector) -> list[str]:
+    """Return what the recording lacks or what is only assumed, for the place where it matters."""
+    texts = {
+        Source.ASSUMED: "phase assumed, not known: calibrate, or set it",
+        Source.ESTIMATED: "phase estimated from the events: calibrate for an accurate one",
+    }
+    phase = texts.get(inspector.sources["phase"], "") if math.isfinite(inspector.turn_us) else ""
+    missing = [note for note in inspector.notes if not (note == NO_ENCODER and inspector.knobs.rpm)]
+    return [*missing, *filter(None, [phase])]
+
+
+# History of a page: undo, redo, reset, and the state in the page's address.
+
+
+class PageHistory:
+    """States that a page has shown."""
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel = panel
+        self._history: History | None = None
+        self._default: ViewState | None = None
+        self._wanted: ViewState | str | None = None
+
+    def forget(self) -> None:
+        """Forget all states, because the page shows another recording."""
+        self._history = self._default = self._wanted = None
+
+    def remember(self, change: str) -> None:
+        """Add what the page shows now to the history. Equal ``change`` of successive states make one step."""
+        state = self._current()
+        if self._history is None:
+            self._history, self._default = History(state), state
+        self._history.add(state, change)
+        self._show()
+
+    def undo(self) -> None:
+        """Go back by one step."""
+        if self._history is not None:
+            self._want(self._history.undo())
+
+    def redo(self) -> None:
+        """Go forward by one step that was undone."""
+        if self._history is not None:
+            self._want(self._history.redo())
+
+    def reset(self) -> None:
+        """Show the first state again."""
+        if self._history is not None and self._default is not None:
+            self._history.add(self._default)
+            self._want(self._default)
+
+    def restore(self, address: str) -> None:
+        """Show the state that an address describes."""
+        self._want(address)
+
+    async def apply(self) -> None:
+        """Show the requested state. Raises :class:`AmiwarpError` if it selects no events."""
+        panel, wanted = self._panel, self._wanted
+        self._wanted = None
+        if wanted is None or self._default is None:
+            return
+        source = panel.inspector.recording.events
+        if isinstance(wanted, str):
+            duration_us = source.t_last - source.t_first + 1
+            wanted, wrong = decode_state(wanted, self._default, size=source.size, duration_us=duration_us)
+            if wrong:
+                panel.show_message("; ".join(wrong), "error")
+        await panel.in_thread(apply_state, panel.inspector, wanted)
+        self._take(wanted)
+
+    def _want(self, state: ViewState | str) -> None:
+        self._wanted = state
+        self._panel.request("state")
+        self._panel.slider_released()
+
+    def _current(self) -> ViewState:
+        """Return the state that the page shows."""
+        s, panel = self._panel.state, self._panel
+        return replace(
+            current_state(panel.inspector), against=panel.comparison.knobs, image=ImageKind(s.kind), axis=Axis(s.axis),
+            colour=Colour(s.colour), view=View(s.view[0]), overlaid=bool(s.overlaid),
+        )  # fmt: skip
+
+    def _take(self, state: ViewState) -> None:
+        """Set the page's state variables to a state."""
+        s, selection = self._panel.state, state.selection
+        width, height = s.size
+        region = selection.region or (0, 0, width, height)
+        kind = s.region_kind if list(region) == s.region_wanted else "whole" if selection.region is None else "drawn"
+        s.update({
+            "start_ms": round(state.start_us * 1e-3, 3), "length_ms": round(state.length_us * 1e-3, 3),
+            "polarity": {None: "both", 1: "ON", 0: "OFF"}[selection.polarity], "hide_hot": selection.hide_hot,
+            "noise_filter": selection.noise_us is not None, "region_wanted": list(region), "region_kind": kind,
+            "kind": state.image.value, "colour": state.colour.value, "axis": state.axis.value,
+            "view": [state.view.value, s.view[1] + int(state.view.value != s.view[0])], "overlaid": state.overlaid,
+        })  # fmt: skip
+        if selection.noise_us is not None:
+            s.noise_ms = selection.noise_us * 1e-3
+        if state.against != self._panel.comparison.knobs:
+            self._panel.comparison.show_b(state.against)
+        self._panel.show_knobs()
+
+    def _show(self) -> None:
+        assert self._history is not None
+        assert self._default is not None
+        history = self._history
+        address = encode_state(history.state, self._default)
+        self._panel.state.update({"can_undo": history.can_undo, "can_redo": history.can_redo, "address": address})
+
+
+# Event rates on a page's timeline: counted in the background, and shown for the part of the time that is visible.
+
+BINS = 400
+"""Number of points of the drawn rates."""
+STEP_S = 0.2
+"""Duration of counting after which the timeline shows what is counted [s]."""
+
+
+class RateView:
+    """Rates of ON and OFF events of a page's recording."""
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel = panel
+        self._rates: EventRates | None = None
+
+    def start(self) -> None:
+        """Count the events of the page's recording."""
+        self._rates = rates = EventRates(self._panel.inspector.recording.events)
+        self._panel.start_job(self._fill(rates))
+
+    def zoom(self, start_ms: float, end_ms: float) -> None:
+        """Show the rates between two times [ms]."""
+        whole = float(self._panel.state.whole_ms)
+        start, end = max(0.0, start_ms), min(end_ms, whole)
+        if end - start > 1e-2:
+            self._panel.state.rate_span = [start, end]
+            self.show()
+
+    def show(self) -> None:
+        """Show the rates of the visible time."""
+        if self._rates is None:
+            return
+        zero_us, (start, end) = self._panel.zero_us, self._panel.state.rate_span
+        curve = self._rates.curve(zero_us + round(start * 1e3), zero_us + round(end * 1e3), BINS)
+        share = self._rates.share
+        note = "" if share >= 1.0 else f"counting events: {100.0 * share:.0f} %"
+        self._panel.state.update({"rate_on": _bytes(curve.on), "rate_off": _bytes(curve.off), "rate_note": note})
+
+    async def _fill(self, rates: EventRates) -> None:
+        finished = False
+        while not finished and rates is self._rates:
+            finished = await self._panel.in_thread(rates.fill, STEP_S)
+            with self._panel.state:
+                self.show()
+
+
+def _bytes(values: NDArray[np.float64]) -> bytes:
+    return values.astype(np.float32).tobytes()
+
+
+# Updates of a page: windows, parameters and looks are computed in threads, and their results sent to the browser.
+
+
+class Updates:
+    """Makes the updates of one page."""
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel, self._state = panel, panel.state
+        self.shown: DisplayedWindow | None = None
+        """Window as the page shows it; None before the first update."""
+        self._picked = -1
+
+    def first(self) -> None:
+        """Forget what another recording has left, and show what there is before the first update."""
+        self.shown, self._picked = None, -1
+        nothing = np.zeros((0, 2), np.float32).tobytes()
+        names = ("cloud_before", "cloud_after", "cloud_third", "colours_before", "colours_after")
+        self._state.update({**dict.fromkeys(names, nothing), "region": [0, 0, *self._state.size], "titles": [],
+                            "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
+                            "third_axis": {"low": 0.0, "high": 1.0, "title": ""}})  # fmt: skip
+        self._show_prism()
+
+    async def make(self, todo: set[str]) -> None:
+        """Make quick updates: "suggestion", "window", "knobs", "look" and "state"."""
+        panel, state = self._panel, self._state
+        if todo & {"window", "suggestion"}:
+            with panel.errors_shown("window"):
+                try:
+                    await self._open(suggest="suggestion" in todo)
+                except AmiwarpError:
+                    self._return_to_open_window()
+                    raise
+        with panel.errors_shown("knobs"):
+            if "knobs" in todo:
+                panel.set_knobs()
+            if self.shown is None:
+                panel.history.remember("")
+            if "state" in todo:
+                await panel.history.apply()
+            panel.show_knobs()  # not after the computation: a value that is typed meanwhile would be lost
+            shown, values = await panel.in_thread(self._compute)
+            self.shown = shown
+            state.update(values)
+            state.curve_mark = float(state[state.knob])
+            self._show_prism()
+            if not state.playing:
+                panel.history.remember("" if todo & {"suggestion", "state"} else panel.change)
+
+    async def make_slow(self, name: str) -> None:
+        """Make a slow update: "curve", "picture", or "preparation" of the first picture."""
+        if name == "preparation":
+            await self._panel.in_thread(prepare, self._panel.inspector)
+        else:
+            await (self._curve() if name == "curve" else self._picture())
+
+    def pick(self, k: int) -> None:
+        """Describe a drawn event, and show its orbit; -1 for none."""
+        known = self.shown is not None and 0 <= k < len(self.shown.events)
+        self._picked = k if known else -1
+        self._panel.request("look")
+
+    async def _open(self, *, suggest: bool) -> None:
+        """Read the window and the selection that the page shows."""
+        panel, s = self._panel, self._state
+        start, length = float(s.start_ms), min(float(s.length_ms), float(s.whole_ms))
+        if not length > 0.0:
+            raise AmiwarpError(f"a window of {length:g} ms; give a length above 0")
+        start_us, length_us = panel.zero_us + round(start * 1e3), max(1, round(length * 1e3))
+        await panel.in_thread(panel.inspector.open, start_us, length_us, panel.selection())
+        if suggest:
+            if await panel.in_thread(estimate_phase, panel.inspector):
+                panel.show_knobs()
+            region = (await panel.in_thread(panel.inspector.suggest_region)).region
+            s.update({"region_wanted": list(region), "region_kind": "suggested"})
+            await panel.in_thread(panel.inspector.open, start_us, length_us, panel.selection())
+        self._picked = -1
+
+    def _return_to_open_window(self) -> None:
+        """Show time and region of the window that is still shown. Playback goes on through a time without events."""
+        inspector, s = self._panel.inspector, self._state
+        if inspector.window is not None and not s.playing:
+            start_us, length_us = inspector.window
+            s.start_ms, s.length_ms = round((start_us - self._panel.zero_us) * 1e-3, 3), round(length_us * 1e-3, 3)
+            s.region_wanted = list(inspector.loaded.region)
+
+    def _compute(self) -> tuple[DisplayedWindow, dict[str, Any]]:
+        """Return what is to be shown, and the state variables that show it."""
+        panel, s, inspector = self._panel, self._state, self._panel.inspector
+        new = self.shown is None
+        shown = inspector.show(against=panel.comparison.knobs)
+        values = cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
+        values |= self._images(shown) | self._orbit(shown)
+        if new or shown.span is not self.shown.span:  # type: ignore[union-attr]
+            values["overview"] = whole_image(shown.span.events, inspector.recording.events.size)
+        compensated = panel.compensates
+        left = panel.comparison.title
+        pair = [[0, left], [1, "compensated" if s.against == "recorded" else "compensated with A"]]
+        text = "" if self._picked < 0 else event_text(shown, self._picked)
+        return shown, {
+            **values, "titles": pair if compensated else [[0, RECORDED]], "events": events_text(shown),
+            "sharpness": sharpness_text(shown, compensated=compensated), "picked": self._picked, "picked_text": text,
+            "against_title": left, "against_choices": panel.comparison.choices,
+        }  # fmt: skip
+
+    def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
+        """Return the state variables of the images of the region; of slow kinds, only that they are."""
+        s, kind = self._state, ImageKind(self._state.kind)
+        if kind is ImageKind.LOG_INTENSITY:
+            return {"image_slow": True}
+        images = count_images(shown) if kind is ImageKind.COUNT else self._make_images()
+        return {"image_slow": False, **self._image_values(images)} | (
+            difference_state(images.before, images.after)
+            if s.difference and kind is ImageKind.COUNT and images.before is not None
+            else {}
+        )
+
+    def _make_images(self) -> ShownImages:
+        panel = self._panel
+        return make_images(panel.inspector, ImageKind(self._state.kind), against=panel.comparison.knobs)
+
+    def _image_values(self, images: ShownImages) -> dict[str, Any]:
+        scale = scale_state(images.scale)
+        before, after = (
+            "" if image is None else jpeg(images.scale.rgb(image)) for image in (images.before, images.after)
+        )
+        return {"before": before, "after": after, "image_scale": scale, "after_scale": scale, "image_note": images.note}
+
+    def _orbit(self, shown: DisplayedWindow) -> dict[str, Any]:
+        """Return the orbit of the scene point of the picked event, or of the middle of the region."""
+        s, inspector = self._state, self._panel.inspector
+        if not (s.orbit_shown and s.axis == Axis.ANGLE.value and self._panel.compensates):
+            return NO_ORBIT
+        orbit, column = map(float_bytes, orbit_lines(inspector, shown, self._picked))
+        recorded = self._panel.comparison.knobs is None  # otherwise, both clouds are compensated
+        return {"orbit": orbit if recorded else column, "column": column, "has_orbit": True}
+
+    def _show_prism(self) -> None:
+        """Show what depends on the rotation of the prism."""
+        turn, compensates = self._panel.inspector.turn_us, self._panel.compensates
+        self._state.update({"turn_ms": turn * 1e-3 if compensates else 0.0, "has_model": compensates,
+                            "step_name": "turn" if compensates else "window"})  # fmt: skip
+
+    async def _curve(self) -> None:
+        panel, s, name = self._panel, self._state, self._state.knob
+        s.calibrate_on = await panel.in_thread(scope_text, panel.inspector)
+        if not panel.compensates:
+            return
+        values, scores = await panel.in_thread(panel.inspector.curve, name)
+        label, title = panel.knob_title()
+        x = (values / UNITS[name]).tolist()
+        if not x:
+            return
+        best = int(np.argmax(scores))
+        peak = f"{'at the edge ' if best in (0, len(x) - 1) else ''}{x[best]:.4g}"
+        s.curve = {"name": label, "title": title, "text": f"peak {peak}, now {s[name]:.4g}", "x": x,
+                   "y": scores.tolist(), "truth": truths(panel.inspector)[name]}  # fmt: skip
+        s.curve_mark = float(s[name])
+
+    async def _picture(self) -> None:
+        """Make images of a slow kind."""
+        s = self._state
+        if s.kind != ImageKind.LOG_INTENSITY.value or self.shown is None:
+            return
+        try:
+            s.update(await self._panel.in_thread(lambda: self._image_values(self._make_images())))
+        except AmiwarpError as error:
+            s.update({"before": "", "after": "", "image_note": str(error)})
+
+
+# Functions that the page calls: what buttons, keys, fields and the mouse do.
+
+EDITABLE = ("start_ms", "length_ms", "turns", "noise_ms")
+"""State variables with a number field, next to the prism's parameters."""
+
+
+class PageCalls:
+    """Functions that one page calls. The server checks their arguments by their annotations."""
+
+    def __init__(self, panel: Panel) -> None:
+        self._panel, self._state = panel, panel.state
+
+    @property
+    def offered(self) -> dict[str, Callable[..., None]]:
+        """Functions that the page may call, by name."""
+        comparison, history = self._panel.comparison, self._panel.history
+        own = (
+            self.key, self.released, self.choose, self.typed, self.edge, self.draw, self.whole, self.suggest,
+            self.look_from, self.step, self.move_window, self.resize_window, self.take_from_curve, self.pick, self.play,
+            self.calibrate, self.accept, self.discard, self.take_truth, self.zoom_timeline, self.undo, self.redo,
+            self.reset, self.keep_b, self.export, self.open_file,
+        )  # fmt: skip
+        return {call.__name__: call for call in (*own, comparison.swap_b, comparison.compare_found, history.restore)}
+
+    def key(self, key: str) -> None:
+        """Run the action of a key that was pressed outside of a text field."""
+        for known, (name, *given), _ in KEYS:
+            if key == known:
+                getattr(self, name)(*given)
+
+    def released(self) -> None:
+        """Update the slow parts of the page after a slider or the timeline was released."""
+        self._panel.slider_released()
+
+    def choose(self, name: str) -> None:
+        """Select the parameter over which the sharpness curve is drawn."""
+        if name in NAMES and name != self._state.knob:
+            self._state.knob = name
+            self._panel.request_slow("curve")
+
+    def typed(self, name: str, text: str) -> None:
+        """Set the value that a user typed into a number field."""
+        if name not in (*NAMES, *EDITABLE):
+            return
+        try:
+            value = finite(text)
+        except ValueError:
+            self._panel.show_message(f"{text!r} is not a number; give a number such as 1.5", "error")
+            return
+        if name == "turns":
+            name, value = "length_ms", value * float(self._state.turn_ms)
+        self._state[name] = round(value, 4)
+        if name in NAMES:
+            self._state.knob = name
+            self._panel.request("knobs")
+        else:
+            self._panel.request("window")
+        self._panel.slider_released()
+
+    def edge(self, side: int, text: str) -> None:
+        """Set one side of the region (0: left, 1: top, 2: right, 3: bottom) to a typed number [px]."""
+        with contextlib.suppress(ValueError):
+            wanted = [*self._state.region]
+            if side in (0, 1, 2, 3):
+                wanted[int(side)] = round(finite(text))
+                self.draw(*wanted)
+
+    def draw(self, left: float, top: float, right: float, bottom: float) -> None:
+        """Show a region of the image [px] that was drawn or typed."""
+        self._panel.show_region([int(each) for each in (left, top, right, bottom)], "drawn")
+
+    def whole(self) -> None:
+        """Show the whole image."""
+        self._panel.show_region([0, 0, *self._state.size], "whole")
+
+    def suggest(self) -> None:
+        """Show the region in which compensation gains most sharpness."""
+        self._panel.request("suggestion", "window")
+        self._panel.slider_released()
+
+    def toggle(self, name: str) -> None:
+        """Invert a state variable that is true or false."""
+        self._state[name] = not self._state[name]
+
+    def toggle_axis(self) -> None:
+        """Switch the third axis between angle and time."""
+        angle, time = Axis.ANGLE.value, Axis.TIME.value
+        self._state.axis = time if self._state.axis == angle else angle
+
+    def look_from(self, view: str) -> None:
+        """Set the view, and reset a camera that the mouse has moved."""
+        if view in list(View):
+            self._state.view = [view, self._state.view[1] + 1]
+
+    def step(self, count: int) -> None:
+        """Move the time window by one turn, forward (1) or back (-1); without a prism, by the window's length."""
+        if count in (-1, 1):
+            turn = self._panel.inspector.turn_us * 1e-3 if self._panel.compensates else float(self._state.length_ms)
+            self._panel.move(float(self._state.start_ms) + count * turn)
+            self._panel.slider_released()
+
+    def move_window(self, start_ms: float) -> None:
+        """Move the time window to a start [ms]; playing stops, except a live stream's."""
+        if not self._state.live:
+            self._state.playing = False
+        self._panel.move(float(start_ms), change="start_ms")
+
+    def resize_window(self, start_ms: float, end_ms: float) -> None:
+        """Set the ends of the time window [ms]."""
+        start, end = max(0.0, float(start_ms)), min(float(end_ms), float(self._state.whole_ms))
+        if end > start:
+            self._state.update({"start_ms": round(start, 3), "length_ms": round(end - start, 3)})
+            self._panel.request("window", change="length_ms")
+
+    def take_from_curve(self, value: float) -> None:
+        """Set the parameter of the sharpness curve to a clicked value."""
+        self._state[self._state.knob] = round(float(value), 4)
+        self._panel.request("knobs")
+        self._panel.slider_released()
+
+    def pick(self, k: int) -> None:
+        """Describe a drawn event; -1 for none."""
+        self._panel.updates.pick(int(k))
+
+    def play(self) -> None:
+        self._panel.playback.toggle()
+
+    def calibrate(self) -> None:
+        self._panel.calibration_job.toggle()
+
+    def accept(self) -> None:
+        """Set the prism's parameters to the result of the calibration."""
+        if self._panel.calibration_job.found is not None:
+            with self._panel.errors_shown("knobs"):
+                self._panel.inspector.accept(self._panel.calibration_job.found)
+            self.discard()
+            self._panel.knobs_taken()
+
+    def discard(self) -> None:
+        """Forget the result of the calibration."""
+        self._panel.calibration_job.found = None
+        self._state.update({"found": "", "surface": None})
+        if self._state.against == "found":
+            self._panel.comparison.show_b(self._panel.comparison.b)
+
+    def undo(self) -> None:
+        self._panel.history.undo()
+
+    def redo(self) -> None:
+        self._panel.history.redo()
+
+    def reset(self) -> None:
+        self._panel.history.reset()
+
+    def keep_b(self) -> None:
+        self._panel.comparison.keep_b()
+
+    def zoom_timeline(self, start_ms: float, end_ms: float) -> None:
+        """Show another part of the time on the timeline [ms]."""
+        self._panel.rates.zoom(float(start_ms), float(end_ms))
+
+    def export(self, what: str) -> None:
+        """Give the browser a file."""
+        self._panel.exports.export(what)
+
+    def open_file(self, name: str) -> None:
+        """Show another recording of the folder."""
+        self._state.open_shown = False
+        self._panel.start_job(self._panel.open_file(name))
+
+    def take_truth(self) -> None:
+        """Set the parameters to the known truth of a simulated recording."""
+        with self._panel.errors_shown("knobs"):
+            self._panel.inspector.take_truth()
+        self._panel.knobs_taken()
+
+
+# Page of the inspector: passes input from the browser to the inspector, and the inspector's results to the browser.
+#
+# Each browser tab has one panel with its own inspector and state. Slow work runs in threads. If a slider moves several
+# times meanwhile, only its last position is used. What waits for an update is marked on the page.
 
 _CUDA_LOCK = asyncio.Lock()
 """Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""

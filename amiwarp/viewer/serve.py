@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import errno
+import inspect
+import ipaddress
 import logging
+import math
 import os
+import re
 import secrets
+import socket
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from functools import partial
@@ -13,15 +19,290 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from weakref import WeakSet
 
+import msgpack  # type: ignore[import-untyped]
+from yarl import URL
+
 from amiwarp.errors import AmiwarpError
 from amiwarp.memory import release_memory
-from amiwarp.viewer.host_names import ALL_INTERFACES, HostNames, address, cannot_serve, normalised
-from amiwarp.viewer.message_filter import MOST_BYTES, Check, MessageFilter
-from amiwarp.viewer.page_files import FOLDER, ROUTE, first_page
 
 if TYPE_CHECKING:
     from aiohttp import web
     from aiohttp.typedefs import Handler
+
+
+# Host names and addresses of the server: the URL to open, and the ``Host`` headers that it accepts.
+
+ALL_INTERFACES = {"0.0.0.0": (socket.AF_INET, "192.0.2.1"), "::": (socket.AF_INET6, "2001:db8::1")}
+"""Hosts that mean every address of this machine, each with its address family and a remote address reserved for
+documentation."""
+LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
+"""Names under which a machine reaches itself."""
+
+
+def normalised(host: str) -> str:
+    """Return a host in lower case, without the brackets of IPv6 and with IP addresses in standard notation."""
+    host = host.strip().strip("[]").rstrip(".").lower()
+    try:
+        return str(ipaddress.ip_address(host))
+    except ValueError:
+        return host
+
+
+def is_local(host: str) -> bool:
+    """Return whether only this machine can connect to a server on ``host``."""
+    try:
+        return ipaddress.ip_address(normalised(host)).is_loopback
+    except ValueError:
+        return normalised(host) == "localhost"
+
+
+def reachable(host: str) -> str:
+    """Return a host that a browser can open: ``host``, or one address of this machine if ``host`` means all of them."""
+    host = normalised(host)
+    if host not in ALL_INTERFACES:
+        return host
+    family, remote = ALL_INTERFACES[host]
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:  # connecting UDP sends nothing; it selects a route
+            probe.connect((remote, 9))
+            return str(probe.getsockname()[0])
+    except OSError:
+        return socket.gethostname()
+
+
+def address(host: str, port: int, token: str) -> str:
+    """Return the URL to open in a browser. Its path is the token."""
+    return str(URL.build(scheme="http", host=reachable(host), port=port) / token / "")
+
+
+def warning(host: str) -> str | None:
+    """Return a warning for the user if other machines can connect to ``host``, else None."""
+    if is_local(host):
+        return None
+    return (
+        f"warning: served on {host} without encryption: everybody on the network who has the address can see the "
+        "recording, control the inspector and open the recordings in its folder; if you are the only user, use an SSH "
+        "tunnel"
+    )
+
+
+class HostNames:
+    """Host names under which the server may be called.
+
+    A request with any other name in its ``Host`` header may come from a foreign page whose host name resolves to this
+    machine (DNS rebinding).
+    """
+
+    def __init__(self, host: str) -> None:
+        names = {normalised(host), reachable(host)}
+        if not is_local(host):
+            own = socket.gethostname().lower()
+            names |= {own, f"{own}.local", own.partition(".")[0]}
+        self.known = LOCAL_NAMES | (names - ALL_INTERFACES.keys())
+
+    def accept(self, request: web.Request) -> bool:
+        """Return whether the request's ``Host`` is a known name or the address at which the request arrived."""
+        try:
+            requested = normalised(URL(f"http://{request.host}").host or "")
+        except ValueError:
+            return False
+        arrived = request.transport.get_extra_info("sockname") if request.transport is not None else None
+        return requested in self.known or (arrived is not None and requested == normalised(str(arrived[0])))
+
+
+def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:
+    """Return the error to raise if the server cannot listen at ``host`` and ``port``."""
+    if isinstance(error, socket.gaierror):
+        return AmiwarpError(
+            f"--host {host!r}: unknown name or address; give an address of this machine, such as 127.0.0.1"
+        )
+    if error.errno == errno.EADDRINUSE:
+        return AmiwarpError(f"--port {port}: is in use on {host}; give another port, or 0 for a free one")
+    if error.errno == errno.EADDRNOTAVAIL:
+        return AmiwarpError(
+            f"--host {host!r} is not an address of this machine; give one of its addresses, such as 127.0.0.1"
+        )
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return AmiwarpError(f"--port {port}: permission denied; give a port above 1023, or 0 for a free one")
+    return AmiwarpError(
+        f"--host {host!r} --port {port}: cannot listen: {error.strerror or error}; give another host or port"
+    )
+
+
+# Filter for messages from a page: known calls whose arguments have the expected type and size. Drops all others.
+
+MOST_BYTES = 64 * 1024
+"""Largest accepted size of a message from a page [bytes]. The page's own messages have a few hundred bytes, and it
+never splits them into parts."""
+HEADER_BYTES = 12
+"""Size of the header of each message part [bytes]: message number, start of the part and length of the message, 32 bits
+each."""
+MOST_CHARACTERS = 2000
+"""Largest accepted length of a text that the page gives to a function of the server, such as the state in its address.
+"""
+LARGEST = 1e12
+"""Largest accepted number in a message; in ms it is 30 years."""
+
+Check = Callable[[Any], bool]
+"""Function that returns whether a value is allowed."""
+
+
+def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
+    """Return a check that accepts numbers from ``low`` to ``high``; it rejects NaN and booleans."""
+
+    def check(value: Any) -> bool:
+        return type(value) in (int, float) and low <= value <= high  # comparisons with NaN are false
+
+    return check
+
+
+def text(most: int) -> Check:
+    """Return a check that accepts strings of at most ``most`` characters."""
+    return lambda value: isinstance(value, str) and len(value) <= most
+
+
+def one_of(*known: Any) -> Check:
+    """Return a check that accepts the ``known`` values, types included."""
+    return lambda value: any(type(value) is type(each) and value == each for each in known)
+
+
+def list_of(*checks: Check) -> Check:
+    """Return a check that accepts lists with one item for each of ``checks``."""
+    return lambda value: (
+        isinstance(value, list)
+        and len(value) == len(checks)
+        and all(check(each) for check, each in zip(checks, value, strict=True))
+    )
+
+
+def record(required: Mapping[str, Check], optional: Mapping[str, Check] | None = None) -> Check:
+    """Return a check that accepts dictionaries with all ``required`` keys, and no others except ``optional`` ones."""
+    known = {**required, **(optional or {})}
+
+    def check(value: Any) -> bool:
+        return (
+            isinstance(value, dict)
+            and required.keys() <= value.keys() <= known.keys()
+            and all(known[name](each) for name, each in value.items())
+        )
+
+    return check
+
+
+def _integer(value: Any) -> bool:
+    return type(value) is int and abs(value) <= LARGEST
+
+
+flag = one_of(True, False)
+ARGUMENTS: Mapping[str, Check] = {"str": text(MOST_CHARACTERS), "float": number(), "int": _integer}
+"""Checks of the arguments of functions that the page calls, by their annotation."""
+
+
+class MessageFilter:
+    """Filter for the messages that one page sends."""
+
+    def __init__(self, server: Any, settable: Mapping[str, Check]) -> None:
+        """Allow the messages of a page on ``server``.
+
+        ``settable`` maps each state variable that the page may set to the check of its values.
+        """
+        self._server, self._warned = server, False
+        change = self._change(settable)
+        self._calls: dict[str, Check] = {
+            "wslink.hello": list_of(record({"secret": text(64)})),
+            "trame.state.get": list_of(),
+            "trame.lifecycle.update": list_of(one_of("client_connected", "client_exited", "client_unmounted")),
+            "trame.error.client": list_of(text(4000)),
+            "trame.state.update": list_of(lambda changes: isinstance(changes, list) and all(map(change, changes))),
+            "trame.trigger": self._is_trigger,
+        }
+
+    def passes(self, message: bytes) -> bool:
+        """Return whether the message is allowed. Log the first message that is not."""
+        try:
+            allowed = self._is_call(_unpacked(message))
+        except Exception:  # invalid bytes make the decoder raise errors of many types
+            allowed = False
+        if not allowed and not self._warned:
+            self._warned = True
+            logging.getLogger(__name__).warning("dropped a message of %d bytes that no page sends", len(message))
+        return allowed
+
+    def _is_call(self, call: Any) -> bool:
+        known = {"id": text(120), "method": text(60), "args": lambda args: isinstance(args, list)}
+        more = {"wslink": text(10), "kwargs": one_of({})}
+        return record(known, more)(call) and call["method"] in self._calls and self._calls[call["method"]](call["args"])
+
+    def _is_trigger(self, args: list[Any]) -> bool:
+        """Return whether a function that the page may call exists and takes arguments of these types."""
+        if not list_of(text(60), lambda given: isinstance(given, list), one_of({}))(args):
+            return False
+        name, given, _ = args
+        called = self._server.controller.trigger_fn(name)
+        if called is None:
+            return False
+        signature = inspect.signature(called)
+        arguments = signature.bind(*given).arguments  # raises TypeError for another number of arguments
+        return all(ARGUMENTS[signature.parameters[k].annotation](value) for k, value in arguments.items())
+
+    @staticmethod
+    def _change(settable: Mapping[str, Check]) -> Check:
+        shape = record({"key": text(60), "value": lambda _: True})
+        return lambda change: shape(change) and change["key"] in settable and settable[change["key"]](change["value"])
+
+
+def _unpacked(message: bytes) -> Any:
+    """Decode a message in one part. Raises :class:`ValueError` for a message in several parts."""
+    start, length = (int.from_bytes(message[k : k + 4], "little") for k in (4, 8))
+    if (start, length) != (0, len(message) - HEADER_BYTES):
+        raise ValueError("received a part of a message; expected the complete message")
+    return msgpack.unpackb(message[HEADER_BYTES:])
+
+
+def finite(given: str) -> float:
+    """Return the typed text as a number, clipped to ±:data:`LARGEST`. Raises :class:`ValueError` for other text."""
+
+    value = float(given or 0.0)
+    if math.isnan(value):
+        raise ValueError(given)
+    return min(max(value, -LARGEST), LARGEST)
+
+
+# Files of the inspector's page: its template, and trame's first page with small changes.
+
+FOLDER = Path(__file__).with_name("page")
+"""Folder with the page's template, style and scripts."""
+ROUTE = "__amiwarp"
+"""Path below which the page finds these files."""
+
+
+def first_page(path: Path) -> str:
+    """Return trame's first page with the page's own socket. The reader can enlarge the page.
+
+    It shows a plain text until the page is ready.
+    """
+    page = path.read_text(encoding="utf-8")
+    page = re.sub(r'<meta\s+name="viewport"[^>]*>', '<meta name="viewport" content="width=device-width">', page)
+    page = re.sub(r"<title>.*?</title>", "<title>amiwarp inspector</title>", page)
+    page = page.replace("<title>", f'<script src="{ROUTE}/socket.js"></script><title>')
+    return re.sub(r'<div id="app"></div>\s*<script>.*?</script>', '<div id="app">opening the inspector …</div>', page,
+                  flags=re.DOTALL)  # fmt: skip
+
+
+def read_template() -> str:
+    """Return the page's template."""
+    return (FOLDER / "page.html").read_text(encoding="utf-8")
+
+
+def use_page(server: Any, template: str) -> None:
+    """Give a trame server the page's style and scripts, and its template."""
+    server.enable_module({
+        "serve": {ROUTE: str(FOLDER)}, "styles": [f"{ROUTE}/page.css"], "module_scripts": [f"{ROUTE}/page.js"],
+        "vue_use": ["amiwarp_page"],
+    })  # fmt: skip
+    # when the connection ends, trame shows the second template: the same page, which then says so
+    server.state.update({f"trame__template_{name}": template for name in ("main", "error")})
+
 
 Closing = Callable[[], object] | None
 """Function that is called when a browser tab is closed, or None."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, urlencode
 
+from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
-from amiwarp.viewer.choices import Axis, Colour, View
-from amiwarp.viewer.image_kinds import ImageKind
-from amiwarp.viewer.parameters import Knobs, Selection, Source
+from amiwarp.viewer.images import ImageKind
+from amiwarp.viewer.window import Knobs, Selection, Source
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector

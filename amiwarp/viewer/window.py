@@ -1,21 +1,292 @@
-"""Time windows of the inspector: their selected events, and what the page shows of them."""
+"""Time windows of the inspector: selection and loading of their events, parameters, and images on the device."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+import enum
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from amiwarp.choices import Colour, Sharpness
+from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
-from amiwarp.imaging.device_events import UploadedEvents
-from amiwarp.viewer.drawn_truth import DrawnTruth
-from amiwarp.viewer.imager import MeasuredImage, Region
+from amiwarp.events.truth import Cause
+from amiwarp.imaging.corners import find_background_activity
+from amiwarp.imaging.iwe import Votes
+from amiwarp.imaging.sharpness import SharpnessMeter, relative_variance
+from amiwarp.imaging.votes import CanvasShape, UploadedEvents, upload_events
+from amiwarp.optics.prism import apex_from_deflection
 from amiwarp.viewer.timeline import Span
 
 if TYPE_CHECKING:
-    import numpy as np
+    from collections.abc import Iterable, Mapping
+
     from numpy.typing import NDArray
 
-    from amiwarp.reconstruction.result import Picture
+    from amiwarp.calib.result import Calibration
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.events.recording import Recording, Truth
+    from amiwarp.optics.camera import Camera
+    from amiwarp.optics.models import Model
+    from amiwarp.optics.prism import Prism
+    from amiwarp.reconstruction.picture import Picture
+
+
+# Ground truth of the events that the inspector draws, read from the recording on first use.
+
+STORES = {Colour.CAUSE: "stored_causes", Colour.INSTANCE: "stored_instances", Colour.DEPTH: "stored_depths"}
+"""Attribute of :class:`amiwarp.Truth` that each colour choice based on ground truth shows."""
+
+
+def colours_on_offer(truth: Truth | None) -> list[Colour]:
+    """Return the colour choices that are possible for a recording with this ground truth."""
+    return [c for c in Colour if c not in STORES or getattr(truth, STORES[c], None) is not None]
+
+
+def truth_text(truth: Truth | None) -> str:
+    """Return a one-line summary of the content of a ground truth; empty without ground truth."""
+    if truth is None:
+        return ""
+    stores = {"point": truth.stored_points, **{c.value: getattr(truth, name) for c, name in STORES.items()},
+              "place": truth.stored_places}  # fmt: skip
+    per_event = ", ".join(name for name, store in stores.items() if store is not None)
+    parts = [f"per event: {per_event}"] if per_event else ["prism"] if truth.parameters else []
+    parts += [f"{len(truth.labels.instances)} instances"] if truth.labels is not None else []
+    parts += [f"{len(truth.frames.t):,} instants"] if truth.frames is not None else []
+    parts += [f"{len(truth.poses):,} poses"] if truth.poses is not None else []
+    return "; ".join(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnTruth:
+    """Ground truth of the events that the inspector draws."""
+
+    truth: Truth | None
+    """Ground truth of the whole recording; None if the recording has none."""
+    span: Span
+    """Time span from which the drawn events are a selection."""
+    positions: NDArray[np.int64]
+    """Indices of the drawn events in ``span.events``, shape ``(n,)``."""
+    _read: dict[Colour, NDArray[Any]] = field(default_factory=dict)
+
+    def values(self, colour: Colour) -> NDArray[Any]:
+        """Return the values of the drawn events that a colour shows, shape ``(n,)``.
+
+        The values are codes of causes, instance numbers, or depths [m]. Raises :class:`AmiwarpError` if the recording
+        does not hold this ground truth.
+        """
+        if colour not in self._read:
+            store = getattr(self.truth, STORES[colour], None)
+            if store is None:
+                given = ", ".join(c.value for c in colours_on_offer(self.truth))
+                raise AmiwarpError(
+                    f"colour {colour.value!r} needs ground truth that the recording does not hold; choose among {given}"
+                )
+            self._read[colour] = self.span.rows(store)[self.positions]
+        return self._read[colour]
+
+    def name(self, colour: Colour, number: int) -> str:
+        """Return the name of the cause with the code ``number``, or of the instance with this number."""
+        if colour is Colour.CAUSE:
+            return list(Cause)[number].value.replace("_", " ") if number < len(Cause) else f"cause {number}"
+        labels = () if self.truth is None or self.truth.labels is None else self.truth.labels.instances
+        return "sky" if number == 0 else labels[number - 1] if number <= len(labels) else f"instance {number}"
+
+    def text(self, k: int) -> str:
+        """Return the known ground truth of the drawn event ``k`` as text: cause, instance and depth."""
+        known = [c for c in colours_on_offer(self.truth) if c in STORES]
+        return "; ".join(
+            f"depth {self.values(c)[k]:.3f} m" if c is Colour.DEPTH else f"{c.value} {self.name(c, self.values(c)[k])}"
+            for c in known
+        )
+
+
+# Images of warped events and their sharpness for the inspector, on the device.
+
+SMOOTHING_PX = 1.0
+"""Standard deviation of the Gaussian that smooths the image before its sharpness is measured, as in calibration [px].
+"""
+
+Region = tuple[int, int, int, int]
+"""Part of the image: left, top, right and bottom [px]; right and bottom are exclusive."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredImage:
+    """Image of warped events with its sharpness in a region."""
+
+    image: NDArray[np.float32]
+    """The whole image [events per pixel], shape ``(height, width)``."""
+    variance: float
+    """Variance over mean of the smoothed region, as :attr:`amiwarp.Sharpness.VARIANCE`. It grows with the number of
+    events."""
+    sharpness: float
+    """Relative variance of the smoothed region, see
+    :func:`amiwarp.imaging.sharpness.relative_variance`. It does not depend on the number of events."""
+
+
+class WindowImager:
+    """Makes images of warped events and measures their sharpness.
+
+    An imager owns its buffers, so only one thread may use it.
+    """
+
+    def __init__(self, size: tuple[int, int], device: Any) -> None:
+        self._votes, self._device = Votes(CanvasShape(*size, dither=True), device), device
+        self._meters: dict[tuple[int, int], SharpnessMeter] = {}
+
+    def measure(self, model: Model, events: UploadedEvents, offset_us: float, region: Region) -> MeasuredImage:
+        """Return the image, and its sharpness in the region.
+
+        ``offset_us`` is added to the encoder's clock offset [us].
+        """
+        self._votes.clear()
+        self._votes.add_events(model, events, drift=offset_us)
+        left, top, right, bottom = region
+        meter = self._meter(right - left, bottom - top)
+        if meter.image.shape == self._votes.canvas.shape:
+            self._votes.read(meter.image)
+            image = part = meter.image.numpy()[0]
+        else:
+            image = self._votes.take()[0]
+            part = image[top:bottom, left:right]
+            meter.image.write(part[None])
+        variance, mean = meter.measure(), float(part.mean())
+        return MeasuredImage(image, variance, relative_variance(variance, mean, SMOOTHING_PX) if mean > 0.0 else 0.0)
+
+    def _meter(self, width: int, height: int) -> SharpnessMeter:
+        """Return the meter of images of this size. Only the last one is kept."""
+        if (width, height) not in self._meters:
+            canvas = CanvasShape(width, height, dither=True)
+            meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
+            self._meters = {(width, height): meter}
+        return self._meters[width, height]
+
+
+# Parameters of the prism and selection of events under which the inspector shows a recording.
+
+
+class Source(enum.StrEnum):
+    """Where the value of a parameter comes from. The value of a member is the text that the page shows."""
+
+    ASSUMED = "assumed"
+    ESTIMATED = "estimated"
+    FILE = "from the file"
+    CALIBRATED = "calibrated"
+    HAND = "set by hand"
+    TRUTH = "known truth"
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """Parameters of the prism that the page's sliders set."""
+
+    model: str = "exact"
+    """Name of the optical model."""
+    apex: float = 0.0
+    """Apex angle of the prism [rad]."""
+    phase: float = 0.0
+    """Phase θ_b of the prism [rad]."""
+    clock_offset: float = 0.0
+    """Offset between the clocks of encoder and camera, as in :class:`Encoder` [us]."""
+    tilt_x: float = 0.0
+    """Tilt of the axis of rotation, x component [rad]."""
+    tilt_y: float = 0.0
+    """Tilt of the axis of rotation, y component [rad]."""
+    rpm: float = 0.0
+    """Speed of the prism if the recording has no encoder [1/min]."""
+    index: float | None = None
+    """Refractive index, if a calibration or the known truth gave it; None: that of the nominal prism."""
+    focal_length: float | None = None
+    """Calibrated focal length [px]; None: that of the camera."""
+
+    @property
+    def calibrated_only(self) -> dict[str, float]:
+        """Parameters by name that the page cannot change, and that a calibration or the known truth gave."""
+        found = {"index": self.index, "focal_length": self.focal_length}
+        return {name: value for name, value in found.items() if value is not None}
+
+
+CURVE_HALF_WIDTH = {
+    "apex": math.radians(0.4), "phase": math.radians(30.0), "clock_offset": 5000.0, "tilt_x": math.radians(5.0),
+    "tilt_y": math.radians(5.0), "rpm": 6.0,
+}  # fmt: skip
+"""Half width of the range of each parameter over which its sharpness curve is drawn, in the parameter's unit."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Conditions for the events that are shown."""
+
+    polarity: int | None = None
+    """Polarity of the shown events: 1 for only ON, 0 for only OFF, None for both."""
+    region: Region | None = None
+    """Region of the image: left, top, right and bottom [px], right and bottom exclusive. None: the whole image."""
+    hide_hot: bool = False
+    """Whether the events of hot pixels are left out."""
+    noise_us: int | None = None
+    """Time within which an earlier event at a neighbouring pixel must support an event [us]; None: no noise filter."""
+
+
+def first_sources(recording: Recording) -> dict[str, Source]:
+    """Return the sources of a recording's camera and of the parameters that the page shows, without a calibration."""
+    apex = getattr(recording.prism, "apex", None)
+    return {
+        "camera": Source.ASSUMED if recording.camera is None else Source.FILE,
+        "apex": Source.ASSUMED if apex is None else Source.FILE,
+        **dict.fromkeys(("model", "phase", "tilt_x", "tilt_y"), Source.ASSUMED),
+        **({"rpm": Source.ASSUMED} if recording.encoder is None else {"clock_offset": Source.FILE}),
+    }
+
+
+def true_knobs(recording: Recording, *, rpm: float) -> Knobs | None:
+    """Return the known parameters of a simulated recording; None without ground truth of its prism.
+
+    ``rpm``: the speed, which ground truth does not hold [1/min].
+    """
+    p = {} if recording.truth is None else recording.truth.parameters
+    if not {"apex", "phase"} <= set(p):
+        return None
+    recorded_us = 0.0 if recording.encoder is None else recording.encoder.clock_offset_us
+    tilts = p.get("tilt_x", 0.0), p.get("tilt_y", 0.0)
+    return Knobs("exact", p["apex"], p["phase"], p.get("clock_offset_us", recorded_us), *tilts, rpm, p.get("index"))
+
+
+def calibrated_knobs(calibration: Calibration, *, offset_us: float, zero_us: int) -> Knobs:
+    """Return the parameters of a calibration.
+
+    ``offset_us``: clock offset if the calibration has none [us]. ``zero_us``: time at which the angle of a
+    prism without encoder is 0 [us]; the phase is converted to it.
+    """
+    p, prism = calibration.parameters, calibration.prism
+    apex = p["apex"] if "apex" in p else apex_from_deflection(p["deflection"], prism.index, prism.flat_side)
+    offset, tilts = p.get("clock_offset", offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
+    rpm, phase = p.get("rpm", 0.0), p["phase"]
+    if calibration.zero_us is not None:
+        phase += rpm * math.tau / 60e6 * (zero_us - calibration.zero_us)
+    return Knobs(calibration.model_name, apex, phase, offset, *tilts, rpm, p.get("index"), p.get("focal_length"))
+
+
+def calibrated_sources(calibration: Calibration, known: Iterable[str]) -> dict[str, Source]:
+    """Return the sources of those ``known`` parameters that a calibration has."""
+
+    def named(names: Iterable[str]) -> set[str]:
+        return {"apex" if name == "deflection" else name for name in names} & set(known)
+
+    given = dict.fromkeys(named(calibration.parameters), Source.FILE)
+    return given | dict.fromkeys(("model", *named(calibration.free)), Source.CALIBRATED)
+
+
+def kept_values(knobs: Knobs, values: Mapping[str, float], *, has_encoder: bool) -> dict[str, float]:
+    """Return the parameters that a calibration file of a model keeps, of the ``values`` for all models."""
+    size = ("deflection",) if knobs.model in ("circle", "radial") else ("apex", "tilt_x", "tilt_y")
+    time = {"clock_offset": knobs.clock_offset} if has_encoder else {"rpm": knobs.rpm}
+    return {name: values[name] for name in (*size, "phase", *knobs.calibrated_only)} | time
+
+
+# Time windows of the inspector: their selected events, and what the page shows of them.
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,3 +357,80 @@ class DisplayedWindow:
     """Sharpness of ``image_before`` in the region: 0 for events at random, whatever their number."""
     sharpness_after: float
     """Sharpness of ``image_after`` in the region."""
+
+
+# Selected events of a time window, on the host and with their prism angles on the device.
+
+MOST_POINTS = 100_000
+"""Largest number of points in each event cloud."""
+CURVE_EVENTS = 200_000
+"""Largest number of events that a sharpness curve uses."""
+LARGEST_APEX = math.radians(3.0)
+"""Apex angle up to which events that move into the region are in its images, if the nominal apex is smaller [rad]."""
+
+
+def load_window(
+    recording: Recording, span: Span, selection: Selection, *, margin_px: int, hot: NDArray[np.bool_] | None
+) -> LoadedWindow:
+    """Select the events of a time window.
+
+    ``margin_px``: how far outside the region events belong to its images. ``hot``: the hot pixels to leave out.
+    Raises :class:`AmiwarpError` if no event meets the selection.
+    """
+    region = selection.region or (0, 0, *recording.events.size)
+    left, top, right, bottom = region
+    wide = (left - margin_px, top - margin_px, right + margin_px, bottom + margin_px)
+    keep = kept(recording, span.events, selection, wide, hot)
+    near = None if keep.all() else np.flatnonzero(keep)  # None stands for all
+    events = span.events if near is None else span.events[near]
+    within = np.flatnonzero(inside(events, region)) if selection.region else None
+    n = len(events) if within is None else len(within)
+    if not n:
+        what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
+        raise AmiwarpError(f"{what} from {(span.start_us - recording.events.t_first) * 1e-3:.3f} ms on for "
+                           f"{span.length_us * 1e-3:.3f} ms; take another window")  # fmt: skip
+    thin = np.arange(min(n, MOST_POINTS)) * n // min(n, MOST_POINTS)
+    thin = thin if within is None else within[thin]
+    drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
+    xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
+    curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
+    return LoadedWindow(span, region, n, drawn, truth, xy, events, curve_events)
+
+
+def upload(events: Events, encoder: Encoder, device: Any, *, drifting: bool) -> UploadedEvents:
+    """Upload events with their prism angles.
+
+    ``drifting``: whether the clock offset of the encoder can be changed afterwards.
+    """
+    return upload_events(events, encoder, device, slope=encoder.speed_at(events.t) * 1e-6 if drifting else None)
+
+
+def margin(camera: Camera, prism: Prism) -> int:
+    """Return how far a prism may move events [px]: the margin around a region."""
+    largest = replace(prism, apex=max(LARGEST_APEX, 2.0 * abs(prism.apex)))
+    return math.ceil(1.2 * math.tan(abs(largest.deflection)) * max(camera.fx, camera.fy))
+
+
+def kept(
+    recording: Recording, events: Events, selection: Selection, region: Region, hot: NDArray[np.bool_] | None
+) -> NDArray[np.bool_]:
+    """Return whether each event meets the selection, with another region, shape ``(n,)``."""
+    keep = np.ones(len(events), np.bool_)
+    if recording.encoder is not None:
+        first, last = recording.encoder.coverage
+        keep &= (events.t >= first) & (events.t <= last)
+    if selection.polarity is not None:
+        keep &= events.p == selection.polarity
+    if selection.region is not None:
+        keep &= inside(events, region)
+    if hot is not None:
+        keep &= ~hot[events.y, events.x]
+    if selection.noise_us is not None:
+        keep &= ~find_background_activity(events, recording.events.size, window_us=selection.noise_us)
+    return keep
+
+
+def inside(events: Events, region: Region) -> NDArray[np.bool_]:
+    """Return whether each event lies in a region, shape ``(n,)``."""
+    left, top, right, bottom = region
+    return (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)

@@ -14,8 +14,7 @@ from typing import Any
 from generated_files import write_page
 from sphinx.application import Sphinx
 
-from amiwarp.studies.evaluate.drawing import draw, save
-from amiwarp.studies.evaluate.report import pivoted
+from amiwarp.studies.evaluate.report import draw, pivoted, save
 from amiwarp.studies.evaluate.results import Chart, ChartKind, Table
 
 FOLDER = "paper-results"

@@ -8,13 +8,16 @@ residual each of a few likely causes would remove, were it free.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.calib.parameters import DRIFTS, LENS, RATES
-from amiwarp.calib.photometric.causes import (
+from amiwarp.calib.photometric.answer_search import size_and_phase_directions
+from amiwarp.calib.photometric.cost import (
     CAUSES,
     CENTER,
     FLAT_SIDE,
@@ -25,13 +28,15 @@ from amiwarp.calib.photometric.causes import (
     turned,
     with_cause,
 )
-from amiwarp.calib.photometric.linear_fit import Estimate, LinearFit, linear_fit, masked
-from amiwarp.calib.photometric.minimum_check import size_and_phase_directions
 from amiwarp.errors import AmiwarpError
+from amiwarp.kernels.equations import multiply
+from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.model_error import predicted_error
+from amiwarp.optics.models import predicted_error
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from amiwarp.calib.parameters import ParameterSpace
@@ -39,6 +44,145 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
     Vector = NDArray[np.float64]
+
+
+# Linearised fits about the photometric stage's answer: what would change if one more parameter were free.
+#
+# Near the answer the residuals are linear in the parameters. With the brightness map eliminated, a fit of any few of
+# them is then a small linear problem. Its sums are kept for each square of pixels, whose scatter gives standard
+# deviations.
+
+SQUARE_PX = 16
+"""Side of the squares of pixels over which sums are kept [px]. Pairs of one square are correlated."""
+MAP_STEPS = 12
+"""Number of conjugate-gradient steps that find the part of a derivative that a change of the map explains."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Change of some parameters by a linearised fit, with its covariance."""
+
+    change: Vector
+    """Change of the parameters, shape (n,)."""
+    gain: float
+    """Share of the sum of squared weighted residuals that the change removes."""
+    inverse: Vector
+    """Inverse of the sum of the Hessians, shape (n, n)."""
+    parts: Callable[[], Vector]
+    """Function that returns the gradient of each square after the change, shape (squares, n)."""
+
+    @cached_property
+    def covariance(self) -> Vector:
+        """Covariance of the change by the sandwich estimate, shape (n, n)."""
+        parts = self.parts()
+        spare = len(parts) / max(1, len(parts) - len(self.change))
+        return np.asarray(self.inverse @ (parts.T @ parts) @ self.inverse * spare)
+
+    def significance(self, first: int) -> float:
+        """Return how many standard deviations the parameters from number ``first`` on are away from 0."""
+        x = self.change[first:]
+        return math.sqrt(max(0.0, float(x @ np.linalg.lstsq(self.covariance[first:, first:], x, rcond=1e-15)[0])))
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """Normal equations of the linearised problem for each square of pixels."""
+
+    names: tuple[str, ...]
+    """Names of the columns: the free parameters first, then other unknowns."""
+    hessian: Vector
+    """Products of the columns, shape (squares, columns, columns)."""
+    gradient: Vector
+    """Products of the columns with the residuals, shape (squares, columns)."""
+    xy: Vector
+    """Middle of each square [px], shape (squares, 2)."""
+    squares_sum: float
+    """Sum of the squared weighted residuals [thresholds²]."""
+    _known: dict[tuple[str, ...], Estimate] = field(default_factory=dict, repr=False, init=False)
+    """Fits in all squares, by the names of their columns."""
+
+    def fit(self, names: tuple[str, ...], where: NDArray[np.bool_] | None = None) -> Estimate:
+        """Return the changes of the columns ``names`` that minimise the residuals, in the squares ``where`` or in all.
+
+        The other columns are fixed.
+        """
+        if where is not None:
+            return self._fit(names, where)
+        if names not in self._known:
+            self._known[names] = self._fit(names, None)
+        return self._known[names]
+
+    def _fit(self, names: tuple[str, ...], where: NDArray[np.bool_] | None) -> Estimate:
+        k = [self.names.index(n) for n in names]
+        hessian, gradient = self._total if where is None else self._sums(where)
+        hessian, gradient = hessian[np.ix_(k, k)], gradient[k]
+        scale = np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+        scales = np.outer(scale, scale)
+        inverse = _pseudo_inverse(hessian / scales) / scales
+        change = -inverse @ gradient
+        gain = float(change @ hessian @ change) / max(self.squares_sum, 1e-30)
+
+        def parts() -> Vector:
+            all_changes, rows = np.zeros(len(self.names)), slice(None) if where is None else where
+            all_changes[k] = change
+            return np.asarray((self.gradient[rows] + self.hessian[rows] @ all_changes)[:, k])
+
+        return Estimate(change, gain, inverse, parts)
+
+    @cached_property
+    def _total(self) -> tuple[Vector, Vector]:
+        """Sums over all squares."""
+        return self._sums(slice(None))
+
+    def _sums(self, where: NDArray[np.bool_] | slice) -> tuple[Vector, Vector]:
+        """Return the sums of the Hessians and of the gradients over some of the squares."""
+        return self.hessian[where].sum(axis=0), self.gradient[where].sum(axis=0)
+
+    def adding(self, names: tuple[str, ...], more: tuple[str, ...]) -> tuple[Estimate, float, float]:
+        """Return the fit of the columns ``names`` and ``more``, and what ``more`` contributes.
+
+        That is how many standard deviations they are away from 0, and the share of the sum of squares that they remove.
+        """
+        estimate = self.fit((*names, *more))
+        return estimate, estimate.significance(len(names)), estimate.gain - self.fit(names).gain
+
+
+def _pseudo_inverse(matrix: Vector) -> Vector:
+    """Return the pseudo-inverse of a symmetric, positive semidefinite matrix, faster than ``numpy.linalg.pinv``.
+
+    Eigenvalues below a millionth of the largest count as 0.
+    """
+    values, vectors = np.linalg.eigh(matrix)
+    large = values > 1e-6 * values[-1]
+    return np.asarray(vectors[:, large] / values[large] @ vectors[:, large].T)
+
+
+def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
+    """Return the linearised problem of ``columns``, derivatives of the residuals on the device, by name.
+
+    The map must have been solved at the answer.
+    """
+    b, camera = cost.brightness, cost.space.camera
+    b.prepare_projection()
+    for name, column in columns.items():
+        if name not in cost.columns or cost.columns[name][0] is not column:
+            cost.columns[name] = column, b.unexplained(column, steps=MAP_STEPS)
+    left = [cost.columns[name][1] for name in columns]
+    next(cost.meanwhile, None)
+    width, height = (-(-side // SQUARE_PX) for side in (camera.width, camera.height))
+    sums, squares = b.residuals.products_by_square([*left, b.residuals.values], SQUARE_PX, width, height)
+    xy = np.stack([squares % width, squares // width], axis=1).astype(np.float64)
+    return LinearFit(
+        tuple(columns), sums[:, :-1, :-1], sums[:, :-1, -1], (xy + 0.5) * SQUARE_PX, float(sums[:, -1, -1].sum())
+    )
+
+
+def masked(column: Any, factor: Any) -> Any:
+    """Return a derivative times a factor for each pair, all on the device."""
+    out = wp.empty_like(column)
+    launch(multiply, len(column), [column, factor], [out], device=column.device)
+    return out
+
 
 SLOPE_PX = 0.02
 """Step of the finite differences that give the derivatives of the residuals [px]."""

@@ -3,21 +3,113 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
-from amiwarp.calib.photometric.causes import place_arguments
-from amiwarp.calib.photometric.gauss_newton import Slopes
+from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
+from amiwarp.brightness.multigrid import Tiles
+from amiwarp.calib.calibration_events import EventsAhead
+from amiwarp.calib.nlopt_solver import SearchStage, best_of
+from amiwarp.calib.parameters import RATES, widened
+from amiwarp.calib.settings import GAUSS_NEWTON
+from amiwarp.calib.sharpness import reach
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import MemoryEvents
+from amiwarp.kernels.iwe import sum_segments
+from amiwarp.kernels.launch import launch
+from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator, Mapping
 
-    import warp as wp
     from numpy.typing import NDArray
 
     from amiwarp.brightness.solver import BrightnessMap
     from amiwarp.calib.parameters import ParameterSpace
+    from amiwarp.calib.settings import PhotometricSettings
+    from amiwarp.calib.sharpness import Search
+    from amiwarp.events.encoder import Encoder
+    from amiwarp.events.recording import Recording
+    from amiwarp.imaging.votes import Image
+
+    Vector = NDArray[np.float64]
+
+# Causes of an answer that does not hold everywhere in the image: what may be wrong in the given camera and prism.
+
+FLAT_SIDE = "flat_side"
+"""Name of the unknown that is 0 for the given flat side of the prism, and 1 for the other."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One thing that may be wrong, and the parameters that correct it."""
+
+    words: str
+    """What is wrong, in words."""
+    names: tuple[str, ...]
+    """Names of the parameters that correct it."""
+
+    @property
+    def rank(self) -> int:
+        """Position in :data:`CAUSES`: of causes with equal evidence, the first one counts."""
+        return CAUSES.index(self)
+
+
+CENTER = Cause("the principal point", ("center_x", "center_y"))
+CAUSES = (
+    Cause("the focal length", ("focal_length",)),
+    CENTER,
+    Cause("the flat side of the prism", (FLAT_SIDE,)),
+    Cause("the lens distortion k1", ("k1",)),
+    Cause("the direction of the prism's axis", ("tilt_x", "tilt_y")),
+)
+"""All causes that the photometric stage can name and correct, the likeliest first."""
+SCREENED = CAUSES[:3]
+"""Causes that every answer is tested for. The effects of the others resemble those of the first two."""
+
+
+def turned(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, float]:
+    """Return values that deflect the axial ray as before if the prism's other side is flat."""
+    prism, index = space.prism, values.get("index", space.prism.index)
+    deflection = Prism(values["apex"], index, prism.flat_side).deflection
+    phase = math.remainder(values["phase"] + math.pi, math.tau)
+    return {**values, "apex": apex_from_deflection(deflection, index, _other(prism)), "phase": phase}
+
+
+def other_side(space: ParameterSpace) -> ParameterSpace:
+    """Return the parameter space with the prism's other side flat."""
+    prism = space.prism
+    apex = apex_from_deflection(prism.deflection, prism.index, _other(prism))
+    return replace(space, prism=Prism(apex, prism.index, _other(prism)), start=turned(space, space.start))
+
+
+def _other(prism: Prism) -> FlatSide:
+    return FlatSide.CAMERA if prism.flat_side is FlatSide.SCENE else FlatSide.SCENE
+
+
+def with_cause(space: ParameterSpace, cause: Cause, values: Mapping[str, float]) -> tuple[ParameterSpace, Vector]:
+    """Return the space in which a cause is corrected or free, and the vector of ``values`` there."""
+    if cause.names == (FLAT_SIDE,):
+        space, values = other_side(space), turned(space, values)
+    else:
+        space = widened(space, tuple(n for n in cause.names if n not in space.names))
+    return space, space.to_vector({**space.start, **values})
+
+
+def place_arguments(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, Any]:
+    """Return the keyword arguments of :meth:`BrightnessMap.place` for parameter values."""
+    return {
+        "model": space.build(values),
+        "drift": space.drift(values),
+        "camera_rotation": space.camera_rotation(values),
+    }
+
 
 FIRST_SCALE = 1.0
 """Scale of the Cauchy weights before the first brightness map is solved [thresholds]."""
@@ -176,3 +268,350 @@ class Cost:
             left.append(b.unexplained(slope, change, steps=self.steps // 2))
             self._changes.append(b.explaining_change())
         return left
+
+
+# Choice of the parts of the scene that the photometric stage maps.
+
+TILE = 32
+"""Side of a tile of the scene [px]."""
+FEW_SEGMENTS = 2048
+"""Smallest number of segments of rows for which a second CPU thread counts events."""
+GRID = (4, 3)
+"""Number of columns and rows into which the image is divided. The tile with most events is chosen from each part."""
+
+
+def choose_tiles(image: Image, pad: int, density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
+    """Choose the tile with most events from each part of the scene.
+
+    ``image`` is the IWE at the answer of the sharpness stage, with a border of ``pad`` px outside the sensor;
+    ``density`` gives map nodes per pixel, and ``margin`` the border of a tile's map [px]. Return the tile number of
+    each of the sensor's pixels, or -1, and the tiles.
+    """
+    layers, height, width = image.shape[0], image.shape[1] - 2 * pad, image.shape[2] - 2 * pad
+    columns, rows = max(1, width // TILE), max(1, height // TILE)
+    used = rows * min(TILE, height)
+    sums: Any = wp.empty((used, columns), dtype=wp.float64, device=image.device)
+    inputs = [image.pixels, image.frame, layers, pad, min(TILE, width)]
+    launch(sum_segments, sums.size, inputs, [sums], device=image.device, smallest=FEW_SEGMENTS)
+    counts = sums.numpy().reshape(rows, -1, columns).sum(axis=1)
+    tile_of = np.full((height, width), -1, dtype=np.int32)
+    corners: list[tuple[int, int]] = []
+    for part_rows in np.array_split(np.arange(rows), min(GRID[1], rows)):
+        for part_columns in np.array_split(np.arange(columns), min(GRID[0], columns)):
+            part = counts[np.ix_(part_rows, part_columns)]
+            row, column = np.unravel_index(int(part.argmax()), part.shape)
+            x, y = int(part_columns[column]) * TILE, int(part_rows[row]) * TILE
+            tile_of[y : y + TILE, x : x + TILE] = len(corners)
+            corners.append((x - margin, y - margin))
+    side = math.ceil((TILE + 2 * margin) * density) + 2
+    return tile_of, Tiles(np.array(corners, dtype=np.float32), side, side, density)
+
+
+def near_tiles(tiles: Tiles, margin: int, far: int, shape: tuple[int, ...]) -> NDArray[np.int32]:
+    """Return 0 for the pixels that are at most ``far`` pixels from a tile, along each axis, else -1.
+
+    ``margin`` is that of the tiles, ``shape`` the image's (height, width). With few nodes per pixel, tiles count as
+    larger than they are, by up to the distance of two nodes.
+    """
+    near = np.full(shape, -1, dtype=np.int32)
+    down, across = (int((n - 2) / tiles.density) - 2 * margin for n in (tiles.rows, tiles.columns))
+    for left, top in (tiles.origin.astype(int) + margin).tolist():
+        near[max(0, top - far) : top + down + far, max(0, left - far) : left + across + far] = 0
+    return near
+
+
+def one_tile(width: int, height: int, density: float, margin: int) -> tuple[NDArray[np.int32], Tiles]:
+    """Return the whole image as one tile, for recordings with few events; see :func:`choose_tiles`."""
+    origin = np.array([[-margin, -margin]], dtype=np.float32)
+    rows, columns = (math.ceil((n + 2 * margin) * density) + 2 for n in (height, width))
+    return np.zeros((height, width), dtype=np.int32), Tiles(origin, rows, columns, density)
+
+
+# Collection of the pairs of successive events of a pixel that the photometric stage uses.
+
+MARGIN_PX, ROTATION_MARGIN_PX = 3, 8
+"""Border of a tile's brightness map for events that a change of the parameters moves [px]: for a still camera, and for
+a rotating one."""
+LONGEST_GAP_US = 60_000
+"""Longest time between the two events of a pair [us]. Noise makes longer gaps unreliable."""
+FEWEST_PAIRS = 1_500
+"""Smallest number of pairs of events for the photometric stage."""
+PAIRS_PER_NODE = 1.5
+"""Smallest number of equations per unknown of the brightness map. A map with fewer fits any parameters."""
+MANY_PAIRS = 100_000
+"""Number of pairs from which on fewer of them per node determine a fine map."""
+FINE_PAIRS_PER_NODE, FINE_PAIRS_PER_NODE_OF_MANY = 4.2, 3.9
+"""Smallest number of equations per unknown of a map with more than one node per pixel along each axis: of a recording
+with few pairs, and of one with :data:`MANY_PAIRS`."""
+FEWEST_TURNS = 2
+"""Number of turns of the prism that are always used, if the recording has them."""
+EVENTS_PER_PAIR = 10
+"""Number of events that are copied ahead for each wanted pair. The tiles hold about a tenth of the events as pairs."""
+FEWEST_TILES = 6
+"""Number of tiles of the scene that are always used."""
+
+
+class _PairCollector:
+    """Collector of pairs of events that fall on the same tile, compensated by the result of the sharpness stage."""
+
+    def __init__(
+        self,
+        recording: Recording,
+        search: Search,
+        tile_of: NDArray[np.int32],
+        near: NDArray[np.int32],
+        sensor: SensorTiming,
+        ahead: EventsAhead | None,
+    ) -> None:
+        """``tile_of`` is the tile of each pixel of the map, or -1; events of the pixels with ``near`` >= 0 are used."""
+        self.recording, self.search, self.sensor, self._ahead = recording, search, sensor, ahead
+        self._tile_of, self._near = (wp.array(a, dtype=int, device=search.device) for a in (tile_of, near))
+        self._found: list[PairSet] = []
+        self._done = 0
+
+    def read(self, spans: list[tuple[int, int]]) -> int:
+        """Collect the pairs of events inside the time spans [us], which extend those of earlier calls.
+
+        Return the number of all pairs. Only new spans are read.
+        """
+        if len(spans) > self._done:
+            self._found.append(self._new_pairs(spans[self._done :]))
+            self._done = len(spans)
+        return sum(map(len, self._found))
+
+    def pairs(self) -> PairSet:
+        """Return all pairs."""
+        return PairSet.concatenate(self._found)
+
+    def _new_pairs(self, spans: list[tuple[int, int]]) -> PairSet:
+        search, source = self.search, self.recording.events
+        space, best, calibration_events = search.space, search.best, search.calibration_events
+        joined = None if self._ahead is None else self._ahead.take(spans)
+        table = EventTable([source.between(*span) for span in spans], self._near, search.device, joined=joined)
+        pairs = table.pairs(
+            calibration_events.encoder, longest_gap_us=LONGEST_GAP_US, shortest_gap_us=2.0 * self.sensor.refractory_us,
+            sensor=self.sensor, middle_us=space.middle_us,
+        )  # fmt: skip
+        if not len(pairs):
+            return pairs
+        if calibration_events.slope_of is not None:
+            pairs = pairs.with_slope(calibration_events.slope_of, space.middle_us)
+        return pairs.on_tiles(space.build(best), space.camera_rotation(best), space.drift(best), self._tile_of)
+
+
+def turn_length(recording: Recording, encoder: Encoder) -> float:
+    """Return the duration of a turn of the prism [us]; the duration of the recording if it is shorter."""
+    whole = float(recording.events.t_last - recording.events.t_first + 1)
+    return min(60e6 / max(abs(encoder.rpm), 1e-6), whole)
+
+
+def time_spans(recording: Recording, search: Search) -> list[tuple[int, int]]:
+    """Return the time spans whose events give pairs, in the order of their use [us]: turns of the prism.
+
+    A rotating camera needs successive turns, so it gets one span.
+    """
+    first, last = recording.events.t_first, recording.events.t_last
+    if search.full_space.moving:
+        return [(first, last + 1)]
+    turn = turn_length(recording, search.calibration_events.encoder)
+    turns = max(1, int((last - first + 1) / turn))
+    return [(first + int(k * turn), first + int(k * turn) + int(turn)) for k in van_der_corput(turns)]
+
+
+def upload_ahead(recording: Recording, search: Search) -> AbstractContextManager[EventsAhead | None]:
+    """Start to copy the events that :func:`collect_pairs` will probably need to a GPU.
+
+    Only events in memory are copied. On a CPU, or without a photometric stage, the context gives None.
+    """
+    device, source, settings = wp.get_device(search.device), recording.events, search.settings
+    if device.is_cpu or not isinstance(source, MemoryEvents) or "photometric" not in settings.stages:
+        return nullcontext()
+    most = EVENTS_PER_PAIR * settings.photometric.pairs
+    return EventsAhead(source, time_spans(recording, search), most, device)
+
+
+def collect_pairs(
+    recording: Recording, search: Search, settings: PhotometricSettings, ahead: EventsAhead | None = None
+) -> tuple[PairSet, Tiles]:
+    """Return about ``settings.pairs`` pairs of events, from whole turns spread over the recording, and the map's tiles.
+
+    At least :data:`FEWEST_TURNS` turns are used, if the recording has them. If these hold too many pairs, whole tiles
+    are left out: fewer pairs on the same tiles would not determine the map. ``ahead``: events already on the device.
+    """
+    first = recording.events.t_first
+    turn = turn_length(recording, search.calibration_events.encoder)
+    margin = ROTATION_MARGIN_PX if search.full_space.moving else MARGIN_PX
+    if len(recording.events.between(first, first + int(FEWEST_TURNS * turn) + 1)) <= settings.pairs:
+        tile_of, tiles = one_tile(*recording.events.size, settings.density, margin)
+    else:
+        tile_of, tiles = choose_tiles(search.fine.image(search.best), search.pad, settings.density, margin)
+    near = near_tiles(tiles, margin, math.ceil(reach(search.space, search.best)) + 1, tile_of.shape)
+    collector = _PairCollector(recording, search, tile_of, near, settings.sensor, ahead)
+    spans = time_spans(recording, search)
+    many = min(FEWEST_TURNS, len(spans))
+    found = collector.read(spans[:many])
+    while found < settings.pairs and many < len(spans):
+        many = min(len(spans), max(many + 1, math.ceil(many * settings.pairs / max(found, 1))))
+        found = collector.read(spans[:many])
+    pairs, count = collector.pairs(), len(tiles.origin)
+    keep = max(FEWEST_TILES, round(count * settings.pairs / max(len(pairs), 1)))
+    if keep >= count:
+        return pairs, tiles
+    return pairs.of_tiles(np.isin(np.arange(count), van_der_corput(count)[:keep])), tiles
+
+
+def van_der_corput(n: int) -> list[int]:
+    """Return 0 … n-1 in van der Corput's order: the first k numbers are evenly spread for every k."""
+    bits = max(1, (n - 1).bit_length())
+    order = (int(f"{k:0{bits}b}"[::-1], 2) for k in range(1 << bits))
+    return [k for k in order if k < n]
+
+
+def pairs_per_node(coverage: NDArray[np.float32], pairs: int) -> float:
+    """Return the number of pairs of events per node of the map that they touch."""
+    return pairs / max(1, int((coverage > 0.5).sum()))
+
+
+def fine_map_is_determined(coverage: NDArray[np.float32], pairs: int) -> bool:
+    """Return whether there are enough pairs for a map with more than one node per pixel along each axis."""
+    fewest = FINE_PAIRS_PER_NODE_OF_MANY if pairs >= MANY_PAIRS else FINE_PAIRS_PER_NODE
+    return pairs_per_node(coverage, pairs) >= fewest
+
+
+def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
+    """Return 1 minus the ratio of map unknowns to pairs of events; raise :class:`AmiwarpError` for too few pairs."""
+    ratio = pairs_per_node(coverage, pairs)
+    if pairs < FEWEST_PAIRS or ratio < PAIRS_PER_NODE:
+        raise AmiwarpError(
+            f"{name}: {pairs} pairs of events are too few for the {pairs / ratio:.0f} unknowns of a brightness map; "
+            "record for longer"
+        )
+    return 1.0 - 1.0 / ratio
+
+
+MOST_STEPS = 15
+"""Largest number of Gauss-Newton steps."""
+
+
+LONGEST_STEP_PX = 1.0
+"""Largest change of any parameter in one Gauss-Newton step [px]."""
+
+
+HALVINGS = 4
+"""Number of step lengths that are tried along a Gauss-Newton direction, each half of the previous one."""
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """Derivatives of the weighted least-squares problem with the brightness map eliminated (Kaufman 1975).
+
+    They are sums over the pairs of events.
+    """
+
+    hessian: Vector
+    """Gauss-Newton Hessian [thresholds²/px²], shape ``(parameters, parameters)``."""
+    gradient: Vector
+    """Half the cost's gradient [thresholds²/px], shape ``(parameters,)``. The brightness map is optimal, so its change
+    adds nothing to the gradient."""
+    parts: Vector
+    """Contribution of each cluster of pairs of events to the gradient, shape ``(parameters, clusters)``."""
+
+    def restricted_to(self, which: list[int]) -> Slopes:
+        """Return the derivatives by some of the parameters only."""
+        return Slopes(self.hessian[np.ix_(which, which)], self.gradient[which], self.parts[which])
+
+    def step(self) -> Vector:
+        """Return the change of the parameters by a Gauss-Newton step [px]."""
+        ridge = 1e-6 * float(np.trace(self.hessian)) * np.eye(len(self.hessian))
+        return np.asarray(-np.linalg.solve(self.hessian + ridge, self.gradient))
+
+    def covariance(self) -> Vector:
+        """Return the parameters' covariance [px²]: the sandwich estimate from the clusters' gradients."""
+        clusters = self.parts.shape[1]
+        parts = self.parts - self.parts.mean(axis=1, keepdims=True)
+        scatter = parts @ parts.T * clusters / max(1, clusters - 1 - len(parts))
+        # successive pairs of a pixel share an event and are correlated, so the inverse Hessian alone is too small
+        inverse = _inverse(self.hessian)
+        return np.asarray(inverse @ scatter @ inverse)
+
+
+def _inverse(hessian: Vector) -> Vector:
+    """Return the inverse of the Hessian, with very small eigenvalues raised."""
+    values, vectors = np.linalg.eigh(hessian)
+    return np.asarray(vectors @ np.diag(1.0 / np.maximum(values, 1e-9 * max(float(values[-1]), 1e-12))) @ vectors.T)
+
+
+def determined(slopes: Slopes, space: ParameterSpace, left: float) -> tuple[str, ...]:
+    """Return the names of the free parameters that the events determine.
+
+    A parameter is weak if its standard deviation is large, or if its curvature, with all others free, is far below the
+    largest one: then the standard deviation is unreliable. The weakest parameter is removed until none is weak. Size,
+    phase and rates always stay. ``left`` is the share of equations beyond the map's unknowns.
+    """
+    names = list(space.names)
+    core = sum(n in (space.size_name, "phase", *RATES) for n in names)
+    names.sort(key=lambda n: n not in (space.size_name, "phase", *RATES))
+    while len(names) > max(core, 1):
+        part = slopes.restricted_to([space.names.index(n) for n in names])
+        curvature = 1.0 / np.diag(_inverse(part.hessian)) / part.hessian.diagonal().max()
+        deviation = np.sqrt(np.diag(part.covariance())) / left
+        weak = [
+            k for k in range(core, len(names))
+            if not (deviation[k] <= UNDETERMINED_PX and curvature[k] >= LEAST_CURVATURE)
+        ]  # fmt: skip
+        if not weak:
+            break
+        names.pop(min(weak, key=lambda k: float(curvature[k])))
+    return tuple(n for n in space.names if n in names)
+
+
+def iterate(
+    start_score: Callable[[Vector], Callable[[], float]],
+    start_slopes: Callable[[Vector], Callable[[], Slopes]],
+    start: Vector,
+    *,
+    low: Vector,
+    high: Vector,
+    tolerance: float,
+    report: Callable[[int, int], None],
+) -> SearchStage:
+    """Maximise a score by Gauss-Newton steps until they are shorter than ``tolerance`` [px] in every parameter.
+
+    A step that lowers the score is halved. The search stays in the box ``low .. high`` [px]. Its answer is the best
+    evaluated point. ``report`` gets the number of steps done and the largest number. ``start_score`` and
+    ``start_slopes`` return functions that wait for the result at a point; slopes are also started where the score may
+    turn out lower, and then not waited for.
+    """
+    began = time.perf_counter()
+    v, points, scores, ended = np.clip(start, low, high), [], [], "budget"
+    waiting, slopes = start_score(v), start_slopes(v)
+    here = waiting()
+    points.append(v)
+    scores.append(here)
+    for k in range(MOST_STEPS):
+        report(k, MOST_STEPS)
+        step = slopes().step()
+        step *= min(1.0, LONGEST_STEP_PX / max(float(np.abs(step).max()), 1e-12))
+        for _ in range(HALVINGS):
+            trial = np.clip(v + step, low, high)
+            moved = float(np.abs(trial - v).max())
+            waiting = start_score(trial)
+            following = start_slopes(trial) if moved >= tolerance and k + 1 < MOST_STEPS else None
+            value = waiting()
+            points.append(trial)
+            scores.append(value)
+            if value >= here:
+                break
+            step = step / 2.0
+        if value >= here:
+            v, here = trial, value
+        if moved < tolerance or value < here:
+            ended = "tolerance" if moved < tolerance else "no better step"
+            break
+        slopes = following or slopes
+    return best_of(GAUSS_NEWTON, points, scores, seconds=time.perf_counter() - began, ended=ended)
+
+
+UNDETERMINED_PX, LEAST_CURVATURE = 0.3, 1e-3
+"""A parameter is undetermined if its standard deviation exceeds the first value [px], or if its curvature is below the
+second, a share of the largest curvature."""

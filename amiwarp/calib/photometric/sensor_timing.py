@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from amiwarp.brightness.slow_pixels import darkness, set_lags
-from amiwarp.calib.photometric.acceptance import LARGEST_EXAMINED_COST
-from amiwarp.calib.photometric.consistency import free_columns
-from amiwarp.calib.photometric.linear_fit import linear_fit
+from amiwarp.brightness.solver import darkness, set_lags
+from amiwarp.calib.photometric.answer_search import LARGEST_EXAMINED_COST
+from amiwarp.calib.photometric.consistency import free_columns, linear_fit
 
 if TYPE_CHECKING:
     from collections.abc import Callable

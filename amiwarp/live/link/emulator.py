@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import bisect
+import contextlib
 import math
+import os
 import random
 import re
+import select
+import threading
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.live.link.clocks import WRAP
-from amiwarp.live.link.emulated_rotors import Played, Rotor
+from amiwarp.live.link.clocks import WRAP, monotonic_us
 from amiwarp.live.link.protocol import (
     FAULTS,
     MOST_SAMPLES,
@@ -35,7 +40,139 @@ from amiwarp.live.link.protocol import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import TracebackType
+
     from numpy.typing import ArrayLike, NDArray
+
+    from amiwarp.events.encoder import Encoder
+
+
+# Rotation of the emulated prism: by a simulated motor, or as in a recording.
+
+MOST_SEGMENTS = 1024
+"""Largest number of motor segments in memory. The oldest segment then also describes all earlier times."""
+RPM = math.tau / 60.0
+"""Factor from turns per minute to rad/s."""
+
+
+class Rotor(Protocol):
+    """Rotation of the emulated prism, with an index pulse at every whole turn. All times are emulation times [us]."""
+
+    def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Return the unwrapped prism angles [rad] at times ``t_us``, same shape.
+
+        Angles of future times assume that no further command comes.
+        """
+
+    def target_rpm(self, t_us: int) -> float:
+        """Return the commanded speed at a time [turns/min]."""
+
+    def set_speed(self, rpm: float, ramp: float, t_us: int) -> bool:
+        """Change to the speed ``rpm`` at ``ramp`` [rpm/s] from ``t_us`` on; return False if commands are not taken."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Segment:
+    """Motion of the motor from ``start`` on: the target speed changes linearly, and the speed follows with a lag."""
+
+    start: float
+    """Time at which the segment starts [s]."""
+    angle: float
+    """Prism angle at the start of the segment [rad]."""
+    speed: float
+    """Speed of the prism at the start of the segment [rad/s]."""
+    target: float
+    """Target speed at the start of the segment [rad/s]."""
+    slope: float
+    """Rate of change of the target speed [rad/s²]."""
+
+
+class Motor:
+    """Simulated motor whose speed follows the ramped target speed with the time constant ``inertia_s`` [s].
+
+    The angle is 0 at time 0. ``ripple``: relative speed variation once and six times per turn, as caused by magnet
+    poles. ``noise``: relative rms speed variation by random friction, from ``seed``. Both are functions of the angle,
+    so a motor at rest stays at rest. The angle is a closed formula: angles can be computed for any times, in any order.
+    """
+
+    def __init__(
+        self, rpm: float = 0.0, *, inertia_s: float = 0.15, ripple: float = 0.01, noise: float = 0.003, seed: int = 0
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        self._inertia = inertia_s
+        self._frequency = np.concatenate([[1.0, 6.0], np.exp(rng.uniform(math.log(0.05), math.log(3.0), 8))])
+        amplitude = np.concatenate([np.full(2, ripple / 2.0), np.full(8, noise * 0.5)])
+        self._amplitude, self._phase = amplitude / self._frequency, rng.uniform(0.0, math.tau, 10)
+        self._segments = [_Segment(start=0.0, angle=0.0, speed=rpm * RPM, target=rpm * RPM, slope=0.0)]
+
+    def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Return the unwrapped prism angles [rad], see :class:`Rotor`. The speed is constant before time 0."""
+        t = np.asarray(t_us, np.float64) * 1e-6
+        smooth = np.empty(t.shape)
+        index = np.maximum(np.searchsorted([p.start for p in self._segments], t, side="right") - 1, 0)
+        for k in np.unique(index):
+            smooth[index == k] = self._state_at(self._segments[k], t[index == k])[0]
+        ripple_angle = np.sin(smooth[..., None] * self._frequency + self._phase) - np.sin(self._phase)
+        return np.asarray(smooth + ripple_angle @ self._amplitude, np.float64)
+
+    def target_rpm(self, t_us: int) -> float:
+        """Return the commanded speed [turns/min], see :class:`Rotor`."""
+        last = self._segments[-1]
+        return last.target / RPM
+
+    def set_speed(self, rpm: float, ramp: float, t_us: int) -> bool:
+        """Change to a speed at a constant rate from now on, see :class:`Rotor`."""
+        t = t_us * 1e-6
+        current = self._segments[max(bisect.bisect_right([p.start for p in self._segments], t) - 1, 0)]
+        self._segments = [p for p in self._segments if p.start <= t][-MOST_SEGMENTS:]
+        target = current.target + current.slope * (t - current.start)
+        slope = math.copysign(ramp * RPM, rpm * RPM - target)
+        angle, speed = self._state_at(current, np.asarray(t))
+        ramped = _Segment(start=t, angle=float(angle), speed=float(speed), target=target, slope=slope)
+        end = t + (rpm * RPM - target) / slope
+        angle, speed = self._state_at(ramped, np.asarray(end))
+        final = _Segment(start=end, angle=float(angle), speed=float(speed), target=rpm * RPM, slope=0.0)
+        self._segments += [ramped, final]
+        return True
+
+    def _state_at(self, segment: _Segment, t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return angle [rad] and speed [rad/s], both without ripple, at times of a segment [s]."""
+        elapsed, lag = t - segment.start, self._inertia
+        behind = segment.speed - segment.target + segment.slope * lag
+        # Before the first segment nothing decays: its speed equals its target.
+        decay = behind * np.exp(-np.maximum(elapsed, 0.0) / lag)
+        angle = segment.angle + elapsed * (segment.target - segment.slope * lag + segment.slope * elapsed / 2.0)
+        return angle + lag * (behind - decay), segment.target + segment.slope * (elapsed - lag) + decay
+
+
+class Played:
+    """Rotation played from a recording.
+
+    The first sample is at ``start_us``; the prism is at rest before and after it.
+    """
+
+    def __init__(self, encoder: Encoder, start_us: int = 0) -> None:
+        self._elapsed = (encoder.t - encoder.t[0]).astype(np.float64)
+        self._angle, self._rpm = encoder.angle, encoder.rpm
+        self.begin(start_us)
+
+    def begin(self, start_us: int) -> None:
+        """Set another start time of the recorded rotation [us]. Only valid before the rotation has begun."""
+        self._t = self._elapsed + start_us
+
+    def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Return the unwrapped prism angles of the recording [rad], see :class:`Rotor`."""
+        return np.asarray(np.interp(np.asarray(t_us, np.float64), self._t, self._angle))
+
+    def target_rpm(self, t_us: int) -> float:
+        """Return the recording's mean speed [turns/min] while it lasts, else 0."""
+        return self._rpm if self._t[0] <= t_us <= self._t[-1] else 0.0
+
+    def set_speed(self, rpm: float, ramp: float, t_us: int) -> bool:
+        """Return False: a recorded rotation takes no commands."""
+        return False
+
 
 LASTING_FAULTS = {
     "garbage": 0.5, "truncate": 0.5, "crc": 0.5, "drop": 0.5, "missed-index": 0.5, "stall": 2.0, "reverse": 1.0,
@@ -325,3 +462,125 @@ def _edges_of(fault: EmulatedFault, start_us: int) -> list[tuple[int, bool]]:
 
 def _int32(count: int) -> int:
     return (count + (1 << 31)) % WRAP - (1 << 31)
+
+
+# Pseudo-terminal that offers an emulated controller as a serial port.
+
+STEP_S = 1e-3
+"""Interval between updates of the emulated controller [s]."""
+RETRY_S = 0.2
+"""Interval between attempts to open a pseudo-terminal after a failure [s]."""
+
+
+class PseudoTerminal:
+    """Pseudo-terminal that runs an emulated controller in real time, in a background thread, until closed.
+
+    ``path``: symbolic link to the port. It exists while the emulated cable is plugged in, and points to the new port
+    after a reconnection, so that programs find it under the same name. ``now_us``: emulation time [us]; default: time
+    since the creation of this object. Raises :class:`AmiwarpError` if ``path`` exists, or if the system has no
+    pseudo-terminals.
+    """
+
+    def __init__(
+        self, controller: Controller, path: str | os.PathLike[str] | None = None,
+        *, now_us: Callable[[], int] | None = None,
+    ) -> None:  # fmt: skip
+        if not hasattr(os, "openpty"):
+            raise AmiwarpError("this system has no pseudo-terminals; the emulator needs Linux or macOS")
+        self._path = None if path is None else Path(path)
+        # A dangling link is the remnant of a killed process and may be replaced.
+        if self._path is not None and self._path.exists():
+            raise AmiwarpError(
+                f"{path}: this file already exists; give another path for the link to the port, or remove the file"
+            )
+        origin = monotonic_us()
+        self._now_us = now_us or (lambda: monotonic_us() - origin)
+        self._controller = controller
+        self._ended = threading.Event()
+        self._master: int | None = None
+        self._open()
+        self._thread = threading.Thread(target=self._run, name="amiwarp-emulator", daemon=True)
+        self._thread.start()
+
+    @property
+    def name(self) -> str:
+        """Name under which programs open the port: the symbolic link if there is one, else the pseudo-terminal."""
+        return self._port if self._path is None else str(self._path)
+
+    def __enter__(self) -> PseudoTerminal:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the background thread, and remove the port and the symbolic link."""
+        self._ended.set()
+        self._thread.join()
+        self._close()
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            data = self._read(self._master)
+            now = self._now_us()
+            self._controller.feed(data, now)
+            out = self._controller.advance(now)
+            if self._controller.plugged and self._master is None:
+                try:
+                    self._open()
+                except OSError:  # no free file descriptor: try again later
+                    self._ended.wait(RETRY_S)
+            elif not self._controller.plugged and self._master is not None:
+                self._close()
+            # Without a reader, or with a slow one, bytes are lost, as on any serial line without flow control.
+            if out and self._master is not None and not self._without_peer(self._master):
+                with contextlib.suppress(OSError):
+                    os.write(self._master, out)
+
+    def _read(self, master: int | None) -> bytes:
+        """Return the bytes that the program at the other end sent, after waiting for at most :data:`STEP_S`."""
+        if master is None or self._without_peer(master):
+            self._ended.wait(STEP_S)
+            return b""
+        poll = select.poll()
+        poll.register(master, select.POLLIN)
+        if not poll.poll(round(1e3 * STEP_S)):
+            return b""
+        with contextlib.suppress(OSError):
+            return os.read(master, 4096)
+        return b""
+
+    def _without_peer(self, master: int) -> bool:
+        poll = select.poll()
+        poll.register(master, 0)
+        return any(event & select.POLLHUP for _, event in poll.poll(0))
+
+    def _open(self) -> None:
+        import tty
+
+        master, port = os.openpty()
+        try:
+            self._port = os.ttyname(port)
+            tty.setraw(port)
+            os.set_blocking(master, False)
+        except BaseException:
+            os.close(master)
+            raise
+        finally:
+            os.close(port)
+        self._master = master
+        if self._path is not None:
+            self._remove_link()
+            self._path.symlink_to(self._port)
+
+    def _remove_link(self) -> None:
+        if self._path is not None and self._path.is_symlink():  # leave a file that replaced the link
+            self._path.unlink()
+
+    def _close(self) -> None:
+        self._remove_link()
+        if self._master is not None:
+            os.close(self._master)
+            self._master = None

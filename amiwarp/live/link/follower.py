@@ -2,17 +2,400 @@
 
 from __future__ import annotations
 
+import enum
 import math
 from collections import deque
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.live.link.angles import AngleTracker, EncoderFault, FaultReport
-from amiwarp.live.link.clocks import FEWEST_PAIRS, WRAP, ClockMap, fit_to_round_trips
-from amiwarp.live.link.follower_state import TRIPS, Connection, Epoch
-from amiwarp.live.link.protocol import FAULTS, Answer, ControllerStatus, Index, Message, Pong, Samples, Sync
-from amiwarp.live.link.updates import LinkUpdate, UpdateQueue
+from amiwarp.errors import AmiwarpError
+from amiwarp.live.link.clocks import FEWEST_PAIRS, WRAP, ClockMap, UnwrappedClock, fit_to_round_trips
+from amiwarp.live.link.protocol import (
+    FAULTS,
+    Answer,
+    ControllerStatus,
+    FrameCounters,
+    FrameDecoder,
+    Index,
+    Message,
+    Pong,
+    Samples,
+    Sync,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+
+# Absolute prism angle from encoder counts and index pulses, with detection of encoder faults.
+
+INDEX_TOLERANCE_TURNS = 0.01
+"""Largest disagreement between an index pulse and the encoder count that is not reported as a slip [turns]. A pulse has
+a width and a latch delay."""
+REVERSAL_TURNS = 0.1
+"""Distance that counts must run backwards before it is reported as a reversal [turns]. A shorter one is a slip, or an
+encoder resting on an edge."""
+UNSEEN_TURNS = 0.5
+"""Step between two counts above which an index pulse between them may have been missed [turns]."""
+MISSED_INDEX_TURNS = 1.5
+"""Distance from the last index pulse at which the next pulse is reported as missed [turns]."""
+
+
+class EncoderFault(enum.StrEnum):
+    """Kind of fault in the encoder's counts or index pulses."""
+
+    SLIP = "slip"
+    """The index pulse and the count disagree: counts were lost, or the encoder disc moved."""
+    MISSED_INDEX = "missed index"
+    """No index pulse came within :data:`MISSED_INDEX_TURNS` turns after the last one."""
+    REVERSED = "reversed"
+    """The prism changed its direction of rotation."""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultReport:
+    """Encoder fault with its time and size."""
+
+    fault: EncoderFault
+    t_us: int
+    """Time of the fault on the controller's clock [us]."""
+    counts: int
+    """Size of the fault [counts]. For a slip: surplus counts, negative if counts were lost. For a missed index: counts
+    since the last pulse. For a reversal: 0."""
+
+
+class AngleTracker:
+    """Converts encoder counts to unwrapped angles [rad].
+
+    Angles are relative to the first count until an index pulse comes. From then on, an angle at an index pulse is a
+    whole number of turns.
+    """
+
+    def __init__(self, counts_per_turn: int) -> None:
+        """Raise :class:`AmiwarpError` if ``counts_per_turn`` is below 1."""
+        if counts_per_turn < 1:
+            raise AmiwarpError(f"counts_per_turn = {counts_per_turn}; give the encoder's counts per turn, 1 or more")
+        self.counts_per_turn = counts_per_turn
+        self.absolute = False
+        """Whether an index pulse has defined the zero of the angle, so that angles are absolute."""
+        self._zero: int | None = None
+        self._index: int | None = None
+        self._extreme: int | None = None
+        self._last = 0
+        self._direction = 0
+        self._missed = False
+
+    def count(self, t_us: int, count: int) -> tuple[float, tuple[FaultReport, ...]]:
+        """Return the prism angle at an encoder count [rad], and the faults that this count reveals."""
+        if self._zero is None:
+            self._zero = count
+        if self._index is not None and abs(count - self._last) > UNSEEN_TURNS * self.counts_per_turn:
+            self._index = count
+        self._last = count
+        reports = []
+        if self._extreme is None or (count - self._extreme) * self._direction >= 0:
+            self._direction = self._direction or (
+                0 if self._extreme is None else (count > self._extreme) - (count < self._extreme)
+            )
+            self._extreme = count
+        elif abs(count - self._extreme) > REVERSAL_TURNS * self.counts_per_turn:
+            reports.append(FaultReport(EncoderFault.REVERSED, t_us, 0))
+            self._direction, self._extreme = -self._direction, count
+            self._index = None if self._index is None else count
+        since = 0 if self._index is None else count - self._index
+        if abs(since) > MISSED_INDEX_TURNS * self.counts_per_turn and not self._missed:
+            self._missed = True
+            reports.append(FaultReport(EncoderFault.MISSED_INDEX, t_us, since))
+        return self.angle(count), tuple(reports)
+
+    def index(self, t_us: int, count: int) -> tuple[FaultReport, ...]:
+        """Set or check the zero of the angle by an index pulse at an encoder count.
+
+        After a slip, later angles use the corrected zero.
+        """
+        self._index, self._last, self._missed = count, count, False
+        was_absolute, self.absolute = self.absolute, True
+        if self._zero is None:
+            self._zero = count
+        error = (count - self._zero + self.counts_per_turn // 2) % self.counts_per_turn - self.counts_per_turn // 2
+        if was_absolute and abs(error) <= INDEX_TOLERANCE_TURNS * self.counts_per_turn:
+            return ()
+        self._zero += error
+        return (FaultReport(EncoderFault.SLIP, t_us, error),) if was_absolute else ()
+
+    def angle(self, count: int) -> float:
+        """Return the prism angle at an encoder count [rad] for the present zero.
+
+        Needs an earlier count or index pulse.
+        """
+        assert self._zero is not None
+        return math.tau * (count - self._zero) / self.counts_per_turn
+
+
+# Data received from the controller, in updates that are split where its clock or counts restarted.
+
+MOST_WAITING_SAMPLES = 100_000
+"""Largest number of samples that wait to be fetched: more than 90 s at 1 kHz. Then the oldest are dropped."""
+MOST_PULSES, MOST_UPDATES = 10_000, 64
+"""Largest number of index or sync pulses in an update that waits to be fetched, and largest number of such updates."""
+MOST_MESSAGES = 1000
+"""Largest number of messages in an update that waits to be fetched."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LinkUpdate:
+    """Data received from the controller since the last fetch, or until its clock or counts restarted."""
+
+    t_us: NDArray[np.int64]
+    """Times of the encoder samples [us] on the controller's unwrapped clock, strictly increasing, shape ``(n,)``."""
+    angle: NDArray[np.float64]
+    """Unwrapped prism angle of each sample [rad], shape ``(n,)``. After the first index pulse, the angle is a whole
+    number of turns at each index pulse."""
+    index_t_us: NDArray[np.int64]
+    """Times of the index pulses from the previous update's last sample to this update's last sample [us]."""
+    sync: tuple[tuple[int, int, int], ...]
+    """Sync pulses, each with its number, the controller's time [us], and the host's time of arrival [us]."""
+    restarted: bool
+    """Whether the controller's clock or counts restarted before these samples. Maps fitted to the earlier clock are
+    then void."""
+    messages: tuple[str, ...]
+    """Messages for the user about encoder faults, losses, resets and the port."""
+
+
+class _PendingUpdate:
+    """Update that is being filled; :class:`UpdateQueue` limits the number of its samples."""
+
+    def __init__(self, *, restarted: bool) -> None:
+        self.restarted = restarted
+        self.samples: deque[tuple[int, float]] = deque()
+        self.index: deque[int] = deque(maxlen=MOST_PULSES)
+        self.sync: deque[tuple[int, int, int]] = deque(maxlen=MOST_PULSES)
+        self.messages: deque[str] = deque(maxlen=MOST_MESSAGES)
+
+    def finished(self) -> LinkUpdate:
+        return LinkUpdate(
+            t_us=np.array([t for t, _ in self.samples], np.int64),
+            angle=np.array([angle for _, angle in self.samples], np.float64),
+            index_t_us=np.array(self.index, np.int64),
+            sync=tuple(self.sync),
+            restarted=self.restarted,
+            messages=tuple(self.messages),
+        )
+
+
+class UpdateQueue:
+    """Bounded queue of updates between the reader of the port and the user of the link."""
+
+    def __init__(self) -> None:
+        self.samples = 0
+        """Number of samples that wait to be fetched."""
+        self._updates = deque([_PendingUpdate(restarted=False)])
+        self._dropped = 0
+
+    def __len__(self) -> int:
+        """Number of updates that wait to be fetched."""
+        return len(self._updates)
+
+    def say(self, sentence: str) -> None:
+        """Add a message for the user, in order with the samples."""
+        self._updates[-1].messages.append(sentence)
+
+    def add_sync(self, number: int, t_us: int, host_us: int) -> None:
+        """Add a sync pulse: its number, the controller's time and the host's time of arrival [us]."""
+        self._updates[-1].sync.append((number, t_us, host_us))
+
+    def add_sample(self, t_us: int, angle: float, index_t_us: Iterable[int]) -> None:
+        """Add a sample and the index pulses before it; drop the oldest sample if there are too many."""
+        latest = self._updates[-1]
+        latest.index.extend(index_t_us)
+        latest.samples.append((t_us, angle))
+        self.samples += 1
+        if self.samples > MOST_WAITING_SAMPLES:
+            dropped_us, _ = self._updates[0].samples.popleft()
+            while (pulses := self._updates[0].index) and pulses[0] <= dropped_us:
+                pulses.popleft()
+            self.samples, self._dropped = self.samples - 1, self._dropped + 1
+            if not self._updates[0].samples:
+                self._merge_first()
+
+    def restart(self) -> None:
+        """Begin a new update, because the controller's clock or counts restarted."""
+        if self._updates[-1].samples:
+            self._updates.append(_PendingUpdate(restarted=True))
+        if len(self._updates) > MOST_UPDATES:
+            dropped = len(self._updates[0].samples)
+            self.samples, self._dropped = self.samples - dropped, self._dropped + dropped
+            self._merge_first()
+        self._updates[-1].restarted = True
+        self._updates[-1].sync.clear()  # the times of these pulses are on the clock before the restart
+
+    def take(self) -> LinkUpdate:
+        """Remove and return the oldest update."""
+        update = self._updates.popleft()
+        if not self._updates:
+            self._updates.append(_PendingUpdate(restarted=False))
+        self.samples -= len(update.samples)
+        if self._dropped:
+            update.messages.append(f"{self._dropped:,} samples were dropped, the oldest: they were not fetched in time")
+            self._dropped = 0
+        return update.finished()
+
+    def _merge_first(self) -> None:
+        """Merge the first update, whose samples are dropped, into the second."""
+        dropped, update = self._updates.popleft(), self._updates[0]
+        update.restarted |= dropped.restarted
+        update.messages.extendleft(reversed(dropped.messages))
+
+
+# State of a :class:`~amiwarp.live.link.follower.Follower`, in one class for each occasion on which it is reset.
+
+TRIPS = 60
+"""Number of latest round trips of pings in memory."""
+REPORT_US = 1_000_000
+"""Shortest interval between messages about losses, and between those about noise [us]."""
+STALL_US, STALL_COUNTS = 300_000, 5.0
+"""Time for which a count must be constant to be reported as stalled [us], and number of counts that the motor must move
+in that time at its speed."""
+
+
+@dataclass(slots=True)
+class LossReporter:
+    """Turns the frame decoder's statistics into messages for the user, at a limited rate."""
+
+    out_of_order: int = 0
+    """Number of samples that were dropped because they were out of order, and are not yet reported."""
+    _damaged: int | None = None
+    """Number of damaged frames so far; None at first, because opening the port cuts a frame."""
+    _lost: int = 0
+    """Number of lost frames that were already reported."""
+    _noise_us: int = -REPORT_US
+    _lost_us: int = -REPORT_US
+
+    def forget_lost(self, received: FrameCounters) -> None:
+        """Mark the frames lost so far as reported."""
+        self._lost = received.lost
+
+    def check(self, received: FrameCounters, host_us: int) -> Iterator[str]:
+        """Yield the messages about losses and noise that are due."""
+        if self._damaged is not None and received.damaged > self._damaged:
+            if host_us - self._noise_us > REPORT_US:
+                yield "dropped damaged frames or lines; is the cable noisy?"
+            self._noise_us = host_us
+        self._damaged = received.damaged
+        if host_us - self._lost_us > REPORT_US and (received.lost > self._lost or self.out_of_order):
+            if received.lost > self._lost:
+                yield f"frames lost: {received.lost - self._lost:,}"
+            if self.out_of_order:
+                yield f"samples dropped, out of order: {self.out_of_order:,}"
+            self._lost, self.out_of_order, self._lost_us = received.lost, 0, host_us
+
+
+@dataclass(slots=True)
+class Connection:
+    """State that is reset when the port is opened."""
+
+    opened_us: int
+    """Host time at which the port was opened [us]."""
+    decoder: FrameDecoder = field(default_factory=FrameDecoder)
+    losses: LossReporter = field(default_factory=LossReporter)
+    received_bytes: int = 0
+    unusable: bool = False
+    """Whether the user was told that the data cannot be used."""
+    ping_answered: bool = False
+    unread: bool = True
+    """Whether no time of the controller has arrived since the port was opened."""
+    _sequence: int | None = None
+    """Latest sequence number of a frame."""
+
+    def runs_back(self, sequence: int) -> bool:
+        """Store a frame's sequence number; return whether it went backwards."""
+        before, self._sequence = self._sequence, sequence
+        return before is not None and (sequence - before) & 0xFFFF >= 1 << 15
+
+
+@dataclass(slots=True)
+class StallDetector:
+    """Finds counts that stay constant while the controller reports that the motor turns."""
+
+    status_us: int = -1
+    """Time of the controller's latest status [us]; -1 before the first status."""
+    _since_us: int = 0
+    """Time from which the count has been constant [us]; 0 before the first sample."""
+    _count: int = 0
+    _reported: bool = False
+
+    def check(self, t: int, count: int, status: ControllerStatus | None, counts_per_turn: int) -> str | None:
+        """Process a sample; return a message when a stall begins."""
+        if self._since_us == 0 or count != self._count:
+            self._since_us, self._count, self._reported = t, count, False
+            return None
+        if self._reported or status is None or self.status_us < self._since_us:
+            return None
+        rpm = max(abs(status.rpm), abs(status.target_rpm) if status.state == 1 else 0.0)
+        rate = rpm / 60e6 * counts_per_turn
+        if rpm > 0 and t - self._since_us > max(STALL_US, STALL_COUNTS / rate):
+            self._reported = True
+            return f"the encoder stays at count {count:,} while the controller reports {status.rpm:g} rpm"
+        return None
+
+
+class Epoch:
+    """State that is reset when the controller's clock or counts restart."""
+
+    def __init__(self, counts_per_turn: int | None) -> None:
+        self.clock = UnwrappedClock()
+        self.largest_lead_us = -math.inf
+        """Largest amount by which the controller's clock was ahead of the host's when data arrived [us]."""
+        self.heard_us = 0
+        """Host time of the latest data [us]."""
+        self.counted: tuple[int, int] | None = None
+        """Latest unwrapped time [us] and unwrapped count."""
+        self.suspect: tuple[int, int] | None = None
+        """Raw time and raw count of a text line that did not continue the previous lines."""
+        self.angles = None if counts_per_turn is None else AngleTracker(counts_per_turn)
+        self.unscaled: deque[tuple[int, int, bool]] = deque(maxlen=MOST_WAITING_SAMPLES)
+        """Data that wait for the counts per turn: time, count, and whether they are an index pulse."""
+        self.unreferenced: deque[tuple[int, int]] | None = deque(maxlen=MOST_WAITING_SAMPLES)
+        """Samples that wait for the first index pulse: time and count; None once samples no longer have to wait."""
+        self.pulses: deque[int] = deque(maxlen=MOST_PULSES)
+        """Times of index pulses that wait for the next sample [us]."""
+        self.given_us: int | None = None
+        """Time of the latest sample that was added to the updates [us]."""
+        self.stall = StallDetector()
+        self.faults = 0
+        """Fault bits of the controller's latest status, see ``protocol.FAULTS``."""
+        self.pings: dict[int, int] = {}
+        """Host times at which unanswered pings were sent [us], by number of the ping."""
+
+    def note_time(self, raw_t: int, host_us: int) -> int:
+        """Store the time of data that arrived at ``host_us`` [us], and return it unwrapped."""
+        t = self.clock(raw_t)
+        self.largest_lead_us, self.heard_us = max(self.largest_lead_us, t - host_us), host_us
+        return t
+
+    def note_count(self, t: int, raw_count: int) -> int:
+        """Store the count of a sample at an unwrapped time, and return it unwrapped."""
+        count = raw_count if self.counted is None else self.counted[1] + self.count_step(raw_count)
+        self.counted = t, count
+        return count
+
+    def count_step(self, raw_count: int) -> int:
+        """Return the step from the latest count, across a wrap of 32 bits if that is shorter."""
+        assert self.counted is not None
+        return (raw_count - self.counted[1] + WRAP // 2) % WRAP - WRAP // 2
+
+    def pulses_until(self, t: int) -> list[int]:
+        """Remove and return the times of the index pulses up to ``t`` [us]."""
+        found = []
+        while self.pulses and self.pulses[0] <= t:
+            found.append(self.pulses.popleft())
+        return found
+
 
 LATE_US = 100_000
 """Step backwards of the controller's clock beyond which the clock is considered reset [us]."""

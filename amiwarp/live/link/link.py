@@ -3,22 +3,120 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import re
 import threading
+import time
 from typing import TYPE_CHECKING, Any
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.link.follower import Follower
-from amiwarp.live.link.port import open_port, usb_id
-from amiwarp.live.link.protocol import REFUSALS, Message, Ping, SetCounts, SetSpeed, Stop, encode
+from amiwarp.live.link.protocol import REFUSALS, FrameDecoder, Message, Ping, SetCounts, SetSpeed, Stop, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from types import TracebackType
 
     from amiwarp.live.link.clocks import ClockMap
+    from amiwarp.live.link.follower import LinkUpdate
     from amiwarp.live.link.protocol import ControllerStatus
-    from amiwarp.live.link.updates import LinkUpdate
+
+
+# Serial ports, opened by name, by USB id, or by detection of the controller.
+
+BAUD = 460_800
+"""Baud rate of the serial port [bit/s]. USB CDC ports ignore it."""
+READ_S, WRITE_S = 0.05, 0.5
+"""Time-outs of a read and of a write on the port [s]."""
+LISTEN_S = 1.0
+"""Time for which each port is read when the controller is searched for [s]."""
+_USB = re.compile(r"([0-9a-fA-F]{4}):([0-9a-fA-F]{4})")
+
+
+def open_port(where: str | None) -> Any:
+    """Open a port and return its ``serial.Serial``.
+
+    ``where``: name, pySerial URL, USB id ``VID:PID`` (hexadecimal), or None to detect the controller. Raises
+    :class:`AmiwarpError`, with the available ports, if there is no such port or it cannot be opened.
+    """
+    if where is None:
+        return _find()
+    match = _USB.fullmatch(where)
+    if match is None:
+        return _open(where)
+    wanted = int(match[1], 16), int(match[2], 16)
+    names = [p.device for p in _ports() if (p.vid, p.pid) == wanted]
+    if len(names) != 1:
+        raise AmiwarpError(f"USB id {where}: {len(names)} ports have this id; {_available()}")
+    return _open(names[0])
+
+
+def usb_id(name: str) -> str | None:
+    """Return ``VID:PID`` of a port, or None if it has none or shares it with another port."""
+    ports = _ports()
+    ids = [(p.vid, p.pid) for p in ports if p.device == name and p.vid is not None]
+    if len(ids) != 1 or sum((p.vid, p.pid) == ids[0] for p in ports) != 1:
+        return None
+    return f"{ids[0][0]:04x}:{ids[0][1]:04x}"
+
+
+def _ports() -> list[Any]:
+    from serial.tools import list_ports
+
+    return sorted(list_ports.comports(), key=lambda p: p.device)
+
+
+def _available() -> str:
+    listed = [p.device if p.vid is None else f"{p.device} ({p.vid:04x}:{p.pid:04x} {p.product})" for p in _ports()]
+    return f"there are {', '.join(listed)}" if listed else "there is no serial port; is the controller plugged in?"
+
+
+def _open(name: str) -> Any:
+    import serial
+
+    try:
+        return serial.serial_for_url(name, BAUD, timeout=READ_S, write_timeout=WRITE_S, exclusive=True)
+    except Exception as error:  # includes termios.error, which is not an OSError
+        number = getattr(error, "errno", None)
+        if number in (errno.EAGAIN, errno.EBUSY):
+            raise AmiwarpError(f"{name}: another program has this port open; close that program first") from error
+        if number == errno.EACCES:
+            raise AmiwarpError(
+                f"{name}: no permission to open this port; on Linux join the port's group (see ls -l {name})"
+            ) from error
+        why = "no such port" if number == errno.ENOENT else f"cannot be opened ({error})"
+        raise AmiwarpError(f"{name}: {why}; {_available()}") from error
+
+
+def _find() -> Any:
+    """Open the first port on which controller frames or lines arrive, and return it."""
+    errors = []
+    for candidate in _ports():
+        try:
+            port = _open(candidate.device)
+        except AmiwarpError as error:
+            errors.append(str(error))
+            continue
+        if _is_controller(port):
+            return port
+        port.close()
+    detail = "".join(f" ({line})" for line in errors)
+    raise AmiwarpError(f"no port sends controller data; {_available()}{detail}; give a port by name")
+
+
+def _is_controller(port: Any) -> bool:
+    """Return whether controller frames or lines arrive within :data:`LISTEN_S`."""
+    decoder, end = FrameDecoder(), time.monotonic() + LISTEN_S
+    while time.monotonic() < end:
+        try:
+            decoder.feed(port.read(max(1, port.in_waiting)))
+        except OSError:
+            return False
+        if decoder.received.frames or decoder.received.lines > 1:
+            return True
+    return False
+
 
 READ_BYTES = 1 << 16
 """Largest number of bytes read from the port at once."""

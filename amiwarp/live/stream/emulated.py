@@ -10,14 +10,13 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.live.stream.packets import encode_events, encode_hello, encode_triggers
-from amiwarp.live.stream.socket_sinks import SocketSink
+from amiwarp.live.stream.sockets import SocketSink
 
 if TYPE_CHECKING:
     from types import TracebackType
 
     from amiwarp.events.recording import Recording
-    from amiwarp.live.link.emulated_rotors import Played
-    from amiwarp.live.link.emulator import Controller
+    from amiwarp.live.link.emulator import Controller, Played
 
 STEP_US, RETRY_S = 2000, 2e-4
 """Duration of an event packet [us], and interval between attempts to send while a client is slow [s]."""

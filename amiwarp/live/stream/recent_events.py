@@ -18,9 +18,8 @@ from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.encoder_stream import start_of_last_run
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.live.stream.queue_policy import Policy
-from amiwarp.live.stream.session import Session
-from amiwarp.live.stream.status import SessionStatus
+from amiwarp.live.stream.queues import Policy
+from amiwarp.live.stream.session import Session, SessionStatus
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

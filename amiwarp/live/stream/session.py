@@ -5,28 +5,233 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
-from amiwarp.compensation.streams import Compensated, Compensator
+import numpy as np
+
+from amiwarp.choices import Sharpness
+from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator, held_bytes
 from amiwarp.events.encoder_stream import EncoderStream
+from amiwarp.imaging.sharpness import SharpnessMeter
+from amiwarp.imaging.votes import CanvasShape
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream.camera_clock import clock_offset
-from amiwarp.live.stream.consumers import Consumers, RawConsumer
-from amiwarp.live.stream.encoder_feed import EncoderFeed
-from amiwarp.live.stream.event_sorter import EventSorter
+from amiwarp.live.stream.camera_clock import EncoderFeed, clock_offset
 from amiwarp.live.stream.phase_check import PhaseCheck
-from amiwarp.live.stream.queue_policy import Policy
-from amiwarp.live.stream.queues import PacketQueue
-from amiwarp.live.stream.status import IntervalFigures, SessionStatus, WindowSharpness
+from amiwarp.live.stream.queues import BackgroundWorker, EventSorter, PacketQueue, Policy
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from amiwarp.calib.result import Calibration
     from amiwarp.events.events import Events
     from amiwarp.io.live_writer import LiveWriter
+    from amiwarp.live.link.clocks import ClockMap
     from amiwarp.live.link.link import Link
+    from amiwarp.live.stream.adaptive import SpeedKeeper
     from amiwarp.live.stream.packets import Packet, Source
-    from amiwarp.live.stream.speed_control import SpeedKeeper
+
+
+# Consumers of a session's data: files and servers, each served by a background thread.
+
+
+class RawConsumer(Protocol):
+    """Consumer (protocol) of the sensor's events in order of time, and of encoder samples on the events' clock."""
+
+    def append(self, events: Events, /) -> None: ...
+
+    def append_encoder(
+        self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: NDArray[np.int64], /
+    ) -> None: ...
+
+    def tick(self) -> None: ...
+
+
+Consumer = TypeVar("Consumer", bound="RawConsumer | LiveWriter", covariant=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Served(Generic[Consumer]):
+    """Consumer together with the background thread that calls it."""
+
+    consumer: Consumer
+    worker: BackgroundWorker
+
+
+class Consumers:
+    """Consumers of a session's data. A consumer that fails is removed; the others continue.
+
+    The consumers ``raw`` get the sensor's events, ``out`` gets the compensated events, and all get the encoder samples.
+    The function ``fail`` is called with the errors of consumers.
+    """
+
+    def __init__(self, raw: Iterable[RawConsumer], out: LiveWriter | None, fail: Callable[[Exception], None]) -> None:
+        self.raw = [Served(consumer, BackgroundWorker()) for consumer in raw]
+        self.out = None if out is None else Served(out, BackgroundWorker())
+        self._fail = fail
+
+    def append(self, events: Events) -> None:
+        """Pass the sensor's events to the consumers of raw events."""
+        for served in list(self.raw):
+            self._put(served, partial(served.consumer.append, events), held_bytes(events))
+
+    def append_encoder(self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64]) -> None:
+        """Pass encoder samples and index pulses to all consumers."""
+        for served in self._all():
+            append = partial(served.consumer.append_encoder, t, angle, index_t)
+            self._put(served, append, t.nbytes + angle.nbytes + index_t.nbytes)
+
+    def append_compensated(self, packet: Compensated) -> None:
+        """Pass compensated events to the consumer of compensated events."""
+        if self.out is None:
+            return
+        flags = packet.flags
+        inside, extrapolated = (flags & OUTSIDE) == 0, (flags & (EXTRAPOLATED | NO_ANGLE)) != 0
+        append = partial(self.out.consumer.append, packet.events, inside=inside, extrapolated=extrapolated)
+        self._put(self.out, append, held_bytes(packet.events) + flags.nbytes)
+
+    def tick(self) -> None:
+        """Let all consumers continue pending work, even without new data."""
+        for served in self._all():
+            self._put(served, served.consumer.tick)
+
+    def finish(self) -> None:
+        """Wait until the consumers have processed all data, and collect their errors."""
+        for served in self._all():
+            try:
+                served.worker.close()
+            except Exception as error:
+                self._fail(error)
+
+    def end(self) -> None:
+        """Wait for the end of all background threads."""
+        for served in self._all():
+            served.worker.end()
+
+    def abandon(self) -> None:
+        """Drop the waiting data, so that the caller can close the consumers at once."""
+        for served in self._all():
+            served.worker.abandon()
+
+    def _all(self) -> list[Served[RawConsumer | LiveWriter]]:
+        return [*self.raw, *([] if self.out is None else [self.out])]
+
+    def _put(self, served: Served[RawConsumer | LiveWriter], job: Callable[[], object], held: int = 0) -> None:
+        """Pass a job to a consumer's thread; remove the consumer if it has failed."""
+        try:
+            served.worker.put(job, held)
+        except Exception as error:
+            self._fail(error)
+            served.worker.end()
+            if served is self.out:
+                self.out = None
+            else:
+                self.raw = [other for other in self.raw if other is not served]
+
+
+# Status of a live session, and the figures in it that are measured between two reports.
+
+IMAGE_US = 33_333
+"""Length of the time window whose image gives the reported sharpness [us]."""
+
+
+@dataclass(slots=True)
+class SessionStatus:
+    """Progress of a session. Counts are totals; shares, rates and latencies refer to the time since the last report."""
+
+    seconds: float = 0.0
+    """Duration of the session [s]."""
+    events: int = 0
+    """Number of events received so far."""
+    done: int = 0
+    """Number of events compensated so far."""
+    outside: int = 0
+    """Number of events displaced out of the image."""
+    guessed: int = 0
+    """Number of events compensated with an extrapolated prism angle."""
+    unknown: int = 0
+    """Number of events without a prism angle."""
+    dropped: int = 0
+    """Number of events dropped by the queue, see :class:`Policy`."""
+    late: int = 0
+    """Number of events that were out of order and got a later time."""
+    waiting: int = 0
+    """Number of events that wait in the queue or for encoder samples."""
+    rate_mev_s: float = 0.0
+    """Rate of the received events since the last report [million events/s]."""
+    covered: float = 1.0
+    """Share of events since the last report whose prism angle was interpolated between encoder samples."""
+    latency_ms: tuple[float, float] = (0.0, 0.0)
+    """Median and 99th percentile of the time from a packet's arrival to its output [ms]."""
+    sharpness: float | None = None
+    """Sharpness of the latest image of compensated events, over :data:`IMAGE_US`; None before the first."""
+    rpm: float | None = None
+    """Speed of the prism [turns/min]; None if it is unknown."""
+    clock: ClockMap | None = None
+    """Map from the controller's clock to the camera's; None without a link."""
+    coverage: float | None = None
+    """Share of the scene's edges that the last window showed, 0 to 1; None without adaptive speed."""
+    phase_away: float | None = None
+    """Difference between the latest estimated and the calibrated phase [rad]; None without an estimate."""
+
+
+class IntervalFigures:
+    """Event rate, latency, and coverage by encoder samples, all since the last report."""
+
+    def __init__(self, began_us: int) -> None:
+        # at the last report: time [us]; numbers of events received, compensated, without a measured angle
+        self._reported = (began_us, 0, 0, 0)
+        self._latencies: list[int] = []
+
+    def add(self, packet: Compensated, now_us: int, status: SessionStatus) -> None:
+        """Count a compensated packet in the figures of the interval."""
+        flags = packet.flags
+        status.done += len(flags)
+        if flags.any():
+            status.outside += int(np.count_nonzero(flags & OUTSIDE))
+            status.guessed += int(np.count_nonzero(flags & EXTRAPOLATED))
+            status.unknown += int(np.count_nonzero(flags & NO_ANGLE))
+        self._latencies.append(now_us - packet.arrived_us)
+
+    def report(self, now_us: int, status: SessionStatus) -> None:
+        """Write the figures since the last report into the status, and start the next interval."""
+        then_us, events, done, unsure_then = self._reported
+        unsure = status.guessed + status.unknown
+        status.rate_mev_s = (status.events - events) / max(now_us - then_us, 1)
+        status.covered = 1.0 - (unsure - unsure_then) / (status.done - done) if status.done > done else 1.0
+        self._reported = (now_us, status.events, status.done, unsure)
+        if self._latencies:
+            median, slow = np.percentile(self._latencies, [50, 99]) * 1e-3
+            status.latency_ms = float(median), float(slow)
+            self._latencies.clear()
+
+
+class WindowSharpness:
+    """Measures the sharpness of the compensated image of one time window per report."""
+
+    def __init__(self, compensator: Compensator, size: tuple[int, int], device: str) -> None:
+        self._compensator = compensator
+        self._meter = SharpnessMeter(CanvasShape(*size), Sharpness.VARIANCE, smoothing=1.0, device=device)
+        self._start_us: int | None = None
+        self._wanted = True
+
+    def update(self, t: int) -> float | None:
+        """Return the sharpness once the window is complete; ``t``: time up to which events are compensated [us]."""
+        if self._start_us is None:
+            self._compensator.image()  # discards the events before the window
+            self._start_us = t
+        elif self._wanted and t - self._start_us >= IMAGE_US:
+            self._meter.image.write(self._compensator.image()[None])
+            sharpness, self._start_us, self._wanted = self._meter.measure(), t, False
+            return sharpness
+        return None
+
+    def restart(self) -> None:
+        """Begin a new time window."""
+        self._start_us, self._wanted = None, True
+
 
 PATIENCE_S = 1.0
 """Longest wait at the end of a session for the source's thread and for encoder samples of the last events [s]."""

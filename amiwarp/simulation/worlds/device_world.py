@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.kernels import world as kernels
-from amiwarp.simulation.worlds.scene import Body, Material, World
+from amiwarp.simulation.worlds.world import Body, Material, World
 
 CUDA_TREE = "cubql"
 """Warp's constructor of the bounding volume hierarchy of a mesh on a GPU.

@@ -4,18 +4,29 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.imaging.sharpness_costs import gaussian
+from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.sharpness import gaussian
 from amiwarp.kernels import world as kernels
-from amiwarp.kernels import world_maps, world_view
+from amiwarp.kernels import world as world_maps
+from amiwarp.kernels import world_rays
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera
+from amiwarp.simulation.pictures import DARK, Placement
+from amiwarp.simulation.scenery import SMALLEST_COSINE, TEXELS_PER_PIXEL, MapSlots
 from amiwarp.simulation.worlds.device_world import DeviceWorld
+from amiwarp.simulation.worlds.trajectory import Trajectory
+from amiwarp.simulation.worlds.world import Body
+
+if TYPE_CHECKING:
+    from amiwarp.simulation.simulator import Simulation
+    from amiwarp.simulation.worlds.world import WorldScene
+
 
 SMALLEST_LAUNCH = 1 << 10
 """Smallest number of rays that one CPU thread handles."""
@@ -65,12 +76,12 @@ def surfaces_at(
     ``instant``: index of the time in the last call of :meth:`DeviceWorld.set_instants`.
     """
     n, device = len(rays), world.device
-    out = world_view.Surfaces()
+    out = world_rays.Surfaces()
     for name, dtype in (("depth", float), ("normal", wp.vec3), ("instance", int), ("mover", int), ("place", wp.vec3)):
         setattr(out, name, wp.empty(n, dtype=dtype, device=device))
     unit = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
     inputs = [world.params, instant, wp.array(unit, dtype=wp.vec3, device=device), device_pose(rotation, position)]
-    launch(world_view.find_surfaces, n, inputs, [out], device=device, smallest=SMALLEST_LAUNCH)
+    launch(world_rays.find_surfaces, n, inputs, [out], device=device, smallest=SMALLEST_LAUNCH)
     return SurfaceView(*(getattr(out, name).numpy() for name in ("depth", "normal", "instance", "mover", "place")))
 
 
@@ -88,7 +99,7 @@ def sample_grid(samples: int, device: Any) -> wp.array:
 
 
 def first_hits(n: int, device: Any) -> Any:
-    """Return the :class:`amiwarp.kernels.world_maps.FirstHits` of ``n`` rays, without an array for the luminance."""
+    """Return the :class:`amiwarp.kernels.world.FirstHits` of ``n`` rays, without an array for the luminance."""
     hits = world_maps.FirstHits()
     hits.face = wp.empty(n, dtype=int, device=device)
     hits.white = wp.empty(n, dtype=float, device=device)
@@ -106,7 +117,7 @@ class MapRenderer:
     def __init__(self, world: DeviceWorld, frame: Any, *, blur: float, dark: float, samples: int) -> None:
         """Set up the renderer.
 
-        ``frame``: a :class:`amiwarp.kernels.world_maps.MapFrame` without a pose; ``blur``: standard deviation [texels];
+        ``frame``: a :class:`amiwarp.kernels.world.MapFrame` without a pose; ``blur``: standard deviation [texels];
         ``dark``: luminance added before the logarithm; ``samples``: rays per texel at edges.
         """
         self._world, self._frame, self._dark = world, frame, dark
@@ -179,3 +190,300 @@ class MapRenderer:
         f.tiles = written
         inputs = [f, self._smooth, self._dark]
         launch(world_maps.log_pieces, len(written) * TILE * TILE, inputs, [maps], device=device)
+
+
+# Speed at which the image of a simulated world moves.
+#
+# The simulator derives the length of its time steps and the times of its maps from this speed.
+
+PROBE = 48
+"""Number of columns of the grid of rays that measures the distances of visible surfaces."""
+NEAREST_M = 0.02
+"""Smallest distance for which speeds in the image are computed [m]. Nearer surfaces are treated as this far away."""
+MOMENT_S = 1e-3
+"""Time over which speeds are computed as difference quotients [s]."""
+FLICKER_SAMPLES = 16
+"""Smallest number of time steps, and of maps, per period of a flickering lamp."""
+SAFETY = 1.2
+"""Factor by which a speed measured on a coarse grid is increased, because the grid can miss the fastest pixel."""
+
+
+def body_speed(body: Body, trajectory: Trajectory, focal: float, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return an upper bound of a moving body's speed in the image [px/s] at times [s], shape ``(n,)``."""
+    assert body.trajectory is not None
+    centre, radius = body.mesh.bounding_sphere
+    rotation, position = body.trajectory.poses(t)
+    rotation_after, position_after = body.trajectory.poses(t + MOMENT_S)
+    place = rotation @ centre + position - trajectory.poses(t)[1]
+    place_after = rotation_after @ centre + position_after - trajectory.poses(t + MOMENT_S)[1]
+    speed = np.linalg.norm(place_after - place, axis=1) / MOMENT_S
+    distance = np.maximum(np.linalg.norm(place, axis=1) - radius, NEAREST_M)
+    return np.asarray(focal * (speed + turn_rate(rotation, rotation_after) * radius) / distance)
+
+
+def turn_rate(rotation: NDArray[np.float64], rotation_after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angular speed [rad/s] between rotations (n, 3, 3) that are :data:`MOMENT_S` apart."""
+    cosine = (np.einsum("nij,nij->n", rotation, rotation_after) - 1.0) / 2.0
+    return np.asarray(np.arccos(np.clip(cosine, -1.0, 1.0)) / MOMENT_S)
+
+
+def parallax_speed(world: DeviceWorld, camera: Camera, trajectory: Trajectory, t: float, instant: int) -> float:
+    """Return the largest speed in the image [px/s] that the camera's translation causes.
+
+    ``instant``: index of the time ``t`` [s] in the last call of :meth:`DeviceWorld.set_instants`.
+    """
+    before, after = (trajectory.poses([at]) for at in (t, t + MOMENT_S))
+    velocity = (after[1][0] - before[1][0]) / MOMENT_S
+    if not velocity.any():
+        return 0.0
+    scale = PROBE / camera.width
+    small = Camera(
+        PROBE, max(1, round(camera.height * scale)), camera.fx * scale, camera.fy * scale,
+        (camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5,
+    )  # fmt: skip
+    seen = surfaces_at(world, pixel_rays(small), before[0][0], before[1][0], instant)
+    near = seen.place[np.isfinite(seen.depth)].astype(np.float64) - before[1][0]
+    if not len(near):
+        return 0.0
+    distance = np.maximum(np.linalg.norm(near, axis=1), NEAREST_M)
+    along = near / distance[:, None]
+    across = np.linalg.norm(velocity - (along @ velocity)[:, None] * along, axis=1)
+    return float(SAFETY * max(camera.fx, camera.fy) * (across / distance).max())
+
+
+def movers_speed(world: DeviceWorld, camera: Camera, trajectory: Trajectory, t: NDArray[np.float64]) -> NDArray[Any]:
+    """Return an upper bound of the speed of all moving bodies in the image [px/s] at times [s], shape ``(n,)``."""
+    speeds = [body_speed(body, trajectory, max(camera.fx, camera.fy), t) for body in world.movers]
+    return np.max([np.zeros(len(t)), *speeds], axis=0)
+
+
+def rotation_speed(camera: Camera, trajectory: Trajectory, t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return an upper bound of the speed in the image [px/s] due to the camera's rotation at times [s], shape (n,)."""
+    rate = turn_rate(*(trajectory.poses(at)[0] for at in (t, t + MOMENT_S)))
+    corner = math.hypot(max(camera.cx, camera.width - 1 - camera.cx), max(camera.cy, camera.height - 1 - camera.cy))
+    focal = max(camera.fx, camera.fy)
+    return np.asarray(rate * focal * (1.0 + (corner / focal) ** 2))
+
+
+def flicker_interval_s(world: Any) -> float:
+    """Return the longest time between two renderings of a world with flickering lamps [s].
+
+    The time is infinite if no lamp flickers.
+    """
+    rates = [lamp.flicker_hz for lamp in world.lamps if lamp.flicker_hz and lamp.flicker_depth]
+    return 1.0 / (FLICKER_SAMPLES * max(rates)) if rates else math.inf
+
+
+# Pre-rendered pictures (maps) of a simulated world at successive times along the camera's trajectory.
+
+MARGIN_PX = 24.0
+"""Border of a map around the view of a moving camera [px]. If the camera rotates further, the
+orientation of the maps changes."""
+LONGEST_S = 0.5
+"""Longest time between two successive maps if the camera or a body moves, or a lamp flickers [s]."""
+SAMPLES = 4
+"""Default number of rays per texel at edges."""
+TEXEL_VARIANCE = 1.0 / 12.0 + 1.0 / 6.0
+"""Variance of the blur that a texel's area (1/12) and bilinear interpolation (1/6) cause [texels squared]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class HeldMap:
+    """Map of a world in device memory."""
+
+    time: float
+    """Time that the map shows [us]."""
+    slot: int
+    """Number of the slot that holds the map, see :class:`amiwarp.simulation.scenery.MapSlots`."""
+    orientation: NDArray[np.float64]
+    """Rotation matrix from the frame of the map's plane to the world's frame, shape (3, 3)."""
+
+
+class WorldMapRing:
+    """Maps of a world for the current span of time, in slots of device memory.
+
+    Successive maps share one orientation until the camera's view leaves the map. The effect of the camera's rotation is
+    therefore exact; only the effects of the camera's translation and of moving bodies are interpolated in time. The
+    interval between two whole maps depends on the speed of the camera's translation. On a CPU, if bodies move faster in
+    the image, further maps are inserted between two whole maps. An inserted map is rendered only where bodies move, and
+    interpolated elsewhere.
+    """
+
+    def __init__(
+        self, simulation: Simulation, scene: WorldScene, world: DeviceWorld, bearings: NDArray[np.float64]
+    ) -> None:
+        """Place the maps. ``bearings``: directions that the camera sees over a turn of the prism, shape (n, 3)."""
+        self._scene, self._camera, self._bearings, self._world = scene, simulation.camera, bearings, world
+        focal = max(self._camera.fx, self._camera.fy)
+        self.placement = _placement(bearings, focal, MARGIN_PX / focal if scene.trajectory.moves else 2.0 / focal)
+        p, frame = self.placement, world_maps.MapFrame()
+        frame.left, frame.top, (frame.pitch_x, frame.pitch_y) = p.left, p.top, p.pitch
+        frame.width, frame.height, frame.cone = p.width, p.height, 1.0 / (TEXELS_PER_PIXEL * focal)
+        self._renderer = MapRenderer(self._world, frame, blur=map_blur(scene.blur), dark=DARK,
+                                     samples=scene.samples or SAMPLES)  # fmt: skip
+        self._texels = p.width * p.height
+        self._slots = MapSlots(self._texels, wp.vec4, wp.int32, device=simulation.device)
+        self._held: list[HeldMap] = []
+        self._whole: list[HeldMap] = []  # whole maps before and after the last held map; one at the start
+        self.rendered = 0
+        """Number of whole maps rendered so far."""
+
+    @property
+    def maps(self) -> wp.array:
+        """Coefficients of bilinear interpolation of the log intensity at each texel of all maps, slot by slot."""
+        return self._slots.arrays[0]
+
+    @property
+    def faces(self) -> wp.array:
+        """Number of the face that each texel of all maps sees, slot by slot; -1 for the sky."""
+        return self._slots.arrays[1]
+
+    @property
+    def _changes(self) -> bool:
+        """Whether anything moves or flickers."""
+        flickers = math.isfinite(flicker_interval_s(self._scene.world))
+        return bool(self._scene.trajectory.moves or self._world.movers or flickers)
+
+    def cover(self, start: int, stop: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """Render the maps for the span ``start`` .. ``stop`` [us]; return their times [us] and their slots.
+
+        There is at least one map. If anything moves, the last map is at ``stop`` or later.
+        """
+        if not self._held:
+            rotation, _ = self._scene.trajectory.poses([0.0])
+            self._whole = [self._render(0.0, rotation[0])]
+            self._held = self._whole[:]
+        while self._held[-1].time < stop and self._changes:
+            self._drop(start)
+            self._next()
+        self._drop(start)
+        return np.array([m.time for m in self._held], np.float64), np.array([m.slot for m in self._held], np.int32)
+
+    def orientations(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return rotation matrices from the camera's frame to the frame of the map at each time [us], (n, 3, 3)."""
+        times = np.array([m.time for m in self._held])
+        which = np.clip(np.searchsorted(times, t_us, side="right") - 1, 0, len(times) - 1)
+        reference = np.stack([m.orientation for m in self._held])[which]
+        rotation, _ = self._scene.trajectory.poses(np.maximum(t_us, 0.0) * 1e-6)
+        return np.asarray(np.swapaxes(reference, 1, 2) @ rotation)
+
+    def _next(self) -> None:
+        """Append the next whole map, or the next inserted map before it."""
+        last = self._held[-1]
+        whole, between = self._intervals_s(last.time * 1e-6)
+        if last is self._whole[-1]:
+            self._whole = [last, *self._following(last, whole)]
+        if last.time + 1e6 * between < self._whole[1].time:
+            self._held.append(self._render_between(last.time + 1e6 * between))
+            return
+        before, *following = self._whole
+        self._held.extend(following)
+        self._whole = following[-1:]
+        self._release(before)
+
+    def _following(self, last: HeldMap, interval: float) -> list[HeldMap]:
+        """Return the next whole map, ``interval`` [s] after the map ``last``.
+
+        If the camera turns so far within the interval that its view leaves the area of ``last``, return two maps of the
+        latest time before: one in the old and one in the new orientation.
+        """
+        start, reference = last.time * 1e-6, last.orientation
+        turned = self._scene.trajectory.poses(np.linspace(start, start + interval, 9)[1:])[0]
+        if all(self._fits(reference.T @ rotation) for rotation in turned):
+            return [self._render(start + interval, reference)]
+        at = self._last_fit(start, start + interval, reference)
+        return [self._render(at, reference), self._render(at, self._scene.trajectory.poses([at])[0][0])]
+
+    def _intervals_s(self, t: float) -> tuple[float, float]:
+        """Return the times [s] from ``t`` [s] until the next whole map and until the next whole or inserted map."""
+        scene, camera = self._scene, self._camera
+        self._world.set_instants(np.array([t]))
+        parallax = parallax_speed(self._world, camera, scene.trajectory, t, 0)
+        movers = float(movers_speed(self._world, camera, scene.trajectory, np.array([t]))[0])
+        longest = min(LONGEST_S, flicker_interval_s(scene.world))
+        whole, between = (min(longest, scene.motion_px / max(v, 1e-9)) for v in (parallax, parallax + movers))
+        if not self._world.device.is_cpu:
+            whole = between  # a GPU renders a whole map faster than the host finds the tiles in which bodies move
+        return max(whole, 1e-6), max(between, 1e-6)
+
+    def _fits(self, turned: NDArray[np.float64]) -> bool:
+        """Return whether the view of a camera, rotated by ``turned`` (3, 3) relative to the map, lies on the map."""
+        x, y, z = turned @ self._bearings.T
+        if z.min() < SMALLEST_COSINE:
+            return False
+        p = self.placement
+        inside_x = (x / z >= p.left) & (x / z <= p.left + p.width / p.pitch[0])
+        inside_y = (y / z >= p.top) & (y / z <= p.top + p.height / p.pitch[1])
+        return bool((inside_x & inside_y).all())
+
+    def _last_fit(self, low: float, high: float, reference: NDArray[np.float64]) -> float:
+        """Return the latest time [s] between ``low`` and ``high`` at which the camera's view lies on the map.
+
+        ``reference``: orientation of the map, shape (3, 3).
+        """
+        for _ in range(20):
+            middle = (low + high) / 2.0
+            rotation, _ = self._scene.trajectory.poses([middle])
+            low, high = (middle, high) if self._fits(reference.T @ rotation[0]) else (low, middle)
+        return low
+
+    def _render(self, t: float, orientation: NDArray[np.float64]) -> HeldMap:
+        """Render a whole map at time ``t`` [s] with a given orientation (3, 3)."""
+        _, position = self._scene.trajectory.poses([t])
+        self._world.set_instants(np.array([t]))
+        slot = self._slots.take()
+        pose = device_pose(orientation, position[0])
+        self._renderer.render(pose, self.maps, self.faces, slot * self._texels)
+        self.rendered += 1
+        return HeldMap(t * 1e6, slot, orientation)
+
+    def _render_between(self, time: float) -> HeldMap:
+        """Render an inserted map at a time [us] between the current two whole maps."""
+        before, after = self._whole[:2]
+        _, position = self._scene.trajectory.poses([time * 1e-6])
+        self._world.set_instants(np.array([time, before.time, after.time]) * 1e-6)
+        slot = self._slots.take()
+        pose, ends = (
+            device_pose(before.orientation, position[0]),
+            (before.slot * self._texels, after.slot * self._texels),
+        )
+        share = (time - before.time) / (after.time - before.time)
+        self._renderer.render_between(pose, self.maps, self.faces, slot * self._texels, ends, share)
+        return HeldMap(time, slot, before.orientation)
+
+    def _drop(self, start: int) -> None:
+        """Drop the maps that are needed only before ``start`` [us]."""
+        while len(self._held) > 1 and self._held[1].time <= start:
+            self._release(self._held.pop(0))
+
+    def _release(self, held: HeldMap) -> None:
+        """Give back the slot of a map if the map is neither held nor a current whole map."""
+        if held not in self._held and held not in self._whole:
+            self._slots.give_back(held.slot)
+
+
+def map_blur(blur: float) -> float:
+    """Return the standard deviation by which a map must be blurred [texels] for a total blur [px].
+
+    The total blur includes that of the texels' area and of bilinear interpolation (:data:`TEXEL_VARIANCE`).
+    """
+    return math.sqrt(max((blur * TEXELS_PER_PIXEL) ** 2 - TEXEL_VARIANCE, 0.0))
+
+
+def _placement(bearings: NDArray[np.float64], focal: float, margin: float) -> Placement:
+    """Return the placement on their plane of maps that show all ``bearings``, shape (n, 3).
+
+    ``focal``: focal length [px]; ``margin``: border [focal lengths].
+    Raises :class:`AmiwarpError` if the view is too wide.
+    """
+    x, y, z = bearings.T
+    if not len(bearings) or z.min() < SMALLEST_COSINE:
+        limit = 2.0 * math.degrees(math.acos(SMALLEST_COSINE))
+        raise AmiwarpError(
+            f"the camera sees more than the {limit:.0f} deg that a map can cover; give seeing='rays' (--seeing rays)"
+        )
+    low_x, high_x = float((x / z).min()) - margin, float((x / z).max()) + margin
+    low_y, high_y = float((y / z).min()) - margin, float((y / z).max()) + margin
+    pitch = TEXELS_PER_PIXEL * focal
+    width, height = math.ceil((high_x - low_x) * pitch), math.ceil((high_y - low_y) * pitch)
+    return Placement(width, height, (0.0, 0.0, 1.0, 1.0), low_x, low_y, (pitch, pitch))

@@ -11,16 +11,23 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.kernels import world as kernels
-from amiwarp.kernels import world_rays, world_view
+from amiwarp.kernels import world_rays
+from amiwarp.kernels import world_rays as world_view
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.device_camera import camera_params
+from amiwarp.optics.camera import camera_params
 from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.motion import movers_speed, parallax_speed, rotation_speed
-from amiwarp.simulation.worlds.renderer import SMALLEST_LAUNCH, TILE, first_hits
+from amiwarp.simulation.worlds.renderer import (
+    SMALLEST_LAUNCH,
+    TILE,
+    first_hits,
+    movers_speed,
+    parallax_speed,
+    rotation_speed,
+)
 
 if TYPE_CHECKING:
     from amiwarp.simulation.simulator import Simulation
-    from amiwarp.simulation.worlds.world_scene import WorldScene
+    from amiwarp.simulation.worlds.world import WorldScene
 
 RAYS_PER_PIXEL = 4
 """Default number of rays per pixel if pixels see the world by rays."""
@@ -142,7 +149,7 @@ class WorldSight:
         launch(world_rays.add_edges, listed, [view, batch, self._listed, self._cast], [], device=device)
 
     def look(self, view: Any, steps: Any, block: Any, n: int, faces: Any) -> Any:
-        """Return the surfaces that ``n`` events saw, as a :class:`amiwarp.kernels.world_view.SeenSurfaces`.
+        """Return the surfaces that ``n`` events saw, as a :class:`amiwarp.kernels.world_rays.SeenSurfaces`.
 
         ``view``, ``steps``: camera and instants of the chunk; ``block``: events; ``faces``: face of each texel of the
         maps, or an empty array without maps.

@@ -2,20 +2,255 @@
 
 from __future__ import annotations
 
+import importlib.util
+import io
+import urllib.parse
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name
+from amiwarp.io.input_files import errors_name, note_input, open_input
 from amiwarp.io.json_files import at_field, build, fields_of, read_json, read_toml
-from amiwarp.simulation.pictures import read_picture
-from amiwarp.simulation.worlds.mesh_files import LoadedMesh, load_mesh
-from amiwarp.simulation.worlds.scene import Body, Lamp, Material, Sky, Sun, World
+from amiwarp.io.reading_process import borrow, give_back
+from amiwarp.simulation.pictures import BAND, LUMINANCE, MOST_PIXELS, PICTURE_FORMATS, read_picture, srgb_to_linear
+from amiwarp.simulation.worlds.named.catalogue import named_world
 from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
+from amiwarp.simulation.worlds.world import Body, Lamp, Material, Mesh, Sky, Sun, World
 from amiwarp.validation import guarded, one_of, real, shown
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
+
+# Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh. Colours become luminance.
+#
+# A file of a few bytes may declare a mesh of many gigabytes, so trimesh runs in the reading process, which has limits
+# of memory and processor time (:mod:`amiwarp.io.reading_process`).
+
+FORMATS = ("glb", "gltf", "obj", "ply", "stl")
+"""Supported suffixes of mesh files."""
+Y_UP = ("glb", "gltf")
+"""Suffixes of the formats in which, by specification, the y axis points up and colours are linear."""
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".gif", ".tga", ".dds", ".ktx2", ".exr")
+"""Suffixes of picture files that a mesh file may use as textures."""
+TO_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Rotation matrix from a frame in which y points up to a frame in which z points up."""
+DEFAULT_REFLECTANCE = 0.5
+"""Reflectance of meshes whose file gives neither colours nor a material."""
+
+Arrays = tuple[NDArray[Any] | None, ...]
+"""Vertices, faces, texture coordinates, light and texture of a part; None for an array that it has not."""
+
+
+class LoadedMesh(NamedTuple):
+    """One mesh of a mesh file, with its material."""
+
+    mesh: Mesh
+    """Triangles in the frame of the file, turned so that z points up [m]."""
+    material: Material
+    """Reflectance and texture that the file gives the mesh."""
+    name: str
+    """Name of the mesh's node in the file."""
+
+
+def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) -> list[LoadedMesh]:
+    """Read the meshes of a glTF, GLB, OBJ, PLY or STL file.
+
+    Needs trimesh: ``pip install "amiwarp[worlds]"``.
+
+    Parameters
+    ----------
+    path : str or Path
+        Mesh file. Files that an OBJ or glTF file refers to (materials, textures, buffers) are read as well.
+    up : str, optional
+        Axis of the file that points up, ``"y"`` or ``"z"``. None means y in glTF and GLB files, and z in other files.
+    scale : float
+        Length of the file's unit [m].
+
+    Returns
+    -------
+    list of LoadedMesh
+        Mesh, material and name of each part. The meshes are in the frame of the file, with z up.
+
+    Raises
+    ------
+    AmiwarpError
+        If the file does not exist, has an unknown format or no faces, or refers to a file that is missing.
+    """
+    path = Path(path)
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        raise AmiwarpError(f"{path}: has an unknown mesh format {path.suffix!r}; give one of {', '.join(FORMATS)}")
+    up = one_of(up or ("y" if kind in Y_UP else "z"), ("y", "z"), "axis that points up")
+    turn = real(scale, "mesh scale", 1e-9, 1e9) * (TO_Z_UP if up == "y" else np.eye(3))
+    if importlib.util.find_spec("trimesh") is None:
+        raise AmiwarpError(f"{path}: mesh files need trimesh; install it by: pip install 'amiwarp[worlds]'")
+    with errors_name(path, lambda: "cannot be read as a mesh"):
+        process = borrow()
+        try:
+            found, arrays = process.call(f"{__name__}:read_parts", path, kind, turn.tolist())
+        finally:
+            give_back(process)
+        for file in found["files"]:
+            note_input(Path(file))
+        parts = [_received(about, arrays) for about in found["parts"]]
+    if not parts:
+        raise AmiwarpError(f"{path}: holds no faces; give a file with triangles, not points or lines alone")
+    return parts
+
+
+def _received(about: dict[str, Any], arrays: list[NDArray[Any]]) -> LoadedMesh:
+    """Return a part that :func:`read_parts` described, and remove its arrays from the front of the list."""
+    values: list[Any] = [None if shape is None else arrays.pop(0).reshape(shape) for shape in about["shapes"]]
+    vertices, faces, uv, light, texture = values
+    return LoadedMesh(Mesh(vertices, faces, uv, light), Material(about["reflectance"], texture), about["name"])
+
+
+def read_parts(path: str, kind: str, turn: list[list[float]]) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Read the parts of a mesh file, in the reading process.
+
+    ``kind``: suffix of the file; ``turn``: matrix (3, 3) by which vertices are multiplied. The first value holds the
+    files that the mesh file refers to, and of each part the name, the reflectance and the shapes of its arrays:
+    vertices, faces, texture coordinates, light and texture. A shape is None if the part has no such array.
+    """
+    scene, files = _open(Path(path), kind)
+    parts: list[dict[str, Any]] = []
+    arrays: list[NDArray[Any]] = []
+    for node in sorted(scene.graph.nodes_geometry):
+        placed, geometry = scene.graph[node]
+        part = scene.geometry[geometry]
+        if len(getattr(part, "faces", ())):
+            matrix = np.array(turn) @ placed[:3]
+            values, reflectance = _part(part, matrix[:, :3], matrix[:, 3], kind)
+            shapes = [None if value is None else value.shape for value in values]
+            parts.append({"name": str(node), "reflectance": reflectance, "shapes": shapes})
+            arrays += [value.ravel() for value in values if value is not None]
+    return {"files": files, "parts": parts}, arrays
+
+
+def _open(path: Path, kind: str) -> tuple[Any, list[str]]:
+    """Return the file as a trimesh scene, and the files that it refers to."""
+    import trimesh
+
+    files = _named_files(path)
+    with open_input(path) as file:
+        try:
+            scene = trimesh.load(file, file_type=kind, resolver=files, force="scene", process=False)
+        except Exception:
+            if files.missing is None:
+                raise
+        if files.missing is not None:
+            raise AmiwarpError(f"refers to the file {files.missing}; put a valid file next to the mesh file")
+    return scene, files.read
+
+
+def _named_files(path: Path) -> Any:
+    """Return a resolver of referenced files that records the first failure, because trimesh ignores failures."""
+    from trimesh.resolvers import FilePathResolver
+
+    class NamedFiles(FilePathResolver):
+        """Resolver of the files that a mesh file refers to."""
+
+        missing: str | None = None
+        """First file that cannot be read, with the reason, for a message."""
+
+        def __init__(self) -> None:
+            super().__init__(str(path))
+            self.read: list[str] = []
+
+        def get(self, name: str) -> bytes:
+            """Return the content of a file; its name is relative to the folder of the mesh file."""
+            file = path.parent / name.replace("\\", "/")
+            file = file if file.exists() else path.parent / urllib.parse.unquote(name)
+            try:
+                with open_input(file) as opened:
+                    data = opened.read()
+                if file.suffix.lower() in PICTURES:
+                    _check_picture(data)
+            except Exception as error:
+                what = "is missing" if isinstance(error, AmiwarpError) else f"cannot be read ({error})"
+                self.missing = self.missing or f"{name!r}, which {what}"
+                raise
+            self.read.append(str(file))
+            return data
+
+    return NamedFiles()
+
+
+def _check_picture(data: bytes) -> None:
+    """Raise an exception if the bytes are no picture in a supported format."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data), formats=PICTURE_FORMATS) as image:
+        image.verify()
+
+
+def _part(part: Trimesh, matrix: NDArray[Any], offset: NDArray[Any], kind: str) -> tuple[Arrays, float]:
+    """Return the arrays and the reflectance of one geometry of the file.
+
+    ``matrix`` and ``offset``: transformation from the geometry to the world; ``kind``: suffix of the file.
+    """
+    vertices = np.asarray(part.vertices, np.float64) @ matrix.T + offset
+    faces = np.asarray(part.faces)
+    visual: Any = part.visual
+    if visual.kind == "texture":
+        return _textured(visual, vertices, faces, kind)
+    if visual.kind == "face":  # faces of different colours cannot share vertices
+        light = np.repeat(_reflectance(visual.face_colors, kind), 3)
+        return (vertices[faces.ravel()], np.arange(faces.size).reshape(-1, 3), None, light, None), 1.0
+    if visual.kind == "vertex":
+        return (vertices, faces, None, _reflectance(visual.vertex_colors, kind), None), 1.0
+    return (vertices, faces, None, None, None), DEFAULT_REFLECTANCE
+
+
+def _textured(visual: Any, vertices: NDArray[Any], faces: NDArray[Any], kind: str) -> tuple[Arrays, float]:
+    """Return arrays and reflectance of a geometry whose file gives a material, with or without a texture."""
+    material = visual.material
+    pbr = hasattr(material, "baseColorFactor")
+    picture = material.baseColorTexture if pbr else material.image
+    colour = material.baseColorFactor if pbr else material.diffuse
+    factor = 1.0 if pbr and colour is None else float(_reflectance(np.atleast_2d(colour), kind)[0])
+    shade = visual.vertex_attributes.get("color")
+    light = None if shade is None else _reflectance(shade, kind)
+    if picture is None or visual.uv is None:
+        return (vertices, faces, None, light, None), factor
+    if not pbr:
+        factor = 1.0  # in OBJ files, a texture replaces the diffuse colour
+    return (vertices, faces, np.asarray(visual.uv)[:, :2], light, _luminance(picture)), factor
+
+
+def _luminance(picture: Any) -> NDArray[np.float32]:
+    """Return the linear luminance of a Pillow picture. A single row or column is duplicated."""
+    if picture.width * picture.height > MOST_PIXELS:
+        raise AmiwarpError(
+            f"a texture has {picture.width}x{picture.height} pixels, more than {MOST_PIXELS}; give a smaller picture"
+        )
+    table = srgb_to_linear(np.arange(256, dtype=np.float32) / 255)
+    light = np.empty((picture.height, picture.width), np.float32)
+    rows = max(1, BAND // (3 * picture.width))
+    for top in range(0, picture.height, rows):  # a large picture as a whole would need four times its memory
+        band = picture.crop((0, top, picture.width, min(top + rows, picture.height))).convert("RGB")
+        light[top : top + rows] = table[np.asarray(band)] @ np.array(LUMINANCE, np.float32)
+    light = np.repeat(light, 2, axis=0) if len(light) < 2 else light
+    return np.repeat(light, 2, axis=1) if light.shape[1] < 2 else light
+
+
+def _reflectance(colours: Any, kind: str) -> NDArray[np.float64]:
+    """Return the luminance of colours (integers, or floats from 0 to 1), shape (n,).
+
+    Colours are linear in glTF and GLB files, and sRGB in other files.
+    """
+    given = np.asarray(colours)
+    values = given[:, :3].astype(np.float64) / (np.iinfo(given.dtype).max if given.dtype.kind in "iu" else 1.0)
+    linear = values if kind in Y_UP else srgb_to_linear(values)
+    return np.asarray(np.clip(linear @ np.array(LUMINANCE), 0.0, 1.0), np.float64)
+
 
 FORMAT, VERSION = "amiwarp-world", 1
 """Expected values of the fields ``format`` and ``version`` of a world file."""
@@ -276,3 +511,33 @@ def _material(part: LoadedMesh, entry: MaterialEntry, texture: Any, where: str) 
         own.texture if texture is None else texture,
         own.emission if entry.emission is None else entry.emission,
     )
+
+
+# Worlds and camera trajectories by name: built-in worlds, or files.
+
+WORLD_FILES = (".toml", ".json")
+"""File suffixes of world files."""
+POSE_FILES = (".txt", ".csv", ".tum")
+"""File suffixes of files with poses."""
+
+
+def open_world(name: str, trajectory: str | None, *, seed: int, duration_s: float) -> tuple[World, Trajectory]:
+    """Return a world and the camera's trajectory through it.
+
+    ``name`` is that of a built-in world or of a world file. ``trajectory`` is a kind of motion of the built-in worlds,
+    or a file of poses; None is handheld motion, or the trajectory of the world file. Raises :class:`AmiwarpError` if
+    one of them does not exist or they do not belong together.
+    """
+    is_file = trajectory is not None and trajectory.lower().endswith(POSE_FILES)
+    poses = Trajectory.from_file(str(trajectory)) if is_file else None
+    if not name.lower().endswith(WORLD_FILES):
+        kind = "still" if poses is not None else trajectory or "handheld"
+        world, own = named_world(name, kind, seed=seed, duration_s=duration_s)
+        return world, poses or own
+    world, stored = load_world(Path(name))
+    if trajectory is not None and poses is None:
+        raise AmiwarpError(f"trajectory {trajectory} applies only to named worlds; give a file of poses for {name}")
+    chosen = poses or stored
+    if chosen is None:
+        raise AmiwarpError(f"{name}: has no camera trajectory; give a file of poses (.txt, .csv) as trajectory")
+    return world, chosen

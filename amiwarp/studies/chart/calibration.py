@@ -14,15 +14,13 @@ from functools import partial
 from typing import Any
 
 from amiwarp.calib import Calibration, Settings, calibrate
-from amiwarp.calib.photometric.stage import PhotometricSettings
 from amiwarp.calib.presets import settings_to
-from amiwarp.calib.sharpness.search import STAGES
+from amiwarp.calib.settings import STAGES, PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import model_error
 from amiwarp.optics.models import MODELS
 from amiwarp.progress import Progress
-from amiwarp.studies.chart.rows import Row, Task, Timed, measure, near_front
-from amiwarp.studies.chart.truth import KnownRecording
+from amiwarp.studies.chart.rows import KnownRecording, Row, Task, Timed, measure, near_front
 
 JOB = "calibration"
 """Name of the job to which all rows of the calibration chart belong."""

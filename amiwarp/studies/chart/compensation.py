@@ -18,26 +18,24 @@ import numpy as np
 import warp as wp
 
 from amiwarp.calib.presets import simplified
+from amiwarp.choices import Vote
 from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.choices import Vote
-from amiwarp.imaging.device_events import TURNS, upload_events
-from amiwarp.imaging.device_image import Image
-from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.imaging.iwe import Votes
+from amiwarp.imaging.votes import TURNS, CanvasShape, Image, upload_events
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.optics.displacement import wrap_angle
 from amiwarp.optics.models import MODELS, Model
 from amiwarp.progress import Progress
-from amiwarp.studies.chart.rows import Row, Task, measure
-from amiwarp.studies.chart.truth import KnownRecording, exact_image, exact_places, raw_places, rms
+from amiwarp.studies.chart.rows import KnownRecording, Row, Task, exact_image, exact_places, measure, raw_places, rms
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib import Calibration
     from amiwarp.events.events import Events
-    from amiwarp.imaging.device_events import UploadedEvents
+    from amiwarp.imaging.votes import UploadedEvents
 
 IMAGE, FILE = "image of events", "file to file"
 """Names of the two measured jobs, an image and a file. Rows of one job can be compared and share a Pareto front."""

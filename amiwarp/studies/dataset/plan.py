@@ -14,12 +14,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.progress import Progress, silent
 from amiwarp.studies.cluster import ANY_GPU
-from amiwarp.studies.dataset.items import Item, list_items
-from amiwarp.studies.dataset.making import simulation_of, write_recording
-from amiwarp.studies.dataset.manifest import Journal, check_folder
-from amiwarp.studies.dataset.run import threads_of_worker, worker_count
-from amiwarp.studies.dataset.sources import content_digest
-from amiwarp.studies.dataset.specification import load_specification
+from amiwarp.studies.dataset.items import Item, list_items, simulation_of, write_recording
+from amiwarp.studies.dataset.run import Journal, check_folder, threads_of_worker, worker_count
+from amiwarp.studies.dataset.specification import content_digest, load_specification
 from amiwarp.validation import guarded
 
 SAMPLES = 24

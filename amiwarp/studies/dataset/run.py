@@ -3,24 +3,179 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
+import json
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
+from amiwarp._version import __version__
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.atomic_output import make_folder, scratch_folder
+from amiwarp.io.atomic_output import NewFile, make_folder, scratch_folder, write_text
+from amiwarp.io.json_files import build
+from amiwarp.io.recorded_dataset import FORMAT, MANIFEST, VERSION
+from amiwarp.io.sealed_json import append_line, create_journal, read_journal
 from amiwarp.progress import Progress, silent
 from amiwarp.studies.cluster import ANY_GPU, Workers, gpu_count, run_jobs, single_worker, start_workers
-from amiwarp.studies.dataset.items import Item, list_items
-from amiwarp.studies.dataset.making import Failed, Job, Made, make
-from amiwarp.studies.dataset.manifest import Journal, check_folder, require_pyarrow, write_manifest
-from amiwarp.studies.dataset.specification import load_specification
+from amiwarp.studies.dataset.items import Failed, Item, Job, Made, list_items, make
+from amiwarp.studies.dataset.specification import Specification, content_digest, load_specification
 from amiwarp.validation import guarded, whole
+
+# Files that describe a data set: the journal of finished recordings, and the manifest as JSON and as Parquet.
+
+JOURNAL, TABLE = "journal.jsonl", "manifest.parquet"
+"""Names of the files in the folder of a data set."""
+
+
+def require_pyarrow() -> Any:
+    """Return pyarrow. Raises :class:`AmiwarpError` if it is not installed."""
+    try:
+        return importlib.import_module("pyarrow")
+    except ModuleNotFoundError as error:
+        raise AmiwarpError("'amiwarp dataset' needs pyarrow; run: pip install 'amiwarp[dataset]'") from error
+
+
+def check_folder(out: Path) -> None:
+    """Raise :class:`AmiwarpError` if a folder holds other files than a data set."""
+    if out.is_dir() and not (out / JOURNAL).exists():
+        other = sorted(p.name for p in out.iterdir() if not p.name.startswith("."))
+        if other:
+            raise AmiwarpError(f"{out}: holds other files, such as {other[0]}; give a new folder")
+
+
+class Journal:
+    """Recordings that were made, on disk. A later entry replaces an earlier one of the same key."""
+
+    def __init__(self, out: Path) -> None:
+        self._out, self._path = out, out / JOURNAL
+        self.damaged: list[str] = []
+        """What is wrong with damaged lines of the journal, and with damaged recordings."""
+        found = read_journal(self._path, lambda data: build(Made, data, ""), self.damaged)
+        self.made = {made.key: made for made in found}
+        """Recordings by the key of their item."""
+
+    def create(self) -> None:
+        """Create the journal unless it exists. It marks the folder as a data set."""
+        create_journal(self._path)
+
+    def add(self, made: Made) -> None:
+        """Add a recording."""
+        self.made[made.key] = made
+        append_line(self._path, asdict(made))
+
+    def is_there(self, item: Item) -> bool:
+        """Return whether the recording of an item is in the journal, and its file has the size stated there."""
+        made = self.made.get(item.key)
+        if made is None or made.file != item.file:
+            return False
+        path = self._out / made.file
+        return path.is_file() and path.stat().st_size == made.bytes
+
+    def is_intact(self, item: Item) -> bool:
+        """Return whether the file of a recording that is there has the checksum of the journal."""
+        made = self.made[item.key]
+        if content_digest(self._out / made.file, noted=False) == made.sha256:
+            return True
+        self.damaged.append(f"{self._out / made.file}: does not have the checksum of {JOURNAL}")
+        return False
+
+    def others(self, items: Sequence[Item]) -> list[str]:
+        """Return the existing recordings that belong to none of the items, for example of an earlier specification."""
+        files = {item.file for item in items}
+        return sorted(made.file for made in self.made.values()
+                      if made.file not in files and (self._out / made.file).exists())  # fmt: skip
+
+
+def write_manifest(
+    out: Path, specification: Specification, items: Sequence[Item], journal: Journal, failed: Sequence[Failed]
+) -> None:
+    """Write the manifest of the recordings that are finished, as JSON and as Parquet."""
+    rows = [_row(item, journal.made[item.key]) for item in items if item.key in journal.made]
+    by_key = {item.key: item for item in items}
+    licences = Counter((item.source, item.licence) for item in items if item.key in journal.made)
+    head = {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": specification.name,
+        "amiwarp": __version__,
+        "date": time.strftime("%Y-%m-%d"),
+        "specification": specification.data,
+        "complete": len(rows) == len(items),
+        "recordings": len(items),
+        "events": sum(row["events"] for row in rows),
+        "bytes": sum(row["bytes"] for row in rows),
+        "splits": dict(Counter(row["split"] for row in rows)),
+        "licences": _licences(licences),
+        "failed": [{"file": by_key[f.key].file, "source": by_key[f.key].source, "error": f.error} for f in failed],
+        "not_in_specification": journal.others(items),
+    }
+    text = json.dumps(head, indent=1, default=str).removesuffix("\n}")
+    lines = ",\n".join("  " + json.dumps(row) for row in rows)  # one line for each recording
+    write_text(out / MANIFEST, f'{text},\n "items": [\n{lines}\n ]\n}}\n', overwrite=True)
+    _write_table(out / TABLE, rows)
+
+
+def _licences(counts: Mapping[tuple[str, str], int]) -> list[dict[str, Any]]:
+    """Return the licences with the number of their sources and recordings."""
+    sources, recordings = Counter[str](), Counter[str]()
+    for (_, licence), count in counts.items():
+        sources[licence] += 1
+        recordings[licence] += count
+    return [
+        {"licence": name or "not stated", "sources": sources[name], "recordings": recordings[name]}
+        for name in sorted(sources)
+    ]
+
+
+def _row(item: Item, made: Made) -> dict[str, Any]:
+    """Return the entry of a recording in the manifest. Settings that it does not have are None."""
+    recipe = item.recipe
+    prism = recipe.get("prism") or {}
+    return {
+        "file": made.file,
+        "sha256": made.sha256,
+        "bytes": made.bytes,
+        "split": item.split,
+        "labels": dict(item.labels),
+        "events": made.events,
+        "duration_s": made.duration_s,
+        "width": made.width,
+        "height": made.height,
+        "seed": None if item.kind == "recordings" else item.seed,
+        "source": item.source,
+        "source_kind": item.kind,
+        "source_sha256": recipe["source"]["sha256"],
+        "licence": item.licence,
+        "apex_deg": prism.get("apex_deg"),
+        "index": prism.get("index"),
+        "flat_side": prism.get("flat_side"),
+        "rpm": recipe.get("rpm"),
+        "sensor": (recipe.get("sensor") or {}).get("name"),
+        "variant": recipe.get("seed"),
+        "trajectory": recipe.get("trajectory"),
+        "device": made.device,
+        "amiwarp": made.amiwarp,
+    }
+
+
+def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write the entries as Parquet. Each label becomes a column ``label_NAME``; the others keep their name."""
+    pyarrow = require_pyarrow()
+    parquet = importlib.import_module("pyarrow.parquet")
+    labels = sorted({name for row in rows for name in row["labels"]})
+    flat = [
+        {**{k: v for k, v in row.items() if k != "labels"}, **{f"label_{n}": row["labels"].get(n) for n in labels}}
+        for row in rows
+    ]
+    with NewFile(path, overwrite=True) as new:
+        parquet.write_table(pyarrow.Table.from_pylist(flat), new.part)
+
 
 MOST_READERS = 8
 """Largest number of threads that read finished recordings."""
@@ -196,7 +351,7 @@ def worker_count(workers: int | None, device: str) -> int:
         return whole(workers, "workers", 1, MOST_WORKERS)
     if device != ANY_GPU:
         return cpu_threads() if device == "cpu" else 1
-    from amiwarp.kernels.quiet_start import start_quietly
+    from amiwarp.kernels.launch import start_quietly
 
     return max(1, gpu_count(start_quietly()))
 
@@ -227,7 +382,7 @@ def _local_workers(scheduler: str | None, workers: int | None, device: str) -> i
         if workers is not None:
             raise AmiwarpError(f"workers = {workers} applies to local processes; leave it out with a scheduler")
         return None
-    from amiwarp.kernels.quiet_start import start_quietly
+    from amiwarp.kernels.launch import start_quietly
 
     known = start_quietly()
     if device not in (*known, *([ANY_GPU] if gpu_count(known) else [])):

@@ -6,21 +6,251 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from amiwarp.calib.selection.smaller_models import QUANTISATION_PX, SHARE
+import numpy as np
+
+from amiwarp.calib.model_choice import QUANTISATION_PX, SHARE
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
+from amiwarp.optics.ellipse_model import EllipseModel
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.models import MODELS, predicted_error
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, part, silent
-from amiwarp.simulation.scene import Scene
+from amiwarp.simulation.motion import PrismMotion
+from amiwarp.simulation.scenery import Scene, place_scene, seen_bearings
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.studies.design.event_volume import Volume, filled, measure
-from amiwarp.studies.design.orbit_size import Orbit, orbit_of
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from amiwarp.optics.camera import Camera
+
+
+# Effect of a prism on a camera's image: radii of the pixels' orbits, and error of each refraction model.
+
+QUARTER_SWING = 1.0 - math.sqrt(0.5)
+"""Smallest displacement across an edge in a quarter turn on an orbit of radius 1.
+
+The minimum is over all edge directions and all start angles.
+"""
+GRID = 12
+"""Number of rows of the grid of pixels on which the circle models are fitted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Orbit:
+    """Effect of a prism on a camera's image, independent of its speed."""
+
+    apex: float
+    """Apex angle of the prism [rad]."""
+    deflection: float
+    """Deflection of the ray on the optical axis [rad]."""
+    radius: float
+    """Radius of the orbits [px], rms over the image."""
+    smallest: float
+    """Radius of the smallest orbit in the image [px]."""
+    errors: dict[str, float]
+    """For each model, the distance of its best fit from the exact model [px rms over image and turn]."""
+
+    @property
+    def swing(self) -> float:
+        """Smallest displacement across an edge in a quarter turn, anywhere in the image [px]."""
+        return QUARTER_SWING * self.smallest
+
+
+def orbit_of(camera: Camera, prism: Prism, device: str = "cpu") -> Orbit:
+    """Return the orbit of a prism: radii, and the errors of all models.
+
+    Raises :class:`AmiwarpError` if no pixel has a ray during a whole turn.
+    """
+    rms, smallest = orbit_radii(camera, prism)
+    return Orbit(prism.apex, prism.deflection, rms, smallest, _model_errors(ExactModel(camera, prism), device))
+
+
+def orbit_radii(camera: Camera, prism: Prism) -> tuple[float, float]:
+    """Return the radius of the orbits [px], rms over the image, and the smallest radius [px].
+
+    Raises :class:`AmiwarpError` if no pixel has a ray during a whole turn.
+    """
+    exact = ExactModel(camera, prism)
+    x, y = np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 25)
+    grid = np.stack([m.ravel() for m in np.meshgrid(x, y)], axis=1)
+    theta = np.arange(24) * (2.0 * np.pi / 24)
+    moved = exact.compensate_points(np.repeat(grid, 24, axis=0), np.tile(theta, len(grid))).reshape(len(grid), 24, 2)
+    radii = np.sqrt(np.mean(np.sum((moved - moved.mean(axis=1, keepdims=True)) ** 2, axis=2), axis=1))
+    radii = radii[np.isfinite(radii)]
+    if not len(radii):
+        raise AmiwarpError(f"apex {math.degrees(prism.apex):.6g} deg: no pixel of this camera has a ray during a "
+                           "whole turn; choose a smaller apex or a lens with a narrower view")  # fmt: skip
+    return float(np.sqrt(np.mean(radii**2))), float(radii.min())
+
+
+def _model_errors(exact: ExactModel, device: str) -> dict[str, float]:
+    """Return the error of each refraction model's best fit [px rms]; circle models get the best deflection."""
+    fitted = {
+        "circle": _fitted(CircleModel, exact),
+        "radial": _fitted(RadialCircleModel, exact),
+        "ellipse": EllipseModel.from_model(exact, device),
+    }
+    return {n: predicted_error(fitted[n], exact, remove_lag=True).rms if n in fitted else 0.0 for n in MODELS}
+
+
+def _fitted(kind: type[CircleModel | RadialCircleModel], exact: ExactModel) -> CircleModel | RadialCircleModel:
+    """Return the circle model whose deflection fits the exact model best."""
+    from scipy.optimize import minimize_scalar
+
+    def sized(deflection: float) -> CircleModel | RadialCircleModel:
+        return replace(kind.from_prism(exact.camera, exact.prism), deflection=deflection)
+
+    def error(deflection: float) -> float:
+        return predicted_error(sized(deflection), exact, grid=GRID).rms
+
+    size = exact.prism.deflection
+    found = minimize_scalar(error, bounds=(0.5 * size, 4.0 * size), method="bounded", options={"xatol": 1e-3 * size})
+    return sized(float(found.x))
+
+
+# Event volume: a law for the event rate, measured by simulating small parts of the image.
+#
+# The law holds for every apex angle, speed and image size of a design study.
+
+TILE, ACROSS_TILES, DOWN_TILES = 16, 12, 9
+"""Side [px] and number, across and down, of the tiles of the image that are simulated."""
+NODES = 4
+"""Largest number of apex angles that are simulated; between them the events per turn are interpolated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Measured law of the event volume.
+
+    Events per turn and pixel are yield · 4 r ⟨|∇L|⟩ / C, where r is the radius of the orbits; sensor noise is added.
+    """
+
+    apexes: NDArray[np.float64]
+    """Apex angles that were simulated [rad], shape ``(n,)``."""
+    rpms: NDArray[np.float64]
+    """Simulated speeds, one or two [turns/min], shape ``(m,)``."""
+    yields: NDArray[np.float64]
+    """Ratio of simulated events to events expected from the scene's gradients, shape ``(n, m)``."""
+    uncertainty: float
+    """Relative standard error of the yields, from the scatter of the tiles."""
+    texture: float
+    """⟨|∇L|⟩: mean gradient of log intensity over the image [1/px]."""
+    contrast: float
+    """C: contrast threshold, the change of log intensity between two events."""
+    pixels: int
+    """Number of pixels of the image."""
+    noise_hz: float
+    """Noise rate of each pixel [events/s]."""
+    simulated: int
+    """Number of pixels that were simulated, summed over the tiles."""
+
+    def events_per_s(self, orbit: Orbit, rpm: float) -> float:
+        """Return the event rate of the whole image [events/s]."""
+        per_turn = self._yield(orbit.apex, rpm) * 4.0 * orbit.radius * self.texture / self.contrast
+        return self.pixels * (per_turn * rpm / 60.0 + self.noise_hz)
+
+    def _yield(self, apex: float, rpm: float) -> float:
+        """Return the ratio of simulated to expected events at an apex angle [rad] and a speed [turns/min].
+
+        It is a power law between simulated apexes; between speeds its reciprocal is linear, as for a dead time.
+        """
+        at = [float(np.interp(math.log(apex), np.log(self.apexes), np.log(y))) for y in self.yields.T]
+        return 1.0 / float(np.interp(rpm, self.rpms, np.exp(-np.array(at))))
+
+
+def filled(scene: Scene, camera: Camera, prism: Prism) -> Scene:
+    """Return the scene, centred and scaled to fill everything that the camera sees through this prism.
+
+    Every part of the image then sees the same part of the scene as in the whole image. A scene with a given size stays
+    unchanged.
+    """
+    if scene.fov is not None:
+        return scene
+    whole = Simulation(scene, camera, prism, 1.0)
+    place_scene(whole)  # raises an error if a plane cannot fill the view
+    bearings = seen_bearings(whole)
+    reach = np.abs(bearings[:, :2] / bearings[:, 2:]).max(axis=0) + 4.0 / min(camera.fx, camera.fy)
+    scale = float(np.max(reach / np.array(scene.frames.size)))
+    return replace(scene, fov=2.0 * math.atan(scale * scene.frames.size[0]))
+
+
+def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float], report: Progress) -> Volume:
+    """Measure the event volume by simulating tiles of the camera.
+
+    The apex angles span the range of ``apexes``; the speeds are the slowest and the fastest of ``rpms``. Each tile is a
+    small camera that sees the same as its part of the image. It is simulated for two turns; the first lets the
+    reference levels of the pixels settle, the second is counted. The events of the tiles are scaled to the image by the
+    gradient along their orbits, which is known everywhere, so that the choice of tiles matters little.
+
+    Raises :class:`AmiwarpError` for a scene without texture.
+    """
+    sensor, camera = template.sensor, template.camera
+    slopes: Any = np.gradient(template.log_view())
+    gradient = np.hypot(slopes[0], slopes[1])
+    if not gradient.mean() > 0.0:
+        raise AmiwarpError("the scene has no texture, so it generates no events with any prism; choose another picture")
+    nodes = np.geomspace(apexes[0], apexes[-1], min(NODES, len(apexes))) if len(apexes) > 1 else np.array(apexes)
+    speeds = np.array(sorted({rpms[0], rpms[-1]}))
+    contrast = 2.0 / (1.0 / sensor.contrast_on + 1.0 / sensor.contrast_off)
+    noise = sensor.shot_noise_hz + sensor.leak_hz + sensor.hot_fraction * sensor.hot_hz
+    cameras = tiles(camera, template.seed)
+    yields, spread = np.empty((len(nodes), len(speeds))), []
+    for k, (i, j) in enumerate(np.ndindex(yields.shape)):
+        report("simulating", k / yields.size)
+        rpm = float(speeds[j])
+        prism = replace(template.prism, apex=float(nodes[i]))
+        case = replace(template, prism=prism, motion=PrismMotion(rpm), duration_s=120.0 / rpm)
+        radius = orbit_radii(camera, prism)[0]
+        found = np.array([_per_turn(case, tile, k) for k, tile in enumerate(cameras)]) - noise * 60.0 / rpm
+        likely = _texture_of(gradient, radius, camera, cameras) * 4.0 * radius / contrast
+        yields[i, j] = max(float(found.mean() / likely.mean()), 1e-6)
+        spread.append(float(np.std(found - yields[i, j] * likely)) / math.sqrt(len(cameras)) / abs(found.mean()))
+    pixels = camera.width * camera.height
+    simulated = sum(tile.width * tile.height for tile in cameras)
+    return Volume(nodes, speeds, yields, float(np.mean(spread)), float(gradient.mean()), contrast, pixels, noise,
+                  simulated)  # fmt: skip
+
+
+def tiles(camera: Camera, seed: int = 0) -> list[Camera]:
+    """Return small cameras that each see a tile of the image, at a random position in each cell of a grid.
+
+    The positions are random so that a repeating texture cannot align with the grid.
+    """
+    across, down = min(ACROSS_TILES, camera.width // TILE), min(DOWN_TILES, camera.height // TILE)
+    if across < 2 or down < 2:
+        return [camera]
+    wide, high = camera.width / across, camera.height / down
+    at = np.random.default_rng([seed, 0x71E5]).random((down, across, 2)) * (wide - TILE, high - TILE)
+    left = np.floor(np.arange(across) * wide + at[..., 0]).ravel()
+    top = np.floor(np.arange(down)[:, None] * high + at[..., 1]).ravel()
+    return [
+        replace(camera, width=TILE, height=TILE, cx=camera.cx - float(x), cy=camera.cy - float(y))
+        for x, y in zip(left, top, strict=True)
+    ]
+
+
+def _per_turn(case: Simulation, tile: Camera, number: int) -> float:
+    """Simulate a tile and return its number of events per pixel in the second turn."""
+    half = case.duration_us // 2
+    seeded = replace(case, camera=tile, seed=(case.seed + number) % (1 << 31))
+    blocks = seeded.blocks(chunk_us=case.duration_us)  # one chunk, because there are few pixels
+    return sum(int((events.t >= half).sum()) for events, _ in blocks) / (tile.width * tile.height)
+
+
+def _texture_of(gradient: NDArray[Any], radius: float, camera: Camera, parts: Sequence[Camera]) -> NDArray[np.float64]:
+    """Return the mean gradient of log intensity along the orbits of each tile's pixels [1/px], shape ``(tiles,)``."""
+    from scipy.ndimage import gaussian_filter
+
+    met = gaussian_filter(gradient, radius / math.sqrt(2.0))  # as wide as a ring of that radius
+    corners = [(round(camera.cx - part.cx), round(camera.cy - part.cy)) for part in parts]
+    boxes = [met[y : y + p.height, x : x + p.width] for p, (x, y) in zip(parts, corners, strict=True)]
+    return np.array([box.mean() for box in boxes], np.float64)
+
 
 ACROSS = math.sqrt(2.0 / 3.0)
 """Share of an error along the orbit that acts across edges.
@@ -214,3 +444,116 @@ def design(
                           seed=seed, device=device)  # fmt: skip
     volume = measure(template, apexes, rpms, part(report, 0.5, 1.0))
     return Design(camera, glass, tuple(orbits), tuple(rpms), volume, timing, limits)
+
+
+# Recommendation of a design study in words: the chosen prism and speed, and why others are rejected.
+
+
+def headline(design: Design) -> str:
+    """Return one line of text: the recommended prism and speed, or that no combination keeps all limits."""
+    chosen = design.chosen
+    if chosen is None:
+        return f"none of {len(design.choices)} choices keeps all limits"
+    return f"apex {degrees(chosen.orbit.apex)} at {chosen.rpm:g} rpm, compensated by the {chosen.model} model"
+
+
+def reasons(design: Design) -> list[str]:
+    """Return the reasons for the recommendation, or for having none: one line of text per limit."""
+    chosen = design.chosen
+    if chosen is None:
+        return _refusals(design)
+    kept = sum(not c.misses for c in design.choices)
+    lines = [
+        f"events: {rate(chosen.events_per_s)}, the fewest of the {kept} choices of {len(design.choices)} "
+        "that keep all limits" + _dearer(design, chosen),
+        f"edges: a quarter turn displaces edges of every direction by at least {chosen.orbit.swing:.2f} px "
+        f"across themselves (required: {LEAST_SWING:g} px)" + _smaller(design, chosen),
+        f"window: a quarter turn takes {chosen.window_ms:.1f} ms (allowed: {design.limits.window_ms:.1f} ms)"
+        + _slower(design, chosen),
+        f"blur: {chosen.error_px:.3f} px across an edge (tolerance: {design.limits.tolerance_px:g} px), from pixels "
+        f"{QUANTISATION_PX:.2f}, clock {chosen.clock_px:.3f}, encoder {chosen.encoder_px:.3f}",
+        f"model: {chosen.model}, with an error of {_px(chosen.orbit.errors[chosen.model])} "
+        f"(allowed: {_px(chosen.budget_px)})" + _simpler(chosen),
+    ]
+    if design.limits.bandwidth is not None:
+        lines.append(f"bandwidth: {rate(chosen.events_per_s)} (limit: {rate(design.limits.bandwidth)})")
+    return [*lines, _range(design, chosen)]
+
+
+def _dearer(design: Design, chosen: Choice) -> str:
+    """Return text about the event rate with the next larger apex."""
+    larger = [c for c in design.choices if c.rpm == chosen.rpm and c.orbit.apex > chosen.orbit.apex]
+    if not larger:
+        return ""
+    more = larger[0].events_per_s / chosen.events_per_s
+    return f"; {degrees(larger[0].orbit.apex)} generates {more:.1f} times as many"
+
+
+def _smaller(design: Design, chosen: Choice) -> str:
+    """Return text about the displacement across edges by the largest apex that is too small."""
+    short = [o for o in design.orbits if o.swing < LEAST_SWING]
+    return f"; {degrees(short[-1].apex)} displaces them by only {short[-1].swing:.2f} px" if short else ""
+
+
+def _slower(design: Design, chosen: Choice) -> str:
+    """Return text about the duration of a quarter turn at the next lower speed."""
+    slow = [rpm for rpm in design.rpms if rpm < chosen.rpm]
+    return f"; at {slow[-1]:g} rpm it takes {15e3 / slow[-1]:.1f} ms" if slow else ""
+
+
+def _simpler(chosen: Choice) -> str:
+    """Return text about the errors of the models that exceed the error budget."""
+    worse = {n: e for n, e in chosen.orbit.errors.items() if e > chosen.budget_px}
+    return "".join(f"; {name} has {_px(error)}" for name, error in worse.items())
+
+
+def _range(design: Design, chosen: Choice) -> str:
+    """Return text about the range of apex angles that keep the limits of edges and blur."""
+    low, high = design.range_at(chosen.rpm)
+    largest = design.orbits[-1].apex
+    ends = f"from {degrees(low)}" + (f" to {degrees(high)}" if high <= largest else " upwards")
+    return f"range: at {chosen.rpm:g} rpm every apex {ends} keeps the limits of edges and blur, also off the grid"
+
+
+def _refusals(design: Design) -> list[str]:
+    """Return text for each limit: how many combinations it rules out, and what would help."""
+    limits, count = design.limits, len(design.choices)
+    best = max(design.orbits, key=lambda o: o.swing)
+    least = min(c.error_px for c in design.choices)
+    fewest = min(c.events_per_s for c in design.choices)
+    advice = {
+        "edges": f"a quarter turn displaces edges by {best.swing:.2f} px at most, and {LEAST_SWING:g} px is required; "
+        "try a larger apex, or a longer focal length",
+        "window": f"the shortest quarter turn takes {15e3 / design.rpms[-1]:.1f} ms, and {limits.window_ms:.1f} ms "
+        "is allowed; try a faster prism, or a longer --window-ms",
+        "blur": f"the smallest blur is {least:.3f} px, and the tolerance is {limits.tolerance_px:g} px; "
+        + (
+            f"pixels alone leave {QUANTISATION_PX:.2f} px, so only a larger --tolerance-px helps"
+            if limits.tolerance_px <= QUANTISATION_PX
+            else "try a better clock or encoder, a slower prism, or a larger --tolerance-px"
+        ),
+        "bandwidth": f"the lowest event rate is {rate(fewest)}, and the limit is {rate(limits.bandwidth or math.inf)}; "
+        "try a higher threshold, or a slower prism",
+    }
+    lines = []
+    for name, text in advice.items():
+        out = sum(name in c.misses for c in design.choices)
+        if out:
+            why = text if out == count else text.rpartition("; ")[2]
+            lines.append(f"{name}: rules out {out} of {count}: {why}")
+    return lines
+
+
+def degrees(angle: float) -> str:
+    """Return an angle [rad] as text in degrees."""
+    return f"{float(f'{math.degrees(angle):.3g}'):g}°"
+
+
+def rate(events_per_s: float) -> str:
+    """Return an event rate [events/s] as text."""
+    return f"{events_per_s / 1e6:.3g} Mev/s"
+
+
+def _px(error: float) -> str:
+    """Return an error [px] as text."""
+    return f"{error:.2g} px"

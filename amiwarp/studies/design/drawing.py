@@ -11,8 +11,7 @@ import numpy as np
 
 from amiwarp.imaging.palette import BLUE, GREEN, ORANGE, VERMILION
 from amiwarp.plotting import figures
-from amiwarp.studies.design.choice import LEAST_SWING
-from amiwarp.studies.design.recommendation import degrees, headline
+from amiwarp.studies.design.choice import LEAST_SWING, degrees, headline
 
 if TYPE_CHECKING:
     from amiwarp.studies.design.choice import Choice, Design

@@ -10,8 +10,18 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import edge_blur
-from amiwarp.studies.evaluate.conditions import BANDWIDTH, DISCS, IDEAL, LIMITS, Condition, Stream, Streams
-from amiwarp.studies.evaluate.disc_target import BACKGROUND, DiscTarget, robust_spread
+from amiwarp.studies.evaluate.conditions import (
+    BACKGROUND,
+    BANDWIDTH,
+    DISCS,
+    IDEAL,
+    LIMITS,
+    Condition,
+    DiscTarget,
+    Stream,
+    Streams,
+    robust_spread,
+)
 from amiwarp.studies.evaluate.results import (
     NO_RESULT,
     Amount,

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.events.events import Events
-from amiwarp.imaging.warped_image import CanvasShape, Votes
+from amiwarp.imaging.iwe import Votes
+from amiwarp.imaging.votes import CanvasShape
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.studies.evaluate.measures.smoothing import smoothed
+from amiwarp.studies.evaluate.measures import smoothed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

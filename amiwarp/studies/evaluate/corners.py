@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 
-from amiwarp.imaging.choices import CornerMethod
+from amiwarp.choices import CornerMethod
 from amiwarp.imaging.corners import detect_corners
-from amiwarp.simulation.worlds.world_scene import WorldScene
+from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
-from amiwarp.studies.evaluate.measures.tracks import GAP_US, LIMITS_PX, link_corners, quality_curve, true_paths
+from amiwarp.studies.evaluate.measures import GAP_US, LIMITS_PX, link_corners, quality_curve, true_paths
 from amiwarp.studies.evaluate.results import (
     Amount,
     CellResult,

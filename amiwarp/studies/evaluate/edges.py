@@ -10,24 +10,22 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
-from amiwarp.imaging.warped_image import iwe
+from amiwarp.imaging.iwe import iwe
 from amiwarp.studies.evaluate.conditions import ENOUGH, Condition, Stream, Streams
-from amiwarp.studies.evaluate.drawing import CHANCE
-from amiwarp.studies.evaluate.measures.edge_match import (
+from amiwarp.studies.evaluate.measures import (
+    CANNY_SIGMA,
     THRESHOLDS,
     Counts,
     best_f,
     binary_entropy,
-    match,
-    normalised,
-)
-from amiwarp.studies.evaluate.measures.true_edges import (
-    CANNY_SIGMA,
     canny_edges,
     geometric_edges,
     grey_picture,
+    match,
+    normalised,
     skimage,
 )
+from amiwarp.studies.evaluate.report import CHANCE
 from amiwarp.studies.evaluate.results import (
     NO_RESULT,
     Amount,

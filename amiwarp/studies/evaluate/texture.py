@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 
 from amiwarp.studies.evaluate.conditions import ENOUGH, Condition, RecordedStreams, Stream
-from amiwarp.studies.evaluate.measures.density import density_variance, event_counts
+from amiwarp.studies.evaluate.measures import density_variance, event_counts
 from amiwarp.studies.evaluate.results import (
     Amount,
     CellResult,

@@ -7,6 +7,8 @@ import hashlib
 import json
 import math
 import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, as_completed
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,24 +18,28 @@ from scipy.optimize import minimize
 
 from amiwarp._version import __version__
 from amiwarp.calib import Settings, calibrate
+from amiwarp.calib.model_choice import Places
 from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.calib.parameters import build_model
 from amiwarp.calib.presets import settings_to
-from amiwarp.calib.selection.smaller_models import Places
-from amiwarp.calib.sharpness.search import AUTO, STAGES
+from amiwarp.calib.settings import AUTO, STAGES
+from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.choices import Sharpness
 from amiwarp.imaging.metrics import model_error
 from amiwarp.io.json_files import build, fields_of, value_of
 from amiwarp.io.sealed_json import CellStore
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.model_error import predicted_error
-from amiwarp.studies.machine_info import machine
-from amiwarp.studies.stability.conditions import Condition, SimulatedSample, make
+from amiwarp.optics.models import predicted_error
+from amiwarp.progress import Progress
+from amiwarp.studies.cluster import machine
+from amiwarp.studies.stability.conditions import AXES, Axis, Condition, SimulatedSample, make
 from amiwarp.validation import instance, real, whole
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
     from amiwarp.calib import Calibration
+
 
 LIMIT_PX = 0.1
 """Largest model error of a successful calibration [px rms], unless the model's best fit to the truth has a large error
@@ -285,3 +291,76 @@ class Store(CellStore):
             "format": FORMAT, "condition": asdict(known.cell.condition), "seed": known.cell.seed,
             "events": known.events, "results": {name: asdict(r) for name, r in sorted(known.results.items())},
         })  # fmt: skip
+
+
+# Run of the stability study by any executor, such as a Dask cluster or a process pool.
+#
+# Each cell (one recording with its results) is stored when it finishes.
+
+QUICK_METHODS = ("default", "paper", "sharpness")
+"""Names of the methods of a quick run."""
+
+
+def quick_axes() -> tuple[Axis, ...]:
+    """Return each axis with at most three values: both ends and the middle."""
+    return tuple(
+        replace(a, values=tuple(dict.fromkeys(a.values[i] for i in (0, len(a.values) // 2, -1))))
+        for a in AXES
+        if a.name != "many events"
+    )
+
+
+def conditions(axes: Sequence[Axis]) -> list[Condition]:
+    """Return every condition of the axes once; all axes share the condition with default values."""
+    return list(dict.fromkeys(c for axis in axes for c in axis.conditions()))
+
+
+def run(
+    axes: Sequence[Axis],
+    seeds: int,
+    methods: Sequence[Method],
+    store: Store,
+    executor: Executor,
+    *,
+    device: str = "cpu",
+    first: int = 0,
+    progress: Progress | None = None,
+    until: Callable[[], bool] | None = None,
+) -> list[Stored]:
+    """Run all cells (conditions and seeds) of the axes, and return their results.
+
+    Cells in ``store`` are reused; if a cell lacks a method, only that method is run. Seeds begin at ``first``. The
+    seed is the outer loop: an interrupted run covers every condition, with fewer seeds. No new cell starts after
+    ``until`` returns True.
+    """
+    cells = [Cell(c, seed) for seed in range(first, first + seeds) for c in conditions(axes)]
+    known = {cell: store.load(cell) for cell in cells}
+    todo = [(cell, missing) for cell in cells if (missing := _missing(known[cell], methods))]
+    waiting: dict[Future[Stored], Cell] = {}
+    done = len(cells) - len(todo)
+    try:
+        for cell, missing in todo:
+            waiting[executor.submit(run_cell, cell, missing, device)] = cell
+        for future in as_completed(waiting):
+            found, cell = future.result(), waiting[future]
+            known[cell] = replace(found, results={**known[cell].results, **found.results})
+            store.save(known[cell])
+            done += 1
+            if progress is not None:
+                progress(f"{done:,} of {len(cells):,} cells", done / len(cells))
+            if until is not None and until():
+                break
+    finally:
+        for future in waiting:
+            future.cancel()
+    return [known[cell] for cell in cells]
+
+
+def _missing(stored: Stored, methods: Sequence[Method]) -> tuple[Method, ...]:
+    """Return the methods for which a cell has no result."""
+    return tuple(m for m in methods if identity(m) not in stored.results)
+
+
+def chosen(names: Sequence[str] = ()) -> tuple[Method, ...]:
+    """Return methods by their names; the default and the paper's method are always included."""
+    return tuple(m for m in METHODS if not names or m.name in (*names, "default", "paper"))

@@ -14,10 +14,9 @@ import numpy as np
 from amiwarp.imaging.palette import BLACK, BLUE, PINK, SKY_BLUE
 from amiwarp.io.atomic_output import NewFile
 from amiwarp.plotting.figures import save
-from amiwarp.studies.stability.axes import Axis
 from amiwarp.studies.stability.cells import LIMIT_PX, Outcome
-from amiwarp.studies.stability.points import AxisPoint, axis_label, value_label
-from amiwarp.studies.stability.report import DEFAULT, PAPER, Atlas
+from amiwarp.studies.stability.conditions import Axis
+from amiwarp.studies.stability.report import DEFAULT, PAPER, Atlas, AxisPoint, axis_label, value_label
 
 COLOURS = {Outcome.SUCCESS: SKY_BLUE, Outcome.REFUSAL: "#d0d0d0", Outcome.SILENT: "#e6702e"}
 """Colour of each outcome: distinguishable with colour vision deficiency, and light enough for black text."""

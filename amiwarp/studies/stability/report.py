@@ -5,19 +5,155 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
+import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy.stats import binomtest
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
-from amiwarp.studies.stability.axes import Axis
-from amiwarp.studies.stability.cells import Cell, Method, Outcome, Store, Stored, identity
-from amiwarp.studies.stability.conditions import Condition, sensible
-from amiwarp.studies.stability.points import AxisPoint, Rate, axis_label, percent, value_label
+from amiwarp.studies.stability.cells import Cell, Method, Outcome, Result, Store, Stored, identity
+from amiwarp.studies.stability.conditions import Axis, Condition, sensible
+
+# Points of the stability study: rates and errors of one method at one value of an axis, and their text.
+
+QUANTILES = (5, 25, 50, 75, 95)
+"""Quantiles of the model error that are reported [%]."""
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Number of calibrations with some outcome, out of a total."""
+
+    count: int
+    """Number of calibrations with the outcome."""
+    total: int
+    """Total number of calibrations."""
+
+    @property
+    def share(self) -> float:
+        """Share of the calibrations with the outcome; NaN for a total of 0."""
+        return self.count / self.total if self.total else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95 % confidence interval of the share."""
+        return _wilson(self.count, self.total)
+
+    def __str__(self) -> str:
+        if not self.total:
+            return "0 of 0"
+        low, high = self.interval
+        return f"{percent(self.share)} ({percent(low)} to {percent(high)}; {self.count:,} of {self.total:,})"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return count, total, share and confidence interval as JSON data."""
+        low, high = self.interval
+        share = round(self.share, 5) if self.total else None
+        return {"count": self.count, "total": self.total, "share": share, "low": round(low, 5), "high": round(high, 5)}
+
+
+@cache
+def _wilson(count: int, total: int) -> tuple[float, float]:
+    """Return Wilson's 95 % confidence interval of ``count / total``."""
+    if not total:
+        return 0.0, 1.0
+    found = binomtest(count, total).proportion_ci(confidence_level=0.95, method="wilson")
+    return float(found.low), float(found.high)
+
+
+@dataclass(frozen=True)
+class AxisPoint:
+    """Results of one method at one value of an axis of the study, over all seeds."""
+
+    axis: Axis
+    """Axis of the study to which the point belongs."""
+    value: Any
+    """Value of the condition field that the axis varies."""
+    method: str
+    """Name of the calibration method."""
+    results: tuple[Result, ...]
+    """Results of the method for all seeds."""
+
+    @property
+    def errors(self) -> list[float]:
+        """Model errors of all calibrations that were not refused [px rms]."""
+        return [r.error_px for r in self.results if r.error_px is not None]
+
+    @property
+    def limit_px(self) -> float:
+        """Median over the seeds of the largest model error that counts as a success [px rms]."""
+        return float(np.median([r.limit_px for r in self.results]))
+
+    @property
+    def seconds(self) -> float:
+        """Median time of a calibration [s]."""
+        return float(np.median([r.seconds for r in self.results]))
+
+    @property
+    def quantiles(self) -> dict[int, float]:
+        """Quantiles of the model error [px rms], by per cent; empty if every recording was refused."""
+        errors = self.errors
+        return dict(zip(QUANTILES, map(float, np.percentile(errors, QUANTILES)), strict=True)) if errors else {}
+
+    def common_message(self, *outcomes: Outcome) -> str:
+        """Return the most frequent message of the results with an outcome; empty if there is none."""
+        return most_common_message(r.message for r in self.results if r.outcome in outcomes)
+
+    def rate(self, outcome: Outcome) -> Rate:
+        """Return how many of the results have an outcome."""
+        return Rate(sum(r.outcome is outcome for r in self.results), len(self.results))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the point as JSON data."""
+        return {
+            "axis": self.axis.name, "field": self.axis.field, "value": self.value, "unit": self.axis.unit,
+            "method": self.method, **{o.name.lower(): self.rate(o).to_json() for o in Outcome},
+            "error_px": {f"{q} %": float(f"{e:.4g}") for q, e in self.quantiles.items()},
+            "limit_px": float(f"{self.limit_px:.4g}"), "seconds": float(f"{self.seconds:.4g}"),
+            "messages": {o.name.lower(): text for o in Outcome if (text := self.common_message(o))},
+        }  # fmt: skip
+
+
+def most_common_message(messages: Iterable[str]) -> str:
+    """Return the most frequent message, without the recording's name.
+
+    Messages that differ only in numbers count as one.
+    """
+    texts = [m.replace("simulation: ", "") for m in messages if m]
+    kinds = [re.sub(r"-?\d[\d.,]*", "#", m) for m in texts]
+    return texts[kinds.index(Counter(kinds).most_common(1)[0][0])] if texts else ""
+
+
+def value_label(axis: Axis, value: Any) -> str:
+    """Return a value of an axis as text; shares in per cent."""
+    if isinstance(value, bool):
+        return "wrong" if value else "right"
+    if isinstance(value, str):
+        return value
+    if axis.field == "window_events" and value == 0:
+        return "all"
+    if axis.unit.startswith(("of all", "of the", "relative")):
+        return f"{100 * value:.10g} %"
+    return f"{value:,.10g}"
+
+
+def axis_label(axis: Axis) -> str:
+    """Return name and unit of an axis."""
+    return f"{axis.name} [{axis.unit}]" if axis.unit else axis.name
+
+
+def percent(share: float) -> str:
+    """Return a share as text in per cent."""
+    return f"{100 * share:.3g} %"
+
 
 DEFAULT, PAPER = "default", "paper"
 """Names of the default method and of the paper's method."""

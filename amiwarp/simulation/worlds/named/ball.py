@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.simulation.worlds.named import parts, room, shapes, textures
-from amiwarp.simulation.worlds.scene import World
+from amiwarp.simulation.worlds.named import bodies, room
 from amiwarp.simulation.worlds.trajectory import Trajectory
+from amiwarp.simulation.worlds.world import World
 
 VIEW = room.VIEW
 """Camera pose, the same as in the world ``room``."""
@@ -38,10 +38,10 @@ The angular velocity about the vertical axis is 0.6 times as large.
 
 def build(rng: np.random.Generator, duration_s: float) -> World:
     """Return the world: the room and the ball. ``duration_s``: length of the ball's trajectory [s]."""
-    ball = parts.solid(
+    ball = bodies.solid(
         "ball",
-        shapes.ellipsoid((RADIUS,) * 3, sides=40, rings=20),
-        textures.weathered(rng, textures.checkerboard(12), 0.2),
+        bodies.ellipsoid((RADIUS,) * 3, sides=40, rings=20),
+        bodies.weathered(rng, bodies.checkerboard(12), 0.2),
         "ball",
         trajectory=thrown(duration_s),
     )

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from amiwarp.simulation.worlds.named import ball, corridor, desk, person, room, street
-from amiwarp.simulation.worlds.named.motion import TRAJECTORIES, Viewpoint, camera_trajectory
-from amiwarp.simulation.worlds.scene import World
+from amiwarp.simulation.worlds.named.bodies import TRAJECTORIES, Viewpoint, camera_trajectory
 from amiwarp.simulation.worlds.trajectory import Trajectory
+from amiwarp.simulation.worlds.world import World
 from amiwarp.validation import guarded, one_of, real, whole
 
 LONGEST_S = 3600.0

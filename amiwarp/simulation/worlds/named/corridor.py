@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from amiwarp.simulation.worlds.named import parts, shapes, textures
-from amiwarp.simulation.worlds.named.motion import Viewpoint
-from amiwarp.simulation.worlds.scene import Body, Lamp, World
+from amiwarp.simulation.worlds.named import bodies as parts
+from amiwarp.simulation.worlds.named import bodies as shapes
+from amiwarp.simulation.worlds.named import bodies as textures
+from amiwarp.simulation.worlds.named.bodies import Viewpoint
+from amiwarp.simulation.worlds.world import Body, Lamp, World
 
 SIZE = (36.0, 2.6, 2.7)
 """Length, width and height of the corridor [m], which lies along the x axis."""

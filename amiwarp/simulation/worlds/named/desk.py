@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from amiwarp.simulation.worlds.named import parts, shapes, textures
-from amiwarp.simulation.worlds.named.motion import Viewpoint
-from amiwarp.simulation.worlds.scene import Body, Lamp, World
+from amiwarp.simulation.worlds.named import bodies as parts
+from amiwarp.simulation.worlds.named import bodies as shapes
+from amiwarp.simulation.worlds.named import bodies as textures
+from amiwarp.simulation.worlds.named.bodies import Viewpoint
+from amiwarp.simulation.worlds.world import Body, Lamp, World
 
 VIEW = Viewpoint((0.05, -0.62, 0.52), (0.0, 0.16, 0.1))
 """Camera pose: at the head of a person who sits at the desk. The top of the desk is at z = 0."""

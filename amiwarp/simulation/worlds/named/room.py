@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from amiwarp.simulation.worlds.named import parts, shapes, textures
-from amiwarp.simulation.worlds.named.motion import Viewpoint
-from amiwarp.simulation.worlds.scene import Body, Lamp, Mesh, World
+from amiwarp.simulation.worlds.named import bodies as parts
+from amiwarp.simulation.worlds.named import bodies as shapes
+from amiwarp.simulation.worlds.named import bodies as textures
+from amiwarp.simulation.worlds.named.bodies import Viewpoint
+from amiwarp.simulation.worlds.world import Body, Lamp, Mesh, World
 
 SIZE = (5.2, 4.4, 2.6)
 """Length (x), width (y) and height (z) of the room [m]."""

@@ -1,1 +1,0 @@
-"""Selection of the model, and of the parameters that a recording determines."""

@@ -1,0 +1,573 @@
+"""Sharpness stage of the calibration: contrast maximisation."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from amiwarp.calib import checks
+from amiwarp.calib.nlopt_solver import SearchStage, maximise
+from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, MOTION, UNITS, build_model
+from amiwarp.calib.result import StageSummary
+from amiwarp.calib.settings import Settings, stage_share
+from amiwarp.choices import Sharpness
+from amiwarp.imaging.iwe import Votes
+from amiwarp.imaging.sharpness import SharpnessMeter
+from amiwarp.imaging.votes import CanvasShape, TileVotes, upload_events
+from amiwarp.optics.camera_rotation import border
+from amiwarp.optics.displacement import points_on_host
+from amiwarp.progress import Progress
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from amiwarp.calib.calibration_events import CalibrationEvents
+    from amiwarp.calib.parameters import ParameterSpace
+    from amiwarp.events.events import Events
+    from amiwarp.imaging.votes import Image, UploadedEvents
+    from amiwarp.optics.camera import Camera
+    from amiwarp.optics.camera_rotation import CameraRotation
+    from amiwarp.optics.models import Model
+
+    Vector = NDArray[np.float64]
+
+
+# Sharpness as a function of the free parameters, computed on the device. All buffers are allocated once.
+
+ROTATION_MARGIN_PX = 16.0
+"""Extra border of the image of events if the camera's rotation is free [px]."""
+
+
+class Objective:
+    """Sharpness of the IWE of a set of events as a function of the free parameters. Counts its evaluations.
+
+    On CUDA the events are sorted into tiles once, and one captured graph is launched per evaluation.
+    """
+
+    def __init__(
+        self,
+        space: ParameterSpace,
+        events: UploadedEvents,
+        *,
+        kind: Sharpness,
+        smoothing: float,
+        pad: int,
+        scale: float = 1.0,
+        per_polarity: bool = False,
+        parts: int = 1,
+        device: Any = "cpu",
+    ) -> None:
+        """Allocate the buffers and copy the parameters of the image of events to the device.
+
+        Parameters
+        ----------
+        space : ParameterSpace
+            The free parameters.
+        events : UploadedEvents
+            The events on the device, with slopes for a free clock offset or rpm, and times for a camera rotation.
+        kind : Sharpness
+            Measure of sharpness.
+        smoothing : float
+            Standard deviation of the Gaussian that smooths the image [sensor px].
+        pad : int
+            Border of the image [px], see :func:`padding`.
+        scale : float
+            Canvas pixels per sensor pixel.
+        per_polarity : bool
+            Whether ON and OFF events form separate images.
+        parts : int
+            Number of disjoint parts of the events that :meth:`each` measures separately.
+        device : str or warp.context.Device
+            The device.
+        """
+        self.space, self._moving = space, space.moving
+        self.evaluations = 0
+        camera = space.camera
+        # the paper's J is computed as published, without dithering
+        dither = kind is not Sharpness.PAPER_J
+        canvas = CanvasShape(camera.width, camera.height, pad, scale, per_polarity, parts=parts, dither=dither)
+        if parts > 1:
+            events = events.in_parts(parts, per_polarity=per_polarity)
+        self._meter = SharpnessMeter(canvas, kind, smoothing=smoothing * scale, device=device)
+        # tiles are prepared for one camera, so a free focal length excludes them
+        if self._meter.device.is_cuda and "focal_length" not in space.names:
+            self._image: _DirectImage | _TiledImage = _TiledImage(canvas, events, self._meter, self._model(space.start))
+        else:
+            self._image = _DirectImage(canvas, events, self._meter)
+
+    def _model(self, values: Mapping[str, float]) -> Model:
+        """Return the model to evaluate: the exact model instead of the ellipse, which is its first harmonic.
+
+        Both have the same optimum, but the ellipse would need new tables at every point.
+        """
+        kind = "exact" if self.space.model == "ellipse" else self.space.model
+        return build_model(kind, self.space.camera, self.space.prism, values)
+
+    def _measure(self, values: Mapping[str, float]) -> list[float]:
+        self.evaluations += 1
+        rotation = self.space.camera_rotation(values) if self._moving else None
+        self._image.measure(self._model(values), self.space.drift(values), rotation)
+        return self._meter.results()
+
+    def values(self, values: Mapping[str, float]) -> float:
+        """Return the sharpness of the image of warped events at parameter values, in their units."""
+        return self._measure(values)[0]
+
+    def __call__(self, v: NDArray[np.float64]) -> float:
+        """Return the sharpness at a search vector [px]."""
+        return self.values(self.space.to_values(v))
+
+    def each(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """Return the sharpness of each part at parameter values, shape (parts,)."""
+        return np.array(self._measure(values))
+
+    def image(self, values: Mapping[str, float]) -> Image:
+        """Return the IWE at parameter values, with the border outside the sensor, until the next evaluation."""
+        self._measure(values)
+        if self._meter.takes_votes:
+            self._image.read()
+        return self._meter.image
+
+
+class _DirectImage:
+    """Image of warped events that is voted in one pass over the events in the order of time."""
+
+    def __init__(self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter) -> None:
+        self._votes, self._events, self._meter = Votes(canvas, meter.device), events, meter
+
+    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation | None) -> None:
+        self._votes.clear()
+        self._votes.add_events(model, self._events, drift=drift, camera_rotation=camera_rotation)
+        self.read()
+        self._meter.launch()
+
+    def read(self) -> None:
+        """Write the votes to the meter's image."""
+        self._votes.read(self._meter.image)
+
+
+class _TiledImage:
+    """Image of warped events that is voted tile by tile, launched as one CUDA graph."""
+
+    def __init__(self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter, like: Model) -> None:
+        self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
+        self._graph: Any = None
+
+    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation | None) -> None:
+        self._tiles.set(0, model, drift=drift, camera_rotation=camera_rotation)
+        if self._graph is None:
+            with wp.ScopedCapture(self._meter.device) as capture:
+                self._launch()
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
+
+    def _launch(self) -> None:
+        self._tiles.launch()
+        if self._meter.takes_votes:
+            self._meter.launch(self._tiles.votes[0])
+        else:
+            self.read()
+            self._meter.launch()
+
+    def read(self) -> None:
+        """Write the votes to the meter's image."""
+        self._tiles.read(0, self._meter.image)
+
+
+def padding(space: ParameterSpace) -> int:
+    """Return the border of the canvas [px] that keeps all events inside at the largest size and at any phase.
+
+    For the camera's rotation it allows twice the start's rates and :data:`ROTATION_MARGIN_PX`; faster answers are
+    wrong anyway. It is never larger than the image.
+    """
+    largest = {n: space.high[n] for n in space.names if n == space.size_name}
+    faster = {n: 2.0 * abs(space.start.get(n, 0.0)) for n in MOTION if n in space.start}
+    margin = ROTATION_MARGIN_PX if space.moving else 0.0
+    most = max(space.camera.width, space.camera.height)
+    return math.ceil(min(reach(space, {**space.start, **largest, **faster}) + margin, most)) + 2
+
+
+def reach(space: ParameterSpace, values: Mapping[str, float]) -> float:
+    """Return the largest displacement of events at ``values`` [px], by the prism and the camera's rotation."""
+    camera = space.camera
+    kind = "exact" if space.model == "ellipse" else space.model
+    xy, *points = _border_points(camera)
+    moved = build_model(kind, camera, space.prism, values).compensate_points(*points).numpy() - xy
+    radius = np.linalg.norm(moved[np.isfinite(moved).all(axis=1)], axis=1)
+    turned = space.camera_rotation(values).reach(camera, space.duration_us * 0.5e-6)
+    return float(radius.max(initial=0.0)) + float(np.linalg.norm(turned))
+
+
+@lru_cache(maxsize=16)
+def _border_points(camera: Camera) -> tuple[NDArray[np.float64], wp.array, wp.array]:
+    """Return pixels of the image's border at 16 prism angles [px], shape (n, 2); and both as Warp arrays on the CPU."""
+    at = border(camera)
+    xy = np.tile(at, (16, 1))
+    return xy, *points_on_host(xy, np.repeat(np.arange(16) * (np.pi / 8), len(at)))
+
+
+# Gradients and Hessian of sharpness about a point by finite differences, for disjoint parts of the events.
+
+STEP_PX = 0.25
+"""Step of the finite differences, as displacement of events [px]."""
+
+
+def finite_differences(at: Callable[[Vector], Vector], directions: Vector) -> tuple[Vector, Vector]:
+    """Return the parts' gradients of sharpness [1/px], shape (n, parts), and the mean Hessian [1/px²], shape (n, n).
+
+    ``at`` returns the sharpness of each part, shape (parts,), at a shift from the point. Each row of ``directions`` is
+    a shift that moves events by one pixel, shape (n, entries of the shift).
+    """
+    n = len(directions)
+    steps = STEP_PX * directions
+    centre, up, down = at(np.zeros(directions.shape[1])), [at(h) for h in steps], [at(-h) for h in steps]
+    hessian = np.zeros((n, n))
+    for i in range(n):
+        hessian[i, i] = np.mean(up[i] - 2.0 * centre + down[i]) / STEP_PX**2
+        for j in range(i):
+            both = at(steps[i] + steps[j]) + at(-steps[i] - steps[j])
+            mixed = both - up[i] - up[j] - down[i] - down[j] + 2.0 * centre
+            hessian[i, j] = hessian[j, i] = np.mean(mixed) / (2.0 * STEP_PX**2)
+    return (np.array(up) - np.array(down)) / (2.0 * STEP_PX), hessian
+
+
+# Sharpness on held-out turns: models are fitted to half of the turns and measured on the other half.
+
+FEWEST_TURNS = 2.0
+"""Number of turns in a recording from which whole turns are held out."""
+SPANS = 32
+"""Number of angle spans into which a recording of fewer than two turns is divided; every other span is held out."""
+SMOOTHING_PX = 0.6
+"""Standard deviation of the Gaussian that smooths the images [px]: small, to resolve differences of good models."""
+LONGEST_STEP_PX = 0.5
+"""Largest step towards the maximum of sharpness [px]."""
+LEAST_CURVATURE_RATIO = 1e-2
+"""Smallest curvature of sharpness, as a share of the largest, at which a step is taken along a direction."""
+PARTS = 8
+"""Number of disjoint parts of each half of the events, whose scatter measures the uncertainty."""
+
+
+def split_turns(calibration_events: CalibrationEvents) -> tuple[Events, Events]:
+    """Return the events of the even and of the odd turns, or of alternate spans if there are less than two turns."""
+    events = calibration_events.events
+    turned = calibration_events.encoder.angle_at(events.t)
+    turned -= turned[0]  # in place: with ten million events, each array has 80 MB
+    np.abs(turned, out=turned)
+    whole = float(turned.max())
+    turned /= math.tau if whole >= FEWEST_TURNS * math.tau else whole / SPANS
+    odd = (turned.astype(np.int32) & 1).astype(np.bool_)
+    del turned
+    return events[np.flatnonzero(~odd)], events[np.flatnonzero(odd)]
+
+
+class HalfSharpness:
+    """Sharpness of one half of the events under any model, measured in disjoint parts."""
+
+    def __init__(
+        self, events: Events, calibration_events: CalibrationEvents, space: ParameterSpace, device: Any
+    ) -> None:
+        """Upload the events. The canvas holds the displacements that the bounds of ``space`` allow."""
+        slope = None if calibration_events.slope_of is None else calibration_events.slope_of(events.t)
+        middle = space.middle_us if space.moving else None
+        uploaded = upload_events(events, calibration_events.encoder, device, slope=slope, middle_us=middle)
+        self._events = uploaded.in_parts(PARTS, per_polarity=False)
+        camera = space.camera
+        canvas = CanvasShape(camera.width, camera.height, padding(space), parts=PARTS, dither=True)
+        self._votes = Votes(canvas, device)
+        self._meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=device)
+        self.fastest: dict[str, float] = {}
+        """Shortest measured time for one event's angle, displacement and vote [s], by name of the model."""
+
+    def each(self, space: ParameterSpace, values: Mapping[str, float]) -> Vector:
+        """Return the sharpness of each part, shape (PARTS,)."""
+        model, device = space.build(values), self._meter.device
+        self._votes.clear()
+        wp.synchronize_device(device)
+        began = time.perf_counter()
+        self._votes.add_events(
+            model, self._events, drift=space.drift(values), camera_rotation=space.camera_rotation(values)
+        )
+        wp.synchronize_device(device)
+        took = (time.perf_counter() - began) / max(self._events.count, 1)
+        self.fastest[space.model] = min(took, self.fastest.get(space.model, math.inf))
+        self._votes.read(self._meter.image)
+        self._meter.launch()
+        return np.array(self._meter.results())
+
+
+def gradient(half: HalfSharpness, space: ParameterSpace, v: Vector) -> Vector:
+    """Return the gradient of the mean sharpness at a search vector [1/px]."""
+    steps = STEP_PX * np.eye(len(v))
+    rise = [half.each(space, space.to_values(v + h)) - half.each(space, space.to_values(v - h)) for h in steps]
+    return np.asarray(np.mean(rise, axis=1) / (2.0 * STEP_PX))
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """Quadratic approximation of sharpness about a point along n directions."""
+
+    slopes: Vector
+    """Gradient of the sharpness of each part of the events [1/px], shape ``(n, parts)``."""
+    hessian: Vector
+    """Hessian of the mean sharpness [1/px²], shape ``(n, n)``."""
+
+    @classmethod
+    def about(cls, half: HalfSharpness, space: ParameterSpace, v: Vector, directions: Vector) -> Quadratic:
+        """Return the approximation about a search vector.
+
+        Each row of ``directions`` is a vector that moves events by one pixel, shape (n, entries of the vector).
+        """
+        return cls(*finite_differences(lambda shift: half.each(space, space.to_values(v + shift)), directions))
+
+    def restricted_to(self, which: list[int]) -> Quadratic:
+        """Return the approximation along the directions whose numbers are in ``which``."""
+        return Quadratic(self.slopes[which], self.hessian[np.ix_(which, which)])
+
+    def step_to_maximum(self, gradient: Vector | None = None) -> Vector:
+        """Return the step to the sharpest point [px]: 0 along flat directions, at most :data:`LONGEST_STEP_PX` long.
+
+        ``gradient`` [1/px] replaces the approximation's own gradient, for another model with about the same Hessian.
+        """
+        values, vectors = np.linalg.eigh(-self.hessian)
+        along = vectors.T @ (self.slopes.mean(axis=1) if gradient is None else gradient)
+        floor = LEAST_CURVATURE_RATIO * max(float(values.max()), 1e-12)
+        step = vectors @ np.where(values > floor, along / np.maximum(values, floor), 0.0)
+        return np.asarray(step * min(1.0, LONGEST_STEP_PX / max(float(np.linalg.norm(step)), 1e-12)))
+
+    @property
+    def curvature(self) -> float:
+        """Mean curvature of sharpness over the directions [1/px²], positive at a maximum."""
+        return -float(np.trace(self.hessian)) / len(self.hessian)
+
+    def deviations(self) -> Vector:
+        """Return the standard deviation of the maximum along each direction [px], by the sandwich estimate."""
+        values, vectors = np.linalg.eigh(-self.hessian)
+        floor = LEAST_CURVATURE_RATIO * max(float(values.max()), 1e-12)
+        inverse = vectors @ np.diag(1.0 / np.maximum(values, floor)) @ vectors.T
+        scatter = np.atleast_2d(np.cov(self.slopes)) / self.slopes.shape[1]
+        return np.asarray(np.sqrt(np.diag(inverse @ scatter @ inverse)))
+
+
+# Contrast maximisation: a global search on a coarse image of events, then a local search on a fine one.
+
+CANDIDATES = 3
+"""Largest number of optima of the coarse image from which the local search starts."""
+"""Number of disjoint parts of the events, whose scatter measures the uncertainty of the parameters."""
+
+
+class Search:
+    """Search for the parameters that make the image of warped events sharpest.
+
+    :meth:`run` sets ``best``, the values of all parameters, and ``score``, the sharpness there.
+    """
+
+    def __init__(
+        self,
+        space: ParameterSpace,
+        calibration_events: CalibrationEvents,
+        settings: Settings,
+        device: Any,
+        progress: Progress | None,
+    ) -> None:
+        self.full_space = space
+        """Parameter space of the photometric stage: all free parameters."""
+        self.space = space.without(DEGENERATE_WITH_APEX) if "photometric" in settings.stages else space
+        """Parameter space of the sharpness search: without the parameters that are left to the photometric stage."""
+        self.calibration_events, self.settings, self.device = calibration_events, settings, device
+        self.progress = progress
+        self.stages: list[StageSummary] = []
+        self.pad = padding(self.space)
+        """Border of the fine image outside the sensor [px]."""
+        self.fine = self._objective(calibration_events, scale=1.0, smoothing=settings.smoothing_px)
+
+    def _objective_by_parts(self, kind: Sharpness) -> Objective:
+        """Return an objective that measures disjoint parts of the events separately."""
+        smoothing = max(1.0, self.settings.smoothing_px)
+        return self._objective(self.calibration_events, scale=1.0, smoothing=smoothing, kind=kind, parts=PARTS)
+
+    def _objective(
+        self,
+        events: CalibrationEvents,
+        *,
+        scale: float,
+        smoothing: float,
+        kind: Sharpness | None = None,
+        space: ParameterSpace | None = None,
+        parts: int = 1,
+    ) -> Objective:
+        s = self.settings
+        kind, space = kind or s.sharpness, space or self.space
+        pad = self.pad if space is self.space else padding(space)
+        if kind is Sharpness.PAPER_J:
+            smoothing = 0.0  # J counts pixels with h > 0, and a Gaussian's tails would make almost all of them positive
+        return Objective(
+            space, events.on(self.device, space.middle_us if space.moving else None),
+            kind=kind, smoothing=smoothing, pad=pad, scale=scale,
+            per_polarity=s.per_polarity, parts=parts, device=self.device,
+        )  # fmt: skip
+
+    def run(self) -> None:
+        """Run the global and the local search; set ``best``, ``score`` and ``stages``."""
+        starts = [self.space.to_vector(self.space.start)]
+        if self.settings.global_algorithm is not None:
+            starts = self._run_global(self.settings.global_algorithm)
+        if self.space.moving:
+            starts = [self._track_rotation(start) for start in starts]
+        runs: list[SearchStage] = []
+        for start in starts:
+            runs.append(self._run_local(start, [run.x for run in runs]))
+        best = max(runs, key=lambda run: run.score)
+        self.best, self.score = self.space.to_values(best.x), best.score
+
+    def _coarse_objective(self, events: CalibrationEvents, space: ParameterSpace) -> Objective:
+        step = max(1, len(events.events) // (self.settings.events // 3 + 1))
+        return self._objective(events.every(step), scale=0.5, smoothing=4.0, space=space)
+
+    def _run_global(self, algorithm: str) -> list[NDArray[np.float64]]:
+        """Run the global search and return the starts of the local search.
+
+        The camera's rotation stays at its start values.
+        """
+        space = self.space.without(MOTION) if self.space.moving else self.space
+        if not space.names:
+            return [self.space.to_vector(self.space.start)]
+        start = space.to_vector(space.start)
+        objective = self._coarse_objective(self.calibration_events, space)
+        stage = self._maximise(objective, algorithm, start, self.settings.global_evaluations, step=1.0)
+        return [self.space.to_vector(space.to_values(v)) for v in distinct_optima(stage, CANDIDATES)]
+
+    def _track_rotation(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Improve the start values of a rotating camera by a local search on the coarse image.
+
+        Without a prism there is no estimate of the rotation. Then the events come from windows that grow about the
+        middle: in a short window the blur is smaller than the smoothing, whatever the speed.
+        """
+        for share in (1.0,) if self.space.sized else (0.125, 0.25, 0.5, 1.0):
+            objective = self._coarse_objective(self.calibration_events.central(share), self.space)
+            stage = self._maximise(
+                objective, self.settings.local_algorithm, start, self.settings.local_evaluations, step=2.0
+            )
+            start = stage.x
+        return start
+
+    def _run_local(self, start: NDArray[np.float64], known: Sequence[NDArray[np.float64]]) -> SearchStage:
+        """Run a local search on the fine image from ``start``. It ends early near an optimum in ``known``."""
+        return self._maximise(
+            self.fine, self.settings.local_algorithm, start, self.settings.local_evaluations, step=0.7, known=known
+        )
+
+    def _maximise(
+        self,
+        objective: Objective,
+        algorithm: str,
+        start: NDArray[np.float64],
+        budget: int,
+        step: float,
+        known: Sequence[NDArray[np.float64]] = (),
+    ) -> SearchStage:
+        """Run a search algorithm and append its summary to ``stages``."""
+        space, values = objective.space, []
+        low, high = space.bounds()
+        name = "global" if algorithm.startswith("G") else "local"
+
+        def score(v: NDArray[np.float64]) -> float:
+            if self.progress is not None:
+                self.progress(*stage_share(self.settings, name, objective.evaluations / budget))
+            values.append(space.to_values(v))
+            return objective.values(values[-1])
+
+        s = self.settings
+        stage = maximise(
+            score, algorithm, low=low, high=high, start=start, evaluations=budget, tolerance=s.tolerance_px, step=step,
+            inner=s.local_algorithm, seed=s.seed, known=known,
+        )  # fmt: skip
+        self.stages.append(StageSummary.of(name, stage, space.names, values))
+        return stage
+
+    def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
+        """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the sharpness."""
+        best = self.best
+        parts = self._objective_by_parts(self.settings.sharpness)
+        if self.space.sized:
+            self._check_sharper_than_chance(best, parts, name)
+            checks.check_directions(self.fine.image(best), self._edge_inset, name)
+        v = self.space.to_vector(best)
+        covariance, warnings = estimate_covariance(parts, v)
+        return self._bound_warnings(best) + warnings, self.space.deviations(v, covariance)
+
+    def _check_sharper_than_chance(self, best: dict[str, float], parts: Objective, name: str) -> None:
+        # variance, whatever the measure of the search: the paper's J may prefer an image without compensation
+        variance = (
+            parts if self.settings.sharpness is Sharpness.VARIANCE else self._objective_by_parts(Sharpness.VARIANCE)
+        )
+        points = (best, {**best, "phase": best["phase"] + math.pi}, {**best, self.space.size_name: 0.0})
+        sharp, opposite, still = (variance.each(values) for values in points)
+        checks.check_texture(sharp, opposite, still, name)
+
+    @property
+    def _edge_inset(self) -> int:
+        """Border of the fine image that the check of edge directions leaves out [px].
+
+        It is the part outside the sensor and as much inside, where the view ends, but at most a quarter of the sensor.
+        """
+        camera = self.space.camera
+        return self.pad + min(self.pad, min(camera.width, camera.height) // 4)
+
+    def sharpness_in(self, space: ParameterSpace, values: Mapping[str, float]) -> float:
+        """Return the sharpness at ``values`` with the camera and the prism of ``space``."""
+        known, fine = self.space, self.fine
+        same = (space.model, space.names, space.camera, space.prism, space.moving, space.start, space.high) == (
+            known.model, known.names, known.camera, known.prism, known.moving, known.start, known.high
+        )  # fmt: skip
+        if not same:
+            smoothing = self.settings.smoothing_px
+            fine = self._objective(self.calibration_events, scale=1.0, smoothing=smoothing, space=space)
+        return fine.values(values)
+
+    def _bound_warnings(self, best: dict[str, float]) -> tuple[str, ...]:
+        """Return a warning for each parameter that ended on a bound."""
+        s = self.space
+        at_bound = [
+            n for n in s.names if n != "phase" and min(best[n] - s.low[n], s.high[n] - best[n]) * s.pixels[n] < 0.05
+        ]
+        return tuple(f"{n} = {best[n]:.6g} {UNITS[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)
+
+
+def distinct_optima(stage: SearchStage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:
+    """Return at most ``most`` best points of a stage, each at least ``apart`` px away from all better points."""
+    points = stage.points.tolist()
+    chosen: list[int] = []
+    for k in np.argsort(-stage.scores, kind="stable").tolist():
+        if all(math.dist(points[k], points[other]) >= apart for other in chosen):
+            chosen.append(k)
+            if len(chosen) == most:
+                break
+    return [stage.points[k] for k in chosen]
+
+
+def estimate_covariance(parts: Objective, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """Return the covariance of the optimum [px²], and warnings that name the parameters of flat directions.
+
+    The sandwich estimate H⁻¹ cov(g) H⁻¹ / n from n disjoint parts of the events: g is a part's gradient at the optimum
+    of all events, and H the mean Hessian of the parts.
+    """
+    slopes, hessian = finite_differences(lambda shift: parts.each(parts.space.to_values(v + shift)), np.eye(len(v)))
+    gradients = slopes.T
+    values, vectors = np.linalg.eigh(-hessian)
+    largest = max(float(values.max()), 1e-12)
+    weak = values < 1e-3 * largest
+    inverse = vectors @ np.diag(1.0 / np.maximum(values, 1e-3 * largest)) @ vectors.T
+    names = parts.space.names
+    warnings = tuple(
+        f"the events hardly determine {names[int(np.argmax(np.abs(vectors[:, k])))]} (curvature "
+        f"{values[k] / largest:.1e} of the largest one)"
+        for k in np.flatnonzero(weak)
+    )
+    return inverse @ np.atleast_2d(np.cov(gradients.T)) @ inverse / len(gradients), warnings

@@ -1,1 +1,0 @@
-"""Sharpness stage of the calibration: contrast maximisation."""

@@ -1,0 +1,242 @@
+"""The prism's encoder from files: logs in CSV, and the trigger edges that a camera recorded with its events."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+from array import array
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import TWO_PI, Encoder, UnwrapError
+from amiwarp.io.formats import Format, detect_format
+from amiwarp.io.input_files import errors_name, open_input, text_lines
+from amiwarp.validation import whole
+
+# Times of a counter that wraps around.
+
+
+def nearest(value: int, bits: int, estimate: int) -> int:
+    """Return the value of a counter of ``bits`` bits with the number of wraps that brings it nearest to an estimate."""
+    return value + ((estimate - value + (1 << bits >> 1)) >> bits << bits)
+
+
+def unwrapped(values: NDArray[np.int64], bits: int, before: int | None = None) -> NDArray[np.int64]:
+    """Return the values of a counter of ``bits`` bits, from 0 on, without its wraps.
+
+    ``before`` is the unwrapped value that they continue. A step of more than half the range is a wrap of the counter,
+    forwards or backwards. A smaller step backwards is a value out of order.
+    """
+    if not values.size:
+        return values
+    size = 1 << bits
+    start = int(values[0]) if before is None else before
+    step = np.diff(values, prepend=start % size)
+    wraps = np.cumsum((step < -(size // 2)).astype(np.int64) - (step > size // 2))
+    return values + (start // size + wraps) * size
+
+
+def last_word(path: Path, offset: int, dtype: str, estimate: int) -> int | None:
+    """Return the 32-bit time of the last record of 8 bytes in a file, unwrapped next to an estimate, or None.
+
+    ``offset`` is the position of the first record. The time is the first word of ``dtype`` "<u4", the second of ">u4".
+    """
+    count = (path.stat().st_size - offset) // 8
+    if not count:
+        return None
+    with open_input(path) as file:
+        file.seek(offset + 8 * (count - 1))
+        words = np.frombuffer(file.read(8), dtype)
+    return nearest(int(words[0 if dtype == "<u4" else 1]), 32, estimate)
+
+
+# Reader of encoder logs in CSV: columns ``t_us``, ``angle_deg`` or ``count``, and optionally ``index`` (0 or 1).
+
+MOST_ROWS = 10_000_000
+"""Largest number of samples of a log: 2.8 hours at 1 kHz."""
+
+
+def read_encoder_csv(
+    path: str | os.PathLike[str],
+    *,
+    counts_per_turn: int | None = None,
+    counter_bits: int | None = None,
+    direction: int = 1,
+) -> Encoder:
+    """Return the encoder of a CSV log, whose header names the columns in any order.
+
+    - ``t_us``: time [us], strictly increasing.
+    - ``angle_deg``: angle [deg], wrapped or not; or ``count``: encoder count. Counts need ``counts_per_turn``, and
+      ``counter_bits`` if the width of the counter is ambiguous (see :meth:`Encoder.from_counts`).
+    - ``index``: 1 in the samples at the index pulse, where the angle is 0.
+
+    ``direction`` -1 negates the angle. Raises :class:`AmiwarpError` with the file and line for anything else.
+    """
+    path = Path(path)
+    with errors_name(path, lambda: "reading the encoder"):
+        names, table, lines = _read_table(path)
+        columns = {name: table[:, at] for at, name in enumerate(names)}
+        t = np.rint(columns["t_us"]).astype(np.int64)
+        late = np.flatnonzero(t[1:] <= t[:-1])
+        if late.size:
+            line = lines[int(late[0]) + 1]
+            raise AmiwarpError(
+                f"{path}: line {line}: t_us is not later than in the line before; sort the lines by t_us and remove "
+                "duplicates"
+            )
+        try:
+            encoder = _encoder(
+                path, columns, t, counts_per_turn=counts_per_turn, counter_bits=counter_bits, direction=direction
+            )
+        except UnwrapError as error:
+            raise AmiwarpError(f"{path}: line {lines[error.sample]}: {error.problem}") from error
+        if "index" not in columns:
+            return encoder
+        bad = np.flatnonzero((columns["index"] != 0) & (columns["index"] != 1))
+        if bad.size:
+            raise AmiwarpError(f"{path}: line {lines[int(bad[0])]}: index is neither 0 nor 1; correct this line")
+        pulses = columns["index"] == 1
+        # A pulse that stays high over several samples is one pulse at its first sample.
+        rising = pulses & ~np.concatenate([[False], pulses[:-1]])
+        return encoder.with_index(t[rising]) if rising.any() else encoder
+
+
+def _encoder(
+    path: Path,
+    columns: dict[str, NDArray[np.float64]],
+    t: NDArray[np.int64],
+    *,
+    counts_per_turn: int | None,
+    counter_bits: int | None,
+    direction: int,
+) -> Encoder:
+    """Return the encoder of the log's columns."""
+    if "count" in columns:
+        if counts_per_turn is None:
+            raise AmiwarpError(f"{path}: holds counts; give the counts per turn as counts_per_turn")
+        return Encoder.from_counts(
+            t, columns["count"], counts_per_turn=counts_per_turn, counter_bits=counter_bits, direction=direction
+        )
+    if counter_bits is not None:
+        raise AmiwarpError(f"{path}: holds angles, which have no counter_bits; leave counter_bits out")
+    if direction not in (1, -1):
+        raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
+    return Encoder.from_angles(t, direction * np.radians(columns["angle_deg"]))
+
+
+def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], Sequence[int]]:
+    """Return column names, values of shape ``(rows, columns)`` and the line number of each row."""
+    names: list[str] = []
+    values, numbers = array("d"), array("q")
+    for number, line in text_lines(path):
+        if not line.strip() or line[0] == "#":
+            continue
+        if not names:
+            names = _column_names(path, line)
+            continue
+        numbers.append(number)
+        if len(numbers) > MOST_ROWS:
+            raise AmiwarpError(f"{path}: has over {MOST_ROWS} samples; give fewer, at a lower rate")
+        try:
+            values.extend(map(float, line.split(",")))
+        except ValueError as error:
+            raise AmiwarpError(f"{path}: line {number} is '{line[:80]}'; expected {len(names)} numbers") from error
+        if len(values) != len(numbers) * len(names):
+            raise AmiwarpError(f"{path}: line {number} is '{line[:80]}'; expected {len(names)} numbers")
+    if not names:
+        raise AmiwarpError(f"{path}: is empty; expected a header t_us,angle_deg or t_us,count")
+    if len(numbers) < 2:
+        raise AmiwarpError(f"{path}: has {len(numbers)} samples; expected at least 2")
+    table = np.frombuffer(values).reshape(-1, len(names))
+    # From 2**53 on, float64 cannot represent every whole microsecond. NaN fails every comparison.
+    right = (np.abs(table) < 2.0**53).all(axis=1)
+    if not right.all():
+        row = int(np.argmin(right))
+        given = ",".join(f"{value:g}" for value in table[row])
+        raise AmiwarpError(f"{path}: line {numbers[row]} is '{given}'; expected {len(names)} finite numbers")
+    return names, table, numbers
+
+
+def _column_names(path: Path, header: str) -> list[str]:
+    """Return the names in a header."""
+    names = [name.strip().lower() for name in header.split(",")]
+    known = {"t_us", "angle_deg", "count", "index"}
+    if len(set(names)) != len(names) or not set(names) <= known or "t_us" not in names:
+        raise AmiwarpError(f"{path}: header '{header[:80]}'; expected t_us,angle_deg or t_us,count, then index")
+    if ("count" in names) == ("angle_deg" in names):
+        raise AmiwarpError(f"{path}: header '{header[:80]}'; expected one of angle_deg and count")
+    return names
+
+
+# The prism's encoder from the external trigger edges that a camera recorded with its events.
+
+READERS = {
+    Format.EVT: "prophesee",
+    Format.AEDAT4: "aedat",
+    Format.AEDAT3: "aedat3",
+    Format.AEDAT2: "aedat2",
+    Format.ROSBAG: "rosbag",
+    Format.HDF5: "hdf5_rows",
+}
+"""Modules of amiwarp.io whose ``trigger_packets`` reads the edges of a format."""
+
+MOST_EDGES = 1 << 26
+"""Largest number of edges that is read: 5 hours at 3.6 kHz."""
+
+
+def read_encoder_triggers(
+    path: str | os.PathLike[str],
+    channel: int = 0,
+    *,
+    counts_per_turn: int = 1,
+    direction: int = 1,
+    topic: str | None = None,
+) -> Encoder:
+    """Return the encoder whose pulses a camera recorded at its trigger input, on the clock of the events.
+
+    Each rising edge of ``channel`` moves the angle by one count, or back if ``direction`` is -1. With one count per
+    turn the edges are index pulses, at which the angle is a multiple of 2 pi. ``topic`` chooses a topic of a ROS bag.
+    Raises :class:`AmiwarpError` if the file stores no triggers, or fewer than two rising edges of the channel.
+    """
+    path = Path(path)
+    whole(channel, "channel", 0, 255)
+    whole(counts_per_turn, "counts_per_turn", 1, 1 << 40)
+    if direction not in (1, -1):
+        raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
+    found = detect_format(path)
+    if found not in READERS:
+        formats = ", ".join(one.value for one in READERS)
+        raise AmiwarpError(f"{path}: files of the format {found.value} store no triggers; expected one of {formats}")
+    with errors_name(path, lambda: "reading the triggers"):
+        channels, t, rising = _edges(path, found, topic)
+    at = np.unique(t[(channels == channel) & rising])
+    if at.size < 2:
+        counts = {int(one): int(np.count_nonzero(channels[rising] == one)) for one in np.unique(channels)}
+        listed = ", ".join(f"{count} of channel {one}" for one, count in counts.items()) or "none"
+        given = f"{path}: has {at.size} rising trigger edges of channel {channel}"
+        raise AmiwarpError(f"{given}; expected at least 2; the rising edges are: {listed}")
+    angle = np.arange(at.size, dtype=np.float64) * (direction * TWO_PI / counts_per_turn)
+    return Encoder(at, angle, index_t=at.copy() if counts_per_turn == 1 else None)
+
+
+def _edges(path: Path, found: Format, topic: str | None) -> tuple[Any, Any, Any]:
+    """Return channel, time [us] and whether it rises, of each edge."""
+    module: Any = importlib.import_module(f"amiwarp.io.{READERS[found]}")
+    chosen = (topic,) if found is Format.ROSBAG else ()
+    source: Any = module.trigger_packets(path, *chosen)
+    parts: list[tuple[Any, ...]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.bool_))]
+    count = 0
+    with contextlib.closing(source):
+        for channel, _, t, rising in source:
+            parts.append((channel.astype(np.int64), t.astype(np.int64), rising > 0))
+            count += len(t)
+            if count > MOST_EDGES:
+                raise AmiwarpError(f"has over {MOST_EDGES} trigger edges; expected those of an encoder")
+    channels, times, edges = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return channels, times, edges

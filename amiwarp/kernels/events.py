@@ -1,0 +1,230 @@
+"""Kernels on event arrays: checks and conversions, the prism angle at a time, background activity."""
+
+from typing import Any
+
+import warp as wp
+
+# Prism angle at an event's time, in integer arithmetic with equal results on every device.
+#
+# Angles are fractions of a turn that wrap on overflow: one turn is 2**64 internally and 2**32 in results. Times are
+# whole microseconds, so slopes may wrap too: a whole turn per microsecond adds whole turns.
+
+wp.set_module_options({"enable_backward": False})
+
+THETA_U16_RAD = wp.constant(2.0 * 3.141592653589793 / 65536.0)  # unit of theta_u16, 2**-16 turn [rad]
+THETA_U32_RAD = wp.constant(2.0 * 3.141592653589793 / 4294967296.0)  # unit of theta_u32, 2**-32 turn [rad]
+
+
+@wp.struct
+class EncoderParams:
+    """Prism angle over time as a piecewise linear function.
+
+    The first and last pieces extend beyond the samples. Built by :mod:`amiwarp.events.device_events`.
+    """
+
+    origin: wp.int64  # event time at the start of the first bucket [us]
+    shift: int  # base-2 logarithm of the length of a bucket of time [us]
+    first: wp.array(dtype=int)  # index of the piece at the start of each bucket; shape (buckets + 1,)
+    start: wp.array(dtype=wp.int64)  # first event time of each piece, relative to the origin [us]
+    angle: wp.array(dtype=wp.uint64)  # prism angle at the start of each piece [2**-64 turn]
+    slope: wp.array(dtype=wp.uint64)  # speed on each piece [2**-64 turn per us]
+
+
+@wp.func
+def piece_at(encoder: EncoderParams, elapsed: wp.int64) -> int:
+    """Return the index of the piece at ``elapsed`` [us] from the origin, found by its bucket and bisection."""
+    buckets = encoder.first.shape[0] - 1
+    bucket = int(wp.clamp(elapsed >> wp.int64(encoder.shift), wp.int64(0), wp.int64(buckets - 1)))
+    low = encoder.first[bucket]
+    high = encoder.first[bucket + 1]
+    while low < high:
+        middle = (low + high + 1) / 2
+        if encoder.start[middle] <= elapsed:
+            low = middle
+        else:
+            high = middle - 1
+    return low
+
+
+@wp.func
+def theta_u32_on(encoder: EncoderParams, piece: int, elapsed: wp.int64) -> wp.uint32:
+    """Return theta_u32, the prism angle [2**-32 turn], on a given piece at ``elapsed`` [us] from the origin."""
+    since = wp.uint64(elapsed - encoder.start[piece])
+    return wp.uint32((encoder.angle[piece] + since * encoder.slope[piece]) >> wp.uint64(32))
+
+
+@wp.func
+def theta_u32_at(encoder: EncoderParams, t: wp.int64) -> wp.uint32:
+    """Return theta_u32, the prism angle [2**-32 turn], at event time ``t`` [us]."""
+    elapsed = t - encoder.origin
+    return theta_u32_on(encoder, piece_at(encoder, elapsed), elapsed)
+
+
+# Checks and conversions of event arrays that other libraries made, on their device.
+
+BEYOND = wp.constant(1 << 16)  # stands for an infinite coordinate among the largest coordinates
+TIME_LIMIT = wp.constant(wp.float64(2.0**62))  # amiwarp.events.events.TIME_LIMIT [us]
+
+
+@wp.func
+def pixel_or_beyond(value: wp.uint16) -> int:
+    """Return a sensor's coordinate [px]."""
+    return int(value)
+
+
+@wp.func
+def pixel_or_beyond(value: float) -> int:
+    """Return BEYOND for an infinite coordinate, else 0: compensated coordinates may be any number, also NaN."""
+    return wp.where(wp.isinf(value), BEYOND, 0)
+
+
+@wp.kernel
+def find_limits(
+    x: wp.array(dtype=Any),
+    y: wp.array(dtype=Any),
+    t: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8),
+    step: int,
+    limits: wp.array(dtype=wp.int64),
+):
+    """Find first and last time, largest x, y and p, and whether times decrease. Thread k takes every ``step``-th."""
+    first = t[wp.tid()]
+    last = first
+    right, bottom, polarity, decreases = int(0), int(0), int(0), int(0)
+    for i in range(wp.tid(), t.shape[0], step):
+        first, last = wp.min(first, t[i]), wp.max(last, t[i])
+        right = wp.max(right, pixel_or_beyond(x[i]))
+        bottom = wp.max(bottom, pixel_or_beyond(y[i]))
+        polarity = wp.max(polarity, int(p[i]))
+        if t[i] < t[wp.max(i - 1, 0)]:
+            decreases = 1
+    wp.atomic_min(limits, 0, first)
+    wp.atomic_max(limits, 1, last)
+    wp.atomic_max(limits, 2, wp.int64(right))
+    wp.atomic_max(limits, 3, wp.int64(bottom))
+    wp.atomic_max(limits, 4, wp.int64(polarity))
+    wp.atomic_max(limits, 5, wp.int64(decreases))
+
+
+@wp.kernel
+def narrow_integers(values: wp.array(dtype=wp.int64), out: wp.array(dtype=wp.uint16), bad: wp.array(dtype=int)):
+    """Convert whole coordinates [px], and set ``bad`` if one does not fit."""
+    i = wp.tid()
+    if values[i] < wp.int64(0) or values[i] > wp.int64(65535):
+        bad[0] = 1
+    out[i] = wp.uint16(values[i])
+
+
+@wp.kernel
+def narrow_floats(values: wp.array(dtype=wp.float64), out: wp.array(dtype=float), bad: wp.array(dtype=int)):
+    """Convert coordinates [px], and set ``bad`` if one becomes infinite."""
+    i = wp.tid()
+    out[i] = float(values[i])
+    if wp.isinf(out[i]):
+        bad[0] = 1
+
+
+@wp.kernel
+def round_times(
+    values: wp.array(dtype=wp.float64),
+    scale: wp.float64,
+    latest: wp.float64,
+    out: wp.array(dtype=wp.int64),
+    bad: wp.array(dtype=int),
+):
+    """Scale times to microseconds and round them, half to even as NumPy does.
+
+    ``bad`` becomes 3 if a time is not finite or beyond the limit, else 2 if times of scale 1 are not whole, else 1 if
+    one is beyond ``latest`` [us].
+    """
+    i = wp.tid()
+    time = values[i] * scale
+    rounded = wp.rint(time)
+    if not wp.abs(time) < TIME_LIMIT:
+        wp.atomic_max(bad, 0, 3)
+    else:
+        out[i] = wp.int64(rounded)
+        if scale == wp.float64(1.0) and rounded != time:
+            wp.atomic_max(bad, 0, 2)
+        elif wp.abs(time) > latest:
+            wp.atomic_max(bad, 0, 1)
+
+
+@wp.kernel
+def narrow_times(values: wp.array(dtype=wp.uint64), out: wp.array(dtype=wp.int64), bad: wp.array(dtype=int)):
+    """Convert unsigned times [us], and set ``bad`` if int64 does not hold one."""
+    i = wp.tid()
+    out[i] = wp.int64(values[i])
+    if out[i] < wp.int64(0):
+        bad[0] = 1
+
+
+@wp.kernel
+def mark_positive(values: wp.array(dtype=wp.float64), out: wp.array(dtype=wp.uint8), bad: wp.array(dtype=int)):
+    """Convert polarities to 1 if they are positive, else 0, and set ``bad`` if one is NaN."""
+    i = wp.tid()
+    out[i] = wp.uint8(wp.where(values[i] > wp.float64(0.0), 1, 0))
+    if wp.isnan(values[i]):
+        bad[0] = 1
+
+
+@wp.kernel
+def flag_events(
+    inside: wp.array(dtype=wp.uint8),
+    extrapolated: wp.array(dtype=wp.uint8),
+    unknown: int,
+    flags: wp.array(dtype=wp.uint8),
+):
+    """Set the flags of amiwarp.compensation.streams. The first ``unknown`` events have no prism angle.
+
+    ``extrapolated``: 1 for each event whose angle is extrapolated; empty for none.
+    """
+    i = wp.tid()
+    flag = 1 - int(inside[i])
+    if extrapolated.shape[0] > 0:
+        flag += 2 * int(extrapolated[i])
+    flags[i] = wp.uint8(wp.where(i < unknown, 5, flag))
+
+
+@wp.kernel
+def join_columns(x: wp.array(dtype=float), y: wp.array(dtype=float), start: int, xy: wp.array2d(dtype=float)):
+    """Write coordinates as the rows of one array."""
+    i = start + wp.tid()
+    xy[i, 0] = x[i]
+    xy[i, 1] = y[i]
+
+
+for _coordinate in (wp.uint16, wp.float32):
+    wp.overload(find_limits, {"x": wp.array(dtype=_coordinate), "y": wp.array(dtype=_coordinate)})
+
+
+# Search for background activity: events without an earlier event at a neighbouring pixel.
+
+NEVER = wp.constant(wp.int64(-(2**63)))  # time of a pixel without events
+
+
+@wp.func
+def latest_nearby(latest: wp.array(dtype=wp.int64), pixel: int, stride: int) -> wp.int64:
+    """Return the latest time of the eight neighbours of a pixel [us]."""
+    side = wp.max(latest[pixel - 1], latest[pixel + 1])
+    above, below = pixel - stride, pixel + stride
+    row = wp.max(wp.max(latest[above - 1], latest[above]), latest[above + 1])
+    return wp.max(wp.max(side, row), wp.max(wp.max(latest[below - 1], latest[below]), latest[below + 1]))
+
+
+@wp.kernel
+def mark_background(
+    x: wp.array(dtype=wp.uint16),
+    y: wp.array(dtype=wp.uint16),
+    t: wp.array(dtype=wp.int64),
+    window_us: wp.int64,
+    stride: int,
+    latest: wp.array(dtype=wp.int64),
+    background: wp.array(dtype=wp.bool),
+):
+    """Pass over all events in their order, in one thread. The surface of times has a border of one pixel."""
+    for i in range(t.shape[0]):
+        pixel = (int(y[i]) + 1) * stride + int(x[i]) + 1
+        near = latest_nearby(latest, pixel, stride)
+        background[i] = near == NEVER or t[i] - near > window_us
+        latest[pixel] = t[i]

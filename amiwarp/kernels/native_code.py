@@ -1,0 +1,219 @@
+"""Native code for what Warp's language lacks: vector loads and stores on CPUs; warps and shared memory on CUDA."""
+
+import warp as wp
+
+# Unstrided loads and stores, and additions to pairs of elements. With them, CPU compilers vectorise a loop.
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func_native("return ((const uint16_t*)values.data)[i];")
+def load_uint16(values: wp.array(dtype=wp.uint16), i: int) -> wp.uint16:
+    """Load element ``i`` of a contiguous array of uint16."""
+
+
+@wp.func_native("return ((const uint8_t*)values.data)[i];")
+def load_uint8(values: wp.array(dtype=wp.uint8), i: int) -> wp.uint8:
+    """Load element ``i`` of a contiguous array of uint8."""
+
+
+@wp.func_native("return ((const uint32_t*)values.data)[i];")
+def load_uint32(values: wp.array(dtype=wp.uint32), i: int) -> wp.uint32:
+    """Load element ``i`` of a contiguous array of uint32."""
+
+
+@wp.func_native("return ((const int32_t*)values.data)[i];")
+def load_int(values: wp.array(dtype=int), i: int) -> int:
+    """Load element ``i`` of a contiguous array of int32."""
+
+
+@wp.func_native("return ((const int64_t*)values.data)[i];")
+def load_int64(values: wp.array(dtype=wp.int64), i: int) -> wp.int64:
+    """Load element ``i`` of a contiguous array of int64."""
+
+
+@wp.func_native("return ((const float*)values.data)[i];")
+def load_float(values: wp.array(dtype=float), i: int) -> float:
+    """Load element ``i`` of a contiguous array of float32."""
+
+
+@wp.func_native("return ((const uint64_t*)values.data)[i];")
+def load_word(values: wp.array(dtype=wp.uint64), i: int) -> wp.uint64:
+    """Load element ``i`` of a contiguous array of uint64."""
+
+
+@wp.func_native("((float*)values.data)[i] = value;")
+def store_float(values: wp.array(dtype=float), i: int, value: float):
+    """Store ``value`` as element ``i`` of a contiguous array of float32."""
+
+
+@wp.func_native("((uint8_t*)values.data)[i] = (uint8_t)value;")
+def store_uint8(values: wp.array(dtype=wp.uint8), i: int, value: int):
+    """Store ``value`` as element ``i`` of a contiguous array of uint8."""
+
+
+@wp.func_native("((uint32_t*)values.data)[i] = value;")
+def store_uint32(values: wp.array(dtype=wp.uint32), i: int, value: wp.uint32):
+    """Store ``value`` as element ``i`` of a contiguous array of uint32."""
+
+
+@wp.func_native("((int32_t*)values.data)[i] = value;")
+def store_int(values: wp.array(dtype=int), i: int, value: int):
+    """Store ``value`` as element ``i`` of a contiguous array of int32."""
+
+
+@wp.func_native("for (int k = 0; k < n; ++k) ((float*)out.data)[k] = ((const float*)values.data)[first + k];")
+def copy_floats(out: wp.array(dtype=float), values: wp.array(dtype=float), first: int, n: int):
+    """Copy ``values[first : first + n]`` of contiguous arrays of float32."""
+
+
+@wp.func_native("for (int k = 0; k < n; ++k) ((uint8_t*)out.data)[k] = ((const uint8_t*)values.data)[first + k];")
+def copy_bytes(out: wp.array(dtype=wp.uint8), values: wp.array(dtype=wp.uint8), first: int, n: int):
+    """Copy ``values[first : first + n]`` of contiguous arrays of uint8."""
+
+
+@wp.func_native("""
+    typedef uint64_t eight __attribute__((vector_size(64)));
+    const uint64_t* t = (const uint64_t*)pairs.data;
+    const uint16_t* i = (const uint16_t*)indices.data + first;
+    for (int k = 0; k < 64; k += 8, i += 8) {
+        const eight some = {t[i[0]], t[i[1]], t[i[2]], t[i[3]], t[i[4]], t[i[5]], t[i[6]], t[i[7]]};
+        memcpy((uint64_t*)out.data + k, &some, 64);
+    }
+""")
+def load_pairs(
+    out: wp.array(dtype=float), pairs: wp.array(dtype=float), indices: wp.array(dtype=wp.uint16), first: int
+):
+    """Copy the pairs of floats at ``indices[first : first + 64]`` of a table of pairs, one load each. For CPUs.
+
+    Eight are stored at once, because a vector load from several waiting stores would wait until they are in the cache.
+    """
+
+
+@wp.func_native("""
+    const int* place = (const int*)places.data;
+    const uint64_t* share = (const uint64_t*)shares.data;
+    uint32_t* sum = (uint32_t*)sums.data;
+#ifndef __CUDACC__
+    for (int k = 0; k < n; ++k) __builtin_prefetch(sum + place[k] + columns, 1);
+#endif
+#pragma clang loop unroll(disable)
+    for (int k = 0; k < n; ++k) {
+        uint64_t above, below;
+        uint32_t* at = sum + place[k];
+        memcpy(&above, at, 8);
+        memcpy(&below, at + columns, 8);
+        above += share[2 * k];
+        below += share[2 * k + 1];
+        memcpy(at, &above, 8);
+        memcpy(at + columns, &below, 8);
+    }
+""")
+def add_word_pairs(
+    sums: wp.array(dtype=int), places: wp.array(dtype=int), shares: wp.array(dtype=int), columns: int, n: int
+):
+    """Add four shares to the 2 x 2 elements at each of ``n`` places of an image, two in one 64-bit addition.
+
+    Only for little-endian CPUs, if no sum overflows 32 bits and no other thread writes to the image. The elements are
+    prefetched, because an image is larger than a core's cache. The loop of additions is not unrolled: with more loads
+    and stores, the same code took up to twice as long at some addresses on an AMD EPYC.
+    """
+
+
+# Sums over neighbouring threads of a CUDA warp, in fixed order.
+#
+# A run is a sequence of neighbouring threads of a warp with the same key. On a CPU each thread is a run. All threads of
+# a warp must call these functions.
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned lane = threadIdx.x & 31u;
+    const int before = __shfl_up_sync(0xffffffffu, key, 1);
+    return (int)((__ballot_sync(0xffffffffu, before != key) | 1u) & (0xffffffffu >> (31u - lane)));
+#endif
+    return 1;
+""")
+def run_starts(key: int) -> int:
+    """Return the threads of the warp, up to this one, at which runs start, as bits."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const int lane = threadIdx.x & 31, first = 31 - __clz(starts);
+    for (int step = 1; step < 32; step *= 2) {
+        const float other = __shfl_up_sync(0xffffffffu, value, step);
+        if (lane - step >= first) value += other;
+    }
+#endif
+    return value;
+""")
+def sum_run(value: float, starts: int) -> float:
+    """Return the sum of a value over the threads of the run up to this one, added in fixed order."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const int after = __shfl_down_sync(0xffffffffu, key, 1);
+    return (threadIdx.x & 31) == 31 || after != key;
+#endif
+    return true;
+""")
+def ends_run(key: int) -> bool:
+    """Return whether this thread is the last one of its run."""
+
+
+# Shared memory of a block of CUDA threads: the windows of :mod:`amiwarp.kernels.tiles`.
+#
+# The memory is used by address. The address is looked up once, while an array's name would be looked up at every vote.
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __shared__ int words[3 * 61 * 64];
+    unsigned address = (unsigned)__cvta_generic_to_shared(words);
+    asm volatile("" : "+r"(address));  // keeps the compiler from looking it up repeatedly
+    return (int)address;
+#endif
+    return 0;
+""")
+def window() -> int:
+    """Return the address of the block's windows in shared memory; 0 on a CPU."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("bar.sync 0;" ::: "memory");
+#endif
+""")
+def wait_for_block():
+    """Wait until all threads of the block arrive here."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("st.shared.u32 [%0], %1;" :: "r"(address), "r"(value) : "memory");
+#endif
+""")
+def set_word(address: int, value: int):
+    """Store a word in shared memory at an address."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    asm volatile("red.shared.add.u32 [%0], %1;" :: "r"(address), "r"(value));
+#endif
+""")
+def add_to_word(address: int, value: int):
+    """Add to a word in shared memory at an address, atomically."""
+
+
+@wp.func_native("""
+    int value = 0;
+#if defined(__CUDA_ARCH__)
+    asm volatile("ld.shared.u32 %0, [%1];" : "=r"(value) : "r"(address) : "memory");
+#endif
+    return value;
+""")
+def get_word(address: int) -> int:
+    """Load a word from shared memory at an address."""

@@ -1,0 +1,583 @@
+"""Pixels of the simulator: photoreceptors, thresholds, and the events that they generate."""
+
+import warp as wp
+
+from amiwarp.kernels.prism_view import (
+    AHEAD,
+    Steps,
+    View,
+    levels_ahead,
+    locate_texels,
+    ray_in_prism_frame,
+    see_level,
+    texels_ahead,
+)
+
+# Event generation of the simulator: one thread per pixel steps through a chunk and writes the events as keys.
+#
+# Times are ticks of 1/16 us since the start of the chunk, in integers, so that results do not depend on where a chunk
+# begins. An event is an int64 key, ``time | pixel | reversed lag | polarity``. Sorted keys give the same stream for any
+# order of the threads.
+
+OPTIONS = {"enable_backward": False}
+wp.set_module_options(OPTIONS)
+
+TICKS = wp.constant(16)  # ticks per microsecond
+HALF_TICKS = wp.constant(8)
+TICK_BITS = wp.constant(4)
+LOW_BITS = wp.constant(22)  # lowest bits of a key: lag (19), cause (2), polarity (1); pixel and time are above them
+LOW_MASK = wp.constant((1 << 22) - 1)
+SIGNAL = wp.constant(0)  # codes of the causes of an event, as in amiwarp.Cause
+SHOT_NOISE = wp.constant(1)
+LEAK = wp.constant(2)
+HOT_PIXEL = wp.constant(3)
+LEAK_SHARE = wp.constant(1.5)  # an ON event is a leak if the level rises by less than this multiple of the drift
+LARGEST_LAG = wp.constant((1 << 19) - 1)
+LAG_ZERO = wp.constant(16)  # ticks added to the lag, because rounding a time stamp may make the lag slightly negative
+NEVER = wp.constant(wp.int64(-(1 << 60)))
+NO_NOISE = wp.constant(wp.int64(1 << 60))
+SMALLEST_THRESHOLD = wp.constant(0.1)  # smallest threshold relative to the nominal one, which mismatch cannot undercut
+PAST_STEP = wp.constant(2.0)  # fraction of a step that means: after the end of the step
+
+
+@wp.struct
+class SensorParams:
+    """Sensor parameters in the units of the simulator."""
+
+    on: float  # nominal ON threshold [log intensity]
+    off: float  # nominal OFF threshold [log intensity]
+    mismatch: float  # relative standard deviation of both thresholds
+    leak: float  # mean leak [thresholds per step]
+    leak_jitter: float  # relative standard deviation of the leak between two events of a pixel
+    noise: float  # shot noise in the dark [events per tick]
+    noise_white: float  # shot noise at white, relative to that in the dark
+    spread: float  # standard deviation of ln(leak) and ln(shot noise) between pixels
+    hot_fraction: float  # fraction of the pixels that are hot
+    hot: float  # rate of additional random events of hot pixels [events per tick]
+    refractory: wp.int64  # refractory period [ticks]
+    latency: float  # mean latency [ticks]
+    jitter: float  # standard deviation of the latency [ticks]
+    bandwidth: float  # photoreceptor's angular cut-off frequency per unit of exp(level) [1/step]
+    dark: float  # luminance added before the logarithm
+
+
+@wp.struct
+class Pixel:
+    """State of one simulated pixel."""
+
+    level: float  # level at the last step, after the photoreceptor [log intensity]
+    reference: float  # reference level [log intensity]
+    on: float  # ON threshold of this pixel [log intensity]
+    off: float  # OFF threshold of this pixel [log intensity]
+    leak: float  # leak of this pixel, without jitter [thresholds per step]
+    noise: float  # shot noise of this pixel in the dark [events per tick]
+    hot: float  # rate of additional random events if the pixel is hot [events per tick], else 0
+    rng: wp.uint32  # state of the random number generator
+    blind_until: wp.int64  # end of the refractory period; NEVER if it has passed
+    next_noise: wp.int64  # time of the next random event; NO_NOISE for none
+    last_stamp: wp.int64  # time stamp of the pixel's last event [us]
+
+
+@wp.struct
+class Interval:
+    """Time interval over which a pixel is advanced: a step, or one of the equal pieces of a step."""
+
+    ticks: int  # length of the interval [ticks]
+    per_tick: float  # length of a tick in units of the interval
+    drift: float  # change of the reference in the interval, caused by the leak [log intensity]
+    shift: int  # bit position of the time in a key
+
+
+@wp.struct
+class Sink:
+    """Destination of the event keys: segments with limited room, each with a counter of events.
+
+    On a CPU a segment is a run of pixels of one thread. On CUDA neighbouring pixels use different segments, because one
+    counter for all pixels, or for all of a warp, would be the bottleneck.
+    """
+
+    keys: wp.array2d(dtype=wp.int64)  # keys of the events; axes: segment, position in the segment
+    count: wp.array2d(dtype=int)  # first column: events of each segment, including those that did not fit
+    run: int  # number of consecutive pixels that share a segment
+
+
+@wp.func
+def whole_step(steps: Steps, p: Pixel) -> Interval:
+    """Return one step of a chunk as a time interval, in which the pixel leaks without jitter."""
+    span = Interval()
+    span.ticks = steps.ticks
+    span.per_tick = steps.per_tick
+    span.drift = p.leak * p.on
+    span.shift = steps.shift
+    return span
+
+
+@wp.func
+def crossing(reference: float, on: float, off: float, level: float, slope: float) -> float:
+    """Return the fraction of the step at which the level next crosses a threshold; above 1 if it does not."""
+    if slope > 0.0:
+        return (reference + on - level) / slope
+    if slope < 0.0:
+        return (reference - off - level) / slope
+    return PAST_STEP
+
+
+@wp.func
+def draw_waiting_time(rate: float, uniform: float) -> wp.int64:
+    """Return an exponential waiting time [ticks] to the next event of a Poisson process."""
+    if rate > 0.0:
+        return wp.int64(1.0 - wp.log(1.0 - uniform) / rate)
+    return NO_NOISE
+
+
+@wp.func
+def append_key(sink: Sink, shift: int, index: int, t: wp.int64, stamp: wp.int64, kind: int):
+    """Append the key of an event at tick ``t`` with time stamp ``stamp`` [us]; ``kind``: 2 cause + polarity."""
+    lag = wp.clamp(int(stamp * wp.int64(TICKS) - t) + LAG_ZERO, 0, LARGEST_LAG)
+    segment = (index / sink.run) % sink.keys.shape[0]
+    place = wp.atomic_add(sink.count, segment, 0, 1)
+    if place < sink.keys.shape[1]:
+        low = wp.int64(index) << wp.int64(LOW_BITS) | wp.int64((LARGEST_LAG - lag) << 3 | kind)
+        sink.keys[segment, place] = stamp << wp.int64(shift) | low
+
+
+@wp.func
+def latency(s: SensorParams, rng: wp.uint32):
+    """Return a random latency [ticks] from a threshold crossing to its time stamp, and the generator's next state."""
+    late = s.latency
+    if s.jitter > 0.0:  # nearly Gaussian: sum of four uniform numbers, within 3.5 standard deviations
+        four = wp.randf(rng) + wp.randf(rng) + wp.randf(rng) + wp.randf(rng)
+        late = wp.max(late + s.jitter * 1.7320508 * (four - 2.0), 0.0)
+    return late, rng
+
+
+@wp.func
+def cause_of(p: Pixel, span: Interval, slope: float, noise: bool) -> int:
+    """Return the cause of an event in a step in which the level, minus the leaking reference, rises by ``slope``."""
+    if noise:
+        return wp.where(p.hot > 0.0, HOT_PIXEL, SHOT_NOISE)
+    return wp.where(slope > 0.0 and slope <= LEAK_SHARE * span.drift, LEAK, SIGNAL)
+
+
+@wp.func
+def next_state(s: SensorParams, rng: wp.uint32) -> wp.uint32:
+    """Return the generator's state after an event. With jitter, the leak until the next event depends on it."""
+    state = rng
+    if s.leak_jitter > 0.0:
+        state = wp.rand_init(int(rng))
+    return state
+
+
+@wp.func
+def thin_noise(p: Pixel, s: SensorParams, slope: float, f: float, noise: bool) -> Pixel:
+    """Return the pixel before an event at fraction ``f`` of the step; in bright light, noise may be postponed.
+
+    Noise is drawn at the rate in the dark. Postponing noise events at random gives the rate at the level of the moment.
+    It falls linearly with luminance, as in v2e (Hu, Liu, Delbruck, CVPR Workshops 2021).
+    """
+    if noise and f < 1.0 and s.noise_white < 1.0:
+        rng = p.rng
+        light = wp.clamp(wp.exp(p.level + f * slope) - s.dark, 0.0, 1.0)
+        rate = p.noise * (1.0 - (1.0 - s.noise_white) * light) + p.hot
+        if wp.randf(rng) * (p.noise + p.hot) >= rate:
+            p.next_noise += draw_waiting_time(p.noise + p.hot, wp.randf(rng))
+        p.rng = rng
+    return p
+
+
+@wp.func
+def fire_event(
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, slope: float, f: float, noise: bool
+) -> Pixel:
+    """Return the pixel after an event at fraction ``f`` of the step, and write that event, if f < 1."""
+    if f < 1.0:
+        rng = p.rng
+        on = int(slope > 0.0)
+        if noise:
+            on = int(wp.randf(rng) < 0.5)
+            p.reference = p.level + f * slope
+        else:
+            p.reference += wp.where(on == 1, p.on, -p.off)
+        t = t0 + wp.int64(f * float(span.ticks))
+        late, rng = latency(s, rng)
+        stamp = (t + wp.int64(late) + wp.int64(HALF_TICKS)) >> wp.int64(TICK_BITS)
+        p.last_stamp = wp.max(stamp, p.last_stamp + wp.int64(1))
+        append_key(sink, span.shift, index, t, p.last_stamp, 2 * cause_of(p, span, slope, noise) + on)
+        p.blind_until = wp.where(s.refractory > wp.int64(0), t + s.refractory, NEVER)
+        if noise or p.next_noise < p.blind_until:
+            p.next_noise = wp.max(t, p.blind_until) + draw_waiting_time(p.noise + p.hot, wp.randf(rng))
+        p.rng = next_state(s, rng)
+    return p
+
+
+@wp.func
+def generate_events(
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, slope: float, quiet: bool
+) -> Pixel:
+    """Generate all events of a step in which the level, minus the leaking reference, rises by ``slope``.
+
+    The struct is changed field by field or unconditionally: a conditional assignment of the whole struct would move it
+    out of the registers.
+    """
+    f = wp.where(quiet, PAST_STEP, 0.0)
+    while f < 1.0:
+        if p.blind_until > NEVER:  # the reference is reset at the end of the refractory period
+            f = wp.max(f, float(p.blind_until - t0) * span.per_tick)
+            if f < 1.0:
+                p.reference = p.level + f * slope
+                p.blind_until = NEVER
+        signal = wp.max(crossing(p.reference, p.on, p.off, p.level, slope), f)
+        due = p.next_noise
+        f = wp.min(signal, wp.max(float(due - t0) * span.per_tick, f))
+        p = thin_noise(p, s, slope, f, f < signal)
+        p = fire_event(p, s, sink, index, t0, span, slope, wp.where(p.next_noise == due, f, PAST_STEP), f < signal)
+    return p
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+__syncwarp();
+#endif
+""")
+def reconverge():
+    """Make the threads of a warp run together again: after an event they would diverge until the end of the chunk."""
+
+
+@wp.func
+def rate_factor(sensor: SensorParams, rng: wp.uint32):
+    """Draw the ratio of a pixel's leak and shot noise to their means; return also the generator's next state."""
+    factor = float(1.0)
+    if sensor.spread > 0.0:
+        factor = wp.exp(sensor.spread * wp.randn(rng))
+    return factor, rng
+
+
+@wp.func
+def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
+    """Draw a pixel's thresholds and noise rate, and set its reference.
+
+    The reference is the level minus a random part of a threshold, which stands for earlier leakage.
+    """
+    rng = wp.rand_init(seed, i)
+    p = Pixel()
+    p.level = level
+    p.on = sensor.on * wp.max(1.0 + sensor.mismatch * wp.randn(rng), SMALLEST_THRESHOLD)
+    p.off = sensor.off * wp.max(1.0 + sensor.mismatch * wp.randn(rng), SMALLEST_THRESHOLD)
+    p.hot = wp.where(wp.randf(rng) < sensor.hot_fraction, sensor.hot, 0.0)
+    factor, rng = rate_factor(sensor, rng)
+    p.noise = sensor.noise * factor
+    p.leak = sensor.leak * factor
+    leaked = wp.randf(rng)
+    p.reference = p.level - wp.where(sensor.leak > 0.0, leaked * p.on, 0.0)
+    p.blind_until = NEVER
+    p.last_stamp = wp.int64(-1)
+    p.next_noise = draw_waiting_time(p.noise + p.hot, wp.randf(rng))
+    p.rng = rng
+    return p
+
+
+@wp.kernel
+def start_pixels(view: View, steps: Steps, sensor: SensorParams, seed: int, start: int, pixels: wp.array(dtype=Pixel)):
+    """Initialise every pixel with the level that it sees at the start."""
+    i = start + wp.tid()
+    pixels[i] = new_pixel(sensor, seed, i, see_level(view, steps.at[steps.margin], ray_in_prism_frame(view, i)))
+
+
+@wp.func
+def advance_pixel(
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, level: float
+) -> Pixel:
+    """Advance a pixel by one interval, at the end of which it sees ``level``."""
+    end = level + span.drift
+    within = end < p.reference + p.on and end > p.reference - p.off
+    quiet = within and p.blind_until == NEVER and p.next_noise >= t0 + wp.int64(span.ticks)
+    p = generate_events(p, s, sink, index, t0, span, end - p.level, quiet)
+    p.level = level
+    p.reference -= span.drift
+    return p
+
+
+@wp.func
+def shift_times(p: Pixel, passed: wp.int64) -> Pixel:
+    """Shift the pixel's times to a new origin that is ``passed`` ticks later."""
+    if p.blind_until > NEVER:
+        p.blind_until -= passed
+    p.next_noise -= passed
+    p.last_stamp -= passed >> wp.int64(TICK_BITS)
+    return p
+
+
+@wp.kernel(module="unique", module_options=OPTIONS)  # so that each device compiles only what it runs
+def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), start: int, sink: Sink):
+    """Advance one pixel per thread through all steps of a chunk."""
+    i = start + wp.tid()
+    p = pixels[i]
+    ray = ray_in_prism_frame(view, i)
+    span = whole_step(steps, p)
+    t0 = wp.int64(0)
+    for k in range(steps.count):
+        level = see_level(view, steps.at[steps.margin + k + 1], ray)
+        p = advance_pixel(p, sensor, sink, i, t0, span, level)
+        t0 += wp.int64(steps.ticks)
+        reconverge()
+    pixels[i] = shift_times(p, t0)
+
+
+@wp.kernel(module="unique", module_options=OPTIONS)
+def run_pixels_ahead(
+    view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), start: int, sink: Sink
+):
+    """Generate the same events as :func:`run_pixels`, bit for bit.
+
+    Faster on a CPU, because it computes the log intensities of several instants at once.
+    """
+    i = start + wp.tid()
+    p = pixels[i]
+    ray = ray_in_prism_frame(view, i)
+    span = whole_step(steps, p)
+    t0 = wp.int64(0)
+    for block in range(steps.ahead.shape[0]):
+        n = wp.min(AHEAD, steps.count - block * AHEAD)
+        at = locate_texels(view, texels_ahead(view.prism, steps.ahead[block], ray))
+        levels = levels_ahead(view, steps, block, n, at)
+        j = int(0)
+        while j < n:
+            p = advance_pixel(p, sensor, sink, i, t0, span, levels[j])
+            t0 += wp.int64(steps.ticks)
+            j += 1
+    pixels[i] = shift_times(p, t0)
+
+
+# Photoreceptors of the simulated pixels: first-order low-pass filters whose bandwidth is proportional to the light.
+#
+# These kernels replace those of :mod:`amiwarp.kernels.pixels` if the sensor's bandwidth is limited, or if its
+# leak has jitter. The level of a pixel is then the output of its photoreceptor. The input is linear in time between two
+# instants, and the filter's equation is solved exactly for it, so that the events hardly depend on the length of the
+# steps.
+
+MOST_PIECES = wp.constant(16)  # largest number of pieces per step; divides the ticks of a step, a multiple of 16
+LARGEST_BEND = wp.constant(0.01)  # largest deviation of the level from a straight line within a piece [ON thresholds]
+SMALLEST_LEAK = wp.constant(0.1)  # smallest leak relative to the mean leak, so that jitter cannot stop the leak
+SMALL_ANGLE = wp.constant(0.1)  # duration [time constants] below which a series is more precise in float32
+SMALL_CHANGE = wp.constant(0.3)  # change of the log intensity below which a series is more precise in float32
+
+
+@wp.struct
+class Input:
+    """Input of a photoreceptor at one instant: the light on its pixel."""
+
+    level: float  # log intensity of the light
+    light: float  # exponential of the level
+
+
+@wp.func
+def last_input(level: float) -> Input:
+    """Return the photoreceptor's input at a level, with the exponential computed."""
+    result = Input()
+    result.level = level
+    result.light = wp.exp(level)
+    return result
+
+
+@wp.func
+def next_input(level: float, last: Input) -> Input:
+    """Return the photoreceptor's input for a level. ``last`` saves the exponential if it has the same level."""
+    result = Input()
+    result.level = level
+    result.light = last.light
+    if level != last.level:
+        result.light = wp.exp(level)
+    return result
+
+
+@wp.func
+def mean_light(before: Input, after: Input) -> float:
+    """Return the mean of exp(level) over an interval in which the level changes linearly."""
+    change = after.level - before.level
+    if wp.abs(change) > SMALL_CHANGE:
+        return (after.light - before.light) / change
+    return 0.5 * (before.light + after.light) * (1.0 - change * change / 12.0)
+
+
+@wp.func
+def filter_level(level: float, before: float, after: float, angle: float) -> float:
+    """Return the filter's output at the end of an interval; ``level`` is that at its beginning.
+
+    The input changes linearly from ``before`` to ``after``. ``angle`` is the duration in time constants. The output
+    starts anew at the input after an instant without light, which is NaN.
+    """
+    lag = angle * (0.5 - angle * (1.0 / 6.0 - angle / 24.0))
+    if angle > SMALL_ANGLE:
+        lag = 1.0 - (1.0 - wp.exp(-angle)) / angle
+    result = level + angle * (1.0 - lag) * (before - level) + lag * (after - before)
+    return wp.where(wp.isnan(level) or wp.isnan(before), after, result)
+
+
+@wp.func
+def piece_count(level: float, before: float, after: float, angle: float, tolerance: float) -> int:
+    """Return the number of pieces of a step, within which the filter's output is nearly linear: a power of two.
+
+    A chord leaves a curve by at most an eighth of the largest second derivative, which is that at the beginning.
+    """
+    bend = wp.abs(angle * (angle * (level - before) + after - before)) / (8.0 * tolerance)
+    n = int(1)
+    while n < MOST_PIECES and bend > float(n * n):
+        n *= 2
+    return n
+
+
+@wp.func
+def jittered_leak(p: Pixel, s: SensorParams) -> float:
+    """Return a pixel's leak [thresholds per step]. It changes with the generator's state, hence at every event."""
+    leak = p.leak
+    if s.leak_jitter > 0.0:
+        rng = wp.rand_init(int(p.rng), 1)
+        leak *= wp.max(1.0 + s.leak_jitter * wp.randn(rng), SMALLEST_LEAK)
+    return leak
+
+
+@wp.func
+def advance_filtered(
+    p: Pixel, s: SensorParams, sink: Sink, index: int, t0: wp.int64, span: Interval, before: Input, after: Input
+) -> Pixel:
+    """Advance a pixel by one step, in which its photoreceptor's input changes from ``before`` to ``after``."""
+    n = piece_count(p.level, before.level, after.level, s.bandwidth * mean_light(before, after), LARGEST_BEND * p.on)
+    piece = Interval()
+    piece.ticks = span.ticks / n
+    piece.per_tick = span.per_tick * float(n)
+    piece.shift = span.shift
+    share = 1.0 / float(n)
+    x0 = before
+    j = int(0)
+    while j < n:
+        j += 1
+        x1 = next_input(wp.where(j == n, after.level, wp.lerp(before.level, after.level, share * float(j))), after)
+        level = x1.level
+        if s.bandwidth > 0.0:
+            level = filter_level(p.level, x0.level, x1.level, s.bandwidth * share * mean_light(x0, x1))
+        piece.drift = share * jittered_leak(p, s) * p.on
+        p = advance_pixel(p, s, sink, index, t0 + wp.int64((j - 1) * piece.ticks), piece, level)
+        x0 = x1
+    return p
+
+
+@wp.kernel(module="unique", module_options=OPTIONS)  # so that each device compiles only what it runs
+def run_filtered_pixels(
+    view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), seen: wp.array(dtype=float),
+    start: int, sink: Sink,
+):  # fmt: skip
+    """Advance one pixel per thread through all steps of a chunk; ``seen``: its photoreceptor's last input."""
+    i = start + wp.tid()
+    p = pixels[i]
+    before = last_input(seen[i])
+    span = whole_step(steps, p)
+    ray = ray_in_prism_frame(view, i)
+    t0 = wp.int64(0)
+    for k in range(steps.count):
+        after = next_input(see_level(view, steps.at[steps.margin + k + 1], ray), before)
+        p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
+        before = after
+        t0 += wp.int64(steps.ticks)
+        reconverge()
+    pixels[i] = shift_times(p, t0)
+    seen[i] = before.level
+
+
+@wp.kernel(module="unique", module_options=OPTIONS)
+def run_filtered_pixels_ahead(
+    view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(dtype=Pixel), seen: wp.array(dtype=float),
+    start: int, sink: Sink,
+):  # fmt: skip
+    """Generate the same events as :func:`run_filtered_pixels`, faster on a CPU."""
+    i = start + wp.tid()
+    p = pixels[i]
+    before = last_input(seen[i])
+    span = whole_step(steps, p)
+    ray = ray_in_prism_frame(view, i)
+    t0 = wp.int64(0)
+    for block in range(steps.ahead.shape[0]):
+        n = wp.min(AHEAD, steps.count - block * AHEAD)
+        at = locate_texels(view, texels_ahead(view.prism, steps.ahead[block], ray))
+        levels = levels_ahead(view, steps, block, n, at)
+        j = int(0)
+        while j < n:
+            after = next_input(levels[j], before)
+            p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
+            before = after
+            t0 += wp.int64(steps.ticks)
+            j += 1
+    pixels[i] = shift_times(p, t0)
+    seen[i] = before.level
+
+
+# Event simulation from a table of the luminance that each pixel sees at every time step.
+
+
+@wp.func
+def table_level(light: wp.array2d(dtype=float), sensor: SensorParams, k: int, i: int) -> float:
+    """Return the log intensity of pixel ``i`` in row ``k`` of a table of luminance."""
+    return wp.log(light[k, i] + sensor.dark)
+
+
+@wp.kernel
+def start_world_pixels(
+    light: wp.array2d(dtype=float), steps: Steps, sensor: SensorParams, seed: int, start: int,
+    pixels: wp.array(dtype=Pixel),
+):  # fmt: skip
+    """Set the state of every pixel at the start of the recording, whose luminance is the first row of ``light``."""
+    i = start + wp.tid()
+    pixels[i] = new_pixel(sensor, seed, i, table_level(light, sensor, 0, i))
+
+
+@wp.kernel
+def run_world_pixels(
+    light: wp.array2d(dtype=float),
+    steps: Steps,
+    sensor: SensorParams,
+    pixels: wp.array(dtype=Pixel),
+    start: int,
+    sink: Sink,
+):
+    """Simulate pixels over the steps of a chunk, and write the keys of their events to ``sink``.
+
+    Counterpart of :func:`amiwarp.kernels.pixels.run_pixels`, which uses maps. ``light``: luminance of each
+    pixel at the end of each step; axes: step, pixel.
+    """
+    i = start + wp.tid()
+    p = pixels[i]
+    span = whole_step(steps, p)
+    t0 = wp.int64(0)
+    for k in range(steps.count):
+        p = advance_pixel(p, sensor, sink, i, t0, span, table_level(light, sensor, k, i))
+        t0 += wp.int64(steps.ticks)
+        reconverge()
+    pixels[i] = shift_times(p, t0)
+
+
+@wp.kernel
+def run_filtered_world_pixels(
+    light: wp.array2d(dtype=float),
+    steps: Steps,
+    sensor: SensorParams,
+    pixels: wp.array(dtype=Pixel),
+    seen: wp.array(dtype=float),
+    start: int,
+    sink: Sink,
+):
+    """Simulate pixels whose photoreceptors have limited bandwidth; see :func:`run_world_pixels`.
+
+    ``seen``: last log intensity that entered each photoreceptor.
+    """
+    i = start + wp.tid()
+    p = pixels[i]
+    before = last_input(seen[i])
+    span = whole_step(steps, p)
+    t0 = wp.int64(0)
+    for k in range(steps.count):
+        after = next_input(table_level(light, sensor, k, i), before)
+        p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
+        before = after
+        t0 += wp.int64(steps.ticks)
+        reconverge()
+    pixels[i] = shift_times(p, t0)
+    seen[i] = before.level

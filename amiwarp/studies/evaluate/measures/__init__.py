@@ -1,1 +1,0 @@
-"""Measures of the evaluations, as functions of arrays."""

@@ -1,0 +1,758 @@
+"""Event clouds: colours, legends, the VTK scene that draws them, and what the browser draws of them."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+import os
+import sys
+from ctypes.util import find_library
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from amiwarp.choices import Axis, Colour, View
+from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.export import save_png
+from amiwarp.imaging.palette import BLUE, OFF_COLOUR, ON_COLOUR, ORANGE, PINK, VERMILION
+from amiwarp.plotting.figures import instance_colours
+from amiwarp.validation import choice
+from amiwarp.viewer.window import STORES
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from amiwarp.events.events import Events
+    from amiwarp.viewer.images import Scale
+    from amiwarp.viewer.inspector import Inspector
+    from amiwarp.viewer.window import DisplayedWindow, DrawnTruth
+
+
+# Colours for events by cause, instance and depth, and the legend of these colours.
+
+CAUSE_COLOURS = (BLUE, ORANGE, PINK, VERMILION)
+"""Colour of each cause of events, in the order of the codes of :class:`amiwarp.Cause`."""
+GREY = "#808080"
+"""Colour of the sky, and of unknown causes."""
+DEPTH_MAP = "viridis_r"
+"""Matplotlib colour map of depth. Near points are light."""
+DEPTH_PERCENTILES = (2.0, 98.0)
+"""Percentiles of the depths of drawn events at which the colour scale begins and ends."""
+Legend: TypeAlias = tuple[tuple[str, str], ...]
+"""Rows of a legend: a colour in hexadecimal notation, and the meaning of the colour.
+
+The colour of the title row is empty.
+"""
+
+
+def truth_colours(truth: DrawnTruth, colour: Colour) -> NDArray[np.uint8]:
+    """Return red, green and blue (0 to 255) of each drawn event, shape ``(n, 3)``."""
+    values = truth.values(colour)
+    rgb = _depths(values, _scale(values)) if colour is Colour.DEPTH else _names(colour, values)
+    return np.rint(255.0 * rgb).astype(np.uint8)
+
+
+def legend_of(truth: DrawnTruth, colour: Colour, most: int) -> Legend:
+    """Return the legend of a colour choice; the legend is empty if the choice does not show ground truth.
+
+    A legend of depth has ``most`` rows. Other legends list at most ``most`` causes or instances, the most frequent
+    first, with their fractions of the drawn events.
+    """
+    if colour not in STORES:
+        return ()
+    if colour is Colour.DEPTH:
+        return (("", "depth [m]"), *_depth_rows(truth.values(colour), most))
+    return (("", colour.value), *_name_rows(truth, colour, most))
+
+
+def _depth_rows(depth: NDArray[Any], most: int) -> Legend:
+    """Return ``most`` legend rows of depths [m] in equal ratios, and a row for the sky if an event saw the sky."""
+    scale = _scale(depth)
+    steps = np.geomspace(*scale, most)
+    rows = _rows(_depths(steps, scale), [f"{step:#.3g}".rstrip(".") for step in steps])
+    return (*rows, (GREY, "sky")) if np.isinf(depth).any() else rows
+
+
+def _name_rows(truth: DrawnTruth, colour: Colour, most: int) -> Legend:
+    """Return the legend rows of the most frequent causes or instances, and a row that sums up the rest."""
+    counts = np.bincount(truth.values(colour))
+    found = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
+    shares = 100.0 * counts / counts.sum()
+    texts = [f"{truth.name(colour, k)} {shares[k]:.3g} %" for k in found[:most].tolist()]
+    rows, others = _rows(_names(colour, found[:most]), texts), found[most:]
+    return (*rows, ("", f"{len(others)} more {shares[others].sum():.3g} %")) if len(others) else rows
+
+
+def _rows(rgb: NDArray[np.float64], texts: list[str]) -> Legend:
+    """Return legend rows of colours (0 to 1), shape (k, 3), and texts."""
+    from matplotlib.colors import to_hex
+
+    return tuple((to_hex(each), text) for each, text in zip(rgb, texts, strict=True))
+
+
+def _names(colour: Colour, values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the colours (0 to 1) of cause codes or instance numbers, shape ``(n, 3)``."""
+    from matplotlib.colors import to_rgb
+
+    if colour is Colour.CAUSE:
+        table = np.array([to_rgb(each) for each in (*CAUSE_COLOURS, GREY)])
+        return np.asarray(table[np.minimum(values, len(CAUSE_COLOURS))])
+    return np.asarray(np.where((values == 0)[:, None], to_rgb(GREY), instance_colours(values)))
+
+
+def _depths(depth: NDArray[Any], scale: tuple[float, float]) -> NDArray[np.float64]:
+    """Return the colours (0 to 1) of depths [m] on a logarithmic scale, shape ``(n, 3)``. The sky is grey.
+
+    ``scale``: depths at both ends of the scale [m].
+    """
+    from matplotlib import colormaps
+    from matplotlib.colors import to_rgb
+
+    low, high = scale
+    share = np.log(np.clip(depth, low, high) / low) / math.log(high / low)
+    return np.asarray(np.where(np.isfinite(depth)[:, None], colormaps[DEPTH_MAP](share)[:, :3], to_rgb(GREY)))
+
+
+def _scale(depth: NDArray[Any]) -> tuple[float, float]:
+    """Return the lowest and the highest depth of the colour scale [m]."""
+    seen = depth[np.isfinite(depth)]
+    low, high = np.percentile(seen, DEPTH_PERCENTILES).tolist() if len(seen) else (1.0, 10.0)
+    low = max(low, 1e-3)
+    return low, max(high, 1.1 * low)
+
+
+# Colours of the points in the event clouds, and the quantities that the colours show.
+
+COLOUR_MAPS = {Colour.ANGLE: "twilight", Colour.TIME: "viridis", Colour.DENSITY: "cividis", Colour.RESIDUAL: "cividis"}
+"""Matplotlib colour map of each quantity that a scale shows."""
+NEAR_PX = 2.0
+"""Standard deviation of the Gaussian weights of the events near an event [px]."""
+WIDEST_PX = 3.0 * NEAR_PX
+"""Largest residual [px]. Wider edges look the same as spread events."""
+VOTE_VARIANCE = 1.0 / 6.0 + 1.0 / 12.0
+"""Variance that bilinear votes and dither add to the place of an event in an image [px²]."""
+WIDE_EVENTS = 2.0
+"""Number of spread events that are assumed near each event, so that a lone event has a large residual."""
+
+
+def third_axis(shown: DisplayedWindow, axis: Axis) -> NDArray[np.float64]:
+    """Return each point's third coordinate, shape ``(n,)``: prism angle [deg], or time [ms]."""
+    if axis is Axis.ANGLE:
+        return np.asarray(np.degrees(shown.theta), np.float64)
+    return np.asarray((shown.events.t - shown.span.first_us) * 1e-3, np.float64)
+
+
+def axis_range(shown: DisplayedWindow, axis: Axis) -> tuple[float, float]:
+    """Return the ends of the third axis: prism angle [deg], or time after the recording's first event [ms]."""
+    if axis is Axis.ANGLE:
+        return 0.0, 360.0
+    return shown.span.start_ms, shown.span.start_ms + shown.span.length_us * 1e-3
+
+
+def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np.uint8]:
+    """Return red, green and blue of each point (0 to 255), shape ``(n, 3)``."""
+    from matplotlib.colors import to_rgb
+
+    if look.overlaid and not after:
+        return np.full((len(shown.events), 3), 128, np.uint8)
+    if look.colour is Colour.POLARITY:
+        two = np.array([to_rgb(OFF_COLOUR), to_rgb(ON_COLOUR)])
+        return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
+    if look.colour in STORES:
+        return truth_colours(shown.truth, look.colour)
+    value, table = _measure(shown, look.colour, after=after), colour_table(look.colour, dark=look.dark)
+    return np.asarray(table[np.clip(np.nan_to_num(value) * 255.0, 0, 255).astype(np.uint8)])
+
+
+def colour_table(colour: Colour, *, dark: bool) -> NDArray[np.uint8]:
+    """Return the 256 colours of a scale, shape ``(256, 3)``.
+
+    The colour maps are perceptually uniform; the colour map of the angle is cyclic.
+    """
+    from matplotlib import colormaps
+
+    name = COLOUR_MAPS[colour]
+    table = colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]
+    if colour is Colour.ANGLE:  # its ends are white and its middle is black: keep both apart from the background
+        table = 1.0 - 0.8 * (1.0 - table) if dark else 0.8 * table
+    return np.asarray(255.0 * table, np.uint8)
+
+
+def scale_of(shown: DisplayedWindow, colour: Colour) -> tuple[str, str, str]:
+    """Return the texts at both ends of a colour scale, and its title."""
+    if colour is Colour.ANGLE:
+        return "0°", "360°", "prism angle θ"
+    if colour is Colour.TIME:
+        low, high = axis_range(shown, Axis.TIME)
+        return f"{low:.6g}", f"{high:.6g} ms", "time"
+    if colour is Colour.DENSITY:
+        return "0", f"{density_top(shown):.3g}", "events per pixel (square root)"
+    return "0", f"{WIDEST_PX:g} px", "residual: width of the edge near an event"
+
+
+def density_top(shown: DisplayedWindow) -> float:
+    """Return the number of events per pixel at which the colour scale of the density ends, for both clouds."""
+    image = shown.image_after
+    return max(float(np.percentile(image[image > 0], 99.0)) if (image > 0).any() else 1.0, 1.0)
+
+
+def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> NDArray[np.float64]:
+    """Return the displayed quantity of each point, scaled to 0 … 1."""
+    if colour is Colour.ANGLE:
+        return shown.theta / math.tau
+    if colour is Colour.TIME:
+        return (shown.events.t - shown.span.start_us) / shown.span.length_us
+    image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
+    if colour is Colour.DENSITY:
+        return np.sqrt(at_pixels(image, xy) / density_top(shown))
+    left, top, right, bottom = shown.region
+    return residual(image, xy, (slice(top, bottom), slice(left, right))) / WIDEST_PX
+
+
+def at_pixels(image: NDArray[Any], xy: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the image's value at each point, 0 outside the image, shape ``(n,)``."""
+    x, y = (np.nan_to_num(xy[:, k], nan=-9.0) for k in (0, 1))
+    column, row = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
+    inside = (column >= 0) & (column < image.shape[1]) & (row >= 0) & (row < image.shape[0])
+    out = np.zeros(len(xy))
+    out[inside] = image[row[inside], column[inside]]
+    return out
+
+
+def residual(
+    image: NDArray[np.float32], xy: NDArray[np.float32], where: tuple[slice, slice] = (slice(None), slice(None))
+) -> NDArray[np.float64]:
+    """Return the width of the edge at each point, or what is left of the prism's motion [px], shape ``(n,)``.
+
+    It is the standard deviation across the edge of the events near the point: near 0 on a sharp edge, and
+    :data:`WIDEST_PX` among spread events and outside the rows and columns ``where``, in which it is computed. The event
+    itself does not count.
+    """
+    wide = np.full(image.shape, WIDEST_PX)
+    spread = _spread_across_edges(image, where)
+    # Gaussian weights of variance n² and an edge of variance w² give a spread of 1 / (1 / n² + 1 / w²).
+    width = spread * NEAR_PX**2 / np.maximum(NEAR_PX**2 - spread, 1e-6) - VOTE_VARIANCE
+    wide[where] = np.sqrt(np.clip(width, 1e-6, WIDEST_PX**2))
+    found = at_pixels(wide, xy)
+    return np.where(found > 0.0, found, WIDEST_PX)
+
+
+def _spread_across_edges(image: NDArray[np.float32], where: tuple[slice, slice]) -> NDArray[np.float64]:
+    """Return the smallest eigenvalue of the second moments of the weighted events about each pixel [px²].
+
+    The moments with weights G of variance s are s G + s² G'', so they follow from derivatives of the smoothed image.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    reach = 4 * math.ceil(NEAR_PX)
+    rows, columns = (range(size)[axis] for size, axis in zip(image.shape, where, strict=True))
+    top, left = max(rows.start - reach, 0), max(columns.start - reach, 0)
+    part = image[top : rows.stop + reach, left : columns.stop + reach].astype(np.float64)
+    orders = ((0, 0), (2, 0), (1, 1), (0, 2))
+    smooth, yy, xy, xx = (gaussian_filter(part, NEAR_PX, order=order, mode="constant") for order in orders)
+    own_variance = NEAR_PX**2 + VOTE_VARIANCE
+    own = 1.0 / (math.tau * own_variance)
+    second = 0.5 * (xx + yy) + own / own_variance - np.hypot(0.5 * (xx - yy), xy)
+    density = np.maximum(smooth - own, 0.0) + WIDE_EVENTS * own
+    spread = np.clip(NEAR_PX**2 + NEAR_PX**4 * second / density, 0.0, NEAR_PX**2)
+    return np.asarray(spread[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left])
+
+
+# Legend of the inspector's picture as VTK actors: rows of a coloured mark and the meaning of the colour.
+
+CORNER = (0.05, 0.985)
+"""Upper left corner of the legend in the strip of the picture that is reserved for the legend.
+
+The coordinates are fractions of the width and height of the strip, from its lower left corner.
+"""
+FONT_SIZE, MARK = 12, "■"
+"""Font size of the legend [px], and character that shows the colour of a row."""
+LETTER_PX, MARGIN_PX, LARGEST_STRIP = 7.2, 48, 0.35
+"""Width of a letter, width of mark and margins [px], and largest width of the strip as a fraction of the picture."""
+ROW_PX, LEAST_ROWS, MOST_ROWS = 40, 3, 12
+"""Height of the picture per row of the legend [px], and smallest and largest number of rows."""
+
+
+def rows_in(height: int) -> int:
+    """Return the largest number of coloured rows of a legend in a picture of a given height [px]."""
+    return max(LEAST_ROWS, min(MOST_ROWS, height // ROW_PX))
+
+
+def strip_share(legend: Legend, width: int) -> float:
+    """Return the fraction of a picture's ``width`` [px] that a legend needs; 0 for an empty legend."""
+    if not legend:
+        return 0.0
+    return min((MARGIN_PX + LETTER_PX * max(len(text) for _, text in legend)) / width, LARGEST_STRIP)
+
+
+def legend_actors(legend: Legend, ink: str, font: Path) -> list[Any]:
+    """Return the actors of a legend in the upper left corner of its strip; ``ink`` is the colour of the text."""
+    actors = []
+    for k, (colour, text) in enumerate(legend):
+        # all rows start at one corner, after line breaks: their distance does not depend on the picture's size
+        if colour:
+            actors.append(_text("\n" * k + MARK, colour, font))
+        actors.append(_text("\n" * k + ("     " if colour else "") + text, ink, font))
+    return actors
+
+
+def _text(text: str, colour: str, font: Path) -> Any:
+    """Return an actor that shows a text at :data:`CORNER`."""
+    import pyvista
+
+    actor = pyvista.Text(text)
+    actor.prop = pyvista.TextProperty(
+        color=colour, font_size=FONT_SIZE, font_file=str(font), justification_horizontal="left",
+        justification_vertical="top",
+    )  # fmt: skip
+    actor.GetPositionCoordinate().SetCoordinateSystemToNormalizedViewport()
+    actor.position = CORNER
+    return actor
+
+
+# VTK scene with the event clouds before and after compensation, drawn off screen without a user interface.
+
+AXIS_HEIGHT = 0.75
+"""Length of the drawn third axis, as a multiple of the region's width."""
+BACKGROUND_AND_INK = {False: ("white", "#333333"), True: ("#15181c", "#d8d8d8")}
+"""Colours of background and lines, for light (False) and dark (True) mode."""
+CAMERA_DIRECTIONS = {
+    View.FREE: ((1.0, -1.35, 0.75), (0.0, 0.0, 1.0)),
+    View.XY: ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+    View.X_AXIS: ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+    View.Y_AXIS: ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+}
+"""Direction from the clouds to the camera, and the upward direction, for each view."""
+ORBIT_COLOUR = "#009e73"
+"""Colour of the model's orbit, as on the page."""
+VIEW_ANGLE = 26.0
+"""Vertical field of view of the camera [deg]."""
+MARGIN = 0.1
+"""Margin around the clouds for labels, as a multiple of the region's width."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """Style in which the event clouds are drawn."""
+
+    colour: Colour = Colour.POLARITY
+    """Quantity that the points' colour shows."""
+    axis: Axis = Axis.ANGLE
+    """Quantity along the third axis: prism angle or time."""
+    point_size: float = 2.0
+    """Diameter of the points in the picture [px]."""
+    opacity: float = 1.0
+    """Opacity of the points, 0 to 1."""
+    dark: bool = False
+    """Whether the background is dark."""
+    overlaid: bool = False
+    """Whether both clouds are drawn in one frame, with the first one in grey."""
+    titles: tuple[str, ...] = ("as recorded", "compensated")
+    """Titles of the clouds. With a single title, only the second cloud is drawn."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "colour", choice(Colour, self.colour, "colour"))
+        object.__setattr__(self, "axis", choice(Axis, self.axis, "axis"))
+
+    def for_clouds(self, titles: Sequence[str]) -> Look:
+        """Return the look for clouds with these titles. A single cloud gets the whole picture."""
+        return replace(self, titles=tuple(titles), overlaid=self.overlaid or len(titles) == 1)
+
+
+@dataclass(frozen=True)
+class Box:
+    """Frame of both clouds: a region of the image [px], and the range of the third axis."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    low: float
+    """Start of the third axis [deg or ms]."""
+    high: float
+    """End of the third axis [deg or ms]."""
+
+    @property
+    def width(self) -> int:
+        """Width of the shown region of the image [px]."""
+        return self.right - self.left
+
+    @property
+    def axis_height(self) -> float:
+        """Length of the third axis in the scene [px]."""
+        return AXIS_HEIGHT * self.width
+
+    @property
+    def stretch(self) -> float:
+        """Scale of the third axis [px per deg or ms]. The scale of x and y is 1."""
+        return self.axis_height / (self.high - self.low)
+
+    def positions(self, xy: NDArray[Any], third: NDArray[Any]) -> NDArray[np.float32]:
+        """Return points in the scene, shape ``(n, 3)``; y is negated, because the scene's y axis points up."""
+        return np.stack([xy[:, 0], -xy[:, 1], (third - self.low) * self.stretch], axis=1).astype(np.float32)
+
+
+def check_display() -> None:
+    """Select EGL for VTK on Linux. Raises :class:`AmiwarpError` without EGL, where VTK would end the process."""
+    if not sys.platform.startswith("linux"):
+        return
+    if find_library("EGL") is None:
+        raise AmiwarpError("VTK needs OpenGL (EGL) to draw; on Debian run: apt-get install libegl1 libgl1-mesa-dri")
+    # by default VTK tries X first, and crashes if libX11 is missing; EGL needs no display
+    os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"
+
+
+def font() -> Path:
+    """Return a font with Greek letters, which VTK's own font lacks."""
+    from matplotlib import get_data_path
+
+    return Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
+
+
+class Scene:
+    """Event clouds before and after compensation, drawn off screen, with one camera for both."""
+
+    def __init__(self, size: tuple[int, int] = (1000, 420)) -> None:
+        """Create an empty scene; ``size`` is the picture's width and height [px].
+
+        Raises :class:`AmiwarpError` if VTK cannot draw on this machine.
+        """
+        check_display()
+        import pyvista
+
+        self.plotter = pyvista.Plotter(off_screen=True, shape=(1, 3), border=False, window_size=list(size))
+        self.plotter.render_window.SetMultiSamples(0)  # doubles the speed of a software renderer
+        self.plotter.link_views((0, 1))
+        self._divide(0.0, overlaid=False)
+        self.view = View.FREE
+        self._clouds: list[Any] = []
+        self._frame: list[tuple[int, Any]] = []
+        self._lines: list[tuple[int, Any]] = []
+        self._explained: tuple[Legend, str] | None = None
+        self._framed: tuple[Any, ...] | None = None
+        self.box = Box(0, 0, 1, 1, 0.0, 1.0)
+
+    def show(self, shown: DisplayedWindow, look: Look, lines: Sequence[NDArray[Any]] = ()) -> None:
+        """Draw the events of a window. The camera moves only if the region of the image has changed.
+
+        ``lines``: a line for each cloud, points x, y [px] and on the third axis, shape ``(n, 3)``.
+        """
+        before = self.box
+        self.box = Box(*shown.region, *axis_range(shown, look.axis))
+        third = third_axis(shown, look.axis)
+        for k, xy in enumerate((shown.before, shown.after)):
+            points = self.box.positions(xy, third)
+            colours = colours_of(shown, look, after=k == 1)
+            valid = np.isfinite(points).all(axis=1) & (k == 1 or len(look.titles) > 1)
+            self._cloud(k, points[valid], colours[valid], look)
+        self._draw_frame(look)
+        self._draw_lines(lines, look)
+        self._draw_legend(legend_of(shown.truth, look.colour, rows_in(self.plotter.window_size[1])), look)
+        if replace(before, low=self.box.low, high=self.box.high) != self.box:  # the region has changed
+            self.look_from(self.view, look)
+
+    def look_from(self, view: View, look: Look) -> None:
+        """Move the camera to a view direction from which both clouds fit into the picture."""
+        self.view = view = choice(View, view, "view")
+        self._draw_frame(look)
+        b = self.box
+        away, up = (np.array(v) for v in CAMERA_DIRECTIONS[view])
+        away = away / np.linalg.norm(away)
+        right = np.cross(up, away) / np.linalg.norm(np.cross(up, away))
+        up = np.cross(away, right)
+        margin = MARGIN * b.width
+        low, high = np.array([b.left, -b.bottom, 0.0]) - margin, np.array([b.right, -b.top, b.axis_height]) + margin
+        middle = (low + high) / 2.0
+        corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - middle
+        wide, tall, near = (np.abs(corners @ right), np.abs(corners @ up), corners @ away)
+        width, height = self.plotter.window_size
+        aspect = width / height * (1.0 - self._strip) * (1.0 if look.overlaid else 0.5)
+        half = math.tan(math.radians(VIEW_ANGLE / 2.0))
+        camera = self.plotter.renderers[0].camera
+        camera.parallel_projection, camera.view_angle = view is not View.FREE, VIEW_ANGLE
+        camera.parallel_scale = float(np.maximum(tall, wide / aspect).max())
+        away = away * float((near + np.maximum(tall, wide / aspect) / half).max())
+        camera.position, camera.focal_point, camera.up = tuple(middle + away), tuple(middle), tuple(up)
+        for renderer in self._views:
+            renderer.camera = camera
+            renderer.reset_camera_clipping_range()
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Return the drawn picture, shape ``(height, width, 3)``."""
+        self.plotter.render_window.Render()
+        return np.asarray(self.plotter.screenshot(None, return_img=True), np.uint8)
+
+    def save(self, path: Path) -> None:
+        """Write the picture as PNG, first under a temporary name."""
+        save_png(path, self.picture())
+
+    def turntable(self, frames: int) -> Any:
+        """Yield pictures while the camera moves once around the clouds, each of shape ``(height, width, 3)``."""
+        for _ in range(frames):
+            yield self.picture()
+            self.plotter.renderers[0].camera.Azimuth(360.0 / frames)
+
+    def close(self) -> None:
+        """Release the VTK renderer and its memory."""
+        self.plotter.close()
+
+    @property
+    def _views(self) -> list[Any]:
+        """Renderers of the two clouds."""
+        return list(self.plotter.renderers)[:2]
+
+    @property
+    def _overlaid(self) -> bool:
+        return bool(self.plotter.renderers[0].GetViewport()[2] > 0.9)
+
+    def _add(self, k: int, mesh: Any, **how: Any) -> Any:
+        self.plotter.subplot(0, k)
+        return self.plotter.add_mesh(mesh, lighting=False, show_scalar_bar=False, reset_camera=False, render=False,
+                                     pickable=False, **how)  # fmt: skip
+
+    def _cloud(self, k: int, points: NDArray[np.float32], colours: NDArray[np.uint8], look: Look) -> None:
+        import pyvista
+
+        mesh = pyvista.PolyData(points) if len(points) else pyvista.PolyData(np.zeros((1, 3), np.float32))
+        mesh["colour"] = colours if len(points) else np.zeros((1, 4), np.uint8)
+        while len(self._clouds) <= k:
+            self._clouds.append(self._add(len(self._clouds), mesh, style="points", scalars="colour", rgb=True))
+        actor = self._clouds[k]
+        actor.mapper.dataset = mesh
+        actor.prop.point_size, actor.prop.opacity = look.point_size, look.opacity
+
+    def _draw_frame(self, look: Look) -> None:
+        """Draw the box, the ticks and the axis titles, if they have changed."""
+        wanted = (self.box, look.axis, look.dark, look.overlaid, look.titles, self.view)
+        if wanted == self._framed:
+            return
+        self._framed = wanted
+        background, ink = BACKGROUND_AND_INK[look.dark]
+        left, right = self._views
+        if look.overlaid != self._overlaid:
+            self._divide(self._strip, overlaid=look.overlaid)
+            home, cloud = (left, right)[not look.overlaid], self._clouds[1]
+            (right if look.overlaid else left).RemoveActor(cloud)
+            home.AddActor(cloud)
+        for renderer in self.plotter.renderers:
+            renderer.set_background(background)
+        for k, actor in self._frame:
+            self.plotter.renderers[k].remove_actor(actor, render=False)
+        self._frame = []
+        titles = (" and ".join(look.titles),) if look.overlaid else look.titles
+        for k, title in enumerate(titles):
+            self._frame += [(k, actor) for actor in self._axes(k, look, ink, title)]
+
+    def _draw_lines(self, lines: Sequence[NDArray[Any]], look: Look) -> None:
+        """Draw a line in each cloud, instead of those drawn before."""
+        import pyvista
+
+        for k, actor in self._lines:
+            self.plotter.renderers[k].remove_actor(actor, render=False)
+        self._lines = []
+        for number, line in enumerate(lines):
+            k = 0 if look.overlaid else number
+            curve = pyvista.lines_from_points(self.box.positions(line[:, :2], line[:, 2]))
+            self._lines.append((k, self._add(k, curve, color=ORBIT_COLOUR, line_width=2.5)))
+
+    def _draw_legend(self, legend: Legend, look: Look) -> None:
+        """Draw the legend in a strip on the left, if it has changed. The clouds shrink to make room."""
+        ink, home, camera = BACKGROUND_AND_INK[look.dark][1], self.plotter.renderers[2], self._views[0].camera
+        strip = strip_share(legend, self.plotter.window_size[0])
+        if strip != self._strip:
+            grows = (1.0 - self._strip) / (1.0 - strip)
+            self._divide(strip, overlaid=look.overlaid)
+            camera.Dolly(1.0 / grows)
+            camera.parallel_scale *= grows
+            self._views[0].reset_camera_clipping_range()
+        if self._explained == (legend, ink):
+            return
+        self._explained = legend, ink
+        home.clear_actors()
+        for actor in legend_actors(legend, ink, font()):
+            home.add_actor(actor, render=False, pickable=False, reset_camera=False)
+
+    def _divide(self, strip: float, *, overlaid: bool) -> None:
+        """Divide the picture into the legend's strip, given as a share of the width, and one or two clouds."""
+        self._strip, (left, right, legend) = strip, self.plotter.renderers
+        middle = (1.0 + strip) / 2.0
+        legend.SetViewport(0.0, 0.0, strip, 1.0)
+        left.SetViewport(strip, 0.0, 1.0 if overlaid else middle, 1.0)
+        right.SetViewport(middle, 0.0, 1.0, 1.0)
+        legend.SetDraw(strip > 0.0)
+        right.SetDraw(not overlaid)
+
+    def _axes(self, k: int, look: Look, ink: str, title: str) -> list[Any]:
+        import pyvista
+
+        b = self.box
+        frame = pyvista.Box((b.left, b.right, -b.bottom, -b.top, 0, b.axis_height)).outline()
+        actors = [self._add(k, frame, color=ink, line_width=1.0)]
+        unit = "θ [°]" if look.axis is Axis.ANGLE else "t [ms]"
+        gap = 0.05 * b.width
+        front, middle = -b.bottom - gap, ((b.left + b.right) / 2.0, -(b.top + b.bottom) / 2.0)
+        labels: list[tuple[str, tuple[float, float, float]]] = []
+        if self.view is not View.Y_AXIS:
+            labels += [(f"{v:g}", (v, front, -gap)) for v in ticks(b.left, b.right)]
+            labels.append(("x [px]", (middle[0], front - gap, -2.5 * gap)))
+        if self.view is not View.X_AXIS:
+            labels += [(f"{v:g}", (b.right + gap, -v, -gap)) for v in ticks(b.top, b.bottom)]
+            flat = self.view is View.XY  # no space to the right
+            place = (b.right + gap, -b.top + 1.2 * gap, 0.0) if flat else (b.right + 2.5 * gap, middle[1], -2.5 * gap)
+            labels.append(("y [px]", place))
+        if self.view is not View.XY:
+            y = -b.top + gap if self.view is View.Y_AXIS else front + gap  # on the left
+            labels += [(f"{v:g}", (b.left - gap, y, (v - b.low) * b.stretch)) for v in ticks(b.low, b.high)]
+            labels.append((unit, (b.left - gap, y, b.axis_height + 1.5 * gap)))
+        for text, place in labels:
+            label = pyvista.Label(text, position=place, size=13)
+            label.prop.color, label.prop.justification_horizontal = ink, "center"
+            label.prop.set_font_file(str(font()))
+            self.plotter.renderers[k].add_actor(label, render=False, pickable=False, reset_camera=False)
+            actors.append(label)
+        self.plotter.subplot(0, k)
+        actors.append(self.plotter.add_text(title, position="upper_edge", font_size=9, color=ink, render=False,
+                                            font_file=str(font())))  # fmt: skip
+        return actors
+
+
+def ticks(low: float, high: float) -> NDArray[np.float64]:
+    """Return round numbers from ``low`` to ``high``; for angles, divisors of a full turn are preferred."""
+    from matplotlib.ticker import MaxNLocator
+
+    steps = [1, 2, 3, 4.5, 6, 9, 10] if high == 360.0 else [1, 2, 2.5, 5, 10]
+    values = np.asarray(MaxNLocator(5, steps=steps).tick_values(low, high), np.float64)
+    return values[(values >= low) & (values <= high)]
+
+
+# What the browser draws of a window: points and colours as bytes, legends, and images as addresses.
+
+JPEG_QUALITY = 90
+LEGEND_ROWS = 8
+"""Largest number of causes, instances or depths in a legend."""
+DIFFERENCES = np.array([[0, 114, 178], [255, 255, 255], [213, 94, 0]], np.float64)
+"""Colours of fewer, equally many and more events in an image of differences."""
+STOPS = 16
+"""Number of colours from which the browser draws a colour scale."""
+
+
+def cloud_state(shown: DisplayedWindow, colour: Colour, axis: Axis, *, dark: bool) -> dict[str, Any]:
+    """Return the state variables of the event clouds."""
+    look, (low, high) = Look(colour, axis, dark=dark), axis_range(shown, axis)
+    title = "prism angle θ (°)" if axis is Axis.ANGLE else "time (ms)"
+    colours = _pixels(colours_of(shown, look, after=True))
+    differ = colour in (Colour.DENSITY, Colour.RESIDUAL)  # depend on the places of the points
+    return {
+        "cloud_before": float_bytes(shown.before), "cloud_after": float_bytes(shown.after),
+        "cloud_third": float_bytes(third_axis(shown, axis)),
+        "colours_before": _pixels(colours_of(shown, look, after=False)) if differ else colours,
+        "colours_after": colours,
+        "third_axis": {"low": low, "high": high, "title": title}, "region": list(shown.region),
+        "legend": legend(shown, colour, dark=dark),
+    }  # fmt: skip
+
+
+def legend(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> dict[str, Any]:
+    """Return the legend of a colour choice: title, rows of colour and text, or a scale with its ends."""
+    if colour is Colour.POLARITY:
+        rows = [[ON_COLOUR, "ON: brighter"], [OFF_COLOUR, "OFF: darker"]]
+        return {"title": "polarity", "rows": rows, "bar": "", "low": "", "high": ""}
+    if known := legend_of(shown.truth, colour, LEGEND_ROWS):
+        return {"title": known[0][1], "rows": [list(row) for row in known[1:]], "bar": "", "low": "", "high": ""}
+    low, high, title = scale_of(shown, colour)
+    return {"title": title, "rows": [], "bar": gradient(colour_table(colour, dark=dark)), "low": low, "high": high}
+
+
+def gradient(table: NDArray[Any]) -> str:
+    """Return a colour map, shape ``(n, 3)``, as a gradient of CSS."""
+    chosen = table[np.linspace(0, len(table) - 1, min(STOPS, len(table))).round().astype(int)]
+    colours = ", ".join(f"rgb({r} {g} {b})" for r, g, b in chosen.round().astype(int).tolist())
+    return f"linear-gradient(90deg, {colours})"
+
+
+def scale_state(scale: Scale) -> dict[str, Any]:
+    """Return the colour bar of an image: its colours, its ticks from 0 to 1, and its title."""
+    title = f"{scale.title} [{scale.unit}]" if scale.unit else scale.title
+    values = scale.low + np.linspace(0.0, 1.0, 256) ** (1.0 / scale.gamma) * (scale.high - scale.low)
+    if scale.colours != "polarity":
+        ticks = [list(tick) for tick in scale.ticks()]
+        return {"bar": gradient(scale.rgb(values[None])[0]), "ticks": ticks, "title": title}
+    off_on = np.concatenate([values[::-2], values[::2]])  # from many OFF events over none to many ON events
+    is_on = np.arange(len(off_on)) >= len(off_on) // 2
+    table = scale.rgb(np.where(is_on, [[0.0], [1.0]], [[1.0], [0.0]])[:, None] * off_on)[0]
+    ticks = [[0.0, f"{scale.high:.3g} OFF"], [0.5, "0"], [1.0, f"{scale.high:.3g} ON"]]
+    return {"bar": gradient(table), "ticks": ticks, "title": title}
+
+
+def difference_state(before: NDArray[Any], after: NDArray[Any]) -> dict[str, Any]:
+    """Return the state variables of an image of differences: blue where ``after`` is lower, red where it is higher."""
+    most = max(float(np.abs(after - before).max()), 1.0)
+    share = (after - before) / (2.0 * most) + 0.5
+    ends = np.linspace(0.0, 1.0, len(DIFFERENCES))
+    colours = np.stack([np.interp(share, ends, DIFFERENCES[:, k]) for k in range(3)], axis=-1)
+    ticks = [[0.0, f"−{most:.3g}"], [0.5, "0"], [1.0, f"+{most:.3g}"]]
+    scale = {"bar": gradient(DIFFERENCES), "ticks": ticks, "title": "difference [events per pixel]"}
+    return {"after": jpeg(colours), "after_scale": scale}
+
+
+def orbit_lines(inspector: Inspector, shown: DisplayedWindow, picked: int = -1) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the orbit of a scene point, and the column in which the model sees it without the prism.
+
+    The scene point is that of a drawn event, or of the middle of the region. Both lines have points x, y [px] and prism
+    angle [deg], shape ``(n, 3)``.
+    """
+    left, top, right, bottom = shown.region
+    point = np.array([left + right, top + bottom]) / 2.0 if picked < 0 else shown.after[picked]
+    theta, orbit = inspector.orbit(float(point[0]), float(point[1]))
+    lines = [np.column_stack([xy, np.degrees(theta)]) for xy in (orbit, np.broadcast_to(point, orbit.shape))]
+    return lines[0], lines[1]
+
+
+NO_ORBIT = {"orbit": b"", "column": b"", "has_orbit": False}
+"""State variables without an orbit."""
+
+
+def whole_image(events: Events, size: tuple[int, int]) -> str:
+    """Return the image of events as recorded, as the address of a JPEG; brightness is the square root of the count."""
+    width, height = size
+    counts = np.bincount(events.y.astype(np.int64) * width + events.x, minlength=width * height)
+    positive = counts[counts > 0]
+    top = max(float(np.percentile(positive, 99.0)), 1.0) if len(positive) else 1.0
+    return jpeg(255.0 * np.sqrt(np.minimum(counts.reshape(height, width) / top, 1.0)))
+
+
+def jpeg(values: NDArray[Any]) -> str:
+    """Return an image as the address of a JPEG.
+
+    ``values``: from 0 to 255, shape ``(height, width)``, or ``(height, width, 3)`` for colours.
+    """
+    from PIL import Image
+
+    data = io.BytesIO()
+    Image.fromarray(values.astype(np.uint8)).save(data, "JPEG", quality=JPEG_QUALITY)
+    return "data:image/jpeg;base64," + base64.b64encode(data.getvalue()).decode()
+
+
+def event_text(shown: DisplayedWindow, k: int) -> str:
+    """Return the description of point ``k``: pixel, time, angle, polarity, compensated position and ground truth."""
+    e, (x, y), truth = shown.events, shown.after[k], shown.truth.text(k)
+    time_ms = (e.t[k] - shown.span.first_us) * 1e-3
+    return (
+        f"x {e.x[k]}, y {e.y[k]} px; {time_ms:.3f} ms; θ {math.degrees(shown.theta[k]):.2f}°; "
+        f"{'ON' if e.p[k] else 'OFF'}; compensated {x:.2f}, {y:.2f} px{truth and f'; {truth}'}"
+    )
+
+
+def float_bytes(values: NDArray[Any]) -> bytes:
+    """Return numbers as the browser reads them: float32, little-endian."""
+    return np.ascontiguousarray(values, np.float32).tobytes()
+
+
+def _pixels(colours: NDArray[np.uint8]) -> bytes:
+    """Return colours, shape ``(n, 3)``, as opaque pixels of an image in the browser."""
+    return np.column_stack([colours, np.full(len(colours), 255, np.uint8)]).tobytes()
