@@ -40,8 +40,8 @@ from amiwarp.studies.dataset import run
 from amiwarp.studies.dataset.items import Item, list_items, simulation_of, write_recording
 from amiwarp.studies.dataset.run import make_dataset
 from amiwarp.studies.dataset.specification import content_digest, load_specification
-from amiwarp.studies.stability import cells as run_cells
-from amiwarp.studies.stability.cells import METHODS, Cell, Stored, run_cell
+from amiwarp.studies.stability.cells import METHODS, Cell, Store, Stored, run_cell
+from amiwarp.studies.stability.cells import run as run_cells
 from amiwarp.studies.stability.conditions import AXES, Axis
 from benchmarks import compensate as file_benchmark
 from benchmarks import simulate
@@ -154,7 +154,7 @@ def run_atlas(place: Place, scheduler: str, tasks: int) -> Done:
     cells.mkdir()
     with start_workers("benchmarks.two_gpus", "cluster", scheduler, 0, place.device) as workers:
         began = time.perf_counter()
-        done = run_cells([axis()], tasks // VALUES, METHODS[:1], cells, workers.executor, device=place.device)
+        done = run_cells([axis()], tasks // VALUES, METHODS[:1], Store(cells), workers, device=place.device)
         seconds = time.perf_counter() - began
     shutil.rmtree(cells)
     return Done(seconds, sum(c.events for c in done), {c.cell.name: known(c) for c in done})

@@ -30,7 +30,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.io.sealed_json import append_line, create_journal, read_journal
 from amiwarp.kernels import launch
 from amiwarp.studies import cluster
-from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker
+from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker, threads_of_worker
 from amiwarp.studies.dataset import items, specification
 from amiwarp.studies.dataset import specification as sources
 from amiwarp.studies.dataset.items import list_items, simulation_of
@@ -41,7 +41,6 @@ from amiwarp.studies.dataset.run import (
     DatasetSummary,
     duration_text,
     make_dataset,
-    threads_of_worker,
 )
 from amiwarp.studies.dataset.specification import load_specification
 

@@ -13,9 +13,9 @@ from amiwarp.cpu_threads import limited_cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.progress import Progress, silent
-from amiwarp.studies.cluster import ANY_GPU
+from amiwarp.studies.cluster import ANY_GPU, threads_of_worker, worker_count
 from amiwarp.studies.dataset.items import Item, list_items, simulation_of, write_recording
-from amiwarp.studies.dataset.run import Journal, check_folder, threads_of_worker, worker_count
+from amiwarp.studies.dataset.run import Journal, check_folder
 from amiwarp.studies.dataset.specification import content_digest, load_specification
 from amiwarp.validation import guarded
 

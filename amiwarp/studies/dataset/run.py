@@ -9,8 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,20 @@ from amiwarp.io.atomic_output import NewFile, make_folder, scratch_folder, write
 from amiwarp.io.json_files import build
 from amiwarp.io.recorded_dataset import FORMAT, MANIFEST, VERSION
 from amiwarp.io.sealed_json import append_line, create_journal, read_journal
+from amiwarp.kernels import launch
 from amiwarp.progress import Progress, silent
-from amiwarp.studies.cluster import ANY_GPU, Workers, gpu_count, run_jobs, single_worker, start_workers
+from amiwarp.studies.cluster import (
+    ANY_GPU,
+    gpu_count,
+    result_of,
+    run_jobs,
+    start_workers,
+    threads_of_worker,
+    worker_count,
+)
 from amiwarp.studies.dataset.items import Failed, Item, Job, Made, list_items, make
 from amiwarp.studies.dataset.specification import Specification, content_digest, load_specification
-from amiwarp.validation import guarded, whole
+from amiwarp.validation import guarded
 
 # Files that describe a data set: the journal of finished recordings, and the manifest as JSON and as Parquet.
 
@@ -181,8 +189,6 @@ MOST_READERS = 8
 """Largest number of threads that read finished recordings."""
 CHECKED = 256
 """Number of recordings that are given to these threads at a time."""
-MOST_WORKERS = 4096
-"""Largest number of local workers."""
 
 
 @guarded
@@ -226,19 +232,6 @@ class DatasetSummary:
     """Largest number of workers; 0 if there was nothing to make."""
     damaged: tuple[str, ...] = ()
     """What was wrong with the journal, and with each damaged recording. These recordings were made again."""
-
-
-@dataclass
-class _Run:
-    """State of a run."""
-
-    made: int = 0
-    events: int = 0
-    bytes: int = 0
-    worker_seconds: float = 0.0
-    processor_seconds: float = 0.0
-    workers: int = 0
-    failed: list[Failed] = field(default_factory=list)
 
 
 @guarded
@@ -304,7 +297,7 @@ def make_dataset(
     2
     """
     began = time.perf_counter()
-    out = Path(out)
+    out, report = Path(out), progress or silent
     spec = load_specification(specification)
     require_pyarrow()
     check_folder(out)
@@ -313,15 +306,50 @@ def make_dataset(
     make_folder(out)
     journal = Journal(out)
     journal.create()
-    state = _Run()
-    todo = missing(journal, items, progress or silent)
+    todo = missing(journal, items, report)
+    made: list[Made] = []
+    failed: list[Failed] = []
+    events = most_workers = 0
     try:
         if todo:
-            jobs = _Jobs(out.resolve(), device, threads_of_worker(device, count))
-            _make_all(todo, jobs, journal, state, _workers(scheduler, count, device), progress or silent)
+            target, threads = out.resolve(), threads_of_worker(device, count)
+            with (
+                scratch_folder(target) as scratch,
+                start_workers("amiwarp dataset", "dataset", scheduler, count or 0, device) as running,
+                contextlib.closing(
+                    run_jobs(running, make, (Job(item, target, scratch, device, threads) for item in todo))
+                ) as results,
+            ):
+                first = time.perf_counter()
+                report(f"0 of {len(todo):,} recordings", 0.0)
+                for done, (job, future) in enumerate(results, 1):
+                    result = _result(job, future)
+                    if isinstance(result, Failed):
+                        failed.append(result)
+                    else:
+                        made.append(result)
+                        events += result.events
+                        journal.add(result)
+                    most_workers = max(most_workers, running.count())
+                    report(_line(done, len(failed), len(todo), events, time.perf_counter() - first), done / len(todo))
     finally:
-        write_manifest(out, spec, items, journal, state.failed)
-    return _summary(items, journal, state, len(items) - len(todo), time.perf_counter() - began)
+        write_manifest(out, spec, items, journal, failed)
+    files = {item.key: item.file for item in items}
+    return DatasetSummary(
+        recordings=len(items),
+        made=len(made),
+        kept=len(items) - len(todo),
+        failed={files[one.key]: one.error for one in failed},
+        not_in_specification=tuple(journal.others(items)),
+        splits=dict(Counter(item.split for item in items if item.key in journal.made)),
+        events=events,
+        size_bytes=sum(one.bytes for one in made),
+        seconds=time.perf_counter() - began,
+        worker_seconds=sum(one.seconds for one in made),
+        processor_seconds=sum(one.processor_s for one in made),
+        workers=most_workers,
+        damaged=tuple(journal.damaged),
+    )
 
 
 def missing(journal: Journal, items: Sequence[Item], progress: Progress) -> list[Item]:
@@ -345,34 +373,6 @@ def missing(journal: Journal, items: Sequence[Item], progress: Progress) -> list
     return sorted(todo, key=lambda item: item.key)
 
 
-def worker_count(workers: int | None, device: str) -> int:
-    """Return the number of local workers; by default one for each GPU or each core."""
-    if workers is not None:
-        return whole(workers, "workers", 1, MOST_WORKERS)
-    if device != ANY_GPU:
-        return cpu_threads() if device == "cpu" else 1
-    from amiwarp.kernels.launch import start_quietly
-
-    return max(1, gpu_count(start_quietly()))
-
-
-def threads_of_worker(device: str, workers: int | None) -> int | None:
-    """Return the number of CPU threads of each of ``workers`` local workers; None for all, in a cluster.
-
-    On the CPU each worker runs on one thread. Workers with a GPU share the cores, which encode and write the events.
-    """
-    if device == "cpu":
-        return 1
-    return None if workers is None else max(1, cpu_threads() // workers)
-
-
-def _workers(scheduler: str | None, count: int | None, device: str) -> AbstractContextManager[Workers]:
-    """Return the workers, which begin when the context is entered. ``count`` is that of local workers."""
-    if count == 1:
-        return single_worker()
-    return start_workers("amiwarp dataset", "dataset", scheduler, count or 0, device)
-
-
 def _local_workers(scheduler: str | None, workers: int | None, device: str) -> int | None:
     """Return the number of local workers; None with a scheduler.
 
@@ -382,70 +382,25 @@ def _local_workers(scheduler: str | None, workers: int | None, device: str) -> i
         if workers is not None:
             raise AmiwarpError(f"workers = {workers} applies to local processes; leave it out with a scheduler")
         return None
-    from amiwarp.kernels.launch import start_quietly
-
-    known = start_quietly()
+    known = launch.start_quietly()
     if device not in (*known, *([ANY_GPU] if gpu_count(known) else [])):
         raise AmiwarpError(f"device {device!r} is not available; choose one of {', '.join(known)}")
     return worker_count(workers, device)
 
 
-@dataclass(frozen=True)
-class _Jobs:
-    """What all jobs of a run share."""
-
-    out: Path
-    device: str
-    threads: int | None
-
-
-def _make_all(
-    todo: Sequence[Item], shared: _Jobs, journal: Journal, state: _Run, workers: AbstractContextManager[Workers],
-    progress: Progress,
-) -> None:  # fmt: skip
-    """Make all recordings, and record each in the journal when it is finished."""
-    began = time.perf_counter()
-    with scratch_folder(shared.out) as scratch, workers as running:
-        jobs = (Job(item, shared.out, scratch, shared.device, shared.threads) for item in todo)
-        results = run_jobs(running, make, jobs)
-        progress(f"0 of {len(todo):,} recordings", 0.0)
-        with contextlib.closing(results):
-            for done, (job, future) in enumerate(results, 1):
-                _keep(journal, state, _result(job, future))
-                state.workers = max(state.workers, running.count())
-                progress(_line(state, done, len(todo), time.perf_counter() - began), done / len(todo))
-
-
 def _result(job: Job, future: Future[Made | Failed]) -> Made | Failed:
     """Return the result of a job. A worker that dies, for example for want of memory, is a failure of its recording."""
-    if future.cancelled():
-        raise AmiwarpError("the scheduler stopped or dropped the work; run the same command again to continue")
-    try:
-        return future.result()
-    except AmiwarpError:
-        raise
-    except Exception as error:
-        return Failed(job.item.key, f"the worker died or lost its connection: {type(error).__name__}: {error}"[:500])
+    error = None if future.cancelled() else future.exception()
+    if error is None or isinstance(error, AmiwarpError):
+        return result_of(future)
+    return Failed(job.item.key, f"the worker died or lost its connection: {type(error).__name__}: {error}"[:500])
 
 
-def _keep(journal: Journal, state: _Run, result: Made | Failed) -> None:
-    if isinstance(result, Failed):
-        state.failed.append(result)
-        return
-    journal.add(result)
-    state.made += 1
-    state.events += result.events
-    state.bytes += result.bytes
-    state.worker_seconds += result.seconds
-    state.processor_seconds += result.processor_s
-
-
-def _line(state: _Run, done: int, total: int, seconds: float) -> str:
+def _line(done: int, failed: int, total: int, events: int, seconds: float) -> str:
     """Return the state of a run as text, with the time left at the mean speed so far."""
     left = (total - done) * seconds / done
-    failed = f", {len(state.failed):,} failed" if state.failed else ""
-    speed = f"{state.events / seconds / 1e6:.3g} Mev/s"
-    return f"{done:,} of {total:,} recordings{failed}, {speed}, {duration_text(left)} left"
+    lost = f", {failed:,} failed" if failed else ""
+    return f"{done:,} of {total:,} recordings{lost}, {events / seconds / 1e6:.3g} Mev/s, {duration_text(left)} left"
 
 
 def duration_text(seconds: float) -> str:
@@ -454,22 +409,3 @@ def duration_text(seconds: float) -> str:
         if seconds >= 2.0 * length:
             return f"{seconds / length:.1f} {unit}"
     return f"{seconds:.0f} s"
-
-
-def _summary(items: Sequence[Item], journal: Journal, state: _Run, kept: int, seconds: float) -> DatasetSummary:
-    files = {item.key: item.file for item in items}
-    return DatasetSummary(
-        recordings=len(items),
-        made=state.made,
-        kept=kept,
-        failed={files[one.key]: one.error for one in state.failed},
-        not_in_specification=tuple(journal.others(items)),
-        splits=dict(Counter(item.split for item in items if item.key in journal.made)),
-        events=state.events,
-        size_bytes=state.bytes,
-        seconds=seconds,
-        worker_seconds=state.worker_seconds,
-        processor_seconds=state.processor_seconds,
-        workers=state.workers,
-        damaged=tuple(journal.damaged),
-    )

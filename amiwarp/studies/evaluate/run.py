@@ -6,7 +6,6 @@ import contextlib
 import json
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,7 @@ from amiwarp.io.json_files import fields_of, value_of
 from amiwarp.io.sealed_json import CellStore
 from amiwarp.kernels.launch import load_all, load_kernels
 from amiwarp.progress import Progress, silent
-from amiwarp.studies.cluster import Workers, run_jobs, single_worker, start_workers
-from amiwarp.studies.dataset.run import worker_count
+from amiwarp.studies.cluster import Workers, result_of, run_jobs, start_workers, worker_count
 from amiwarp.studies.demo import EXACT_KERNELS
 from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition, RecordedStreams, Streams
 from amiwarp.studies.evaluate.measures import library
@@ -274,7 +272,7 @@ def evaluate(
     if scheduler is None:
         jobs = [replace(job, threads=max(1, cpu_threads() // count)) for job in jobs]
     store = Store(folder / "cells")
-    with _workers(scheduler, count, device) as there:
+    with start_workers("amiwarp evaluate", "cluster", scheduler, count, device) as there:
         results, new, processor_s = _run(jobs, store, there, progress or silent)
     names = [name for name in EVALUATIONS if any(r.evaluation == name for r in results)]
     sections = [section(name, [r for r in results if r.evaluation == name]) for name in names]
@@ -287,13 +285,6 @@ def evaluate(
         len(results), new, sum(bool(r.error) for r in results), {v: verdicts.count(v) for v in dict.fromkeys(verdicts)},
         files, time.perf_counter() - began, processor_s, tuple(store.damaged),
     )  # fmt: skip
-
-
-def _workers(scheduler: str | None, count: int, device: str) -> AbstractContextManager[Workers]:
-    """Return the workers: those of the scheduler, this process, or local processes."""
-    if scheduler is None and count == 1:
-        return single_worker()
-    return start_workers("amiwarp evaluate", "cluster", scheduler, count, device)
 
 
 def _run(
@@ -315,7 +306,7 @@ def _run(
         processor_s = compiling.result()
     with contextlib.closing(run_jobs(workers, run_job, todo)) as running:
         for job, future in running:
-            result = future.result()
+            result = result_of(future)
             for cell in result.cells:
                 store.save(cell, job.settings)
             results += result.cells
