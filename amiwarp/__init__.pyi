@@ -116,10 +116,10 @@ from .simulation.worlds.world import World as World
 from .simulation.worlds.world import WorldScene as WorldScene
 from .simulation.worlds.world_files import load_world as load_world
 from .simulation.worlds.world_truth import TruthRenderer as TruthRenderer
-from .studies.dataset.plan import DatasetPlan as DatasetPlan
-from .studies.dataset.plan import plan_dataset as plan_dataset
-from .studies.dataset.run import DatasetSummary as DatasetSummary
-from .studies.dataset.run import make_dataset as make_dataset
+from .studies.dataset.making import DatasetPlan as DatasetPlan
+from .studies.dataset.making import DatasetSummary as DatasetSummary
+from .studies.dataset.making import make_dataset as make_dataset
+from .studies.dataset.making import plan_dataset as plan_dataset
 from .studies.evaluate.run import EvaluationSummary as EvaluationSummary
 from .studies.evaluate.run import evaluate as evaluate
 from .translation.datasets import DataSet as DataSet

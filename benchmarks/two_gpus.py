@@ -36,9 +36,9 @@ from amiwarp.cpu_threads import cpu_threads
 from amiwarp.io import open_recording
 from amiwarp.kernels.launch import start_quietly
 from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, machine, processor, run_jobs, start_workers, versions
-from amiwarp.studies.dataset import run
+from amiwarp.studies.dataset import making
 from amiwarp.studies.dataset.items import Item, list_items, simulation_of, write_recording
-from amiwarp.studies.dataset.run import make_dataset
+from amiwarp.studies.dataset.making import make_dataset
 from amiwarp.studies.dataset.specification import content_digest, load_specification
 from amiwarp.studies.stability.cells import METHODS, Cell, Store, Stored, run_cell
 from amiwarp.studies.stability.cells import run as run_cells
@@ -167,7 +167,7 @@ def run_dataset(place: Place, scheduler: str, tasks: int) -> Done:
     seconds = time.perf_counter() - began
     if done.failed:
         raise SystemExit(f"recordings failed: {done.failed}")
-    items = json.loads((out / run.MANIFEST).read_text())["items"]
+    items = json.loads((out / making.MANIFEST).read_text())["items"]
     shutil.rmtree(out)
     return Done(seconds, done.events, {item["file"]: item["sha256"] for item in items})
 
@@ -333,7 +333,7 @@ def main() -> int:
     args = parser.parse_args()
     began = time.perf_counter()
     try:
-        run.require_pyarrow()
+        making.require_pyarrow()
     except ValueError:
         leave_out_tables()
     start_quietly()

@@ -52,7 +52,7 @@ from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.simulation.worlds.world_files import load_mesh, load_world
 from amiwarp.studies import stability
 from amiwarp.studies.dataset.items import Made, list_items
-from amiwarp.studies.dataset.run import JOURNAL, Journal
+from amiwarp.studies.dataset.making import JOURNAL, Journal
 from amiwarp.studies.dataset.specification import load_specification
 from amiwarp.studies.evaluate.conditions import Condition, Stream
 from amiwarp.studies.evaluate.measures import THRESHOLDS

@@ -34,14 +34,7 @@ from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker, t
 from amiwarp.studies.dataset import items, specification
 from amiwarp.studies.dataset import specification as sources
 from amiwarp.studies.dataset.items import list_items, simulation_of
-from amiwarp.studies.dataset.run import (
-    JOURNAL,
-    MANIFEST,
-    TABLE,
-    DatasetSummary,
-    duration_text,
-    make_dataset,
-)
+from amiwarp.studies.dataset.making import JOURNAL, MANIFEST, TABLE, DatasetSummary, duration_text, make_dataset
 from amiwarp.studies.dataset.specification import load_specification
 
 HEAD = 'format = "amiwarp-dataset-specification"\nversion = 1\n'

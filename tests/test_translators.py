@@ -31,10 +31,9 @@ from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.sequences import PictureStack, open_pictures
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.translation.datasets import SACCADE_US, SACCADES_PX, DataSet, open_mvsec, saccades
-from amiwarp.translation.inputs import translator_input
 from amiwarp.translation.pictures_between import READ_US, EventPictures, Interpolation, MotionPictures, PicturePair
 from amiwarp.translation.reconstructed_pictures import find_motion
-from amiwarp.translation.translator import translate, translation
+from amiwarp.translation.translator import translate, translation, translator_input
 
 WEDGE = Prism(math.radians(1.0))
 SIZE = (48, 64)

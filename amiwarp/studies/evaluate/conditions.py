@@ -20,7 +20,6 @@ from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.events.truth import EventTruth
-from amiwarp.io import open_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
@@ -247,11 +246,6 @@ class RecordedStreams:
 
     def __init__(self, recording: Recording, device: str = "cpu") -> None:
         self.recording, self.device = recording, device
-
-    @classmethod
-    def of(cls, condition: RecordedCondition, device: str) -> RecordedStreams:
-        """Return the streams of a file."""
-        return cls(open_recording(condition.path), device)
 
     @property
     def size(self) -> tuple[int, int]:

@@ -24,6 +24,7 @@ from amiwarp.studies.evaluate.results import (
     Table,
     by_case,
     compared,
+    finite,
     grouped,
     rows_of,
 )
@@ -135,8 +136,7 @@ def _quality(
     found = []
     for q in quality_curve(tracks, truth, LIMITS_PX):
         values = (float(q.number), 1e3 * q.lifetime_s, q.error_px, q.update_hz)
-        known = (value if math.isfinite(value) else None for value in values)
-        found.append({"limit": q.limit_px, "gap": gap_us / 1e3, **dict(zip(VALUES, known, strict=True))})
+        found.append({"limit": q.limit_px, "gap": gap_us / 1e3, **dict(zip(VALUES, map(finite, values), strict=True))})
     return found
 
 

@@ -21,9 +21,9 @@ from amiwarp.studies.evaluate.measures import (
     canny_edges,
     geometric_edges,
     grey_picture,
+    library,
     match,
     normalised,
-    skimage,
 )
 from amiwarp.studies.evaluate.report import CHANCE
 from amiwarp.studies.evaluate.results import (
@@ -164,7 +164,7 @@ class _Image:
             above = np.asarray(self.image >= threshold, np.bool_)
             count = int(above.sum())
             if count not in known:
-                known[count] = (above, np.asarray(skimage("morphology").skeletonize(above), np.bool_))
+                known[count] = (above, np.asarray(library("skimage.morphology").skeletonize(above), np.bool_))
             out.append(known[count])
         return out
 

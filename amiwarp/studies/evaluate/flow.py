@@ -9,6 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from amiwarp.imaging.iwe import iwe
+from amiwarp.simulation.pictures import DARK
 from amiwarp.studies.evaluate.conditions import FOCAL_PX, Condition, Stream, Streams
 from amiwarp.studies.evaluate.contrast_motion import (
     MOST_LOCAL,
@@ -29,8 +30,8 @@ from amiwarp.studies.evaluate.results import (
     Settings,
     Share,
     Table,
+    finite,
     grouped,
-    mean_of,
     rows_of,
     where_calibrated,
     wide_focal,
@@ -148,8 +149,6 @@ STANDARD_TURNS = 0.25
 """Length of the windows of the comparison with the paper [turns]: a quarter turn, its least."""
 EDGE_CONTRAST = 0.1
 """Least slope of the true log luminance at an edge [1/px]."""
-DARK = 0.02
-"""Luminance that is added before the logarithm, as in the simulated sensor."""
 PAPER_PX = 0.19
 """Increase of the endpoint error by the prism in the paper [px]."""
 
@@ -199,13 +198,9 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
                 for pixels, where in (("events", seen & still), ("edges", edges)):
                     found = flow_error(flow * window * 1e-6, truth.flow * window * 1e-6, where)
                     rows.append({"stream": stream.value, "method": method, "turns": turns, "pixels": pixels,
-                                 "epe": _number(found.epe), "outliers": _number(found.outliers),
+                                 "epe": finite(found.epe), "outliers": finite(found.outliers),
                                  "share": float(where.mean())})  # fmt: skip
     return {"rows": rows}
-
-
-def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def _estimates(
@@ -260,14 +255,12 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
 
 
 def _claim(rows: Sequence[dict[str, Any]], method: str) -> Claim:
-    ours, plain = (
-        mean_of([r for r in rows if r["stream"] == stream], "epe", lambda _: True)
-        for stream in (Stream.CALIBRATED, Stream.PLAIN)
-    )
+    means = {stream: mean for stream, _, mean, _ in grouped(rows, ["stream"], ["epe"])}
+    ours, plain = means.get(Stream.CALIBRATED), means.get(Stream.PLAIN)
     text = f"With the prism, compensated, the endpoint error is only slightly larger ({method})."
     rule = f"the mean of '{Stream.CALIBRATED}' is at most twice {PAPER_PX} px above that of '{Stream.PLAIN}', at edges"
     rule += ", over the recordings that could be calibrated"
-    if ours is None or plain is None:
+    if not isinstance(ours, float) or not isinstance(plain, float):
         return Claim.judge(text, f"+{PAPER_PX} px", NO_RESULT, None, rule)
     shown = f"{ours - plain:+.2f} px ({plain:.2f} to {ours:.2f} px)"
     return Claim.judge(text, f"+{PAPER_PX} px", shown, ours - plain <= 2.0 * PAPER_PX, rule)

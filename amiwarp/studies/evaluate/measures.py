@@ -203,14 +203,6 @@ CREASE_COS = 0.94
 """Cosine of the smallest angle between the normals at a geometric edge, 20 deg."""
 
 
-def skimage(name: str) -> Any:
-    """Return a module of scikit-image. Raises :class:`AmiwarpError` if it is not installed."""
-    try:
-        return importlib.import_module(f"skimage.{name}")
-    except ModuleNotFoundError as error:
-        raise AmiwarpError("'amiwarp evaluate' needs scikit-image; run: pip install 'amiwarp[evaluate]'") from error
-
-
 def grey_picture(intensity: NDArray[np.floating]) -> NDArray[np.float64]:
     """Return grey values 0 .. 1 of a picture of luminance, of which the brightest half percent is white."""
     top = float(np.percentile(intensity, 99.5)) or 1.0
@@ -219,7 +211,7 @@ def grey_picture(intensity: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def canny_edges(intensity: NDArray[np.floating], sigma: float = CANNY_SIGMA) -> NDArray[np.bool_]:
     """Return the Canny edges of a picture of luminance, smoothed by a Gaussian of ``sigma`` [px]."""
-    return np.asarray(skimage("feature").canny(grey_picture(intensity), sigma=sigma), np.bool_)
+    return np.asarray(library("skimage.feature").canny(grey_picture(intensity), sigma=sigma), np.bool_)
 
 
 def geometric_edges(frame: FrameTruth) -> NDArray[np.bool_]:
@@ -227,7 +219,7 @@ def geometric_edges(frame: FrameTruth) -> NDArray[np.bool_]:
     edges = np.zeros(frame.depth.shape, np.bool_)
     for here, there in (((slice(None), slice(-1)), (slice(None), slice(1, None))), ((slice(-1),), (slice(1, None),))):
         edges[here] |= _differ(frame, here, there)
-    return np.asarray(skimage("morphology").skeletonize(edges), np.bool_)
+    return np.asarray(library("skimage.morphology").skeletonize(edges), np.bool_)
 
 
 def _differ(frame: FrameTruth, here: Any, there: Any) -> NDArray[np.bool_]:

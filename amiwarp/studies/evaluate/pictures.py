@@ -18,6 +18,7 @@ from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import Reconstruction
+from amiwarp.simulation.pictures import DARK
 from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
 from amiwarp.studies.evaluate.contrast_motion import estimate_rotation
 from amiwarp.studies.evaluate.measures import BLOCK, displayed, fitted, niqe, similarity
@@ -154,8 +155,6 @@ RATES_HZ, HOLD = (30.0, 100.0, 1000.0), (0.0, 0.5, 1.0)
 """Rates of the pictures in the sensitivity curve [1/s], and times of comparison as shares of the interval."""
 PICTURES = 6
 """Number of pictures over time."""
-DARK = 0.02
-"""Luminance that is added before the logarithm, as in the simulated sensor."""
 
 
 class _Quality(TypedDict):

@@ -73,7 +73,10 @@ class Evaluation(Protocol):
         """Return the tables of all results, each with its chart. Results of failed cells have no values."""
 
     def claims(self, results: Sequence[CellResult]) -> list[Claim]:
-        """Return the paper's claims with the verdicts that follow from the results."""
+        """Return the paper's claims with the verdicts that follow from the results.
+
+        The function ``pictures(results)``, which returns the pictures of the evaluation, is optional.
+        """
 
 
 def load(name: str) -> Evaluation:
@@ -81,12 +84,6 @@ def load(name: str) -> Evaluation:
     if name not in EVALUATIONS:
         raise AmiwarpError(f"unknown evaluation {name!r}; choose among {', '.join(EVALUATIONS)}")
     return cast("Evaluation", importlib.import_module(f"amiwarp.studies.evaluate.{name}"))
-
-
-def pictures(evaluation: Evaluation, results: Sequence[CellResult]) -> list[Picture]:
-    """Return the pictures of an evaluation; its function ``pictures(results)`` is optional."""
-    draw = getattr(evaluation, "pictures", None)
-    return [] if draw is None else draw(results)
 
 
 # Charts of the tables of an evaluation, for print: drawn from the table alone.
@@ -278,9 +275,10 @@ def section(name: str, results: Sequence[CellResult]) -> Section:
     good = [r for r in results if not r.error]
     errors = [f"{r.condition}: {r.error}" for r in results if r.error]
     shown = evaluation.tables(good) if good else []
+    pictures = getattr(evaluation, "pictures", lambda _: [])(good)
     return Section(
         name, evaluation.TITLE, evaluation.PROTOCOL, evaluation.DIFFERENCES, evaluation.claims(good), shown,
-        pictures(evaluation, good), len(results), errors, refused(good), sum(r.processor_s for r in results),
+        pictures, len(results), errors, refused(good), sum(r.processor_s for r in results),
     )  # fmt: skip
 
 

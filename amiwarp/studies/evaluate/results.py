@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import enum
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
@@ -289,10 +289,9 @@ def by_case(rows: Sequence[dict[str, Any]], by: Sequence[str], value: str) -> di
     return cases
 
 
-def mean_of(rows: Sequence[dict[str, Any]], name: str, where: Callable[[dict[str, Any]], bool]) -> float | None:
-    """Return the mean of a column over the rows that fulfil ``where``, or None if there are none."""
-    given = [row[name] for row in rows if where(row) and row[name] is not None and np.isfinite(row[name])]
-    return float(np.mean(given)) if given else None
+def finite(value: float) -> float | None:
+    """Return a number for a cell; None if it is not finite."""
+    return value if np.isfinite(value) else None
 
 
 def encode_picture(picture: NDArray[np.uint8]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 from amiwarp._version import __version__
 from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.errors import AmiwarpError
+from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import check_output, make_folder, own_folder
 from amiwarp.io.json_files import fields_of, value_of
 from amiwarp.io.sealed_json import CellStore
@@ -24,6 +25,7 @@ from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition, Re
 from amiwarp.studies.evaluate.measures import library
 from amiwarp.studies.evaluate.report import EVALUATIONS, REPORT_FILES, SHORT, load, section, write
 from amiwarp.studies.evaluate.results import FULL, QUICK, CellResult, Settings
+from amiwarp.translation.pictures_between import limited_opencv
 from amiwarp.validation import guarded, real, whole
 
 # Cells of the study: one evaluation under one condition. Each is a file, so that a stopped run can be continued.
@@ -59,28 +61,16 @@ class JobResult:
 def run_job(job: Job) -> JobResult:
     """Simulate the condition of a job once, or open its recording, and run its evaluations."""
     began = time.process_time()
-    with limited_cpu_threads(job.threads), _limited_opencv(cpu_threads()):
+    with limited_cpu_threads(job.threads), limited_opencv(library("cv2"), cpu_threads()):
         try:
             if isinstance(job.condition, Condition):
                 streams: RecordedStreams = Streams(job.condition, job.settings.device)
             else:
-                streams = RecordedStreams.of(job.condition, job.settings.device)
+                streams = RecordedStreams(open_recording(job.condition.path), job.settings.device)
             cells = [_run_cell(name, streams, job) for name in job.evaluations]
         except AmiwarpError as error:
             cells = [CellResult(name, job.condition, error=str(error)) for name in job.evaluations]
     return JobResult(cells, time.process_time() - began)
-
-
-@contextlib.contextmanager
-def _limited_opencv(threads: int) -> Iterator[None]:
-    """Let OpenCV use a number of threads within the block; by default it uses all cores."""
-    cv2 = library("cv2")
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(threads)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
 
 
 def compile_kernels(names: Sequence[str], device: str) -> float:

@@ -33,6 +33,7 @@ from amiwarp.studies.evaluate.results import (
     Table,
     by_case,
     compared,
+    finite,
     grouped,
     rows_of,
     wide_focal,
@@ -203,7 +204,7 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
             assert instance is not None
             truth = np.isin(instance, moving)
             for chosen, found in zip(choices, moving_events(events, streams.camera, choices), strict=True):
-                scores = {name: _number(value) for name, value in asdict(overlap(found, truth)).items()}
+                scores = {name: finite(value) for name, value in asdict(overlap(found, truth)).items()}
                 rows.append({"stream": stream.value, "events": len(events), **_values(chosen),
                              "share": float(truth.mean()) if len(truth) else None, **scores})  # fmt: skip
     return {"rows": rows}
@@ -221,10 +222,6 @@ def _curves(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         row | {"setting": NAMES[name], "value of the setting": row[name]}
         for name in VARIED for row in rows if all(row[other] == usual[other] for other in VARIED if other != name)
     ]  # fmt: skip
-
-
-def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:

@@ -329,7 +329,8 @@ def run(
     """
     cells = [Cell(c, seed) for seed in range(first, first + seeds) for c in conditions(axes)]
     known = {cell: store.load(cell) for cell in cells}
-    todo = [(cell, missing) for cell in cells if (missing := _missing(known[cell], methods))]
+    missing = {cell: tuple(m for m in methods if identity(m) not in known[cell].results) for cell in cells}
+    todo = [(cell, lacking) for cell, lacking in missing.items() if lacking]
     done = len(cells) - len(todo)
     with contextlib.closing(run_jobs(workers, partial(_run_missing, device), todo)) as running:
         for (cell, _), future in running:
@@ -347,11 +348,6 @@ def run(
 def _run_missing(device: str, job: tuple[Cell, tuple[Method, ...]]) -> Stored:
     """Run the methods that a cell lacks."""
     return run_cell(*job, device)
-
-
-def _missing(stored: Stored, methods: Sequence[Method]) -> tuple[Method, ...]:
-    """Return the methods for which a cell has no result."""
-    return tuple(m for m in methods if identity(m) not in stored.results)
 
 
 def chosen(names: Sequence[str] = ()) -> tuple[Method, ...]:
