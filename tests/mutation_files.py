@@ -51,14 +51,12 @@ from amiwarp.simulation.sequences import _read_times, open_pictures
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.simulation.worlds.world_files import load_mesh, load_world
 from amiwarp.studies import stability
-from amiwarp.studies.dataset.items import Made, list_items
-from amiwarp.studies.dataset.making import JOURNAL, Journal
+from amiwarp.studies.dataset.making import JOURNAL, Journal, Made, list_items
 from amiwarp.studies.dataset.specification import load_specification
-from amiwarp.studies.evaluate.conditions import Condition, Stream
 from amiwarp.studies.evaluate.measures import THRESHOLDS
 from amiwarp.studies.evaluate.report import CHANCE, section
-from amiwarp.studies.evaluate.results import QUICK, CellResult, encode_picture
 from amiwarp.studies.evaluate.run import Store
+from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, encode_picture
 
 MEMORY_KIB = 3 << 19
 """Largest memory that a check may take, 1.5 GiB [KiB]."""

@@ -14,38 +14,17 @@ from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.io.formats import detect_format, open_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.progress import Progress
+from amiwarp.simulation import sequences
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.scenery import Scene, Still
 from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.sequences import (
-    PICTURE_SUFFIXES,
-    PictureFolder,
-    Pictures,
-    PictureStack,
-    VideoFile,
-    open_pictures,
-)
+from amiwarp.simulation.sequences import Pictures
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.translation.datasets import (
-    SACCADE_US,
-    SACCADES_PX,
-    DataSet,
-    MvsecPictures,
-    open_mvsec,
-    saccade_rates,
-    saccades,
-)
+from amiwarp.translation import datasets, reconstructed_pictures
+from amiwarp.translation.datasets import DataSet, MvsecPictures
 from amiwarp.translation.pictures_between import EventPictures, Interpolation, MotionPictures
-from amiwarp.translation.reconstructed_pictures import (
-    ReconstructedPictures,
-    RectifiedPictures,
-    Window,
-    centred,
-    find_motion,
-    is_centred,
-    motion_of,
-)
+from amiwarp.translation.reconstructed_pictures import Window
 from amiwarp.validation import check_names, choice, guarded
 
 if TYPE_CHECKING:
@@ -89,7 +68,7 @@ def translator_input(
     pictures: Pictures | MvsecPictures
     if dataset is DataSet.MVSEC:
         path = _path(source, "mvsec")
-        pictures, events = open_mvsec(path), path if events is None else events
+        pictures, events = datasets.open_mvsec(path), path if events is None else events
         return _with_events(pictures, _recording(events), interpolation)
     if isinstance(source, Recording) or (isinstance(source, str | Path) and _is_recording(Path(source))):
         if events is not None:
@@ -98,7 +77,9 @@ def translator_input(
     if dataset is DataSet.N_CALTECH101:
         return _from_picture(_path(source, "n-caltech101"))
     pictures = (
-        source if isinstance(source, PictureFolder | PictureStack | VideoFile) else open_pictures(source, fps=fps)
+        source
+        if isinstance(source, sequences.PictureFolder | sequences.PictureStack | sequences.VideoFile)
+        else sequences.open_pictures(source, fps=fps)
     )
     if events is not None:
         return _with_events(pictures, _recording(events), interpolation)
@@ -109,7 +90,7 @@ def translator_input(
 
 def _is_recording(path: Path) -> bool:
     """Whether a file is a recording of events, by its content."""
-    if path.is_dir() or path.suffix.lower() in (".npy", *PICTURE_SUFFIXES) or not path.exists():
+    if path.is_dir() or path.suffix.lower() in (".npy", *sequences.PICTURE_SUFFIXES) or not path.exists():
         return False
     try:
         detect_format(path)
@@ -143,8 +124,10 @@ def _with_events(
         "source_contrast_on": fast.contrasts[0], "source_contrast_off": fast.contrasts[1],
     }  # fmt: skip
     camera = recording.camera or Camera.from_fov(*pictures.size, DEFAULT_FOV)
-    frames = fast if is_centred(camera) else RectifiedPictures(fast, camera)
-    return TranslatorInput(frames, fast.duration_us, centred(camera), about=about)
+    frames = (
+        fast if reconstructed_pictures.is_centred(camera) else reconstructed_pictures.RectifiedPictures(fast, camera)
+    )
+    return TranslatorInput(frames, fast.duration_us, reconstructed_pictures.centred(camera), about=about)
 
 
 def _from_events(
@@ -157,34 +140,34 @@ def _from_events(
         raise AmiwarpError(f"{recording.name} was recorded through a prism; give a recording of a plain event camera")
     camera = recording.camera or Camera.from_fov(*recording.events.size, DEFAULT_FOV)
     if dataset is DataSet.N_CALTECH101:
-        windows, motion = _saccade_windows(recording.events.t_first, camera), saccades(camera)
+        windows, motion = _saccade_windows(recording.events.t_first, camera), datasets.saccades(camera)
     else:
-        windows = find_motion(recording, camera, device=device, progress=progress)
-        motion = motion_of(windows)
-    frames = ReconstructedPictures(recording, camera, windows, motion, device=device)
+        windows = reconstructed_pictures.find_motion(recording, camera, device=device, progress=progress)
+        motion = reconstructed_pictures.motion_of(windows)
+    frames = reconstructed_pictures.ReconstructedPictures(recording, camera, windows, motion, device=device)
     about: dict[str, MetadataValue] = {"translated_from": "events", "windows": len(windows)}
-    return TranslatorInput(frames, frames.duration_us, centred(camera), about=about)
+    return TranslatorInput(frames, frames.duration_us, reconstructed_pictures.centred(camera), about=about)
 
 
 def _saccade_windows(start_us: int, camera: Camera) -> list[Window]:
     """Return one window for each saccade."""
-    rates = saccade_rates(camera)
-    return [Window(start_us + k * SACCADE_US, SACCADE_US, each) for k, each in enumerate(rates)]
+    rates = datasets.saccade_rates(camera)
+    return [Window(start_us + k * datasets.SACCADE_US, datasets.SACCADE_US, each) for k, each in enumerate(rates)]
 
 
 def _from_picture(path: Path) -> TranslatorInput:
     """Return a still picture in front of which the camera makes the saccades of N-Caltech101."""
     light = read_picture(path)
     camera = Camera.from_fov(light.shape[1], light.shape[0], DEFAULT_FOV)
-    duration = float(len(SACCADES_PX) * SACCADE_US)
+    duration = float(len(datasets.SACCADES_PX) * datasets.SACCADE_US)
     about: dict[str, MetadataValue] = {"translated_from": "picture", "dataset": DataSet.N_CALTECH101.value}
-    return TranslatorInput(Still(light), duration, camera, saccades(camera), about)
+    return TranslatorInput(Still(light), duration, camera, datasets.saccades(camera), about)
 
 
 def with_camera(given: TranslatorInput, camera: Camera) -> TranslatorInput:
     """Return the input for another camera; the image of a still picture moves by the same number of pixels."""
     moves = isinstance(given.frames, Still)
-    return replace(given, camera=camera, camera_motion=saccades(camera) if moves else given.camera_motion)
+    return replace(given, camera=camera, camera_motion=datasets.saccades(camera) if moves else given.camera_motion)
 
 
 @guarded

@@ -12,22 +12,9 @@ import numpy as np
 from amiwarp.choices import CornerMethod
 from amiwarp.imaging.corners import detect_corners
 from amiwarp.simulation.worlds.world import WorldScene
-from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
+from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.measures import GAP_US, LIMITS_PX, link_corners, quality_curve, true_paths
-from amiwarp.studies.evaluate.results import (
-    Amount,
-    CellResult,
-    Chart,
-    ChartKind,
-    Claim,
-    Settings,
-    Table,
-    by_case,
-    compared,
-    finite,
-    grouped,
-    rows_of,
-)
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,12 +53,12 @@ VALUES = ("number", "lifetime_ms", "error_px", "update_hz")
 class _Row(TypedDict):
     detector: CornerMethod
     stream: Stream
-    limit: Amount
-    gap: Amount
-    number: Amount | None
-    lifetime_ms: Amount | None
-    error_px: Amount | None
-    update_hz: Amount | None
+    limit: study.Amount
+    gap: study.Amount
+    number: study.Amount | None
+    lifetime_ms: study.Amount | None
+    error_px: study.Amount | None
+    update_hz: study.Amount | None
 
 
 class Values(TypedDict):
@@ -136,13 +123,15 @@ def _quality(
     found = []
     for q in quality_curve(tracks, truth, LIMITS_PX):
         values = (float(q.number), 1e3 * q.lifetime_s, q.error_px, q.update_hz)
-        found.append({"limit": q.limit_px, "gap": gap_us / 1e3, **dict(zip(VALUES, map(finite, values), strict=True))})
+        found.append(
+            {"limit": q.limit_px, "gap": gap_us / 1e3, **dict(zip(VALUES, map(study.finite, values), strict=True))}
+        )
     return found
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the quality at the limit of the comparison, and the curves of lifetime and error over the limit."""
-    rows = rows_of(results, "rows")
+    rows = study.rows_of(results, "rows")
     by = ("scene", "camera", "detector", "stream")
     names = ("seeds", "tracks", "std of tracks", "lifetime [ms]", "std", "error [px]", "std of error",
              "updates [1/s]", "std of updates")  # fmt: skip
@@ -151,20 +140,21 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
     def over_limit(name: str, value: str, shown: str) -> Table:
         return Table(name, f"{shown.partition(' ')[0].capitalize()} over the limit",
-                     (*by, "limit [px]", "seeds", shown, "std"), grouped(rows, (*by, "limit"), [value]),
+                     (*by, "limit [px]", "seeds", shown, "std"), study.grouped(rows, (*by, "limit"), [value]),
                      "A lenient limit hides errors; a strict one ends tracks early.",
                      Chart("limit [px]", shown, "stream", "std", panels=panels))  # fmt: skip
 
     return [
         Table("corners", f"Tracks of corners that end {LIMIT_PX:g} px from the truth", (*by, *names),
-              grouped(standard, by, VALUES), "Longer lifetimes and smaller errors are better. "
+              study.grouped(standard, by, VALUES), "Longer lifetimes and smaller errors are better. "
               "A plain camera at rest has no tracks.",
-              Chart("camera", "lifetime [ms]", "stream", "std", panels=("scene", "detector"), kind=ChartKind.BARS)),
+              Chart("camera", "lifetime [ms]", "stream", "std", panels=("scene", "detector"),
+                    kind=study.ChartKind.BARS)),
         over_limit("corners_lifetime", "lifetime_ms", "lifetime [ms]"),
         over_limit("corners_error", "error_px", "error [px]"),
         Table("corners_gap", "Lifetime over the largest time between two corner events of a track",
               (*by, "gap [ms]", "seeds", "lifetime [ms]", "std"),
-              grouped(rows_of(results, "gaps"), (*by, "gap"), ["lifetime_ms"]),
+              study.grouped(study.rows_of(results, "gaps"), (*by, "gap"), ["lifetime_ms"]),
               "A quarter turn at 720 rpm takes 21 ms.",
               Chart("gap [ms]", "lifetime [ms]", "stream", "std", panels=panels)),
     ]  # fmt: skip
@@ -172,7 +162,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the lifetime of tracks at the limit of the comparison, and for every limit."""
-    moving = [r for r in rows_of(results, "rows") if r["camera"] != "still"]
+    moving = [r for r in study.rows_of(results, "rows") if r["camera"] != "still"]
     standard = [r for r in moving if r["limit"] == LIMIT_PX]
     text = "Corners of the AMI-EV live substantially longer than those of the S-EV (moving camera)."
     return [
@@ -183,7 +173,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
 
 def _longer(rows: Sequence[dict[str, Any]], text: str, paper: str) -> Claim:
     """Judge whether the tracks of the calibrated AMI-EV live longer than those of the S-EV in each case."""
-    cases = by_case(rows, ("scene", "camera", "detector", "limit"), "lifetime_ms")
-    holds, ours = compared(cases, Stream.PLAIN, "longer", larger=True)
+    cases = study.by_case(rows, ("scene", "camera", "detector", "limit"), "lifetime_ms")
+    holds, ours = study.compared(cases, Stream.PLAIN, "longer", larger=True)
     rule = f"the mean lifetime of '{Stream.CALIBRATED}' exceeds that of '{Stream.PLAIN}' by more than either spread"
     return Claim.judge(text, paper, ours, holds, rule)

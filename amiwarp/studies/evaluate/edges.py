@@ -11,7 +11,7 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.imaging.iwe import iwe
-from amiwarp.studies.evaluate.conditions import ENOUGH, Condition, Stream, Streams
+from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.measures import (
     CANNY_SIGMA,
     THRESHOLDS,
@@ -26,27 +26,7 @@ from amiwarp.studies.evaluate.measures import (
     normalised,
 )
 from amiwarp.studies.evaluate.report import CHANCE
-from amiwarp.studies.evaluate.results import (
-    NO_RESULT,
-    Amount,
-    CellResult,
-    Chart,
-    ChartKind,
-    Claim,
-    Count,
-    Picture,
-    Score,
-    Settings,
-    Share,
-    Table,
-    check_pictures,
-    compared,
-    decode_picture,
-    encode_picture,
-    grouped,
-    rows_of,
-    where_calibrated,
-)
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -93,22 +73,22 @@ SLOWEST = 5.0
 
 class _Summary(TypedDict):
     stream: Literal["chance", *Stream]  # type: ignore[valid-type]
-    found: list[Count]
-    entropy: list[Share]
+    found: list[study.Count]
+    entropy: list[study.Share]
 
 
 class _Row(TypedDict):
     stream: Literal["chance", *Stream]  # type: ignore[valid-type]
     truth: Literal["Canny", "geometry", "Canny, σ 1 px", "Canny, σ 3 px"]
-    tolerance: Amount
-    matched: list[Count]
-    true: Count
+    tolerance: study.Amount
+    matched: list[study.Count]
+    true: study.Count
 
 
 class _Sector(TypedDict):
     stream: Stream
-    angle: Amount
-    recall: Share
+    angle: study.Amount
+    recall: study.Share
 
 
 class _Values(TypedDict):
@@ -120,7 +100,7 @@ class _Values(TypedDict):
 
 def _checked(values: _Values, what: str) -> _Values:
     """Return the values if each row has its images, its chance and a number for each threshold."""
-    check_pictures(list(values["pictures"].values()), 2, f"{what}.pictures")
+    study.check_pictures(list(values["pictures"].values()), 2, f"{what}.pictures")
     lists = [row[name] for name in ("found", "entropy") for row in values["images"]]
     if any(len(numbers) != len(THRESHOLDS) for numbers in (*lists, *(row["matched"] for row in values["rows"]))):
         raise AmiwarpError(f"{what} has lists of other lengths than the {len(THRESHOLDS)} thresholds")
@@ -198,7 +178,7 @@ def _enough(streams: Streams, stream: Stream, settings: Settings) -> bool:
     if stream is not Stream.SAME_COUNT:
         return True
     spans = [(t - WINDOW_US // 2, t + WINDOW_US // 2) for t in _middles(streams, settings)]
-    return all(len(streams.window(stream, *s)) >= ENOUGH * streams.count(Stream.RAW, *s) for s in spans)
+    return all(len(streams.window(stream, *s)) >= study.ENOUGH * streams.count(Stream.RAW, *s) for s in spans)
 
 
 def _middles(streams: Streams, settings: Settings) -> list[int]:
@@ -295,14 +275,14 @@ def _angle(frame: FrameTruth) -> NDArray[np.float64]:
 
 def _shown(image: NDArray[Any]) -> str:
     """Return an image as text; black on white for events and edges."""
-    return encode_picture(np.asarray(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0, np.uint8))
+    return study.encode_picture(np.asarray(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0, np.uint8))
 
 
 def scores(results: Sequence[CellResult]) -> list[dict[str, Any]]:
     """Return the ODS-F of each world, motion, stream, kind of truth and tolerance, with its precision and recall."""
-    images = {(_recording(r), r["stream"]): r for r in rows_of(results, "images")}
+    images = {(_recording(r), r["stream"]): r for r in study.rows_of(results, "images")}
     sets: dict[tuple[Any, ...], list[tuple[Counts, list[float]]]] = {}
-    for row in rows_of(results, "rows"):
+    for row in study.rows_of(results, "rows"):
         seen = images[_recording(row), row["stream"]]
         key = tuple(row[c] for c in ("scene", "camera", "stream", "truth", "tolerance"))
         sets.setdefault(key, []).append((_counts(row, seen), seen["entropy"]))
@@ -339,7 +319,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     widths = {name: sigma for sigma, name in SIGMAS.items()}
     smoothed = [r | {"sigma": widths[r["truth"]]} for r in found
                 if r["truth"] in widths and r["tolerance"] == STRICT and r["stream"] != CHANCE]  # fmt: skip
-    sectors = grouped(rows_of(results, "sectors"), ("scene", "camera", "angle", "stream"), ["recall"])
+    sectors = study.grouped(study.rows_of(results, "sectors"), ("scene", "camera", "angle", "stream"), ["recall"])
     return [
         Table("edges", "F-score, entropy, precision and recall at two tolerances", names,
               [tuple(r[k] for k in keys) for r in usual if r["tolerance"] in (USUAL, STRICT)],
@@ -358,11 +338,11 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
               sectors, "At 90° an edge lies along the motion, and a plain event camera loses it. The threshold is the "
               "best of the recording. A still camera has no motion.",
               Chart("angle between motion and edge normal [deg]", "recall", "stream", "std",
-                    panels=("scene", "camera"), kind=ChartKind.LINES)),
+                    panels=("scene", "camera"), kind=study.ChartKind.LINES)),
     ]  # fmt: skip
 
 
-def pictures(results: Sequence[CellResult]) -> list[Picture]:
+def pictures(results: Sequence[CellResult]) -> list[study.Picture]:
     """Return the first event images of each motion, side by side."""
     out = []
     for camera in dict.fromkeys(r.condition.trajectory for r in results if isinstance(r.condition, Condition)):
@@ -372,7 +352,9 @@ def pictures(results: Sequence[CellResult]) -> list[Picture]:
             names = [n for n in ("grey picture", CANNY, GEOMETRY, Stream.PLAIN, Stream.CALIBRATED, Stream.RAW)
                      if n in given]  # fmt: skip
             caption = f"Camera {camera}. From left to right: {', '.join(names)}."
-            out.append(Picture(f"edges_{camera}", caption, [_mosaic([decode_picture(given[n]) for n in names])]))
+            out.append(
+                study.Picture(f"edges_{camera}", caption, [_mosaic([study.decode_picture(given[n]) for n in names])])
+            )
     return out
 
 
@@ -407,17 +389,17 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
                  "not in the paper"),
         _ranking(of(still, *TOLERANCES), Stream.PLAIN, "At rest the AMI-EV sees edges and the S-EV does not.",
                  "curves"),
-        _fading(where_calibrated(rows_of(results, "sectors"))),
+        _fading(study.where_calibrated(study.rows_of(results, "sectors"))),
     ]  # fmt: skip
 
 
 def _ranking(rows: Sequence[dict[str, Any]], other: Stream, text: str, paper: str) -> Claim:
     """Judge whether the calibrated AMI-EV has the larger margin over chance in each case."""
-    by: dict[tuple[Any, ...], dict[str, Score]] = {}
+    by: dict[tuple[Any, ...], dict[str, study.Score]] = {}
     for r in rows:
-        score = Score(max(r["margin"], 0.0), r["std"], r["seeds"])
+        score = study.Score(max(r["margin"], 0.0), r["std"], r["seeds"])
         by.setdefault((r["scene"], r["camera"], r["tolerance"]), {})[r["stream"]] = score
-    holds, ours = compared(by, other, "larger margin", larger=True)
+    holds, ours = study.compared(by, other, "larger margin", larger=True)
     rule = (
         f"the margin of the ODS-F over chance, at least 0, of '{Stream.CALIBRATED}' is above that of '{other}' by more "
         "than either spread in every case"
@@ -436,7 +418,7 @@ def _fading(rows: Sequence[dict[str, Any]]) -> Claim:
         )
         if along and across:
             ratio[stream] = float(np.mean(along) / max(np.mean(across), 1e-9))
-    ours = ", ".join(f"{s} {r:.2f}" for s, r in ratio.items()) or NO_RESULT
+    ours = ", ".join(f"{s} {r:.2f}" for s, r in ratio.items()) or study.NO_RESULT
     holds = ratio[Stream.PLAIN] < ratio[Stream.CALIBRATED] if len(ratio) == 2 else None
     rule = "recall at more than 60° over recall below 30° is lower for the S-EV than for the calibrated AMI-EV"
     text = "Edges along the motion fade from the S-EV, and not from the AMI-EV."

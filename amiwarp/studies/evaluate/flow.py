@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from amiwarp.imaging.iwe import iwe
 from amiwarp.simulation.pictures import DARK
-from amiwarp.studies.evaluate.conditions import FOCAL_PX, Condition, Stream, Streams
+from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.contrast_motion import (
     MOST_LOCAL,
     dithered,
@@ -21,21 +21,7 @@ from amiwarp.studies.evaluate.contrast_motion import (
     velocity_grid,
 )
 from amiwarp.studies.evaluate.measures import flow_error, library
-from amiwarp.studies.evaluate.results import (
-    NO_RESULT,
-    Amount,
-    CellResult,
-    Chart,
-    Claim,
-    Settings,
-    Share,
-    Table,
-    finite,
-    grouped,
-    rows_of,
-    where_calibrated,
-    wide_focal,
-)
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -156,11 +142,11 @@ PAPER_PX = 0.19
 class _Row(TypedDict):
     stream: Stream
     method: Literal["DIS", "contrast maximisation"]
-    turns: Amount
+    turns: study.Amount
     pixels: Literal["events", "edges"]
-    epe: Amount | None
-    outliers: Share | None
-    share: Share
+    epe: study.Amount | None
+    outliers: study.Share | None
+    share: study.Share
 
 
 class Values(TypedDict):
@@ -174,7 +160,11 @@ def conditions(settings: Settings) -> list[Condition]:
     room = settings.conditions(world="room", trajectory="handheld")
     if settings.quick:
         return room
-    more = [("room", "fast", FOCAL_PX), ("desk", "handheld", FOCAL_PX), ("ball", "handheld", wide_focal(settings))]
+    more = [
+        ("room", "fast", study.FOCAL_PX),
+        ("desk", "handheld", study.FOCAL_PX),
+        ("ball", "handheld", study.wide_focal(settings)),
+    ]
     return room + [c for world, motion, focal in more
                    for c in settings.conditions(world=world, trajectory=motion, focal_px=focal)]  # fmt: skip
 
@@ -198,7 +188,7 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
                 for pixels, where in (("events", seen & still), ("edges", edges)):
                     found = flow_error(flow * window * 1e-6, truth.flow * window * 1e-6, where)
                     rows.append({"stream": stream.value, "method": method, "turns": turns, "pixels": pixels,
-                                 "epe": finite(found.epe), "outliers": finite(found.outliers),
+                                 "epe": study.finite(found.epe), "outliers": study.finite(found.outliers),
                                  "share": float(where.mean())})  # fmt: skip
     return {"rows": rows}
 
@@ -231,17 +221,17 @@ def edge_pixels(truth: FrameTruth) -> NDArray[np.bool_]:
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the errors of the paper's protocol, and those over the length of the window."""
-    rows = rows_of(results, "rows")
+    rows = study.rows_of(results, "rows")
     names, values = ("scene", "camera", "pixels", "method", "stream"), ["epe", "outliers", "share"]
     columns = ("seeds", "EPE [px]", "std", "outliers", "std of outliers", "share of pixels", "std of share")
     standard = [r for r in rows if r["turns"] == STANDARD_TURNS]
     by_length = [r for r in rows if r["pixels"] == "edges"]
     return [
         Table("flow", "Endpoint error on still objects, windows of a quarter turn", (*names, *columns),
-              grouped(standard, names, values), "Outliers: share of pixels with an error above 3 px."),
+              study.grouped(standard, names, values), "Outliers: share of pixels with an error above 3 px."),
         Table("flow_window", "Endpoint error at edges over the length of the window",
               ("scene", "camera", "method", "stream", "window [turns]", *columns[:3]),
-              grouped(by_length, ("scene", "camera", "method", "stream", "turns"), ["epe"]),
+              study.grouped(by_length, ("scene", "camera", "method", "stream", "turns"), ["epe"]),
               "Errors in pixels grow with the length, as the motion does.",
               Chart("window [turns]", "EPE [px]", "stream", "std", panels=("scene", "camera", "method"), log_x=True)),
     ]  # fmt: skip
@@ -249,18 +239,18 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdict on the small increase of the error by the prism, for each method."""
-    rows = where_calibrated(rows_of(results, "rows"))
+    rows = study.where_calibrated(study.rows_of(results, "rows"))
     rows = [r for r in rows if r["turns"] == STANDARD_TURNS and r["pixels"] == "edges"]
     return [_claim([r for r in rows if r["method"] == method], method) for method in ("DIS", "contrast maximisation")]
 
 
 def _claim(rows: Sequence[dict[str, Any]], method: str) -> Claim:
-    means = {stream: mean for stream, _, mean, _ in grouped(rows, ["stream"], ["epe"])}
+    means = {stream: mean for stream, _, mean, _ in study.grouped(rows, ["stream"], ["epe"])}
     ours, plain = means.get(Stream.CALIBRATED), means.get(Stream.PLAIN)
     text = f"With the prism, compensated, the endpoint error is only slightly larger ({method})."
     rule = f"the mean of '{Stream.CALIBRATED}' is at most twice {PAPER_PX} px above that of '{Stream.PLAIN}', at edges"
     rule += ", over the recordings that could be calibrated"
     if not isinstance(ours, float) or not isinstance(plain, float):
-        return Claim.judge(text, f"+{PAPER_PX} px", NO_RESULT, None, rule)
+        return Claim.judge(text, f"+{PAPER_PX} px", study.NO_RESULT, None, rule)
     shown = f"{ours - plain:+.2f} px ({plain:.2f} to {ours:.2f} px)"
     return Claim.judge(text, f"+{PAPER_PX} px", shown, ours - plain <= 2.0 * PAPER_PX, rule)

@@ -11,22 +11,10 @@ from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.simulation.worlds.world import WorldScene
-from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
+from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.measures import box_overlap, detected_joints, displayed
 from amiwarp.studies.evaluate.pictures import PictureMaker, Window, reconstructed_streams
-from amiwarp.studies.evaluate.results import (
-    Amount,
-    CellResult,
-    Chart,
-    Claim,
-    Settings,
-    Share,
-    Table,
-    Verdict,
-    grouped,
-    rows_of,
-    wide_focal,
-)
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 # Detector of a figure's joints that only checks the plumbing of the pose evaluation. It is no pose estimator.
 
@@ -99,10 +87,12 @@ TORSO = ("left shoulder", "right hip")
 class _Row(TypedDict):
     stream: Literal["truth", *Stream]  # type: ignore[valid-type]
     detector: Literal["blob", "true joints"]
-    rate: Amount
-    pdj: Share | None
-    iou: Share | None
-    pdj_over_fraction: tuple[Share | None, Share | None, Share | None, Share | None, Share | None]
+    rate: study.Amount
+    pdj: study.Share | None
+    iou: study.Share | None
+    pdj_over_fraction: tuple[
+        study.Share | None, study.Share | None, study.Share | None, study.Share | None, study.Share | None
+    ]
 
 
 class Values(TypedDict):
@@ -113,7 +103,7 @@ class Values(TypedDict):
 
 def conditions(settings: Settings) -> list[Condition]:
     """Return the walking figure before a moving camera. The lens sees the whole figure."""
-    return settings.conditions(world="person", trajectory="handheld", focal_px=wide_focal(settings))
+    return settings.conditions(world="person", trajectory="handheld", focal_px=study.wide_focal(settings))
 
 
 def measure(streams: Streams, settings: Settings, detectors: Mapping[str, Detector] | None = None) -> dict[str, Any]:
@@ -193,7 +183,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return PDJ and IoU over the rate of the pictures, and the PDJ over its threshold."""
     names = ("scene", "camera", "detector", "stream")
     caption = "'blob' checks the plumbing only. 'true joints' show the effect of window and rate alone."
-    rows = rows_of(results, "rows")
+    rows = study.rows_of(results, "rows")
     spread = [{**r, "fraction": f, "pdj": pdj} for r in rows if r["rate"] == FRACTION_HZ
               for f, pdj in zip(FRACTIONS, r["pdj_over_fraction"], strict=True)]  # fmt: skip
 
@@ -203,14 +193,14 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     return [
         Table("pose", "Detected joints over the rate of the pictures",
               (*names, "rate [1/s]", "comparisons", "PDJ", "std of PDJ", "IoU", "std of IoU"),
-              grouped(rows, (*names, "rate"), ["pdj", "iou"]), caption, chart("rate [1/s]")),
+              study.grouped(rows, (*names, "rate"), ["pdj", "iou"]), caption, chart("rate [1/s]")),
         Table("pose_threshold", f"Detected joints over the threshold, {FRACTION_HZ:g} pictures/s",
               (*names, "threshold [torso diameters]", "comparisons", "PDJ", "std of PDJ"),
-              grouped(spread, (*names, "fraction"), ["pdj"]), caption, chart("threshold [torso diameters]")),
+              study.grouped(spread, (*names, "fraction"), ["pdj"]), caption, chart("threshold [torso diameters]")),
     ]  # fmt: skip
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return that the paper's claim cannot be tested without a pose network."""
     return [Claim("Pose is better with the AMI-EV, above all at high picture rates.", "curves of PDJ and IoU", "–",
-                  Verdict.NOT_TESTABLE, "needs a pose network, and no weights are part of amiwarp")]  # fmt: skip
+                  study.Verdict.NOT_TESTABLE, "needs a pose network, and no weights are part of amiwarp")]  # fmt: skip

@@ -20,14 +20,15 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import BLACK, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, VERMILION
 from amiwarp.io.atomic_output import NewFile, make_folder, write_text
 from amiwarp.studies.cluster import machine, versions
-from amiwarp.studies.evaluate.conditions import Condition, Stream
-from amiwarp.studies.evaluate.results import (
+from amiwarp.studies.evaluate.study import (
     CellResult,
     Chart,
     ChartKind,
     Claim,
+    Condition,
     Picture,
     Settings,
+    Stream,
     Table,
     Value,
     rows_of,
@@ -275,7 +276,7 @@ def section(name: str, results: Sequence[CellResult]) -> Section:
     good = [r for r in results if not r.error]
     errors = [f"{r.condition}: {r.error}" for r in results if r.error]
     shown = evaluation.tables(good) if good else []
-    pictures = getattr(evaluation, "pictures", lambda _: [])(good)
+    pictures: list[Picture] = getattr(evaluation, "pictures", lambda _: [])(good)
     return Section(
         name, evaluation.TITLE, evaluation.PROTOCOL, evaluation.DIFFERENCES, evaluation.claims(good), shown,
         pictures, len(results), errors, refused(good), sum(r.processor_s for r in results),

@@ -21,10 +21,18 @@ from amiwarp.kernels.launch import load_all, load_kernels
 from amiwarp.progress import Progress, silent
 from amiwarp.studies.cluster import Workers, result_of, run_jobs, start_workers, worker_count
 from amiwarp.studies.demo import EXACT_KERNELS
-from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition, RecordedStreams, Streams
 from amiwarp.studies.evaluate.measures import library
 from amiwarp.studies.evaluate.report import EVALUATIONS, REPORT_FILES, SHORT, load, section, write
-from amiwarp.studies.evaluate.results import FULL, QUICK, CellResult, Settings
+from amiwarp.studies.evaluate.study import (
+    FULL,
+    QUICK,
+    CellResult,
+    Condition,
+    RecordedCondition,
+    RecordedStreams,
+    Settings,
+    Streams,
+)
 from amiwarp.translation.pictures_between import limited_opencv
 from amiwarp.validation import guarded, real, whole
 
