@@ -1,4 +1,7 @@
-"""Making of a data set on local processes or a cluster. What is there already is kept."""
+"""Data sets: their recordings, the making on local processes or a cluster, the manifest, and an estimate of the cost.
+
+What is there already is kept.
+"""
 
 from __future__ import annotations
 

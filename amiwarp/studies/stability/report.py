@@ -1,4 +1,4 @@
-"""Evaluation of the stability study: rates along each axis, aims, and a summary."""
+"""Report of the stability study: rates along each axis, aims, a summary, tables and figures."""
 
 from __future__ import annotations
 
