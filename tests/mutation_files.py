@@ -53,7 +53,7 @@ from amiwarp.simulation.worlds.world_files import load_mesh, load_world
 from amiwarp.studies import stability
 from amiwarp.studies.dataset.making import JOURNAL, Journal, Made, list_items
 from amiwarp.studies.dataset.specification import load_specification
-from amiwarp.studies.evaluate.measures import THRESHOLDS
+from amiwarp.studies.evaluate.edges import THRESHOLDS
 from amiwarp.studies.evaluate.report import CHANCE, section
 from amiwarp.studies.evaluate.run import Store
 from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, encode_picture

@@ -25,15 +25,7 @@ from amiwarp.io.sealed_json import sealed
 from amiwarp.progress import silent
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.evaluate import apex_speed, corners, fading, texture
-from amiwarp.studies.evaluate.measures import (
-    Counts,
-    best_f,
-    binary_entropy,
-    density_variance,
-    event_counts,
-    geometric_edges,
-    match,
-)
+from amiwarp.studies.evaluate.edges import Counts, best_f, binary_entropy, geometric_edges, match
 from amiwarp.studies.evaluate.report import EVALUATIONS, load, refused, section, write
 from amiwarp.studies.evaluate.run import Job, Store, _run, plan, run_job
 from amiwarp.studies.evaluate.study import (
@@ -56,6 +48,7 @@ from amiwarp.studies.evaluate.study import (
     robust_spread,
     where_calibrated,
 )
+from amiwarp.studies.evaluate.texture import density_variance, event_counts
 
 SMALL = replace(QUICK, width=64, height=48, duration_s=0.1, seeds=1)
 

@@ -22,8 +22,7 @@ from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
 from amiwarp.simulation.worlds.world import Body, Material, Mesh, World, WorldScene
 from amiwarp.studies.evaluate import contrast_motion, flow, pictures, pose, segmentation
 from amiwarp.studies.evaluate.contrast_motion import estimate_rotation, rotated_back
-from amiwarp.studies.evaluate.flow import flow_by_contrast, flow_by_dis, rotation_flow
-from amiwarp.studies.evaluate.measures import flow_error
+from amiwarp.studies.evaluate.flow import flow_by_contrast, flow_by_dis, flow_error, rotation_flow
 from amiwarp.studies.evaluate.pose import PROPORTIONS
 from amiwarp.studies.evaluate.segmentation import SegmentationSettings, moving_events
 from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, Streams, Table, Verdict

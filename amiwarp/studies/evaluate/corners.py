@@ -4,20 +4,287 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.choices import CornerMethod
+from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.corners import detect_corners
+from amiwarp.kernels import corners, launch
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.measures import GAP_US, LIMITS_PX, link_corners, quality_curve, true_paths
+from amiwarp.studies.evaluate.measures import library
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from amiwarp.events.truth import FrameTruth
+    from amiwarp.optics.camera import Camera
+    from amiwarp.simulation.worlds.trajectory import Trajectory
+
+
+# Tracks of corners: made of corner events or of images, and their lifetime, error and update rate against truth.
+
+LIMITS_PX = tuple(float(limit) for limit in range(2, 11))
+"""Distances from the truth at which a track ends, for the curves [px]."""
+RADIUS_PX = 3.0
+"""Largest step of a track of corner events [px]."""
+GAP_US = 25_000
+"""Largest time between two corner events of a track [us]: a little more than a quarter turn at 720 turns/min."""
+WINDOW, LEVELS, CONSISTENT_PX = 21, 3, 1.0
+"""Lucas-Kanade: side of the window [px], levels of the pyramid, largest difference between forward and back [px]."""
+MOST_CORNERS, QUALITY, SPACING_PX = 200, 0.01, 10.0
+"""Corners that tracks in images start from: largest number, least quality relative to the best, least distance [px]."""
+OCCLUDED = 0.95
+"""A point is occluded where the surface in its direction is nearer than this part of its depth."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """Points of tracks, sorted by track, then by time."""
+
+    number: NDArray[np.int64]
+    """Number of the track of each point, from 0 without gaps, shape ``(n,)``."""
+    t: NDArray[np.int64]
+    """Times [us], shape ``(n,)``."""
+    xy: NDArray[np.float64]
+    """Places [px], shape ``(n, 2)``."""
+    index: NDArray[np.int64]
+    """Index of the corner event or of the image of each point, shape ``(n,)``."""
+
+    @property
+    def first(self) -> NDArray[np.int64]:
+        """Position of the first point of each track, shape ``(tracks,)``."""
+        return np.flatnonzero(np.diff(self.number, prepend=-1))
+
+
+def sorted_tracks(number: ArrayLike, t: ArrayLike, xy: ArrayLike, index: ArrayLike) -> Tracks:
+    """Return the points of tracks of at least two points, sorted and numbered anew. Points are given in time order."""
+    numbers = np.asarray(number, np.int64)
+    counts = np.bincount(numbers, minlength=1)
+    order = np.argsort(numbers, kind="stable")
+    order = order[counts[numbers[order]] >= 2]
+    new = np.cumsum(counts >= 2) - 1
+    places = np.asarray(xy, np.float64).reshape(-1, 2)
+    return Tracks(
+        new[numbers[order]], np.asarray(t, np.int64)[order], places[order], np.asarray(index, np.int64)[order]
+    )
+
+
+def link_corners(
+    t: NDArray[np.int64], xy: NDArray[np.floating], *, radius_px: float = RADIUS_PX, gap_us: int = GAP_US
+) -> Tracks:
+    """Join corner events to tracks: each to the track whose last point is nearest, or to a new one.
+
+    ``t``: rising times [us]. ``xy``: places [px], shape (n, 2); NaN for corners without a place, which are left out.
+    A track takes corners up to ``radius_px`` from its last point and ``gap_us`` after it.
+    """
+    kept = np.flatnonzero(np.isfinite(xy).all(axis=1))
+    number = wp.empty(len(kept), dtype=int, device="cpu")
+    chains = _chains(np.asarray(t, np.int64)[kept], np.asarray(xy, np.float64)[kept], radius_px, gap_us)
+    launch.load(corners.link_events, number.device)
+    wp.launch(corners.link_events, 1, [chains], [number], device="cpu")
+    return sorted_tracks(number.numpy(), np.asarray(t)[kept], np.asarray(xy)[kept], kept)
+
+
+def _chains(t: NDArray[np.int64], xy: NDArray[np.float64], radius_px: float, gap_us: int) -> Any:
+    """Return corner events and empty lists of tracks as the struct that the kernel takes."""
+    column, row = np.floor(xy / radius_px).astype(np.int64).T
+    if len(t):
+        column, row = column - column.min() + 1, row - row.min() + 1  # a border of empty cells
+    columns, rows = (int(v.max(initial=0)) + 2 for v in (column, row))
+    chains = corners.CornerChains()
+    chains.x, chains.y = (wp.array(v, dtype=wp.float64, device="cpu") for v in xy.T)
+    chains.t, chains.cell = wp.array(t, device="cpu"), wp.array((row * columns + column).astype(np.int32), device="cpu")
+    chains.columns, chains.radius, chains.gap = columns, radius_px, gap_us
+    chains.head = wp.full(columns * rows, -1, dtype=int, device="cpu")
+    chains.after, chains.last = (wp.zeros(len(t), dtype=int, device="cpu") for _ in range(2))
+    return chains
+
+
+def follow_images(images: Sequence[NDArray[Any]], t: ArrayLike) -> Tracks:
+    """Follow corners through images by Lucas-Kanade on pyramids; a track ends where forward and back disagree.
+
+    ``images``: of equal shape, such as images of warped events. ``t``: their times [us]. New tracks start at corners
+    (Shi and Tomasi) away from others. Source: J.-Y. Bouguet, "Pyramidal implementation of the Lucas Kanade feature
+    tracker", 2001. Needs OpenCV.
+    """
+    times = np.asarray(t, np.int64)
+    if len(images) != len(times):
+        raise AmiwarpError(f"there are {len(images)} images and {len(times)} times; give one time for each image")
+    grey = [_grey(image) for image in images]
+    points, ids, tracks = np.zeros((0, 2), np.float32), np.zeros(0, np.int64), 0
+    parts: list[tuple[NDArray[np.int64], NDArray[np.float32], int]] = []
+    for k, image in enumerate(grey):
+        if k:
+            points, found = _followed(grey[k - 1], image, points)
+            points, ids = points[found], ids[found]
+        fresh = _fresh_corners(image, points)
+        points, ids = np.concatenate([points, fresh]), np.concatenate([ids, tracks + np.arange(len(fresh))])
+        tracks += len(fresh)
+        parts.append((ids, points, k))
+    if not parts:
+        return sorted_tracks([], [], [], [])
+    number, xy = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+    index = np.concatenate([np.full(len(part[0]), part[2]) for part in parts])
+    return sorted_tracks(number, times[index], xy, index)
+
+
+def _grey(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return an image in 8 bits, from 0 to its 99.5th percentile of non-zero values."""
+    full = image[image > 0]
+    top = float(np.percentile(full, 99.5)) if full.size else 1.0
+    return np.clip(image * (255.0 / top), 0.0, 255.0).astype(np.uint8)
+
+
+def _followed(
+    before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return points of the image before in the image after, and which were found."""
+    if not len(points):
+        return points, np.zeros(0, np.bool_)
+    cv2 = library("cv2")
+    settings = {"winSize": (WINDOW, WINDOW), "maxLevel": LEVELS - 1}
+    there, seen, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, **settings)
+    back, seen_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **settings)
+    height, width = after.shape
+    inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
+    close = np.hypot(*(back - points).T) < CONSISTENT_PX
+    return there, np.asarray((seen[:, 0] == 1) & (seen_back[:, 0] == 1) & inside & close)
+
+
+def _fresh_corners(image: NDArray[np.uint8], points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return corners of an image that are away from the given points."""
+    cv2 = library("cv2")
+    mask = np.full(image.shape, 255, np.uint8)
+    for x, y in points:
+        cv2.circle(mask, (round(float(x)), round(float(y))), round(SPACING_PX), 0, -1)
+    found = cv2.goodFeaturesToTrack(image, max(1, MOST_CORNERS - len(points)), QUALITY, SPACING_PX, mask=mask)
+    if found is None or len(points) >= MOST_CORNERS:
+        return np.zeros((0, 2), np.float32)
+    return np.asarray(found, np.float32).reshape(-1, 2)
+
+
+def project(
+    camera: Camera, trajectory: Trajectory, places: NDArray[np.floating], t_us: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where a camera without a prism sees a resting point at each time [px], shape (n, 2), and its depth [m].
+
+    ``places``: points in the world [m], shape (n, 3), one for each time ``t_us`` [us], shape (n,). NaN if a point lies
+    behind the camera.
+    """
+    if not len(places):
+        return np.zeros((0, 2)), np.zeros(0)
+    rotation, position = trajectory.poses(np.asarray(t_us, np.float64) * 1e-6)
+    rays = np.einsum("ni,nij->nj", np.asarray(places, np.float64) - position, rotation)
+    return np.asarray(camera.rays_to_pixels(rays), np.float64), rays[:, 2]
+
+
+def true_paths(
+    tracks: Tracks,
+    places: NDArray[np.floating],
+    camera: Camera,
+    trajectory: Trajectory,
+    frames: Sequence[FrameTruth] = (),
+) -> NDArray[np.float64]:
+    """Return the true place of each point of the tracks [px], shape (n, 2); NaN where it cannot be seen.
+
+    ``places``: resting point in the world that each track begins on [m], shape (tracks, 3); NaN if unknown, such as on
+    a moving body. ``frames``: ground truth at some instants; a point is occluded if a surface in the nearest of them is
+    in front of it.
+    """
+    points = np.asarray(places, np.float64)[tracks.number]
+    truth, depth = project(camera, trajectory, points, tracks.t)
+    if not len(frames) or not len(truth):
+        return truth
+    instants = np.array([frame.t_us for frame in frames])
+    nearest = np.abs(tracks.t[:, None] - instants).argmin(axis=1)
+    for k, frame in enumerate(frames):
+        of = np.flatnonzero((nearest == k) & np.isfinite(truth).all(axis=1))
+        at, _ = project(camera, trajectory, points[of], np.full(len(of), frame.t_us))
+        truth[of[_farthest(frame.depth, at) < OCCLUDED * depth[of]]] = np.nan
+    return truth
+
+
+def _farthest(depth: NDArray[np.float32], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the largest depth in the 3 x 3 pixels around places: infinite outside the image."""
+    padded = np.pad(depth.astype(np.float64), 2, constant_values=np.inf)
+    height, width = depth.shape
+    column, row = (
+        np.clip(np.rint(np.nan_to_num(v)), -1, n).astype(int) + 2 for v, n in zip(xy.T, (width, height), strict=True)
+    )
+    return np.max([padded[row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)], axis=0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackQuality:
+    """Quality of tracks, for one limit."""
+
+    limit_px: float
+    """Distance from the truth at which a track ends [px]."""
+    number: int
+    """Number of tracks that live at least up to their second point."""
+    lifetime_s: float
+    """Mean time from the first point of a track to the last before it ends [s], over all tracks; NaN without tracks."""
+    error_px: float
+    """Mean distance from the truth until the end, over all points after the first of each track [px]."""
+    update_hz: float
+    """Number of points after the first of each track, by the time that tracks live [1/s]."""
+
+
+def lives(tracks: Tracks, truth: NDArray[np.float64], limit_px: float) -> NDArray[np.bool_]:
+    """Return which points belong to the life of their track, shape (n,).
+
+    A track ends before its first point that is more than ``limit_px`` from the truth, or whose truth is NaN.
+    """
+    if truth.shape != tracks.xy.shape:
+        raise AmiwarpError(f"truth has shape {truth.shape}; expected that of the tracks, {tracks.xy.shape}")
+    near = np.hypot(*(tracks.xy - truth).T) <= limit_px  # false for NaN
+    ended = np.cumsum(~near)
+    before = ended[tracks.first] - ~near[tracks.first]
+    return np.asarray(ended == before[tracks.number])
+
+
+def lifetimes(tracks: Tracks, truth: NDArray[np.float64], limit_px: float) -> NDArray[np.float64]:
+    """Return the lifetime of each track [s], shape (tracks,); 0 if it ends before its second point.
+
+    :func:`lives` says when a track ends.
+    """
+    alive = lives(tracks, truth, limit_px)
+    count = np.bincount(tracks.number[alive], minlength=len(tracks.first))
+    last = tracks.first + np.maximum(count, 1) - 1
+    return np.asarray((tracks.t[last] - tracks.t[tracks.first]) * 1e-6)
+
+
+def track_quality(tracks: Tracks, truth: NDArray[np.float64], limit_px: float) -> TrackQuality:
+    """Return the quality of tracks that end more than ``limit_px`` from the truth, or where it is NaN."""
+    updates = lives(tracks, truth, limit_px)
+    updates[tracks.first] = False
+    life = lifetimes(tracks, truth, limit_px)
+    errors = np.hypot(*(tracks.xy - truth)[updates].T)
+    total = float(life.sum())
+    return TrackQuality(
+        limit_px,
+        len(np.unique(tracks.number[updates])),
+        float(life.mean()) if len(life) else float("nan"),
+        float(errors.mean()) if len(errors) else float("nan"),
+        len(errors) / total if total > 0.0 else float("nan"),
+    )
+
+
+def quality_curve(
+    tracks: Tracks, truth: NDArray[np.float64], limits_px: Sequence[float] = LIMITS_PX
+) -> list[TrackQuality]:
+    """Return the quality of tracks for each of several limits, see :func:`track_quality`."""
+    return [track_quality(tracks, truth, limit) for limit in limits_px]
+
+
+# Evaluation.
 
 TITLE = "Corners"
 PROTOCOL = (

@@ -12,7 +12,7 @@ from scipy import ndimage
 from amiwarp.errors import AmiwarpError
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.measures import box_overlap, detected_joints, displayed
+from amiwarp.studies.evaluate.measures import displayed
 from amiwarp.studies.evaluate.pictures import PictureMaker, Window, reconstructed_streams
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
@@ -51,6 +51,46 @@ def blob_keypoints(picture: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
 Detector = Callable[[NDArray[Any]], Mapping[str, NDArray[Any]]]
 """Function that returns the joints (x, y) [px] by name in a grey picture with values from 0 to 255; missing ones are
 left out. The names are those of the world's joints."""
+
+
+# Accuracy of detected joints.
+
+
+def detected_joints(found: NDArray[Any], truth: NDArray[Any], torso_px: float, *, fraction: float = 0.2) -> float:
+    """Return the percentage of detected joints (PDJ), as a share from 0 to 1.
+
+    A joint counts as detected if it is closer to its true place than ``fraction`` of the torso's diameter. ``found``
+    and ``truth``: joints in the same order [px], shape (n, 2). A joint that was not found is NaN and counts as not
+    detected. True joints that are NaN, as outside the view, do not count. The result is NaN if no true joint counts.
+
+    Source: B. Sapp and B. Taskar, "MODEC: Multimodal Decomposable Models for Human Pose Estimation", CVPR 2013; the
+    diameter is the distance from the left shoulder to the right hip.
+    Raises :class:`AmiwarpError` for different shapes.
+    """
+    if found.shape != truth.shape or truth.ndim != 2 or truth.shape[1] != 2:
+        raise AmiwarpError(f"found and true joints have shapes {found.shape} and {truth.shape}; give (n, 2) twice")
+    known = np.isfinite(truth).all(axis=1)
+    if not known.any():
+        return float("nan")
+    distance = np.hypot(*(found[known] - truth[known]).T)
+    return float((distance < fraction * torso_px).mean())  # a comparison with NaN is false
+
+
+def box_overlap(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Return the intersection over union of the bounding boxes of two point sets, shapes (n, 2) and (m, 2).
+
+    Points that are not finite do not count. The result is 0 if a set has no points or a box has no area.
+    """
+    a, b = (points[np.isfinite(points).all(axis=1)] for points in (a, b))
+    if not len(a) or not len(b):
+        return 0.0
+    low, high = np.stack([a.min(axis=0), b.min(axis=0)]), np.stack([a.max(axis=0), b.max(axis=0)])
+    shared = float(np.prod(np.maximum(high.min(axis=0) - low.max(axis=0), 0.0)))
+    union = float(np.prod(high - low, axis=1).sum()) - shared
+    return shared / union if union > 0.0 else 0.0
+
+
+# Evaluation.
 
 TITLE = "Human pose"
 PROTOCOL = (

@@ -7,7 +7,9 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.contrast_motion import (
@@ -21,7 +23,7 @@ from amiwarp.studies.evaluate.contrast_motion import (
     velocity_grid,
 )
 from amiwarp.studies.evaluate.flow import moving_instances
-from amiwarp.studies.evaluate.measures import library, overlap
+from amiwarp.studies.evaluate.measures import library
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 if TYPE_CHECKING:
@@ -119,6 +121,32 @@ def in_large_clusters(
     distance, nearest = KDTree(points[chosen]).query(points)
     return np.asarray(large[label + 1][nearest] & (distance <= radius))
 
+
+# Agreement of a set of events or pixels with the true set.
+
+
+@dataclass(frozen=True, slots=True)
+class Overlap:
+    """Overlap of a found set with the true set. A ratio without a denominator is NaN."""
+
+    iou: float
+    """Intersection over union."""
+    precision: float
+    """Share of the found members that are true."""
+    recall: float
+    """Share of the true members that are found."""
+
+
+def overlap(found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> Overlap:
+    """Return the overlap of two Boolean arrays of one shape. Raises :class:`AmiwarpError` for different shapes."""
+    if found.shape != truth.shape:
+        raise AmiwarpError(f"found and true masks have shapes {found.shape} and {truth.shape}; give equal shapes")
+    both = int(np.count_nonzero(found & truth))
+    counts = [int(np.count_nonzero(mask)) for mask in (found | truth, found, truth)]
+    return Overlap(*(both / n if n else float("nan") for n in counts))
+
+
+# Evaluation.
 
 TITLE = "Motion segmentation"
 PROTOCOL = (
