@@ -1,4 +1,4 @@
-"""Tracks of corners: association, Lucas-Kanade, truth by projection, lifetime and error with known answers."""
+"""Tracks of corners: association, truth by projection, lifetime and error with known answers."""
 
 from __future__ import annotations
 
@@ -115,38 +115,6 @@ def test_a_track_does_not_return_from_its_end() -> None:
     assert corners.lifetimes(tracks, truth, 10.0).tolist() == [0.003]
     with pytest.raises(amiwarp.AmiwarpError, match="expected that of the tracks"):
         corners.lives(tracks, truth[:2], 5.0)
-
-
-def test_images_are_followed_with_subpixel_error() -> None:
-    """Blurred discs on a smooth ground move by (1.3, -0.7) px per image."""
-    rng = np.random.default_rng(3)
-    centres = np.array([[30 + 34 * i, 60 + 30 * j] for i in range(4) for j in range(3)], float) + rng.uniform(
-        -4, 4, (12, 2)
-    )
-    rows, columns = np.mgrid[:180, :240]
-    speed, count = np.array([1.3, -0.7]), 12
-    images = []
-    for k in range(count):
-        image = np.zeros((180, 240))
-        for x, y in centres + k * speed:
-            image += np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 18.0)
-        images.append(image)
-    found = corners.follow_images(images, np.arange(count) * 20_833)
-    first = found.first
-    steps = found.index - found.index[first][found.number]
-    truth = found.xy[first][found.number] + steps[:, None] * speed
-    quality = corners.track_quality(found, truth, 1.0)
-    assert quality.number >= 12
-    assert quality.error_px < 0.2
-    assert corners.lifetimes(found, truth, 1.0).max() == pytest.approx((count - 1) * 20_833e-6)
-    assert quality.update_hz == pytest.approx(1e6 / 20_833)
-
-
-def test_images_without_texture_and_wrong_times() -> None:
-    assert len(corners.follow_images([np.zeros((40, 50))] * 3, [0, 1, 2]).first) == 0
-    assert len(corners.follow_images([], []).first) == 0
-    with pytest.raises(amiwarp.AmiwarpError, match="2 images and 3 times"):
-        corners.follow_images([np.zeros((40, 50))] * 2, [0, 1, 2])
 
 
 def test_a_point_is_projected_where_the_camera_sees_it() -> None:

@@ -288,35 +288,26 @@ def _make(job: Job) -> Made:
     make_folder(path.parent)
     put_in_place(part, path, overwrite=True)
     return Made(
-        item.key, item.file, path.stat().st_size, digest, written.events, written.duration_s,
-        written.width, written.height, round(time.perf_counter() - began, 6),
+        item.key, item.file, path.stat().st_size, digest, *written, round(time.perf_counter() - began, 6),
         round(time.process_time() - began_processor, 6), device, __version__,
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Written:
-    """A recording that was written."""
+def write_recording(
+    item: Item, path: Path, device: str, duration_s: float | None = None
+) -> tuple[int, float, int, int]:
+    """Write a recording to ``path``, replacing it. ``duration_s`` shortens a simulated recording.
 
-    events: int
-    """Number of events."""
-    duration_s: float
-    """Duration: as simulated, or from the first event to the last [s]."""
-    width: int
-    """Width of the sensor [px]."""
-    height: int
-    """Height of the sensor [px]."""
-
-
-def write_recording(item: Item, path: Path, device: str, duration_s: float | None = None) -> Written:
-    """Write a recording to ``path``, replacing it. ``duration_s`` shortens a simulated recording."""
+    Return its number of events, its duration (as simulated, or from the first event to the last) [s], and the width and
+    height of the sensor [px].
+    """
     if item.kind == "recordings":
         done = convert(item.folder / item.source, path, overwrite=True)
         length = 0 if done.t_first is None or done.t_last is None else done.t_last - done.t_first
-        return Written(done.events, length * 1e-6, done.width, done.height)
+        return done.events, length * 1e-6, done.width, done.height
     simulation = simulation_of(item, device, duration_s)
     events = simulation.write(path, truth_hz=item.recipe.get("truth_hz"), overwrite=True)
-    return Written(events, simulation.duration_s, simulation.camera.width, simulation.camera.height)
+    return events, simulation.duration_s, simulation.camera.width, simulation.camera.height
 
 
 def simulation_of(item: Item, device: str, duration_s: float | None = None) -> Simulation:
@@ -945,8 +936,8 @@ def _cost(item: Item, scratch: Path, device: str, duration_s: float | None) -> _
     """Make a recording, and return its computing time and its size."""
     path = scratch / f"{item.key}.h5"
     began = time.perf_counter()
-    written = write_recording(item, path, device, duration_s)
+    events, *_ = write_recording(item, path, device, duration_s)
     content_digest(path, noted=False)
-    cost = _Cost(written.events, path.stat().st_size, time.perf_counter() - began)
+    cost = _Cost(events, path.stat().st_size, time.perf_counter() - began)
     path.unlink()
     return cost

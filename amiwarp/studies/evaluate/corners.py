@@ -17,7 +17,6 @@ from amiwarp.imaging.corners import detect_corners
 from amiwarp.kernels import corners, launch
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.measures import library
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from amiwarp.simulation.worlds.trajectory import Trajectory
 
 
-# Tracks of corners: made of corner events or of images, and their lifetime, error and update rate against truth.
+# Tracks of corner events, and their lifetime, error and update rate against truth.
 
 LIMITS_PX = tuple(float(limit) for limit in range(2, 11))
 """Distances from the truth at which a track ends, for the curves [px]."""
@@ -36,10 +35,6 @@ RADIUS_PX = 3.0
 """Largest step of a track of corner events [px]."""
 GAP_US = 25_000
 """Largest time between two corner events of a track [us]: a little more than a quarter turn at 720 turns/min."""
-WINDOW, LEVELS, CONSISTENT_PX = 21, 3, 1.0
-"""Lucas-Kanade: side of the window [px], levels of the pyramid, largest difference between forward and back [px]."""
-MOST_CORNERS, QUALITY, SPACING_PX = 200, 0.01, 10.0
-"""Corners that tracks in images start from: largest number, least quality relative to the best, least distance [px]."""
 OCCLUDED = 0.95
 """A point is occluded where the surface in its direction is nearer than this part of its depth."""
 
@@ -55,7 +50,7 @@ class Tracks:
     xy: NDArray[np.float64]
     """Places [px], shape ``(n, 2)``."""
     index: NDArray[np.int64]
-    """Index of the corner event or of the image of each point, shape ``(n,)``."""
+    """Index of the corner event of each point, shape ``(n,)``."""
 
     @property
     def first(self) -> NDArray[np.int64]:
@@ -105,69 +100,6 @@ def _chains(t: NDArray[np.int64], xy: NDArray[np.float64], radius_px: float, gap
     chains.head = wp.full(columns * rows, -1, dtype=int, device="cpu")
     chains.after, chains.last = (wp.zeros(len(t), dtype=int, device="cpu") for _ in range(2))
     return chains
-
-
-def follow_images(images: Sequence[NDArray[Any]], t: ArrayLike) -> Tracks:
-    """Follow corners through images by Lucas-Kanade on pyramids; a track ends where forward and back disagree.
-
-    ``images``: of equal shape, such as images of warped events. ``t``: their times [us]. New tracks start at corners
-    (Shi and Tomasi) away from others. Source: J.-Y. Bouguet, "Pyramidal implementation of the Lucas Kanade feature
-    tracker", 2001. Needs OpenCV.
-    """
-    times = np.asarray(t, np.int64)
-    if len(images) != len(times):
-        raise AmiwarpError(f"there are {len(images)} images and {len(times)} times; give one time for each image")
-    grey = [_grey(image) for image in images]
-    points, ids, tracks = np.zeros((0, 2), np.float32), np.zeros(0, np.int64), 0
-    parts: list[tuple[NDArray[np.int64], NDArray[np.float32], int]] = []
-    for k, image in enumerate(grey):
-        if k:
-            points, found = _followed(grey[k - 1], image, points)
-            points, ids = points[found], ids[found]
-        fresh = _fresh_corners(image, points)
-        points, ids = np.concatenate([points, fresh]), np.concatenate([ids, tracks + np.arange(len(fresh))])
-        tracks += len(fresh)
-        parts.append((ids, points, k))
-    if not parts:
-        return sorted_tracks([], [], [], [])
-    number, xy = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-    index = np.concatenate([np.full(len(part[0]), part[2]) for part in parts])
-    return sorted_tracks(number, times[index], xy, index)
-
-
-def _grey(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return an image in 8 bits, from 0 to its 99.5th percentile of non-zero values."""
-    full = image[image > 0]
-    top = float(np.percentile(full, 99.5)) if full.size else 1.0
-    return np.clip(image * (255.0 / top), 0.0, 255.0).astype(np.uint8)
-
-
-def _followed(
-    before: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return points of the image before in the image after, and which were found."""
-    if not len(points):
-        return points, np.zeros(0, np.bool_)
-    cv2 = library("cv2")
-    settings = {"winSize": (WINDOW, WINDOW), "maxLevel": LEVELS - 1}
-    there, seen, _ = cv2.calcOpticalFlowPyrLK(before, after, points, None, **settings)
-    back, seen_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, None, **settings)
-    height, width = after.shape
-    inside = ((there >= 0) & (there <= (width - 1, height - 1))).all(axis=1)
-    close = np.hypot(*(back - points).T) < CONSISTENT_PX
-    return there, np.asarray((seen[:, 0] == 1) & (seen_back[:, 0] == 1) & inside & close)
-
-
-def _fresh_corners(image: NDArray[np.uint8], points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return corners of an image that are away from the given points."""
-    cv2 = library("cv2")
-    mask = np.full(image.shape, 255, np.uint8)
-    for x, y in points:
-        cv2.circle(mask, (round(float(x)), round(float(y))), round(SPACING_PX), 0, -1)
-    found = cv2.goodFeaturesToTrack(image, max(1, MOST_CORNERS - len(points)), QUALITY, SPACING_PX, mask=mask)
-    if found is None or len(points) >= MOST_CORNERS:
-        return np.zeros((0, 2), np.float32)
-    return np.asarray(found, np.float32).reshape(-1, 2)
 
 
 def project(

@@ -309,7 +309,8 @@ def write(out: Path, sections: Sequence[Section], settings: Settings, processor_
                 save(figure, out / "figures" / f"{table.name}.{kind}")
     films = {p.name: _encode(p) for s in sections for p in s.pictures}
     for picture in (p for s in sections for p in s.pictures):
-        _write_bytes(out / "figures" / f"{picture.name}.{_kind(picture)}", films[picture.name])
+        with NewFile(out / "figures" / f"{picture.name}.{_kind(picture)}") as new:
+            new.part.write_bytes(films[picture.name])
     about = _about(settings, processor_s)
     files = dict(zip(("report", "data"), (out / name for name in REPORT_FILES), strict=True))
     write_text(files["report"], _page(sections, figures, films, about))
@@ -338,11 +339,6 @@ def _write_csv(path: Path, table: Table) -> None:
     rows.writerow(table.columns)
     rows.writerows(table.rows)
     write_text(path, buffer.getvalue())
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    with NewFile(path) as new:
-        new.part.write_bytes(data)
 
 
 def _kind(picture: Picture) -> str:
@@ -399,13 +395,6 @@ def pivoted(table: Table) -> tuple[list[str], list[list[str]]]:
         return names, [[_cell(table, row, name) for name in names] for row in rows]
     chart = table.chart
     index = [c for c in dict.fromkeys((*chart.panels, chart.x)) if c in table.columns]
-    return _pivot(table, chart, rows, index)
-
-
-def _pivot(
-    table: Table, chart: Chart, rows: list[dict[str, Value]], index: list[str]
-) -> tuple[list[str], list[list[str]]]:
-    """Return the table with one column for each series of its chart."""
     series = list(dict.fromkeys(row[chart.series] for row in rows))
     found: dict[tuple[Value, ...], dict[Value, str]] = {}
     for row in rows:
