@@ -37,8 +37,9 @@ from amiwarp.optics.camera import Camera, camera_params
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting.figures import save
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scenery import MapRing, Scene, place_scene, step_us
+from amiwarp.simulation.scenery import MapRing, place_scene, step_us
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.cluster import machine, versions
 from amiwarp.studies.demo import earth

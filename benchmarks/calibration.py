@@ -49,8 +49,8 @@ from amiwarp.events.recording import Recording, Truth
 from amiwarp.imaging.metrics import edge_blur, model_error, truth_model
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 

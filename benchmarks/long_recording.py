@@ -105,7 +105,7 @@ def decorrelation(folder: Path) -> float:
     """Return 1 minus the correlation of the picture with the scene's log brightness, without the image's border."""
     from PIL import Image
 
-    from amiwarp.simulation.scenery import Scene
+    from amiwarp.simulation.description import Scene
     from amiwarp.simulation.simulator import Simulation
 
     truth = Simulation(Scene.from_picture(blocks_picture()), CAMERA, PRISM, 1.0).log_view()

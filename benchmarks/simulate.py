@@ -24,9 +24,10 @@ import warp as wp
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.motion import EncoderModel
-from amiwarp.simulation.scenery import Scene, step_us
+from amiwarp.simulation.scenery import step_us
 from amiwarp.simulation.simulator import Simulation
 
 WIDTH, HEIGHT, FOV, INDEX = 640, 480, math.radians(60.0), 1.55

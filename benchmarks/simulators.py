@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
-from amiwarp.simulation.scenery import Scene
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.sequences import PictureStack
 from amiwarp.simulation.simulator import Simulation

@@ -23,8 +23,8 @@ from amiwarp.events.events import Events
 from amiwarp.events.truth import EventTruth
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.engine import Engine
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.named import named_world
 from amiwarp.simulation.worlds.world import WorldScene

@@ -13,8 +13,8 @@ from amiwarp.live.stream.adaptive import DIRECTIONS, Coverage, CoverageMeter, Sp
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.stability.conditions import SceneKind, draw
 

@@ -28,7 +28,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
-from amiwarp.simulation.scenery import Scene
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.simulator import Simulation
 
 WIDTH, HEIGHT = 64, 48

@@ -23,8 +23,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.design import Design, Limits, Timing, design

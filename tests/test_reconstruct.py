@@ -38,8 +38,8 @@ from amiwarp.reconstruction.picture import (
     without_small_holes,
     without_small_regions,
 )
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 

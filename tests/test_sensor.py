@@ -17,9 +17,9 @@ from amiwarp.events.events import Events
 from amiwarp.kernels import pixels
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation, simulate
 

@@ -20,9 +20,10 @@ from amiwarp.kernels import pixels as kernels
 from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import DARK, Placement, linear_luminance, log_map, place_picture, read_picture
-from amiwarp.simulation.scenery import Scene, step_us
+from amiwarp.simulation.scenery import step_us
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation, simulate
 

@@ -24,9 +24,9 @@ from amiwarp.io.formats import open_recording
 from amiwarp.io.native_writer import save_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.sequences import PictureStack, open_pictures
 from amiwarp.simulation.simulator import Simulation

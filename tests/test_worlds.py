@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.engine import Engine
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.device_world import DeviceWorld
