@@ -46,9 +46,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, Model
 from amiwarp.optics.prism import Prism
 from benchmarks.simulate import FOV, HEIGHT, INDEX, WIDTH, blocks_picture
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-import reference
+from reference import optics as oracle
 
 APEX, PHASE, RPM, REPEATED_US = math.radians(2.0), 0.7, 720.0, 500_000
 CAMERA, PRISM = Camera.from_fov(WIDTH, HEIGHT, FOV), Prism(APEX, INDEX)
@@ -149,7 +147,7 @@ def truth(name: str, model: Any, xy: Any, theta: Any, prism: Prism = PRISM, phas
         phi = (theta + PHASE)[:, None]
         at = xy[:, 1].astype(int), xy[:, 0].astype(int)
         return xy + model.offset[at] + model.cosine[at] * np.cos(phi) + model.sine[at] * np.sin(phi)
-    return reference.place(name, CAMERA, prism, xy, theta, phase=phase)
+    return oracle.place(name, CAMERA, prism, xy, theta, phase=phase)
 
 
 def error_of(

@@ -1,6 +1,6 @@
 """Speed of the simulator, and the error of the timed events. Prints JSON, one row per line.
 
-    python benchmarks/simulate.py [--device cuda:0] [--picture FILE] [--apex 0.5 1 2] [--duration 1]
+    python -m benchmarks.simulate [--device cuda:0] [--picture FILE] [--apex 0.5 1 2] [--duration 1]
 
 The camera has 640x480 pixels and 60 degrees, the prism 720 turns/min, and the sensor its default settings. ``ratio`` is
 elapsed time over simulated time; below 1 is faster than real time. ``device`` leaves the events on the device; ``host``

@@ -3,7 +3,6 @@
 import math
 import os
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,8 +19,6 @@ from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.simulator import simulate
 
-# Makes benchmarks importable. At the end of the path, so that tests use the installed package, not the checkout.
-sys.path.append(str(Path(__file__).parents[1]))
 wp.init()
 
 LONGEST_FIRST = (

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import COARSE
 from scipy.optimize import minimize
 
 from amiwarp.calib import Calibration, Settings, model_choice
@@ -43,6 +42,7 @@ from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.simulator import simulate
+from tests.conftest import COARSE
 
 BOTH = Settings(events=120_000, photometric=COARSE)
 SHARPNESS = Settings(events=120_000, stages=("sharpness",))

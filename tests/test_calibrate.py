@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import NOMINAL_PRISM, TRUE_PRISM
 
 from amiwarp import calib
 from amiwarp.calib import Calibration, Settings
@@ -30,6 +29,7 @@ from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import simulate
+from tests.conftest import NOMINAL_PRISM, TRUE_PRISM
 
 calibrate = functools.partial(calib.calibrate, stages=("sharpness",))
 

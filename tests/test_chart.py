@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import reference
 from matplotlib.text import Text
 from PIL import Image
 from typer.testing import CliRunner, Result
@@ -51,6 +50,7 @@ from amiwarp.studies.chart.rows import (
     told_apart,
 )
 from benchmarks import libraries as peers
+from reference import optics as oracle
 
 
 def run(*args: str | Path) -> Result:
@@ -92,7 +92,7 @@ def test_exact_places_are_those_of_the_trace(side: FlatSide, distortion: Any, ba
     rng = np.random.default_rng(0)
     xy = np.stack([rng.integers(0, 320, 2000), rng.integers(0, 240, 2000)], axis=1).astype(np.float64)
     theta = rng.uniform(-10.0, 10.0, 2000)
-    expected = reference.move(camera, model.prism, xy, theta, to_scene=True, phase=model.phase, tilt=model.tilt)
+    expected = oracle.move(camera, model.prism, xy, theta, to_scene=True, phase=model.phase, tilt=model.tilt)
     assert np.isfinite(expected).all()
     np.testing.assert_allclose(exact_places(model, xy, theta), expected, rtol=0.0, atol=bar)
 

@@ -18,7 +18,7 @@ from amiwarp.cli.options import Common
 from amiwarp.errors import AmiwarpError, printable
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter, open_recording
-from tests.io_samples_extra import arrays, write_ros2
+from reference.io_samples_extra import arrays, write_ros2
 
 NASTY = "a\x1b]0;owned\x07\x1b[31m\nb\u202egnp\u2028c.h5"
 """File name that sets the terminal's title and colour, breaks the line and reverses the direction of text."""

@@ -11,10 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-import reference
 import warp as wp
-from calibration_sample import exact_calibration
-from conftest import TRUE_PRISM
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -43,6 +40,9 @@ from amiwarp.optics.circle_models import CircleModel
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import FlatSide, Prism
+from reference import optics as oracle
+from reference.calibration_sample import exact_calibration
+from tests.conftest import TRUE_PRISM
 
 
 @wp.kernel
@@ -135,7 +135,7 @@ def test_places_are_the_models(name: str, lens: RadialTangential | Fisheye | Non
     np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-3)
     if name == "exact":
         some = slice(0, 3000)
-        traced = reference.move(camera, TRUE_PRISM, xy[some], encoder.angle_at(t[some]), to_scene=True, phase=0.4)
+        traced = oracle.move(camera, TRUE_PRISM, xy[some], encoder.angle_at(t[some]), to_scene=True, phase=0.4)
         np.testing.assert_allclose(moved[some], traced, rtol=0, atol=1e-3)
 
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from conftest import TRUE_PHASE, TRUE_PRISM
 
 from amiwarp.brightness.event_pairs import EventTable
 from amiwarp.brightness.multigrid import GridHierarchy, Tiles
@@ -22,6 +21,7 @@ from amiwarp.kernels.launch import Program
 from amiwarp.optics.camera import RadialTangential
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.exact_model import ExactModel
+from tests.conftest import TRUE_PHASE, TRUE_PRISM
 
 SCALE = 2.0**-32
 

@@ -18,7 +18,6 @@ import pytest
 from faery.extension import aedat, evt
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from io_samples import SIZE, make_events
 from rosbags.highlevel import AnyReader
 
 from amiwarp.errors import AmiwarpError
@@ -32,6 +31,7 @@ from amiwarp.io.output_formats import OutputFormat, Rounding
 from amiwarp.io.prophesee import Evt3Encoder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+from reference.io_samples import SIZE, make_events
 
 Columns = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 """x, y, t and p, as a client gives them."""

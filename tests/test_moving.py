@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import TRUE_PRISM
 from numpy.typing import NDArray
 
 from amiwarp.brightness.event_pairs import SensorTiming
@@ -33,6 +32,7 @@ from amiwarp.simulation.pictures import linear_luminance
 from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation, simulate
+from tests.conftest import TRUE_PRISM
 
 CAMERA = Camera.from_fov(140, 105, math.radians(50.0))
 SMALL = Camera.from_fov(100, 75, math.radians(50.0))

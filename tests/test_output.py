@@ -23,7 +23,6 @@ from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
 from PIL import Image
 from typer.models import ArgumentInfo
 from typer.testing import CliRunner, Result
@@ -46,6 +45,7 @@ from amiwarp.io.json_files import read_json
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+from reference.calibration_sample import exact_calibration
 
 SPECIFICATION = """
 format = "amiwarp-dataset-specification"

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
-from conftest import COARSE, TRUE_PHASE, TRUE_PRISM
 from scipy import ndimage
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
@@ -33,6 +32,7 @@ from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import simulate
+from tests.conftest import COARSE, TRUE_PHASE, TRUE_PRISM
 
 KNOWN = PhotometricSettings(sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
 KNOWN_COARSE = replace(COARSE, sensor=KNOWN.sensor)

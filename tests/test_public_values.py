@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from public_calls import CAMERA, RECORDING, REFUSED, PublicCall, public_calls, write_files
 
 import amiwarp
 from amiwarp.errors import AmiwarpError
@@ -25,6 +24,7 @@ from amiwarp.optics.camera import LARGEST_FOCAL, Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
 from amiwarp.validation import shown
+from tests.public_calls import CAMERA, RECORDING, REFUSED, PublicCall, public_calls, write_files
 
 
 class Odd:

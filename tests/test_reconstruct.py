@@ -9,7 +9,6 @@ import av
 import numpy as np
 import pytest
 import warp as wp
-from calibration_sample import exact_calibration
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
@@ -42,6 +41,7 @@ from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
+from reference.calibration_sample import exact_calibration
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 PRISM, PHASE = Prism(math.radians(1.2)), 2.0

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import COARSE, TRUE_PRISM
 
 from amiwarp.calib import calibrate
 from amiwarp.calib.checks import check_pulses, check_texture
@@ -23,6 +22,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.simulator import simulate
+from tests.conftest import COARSE, TRUE_PRISM
 
 WIDTH, HEIGHT, LENGTH_US = 96, 72, 500_000
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, math.radians(50.0))

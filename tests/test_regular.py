@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from io_samples import SIZE, make_events, write_text
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import Format, open_recording, read_encoder_csv
@@ -23,6 +22,7 @@ from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.sequences import open_pictures
 from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.studies.chart.charts import Charts
+from reference.io_samples import SIZE, make_events, write_text
 
 
 def fifo(path: Path) -> Path:

@@ -15,8 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
-from rig_world import LONG_S, Counted, Wire, World, has_taken_in
 
 from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.compensation.streams import OUTSIDE, Compensated
@@ -37,6 +35,8 @@ from amiwarp.live.stream.sources import open_source
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
+from reference.calibration_sample import exact_calibration
+from tests.rig_world import LONG_S, Counted, Wire, World, has_taken_in
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 MODEL = ExactModel.from_prism(CAMERA, PRISM, 0.4)

@@ -21,8 +21,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
-from rig_world import LONG_S
 from typer.testing import CliRunner
 
 from amiwarp.calib.result import Calibration
@@ -39,6 +37,8 @@ from amiwarp.live.stream.session import SessionStatus
 from amiwarp.live.stream.sockets import close_listener, listen
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
+from reference.calibration_sample import exact_calibration
+from tests.rig_world import LONG_S
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 SCRIPT = (

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
 
 from amiwarp.calib.result import Calibration
 from amiwarp.compensation.streams import Compensated, Compensator
@@ -36,6 +35,7 @@ from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.jobs import LiveSource
+from reference.calibration_sample import exact_calibration
 
 CAMERA, PRISM = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(2.0))
 BIAS_DEG = 3.5

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from test_serve import WAIT_S, served, until
 
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.events.events import MemoryEvents
@@ -30,6 +29,7 @@ from amiwarp.viewer.inspector import Inspector, Library
 from amiwarp.viewer.jobs import LiveFigures, LiveSource, estimate_phase
 from amiwarp.viewer.layout import KEYS
 from amiwarp.viewer.panel import SETTABLE
+from tests.test_serve import WAIT_S, served, until
 
 pytest.importorskip("trame_client")
 APEX_DEG, NOMINAL_DEG, RPM, PHASE = 1.0, 1.2, 720.0, 2.0

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -29,6 +28,7 @@ from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import app as viewer_app
 from amiwarp.viewer.app import BROWSERS, has_display, open_window
 from amiwarp.viewer.inspector import Inspector, Library
+from reference.calibration_sample import exact_calibration
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
@@ -31,6 +30,7 @@ from amiwarp.viewer.clouds import WIDEST_PX, Look, Scene, axis_range, colours_of
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.timeline import read_span
 from amiwarp.viewer.window import Knobs, Selection
+from reference.calibration_sample import exact_calibration
 
 TRUE = Prism(math.radians(1.0))
 PICTURES = Path(__file__).parent / "pictures"

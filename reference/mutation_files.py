@@ -1,7 +1,7 @@
 """Damaged files for tests and long fuzzing runs: small samples of every input, a mutator, and a supervised check.
 
 The rule: a damaged file is read, or refused with one :class:`AmiwarpError`. Nothing else is raised, nothing crashes or
-hangs, and memory stays below :data:`MEMORY_KIB`. ``python tests/mutation_files.py COUNT [NAME ...]`` checks COUNT
+hangs, and memory stays below :data:`MEMORY_KIB`. ``python -m reference.mutation_files COUNT [NAME ...]`` checks COUNT
 mutants of each named input, or of all inputs.
 """
 
@@ -11,6 +11,7 @@ import contextlib
 import io
 import json
 import math
+import os
 import random
 import re
 import subprocess
@@ -28,9 +29,6 @@ from typing import Any
 import h5py
 import hdf5plugin
 import numpy as np
-from calibration_sample import exact_calibration
-from io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
-from io_samples_extra import MORE_WRITERS, packets, small, write_bin, write_ros2
 from PIL import Image
 
 from amiwarp.calib import Calibration
@@ -59,6 +57,9 @@ from amiwarp.studies.evaluate.measures import THRESHOLDS
 from amiwarp.studies.evaluate.report import CHANCE, section
 from amiwarp.studies.evaluate.results import QUICK, CellResult, encode_picture
 from amiwarp.studies.evaluate.run import Store
+from reference.calibration_sample import exact_calibration
+from reference.io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
+from reference.io_samples_extra import MORE_WRITERS, packets, small, write_bin, write_ros2
 
 MEMORY_KIB = 3 << 19
 """Largest memory that a check may take, 1.5 GiB [KiB]."""
@@ -716,9 +717,9 @@ class Checker:
         self._start()
 
     def _start(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, __file__, "--serve"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+        command = [sys.executable, "-P", "-m", "reference.mutation_files", "--serve"]
+        modules = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}  # the amiwarp of this process
+        self._process = subprocess.Popen(command, env=modules, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def check(self, path: Path, name: str) -> str | None:
         """Run :func:`check`. Raise :class:`AssertionError` for a crash, a hang or a wrong exception as well."""
