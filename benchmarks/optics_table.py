@@ -62,9 +62,9 @@ def ladder_rows() -> Iterator[str]:
 
 def lens_camera(width: int, height: int, fov: float, lens: Distortion | None) -> Camera:
     """Return a camera whose horizontal field of view, including the lens distortion, is ``fov`` [rad]."""
-    bare = Camera(width, height, 1.0, 1.0, 0.0, 0.0, lens)
+    bare = Camera(width, height, float(width), float(width), 0.0, 0.0, lens)
     edge = oracle.rays_to_pixels(bare, np.array([[math.sin(fov / 2), 0.0, math.cos(fov / 2)]]))[0, 0]
-    focal = width / (2.0 * float(edge))
+    focal = width**2 / (2.0 * float(edge))
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, lens)
 
 
