@@ -12,10 +12,6 @@ import h5py
 import numpy as np
 import pytest
 import warp as wp
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typer.testing import CliRunner
 
 from amiwarp.calib import Calibration
@@ -369,14 +365,17 @@ HOST_NS = 1_700_000_000_123_456_789
 DELAY_NS = 4_000_000
 """Time from the first event of a message to its recording [ns]."""
 
-LATCHED = Qos(
-    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, QosTime(0, 0), QosTime(1, 2),
-    QosLiveliness.AUTOMATIC, QosTime(3, 4), False,
-)  # fmt: skip
-
 
 def write_bag(path: Path, events: Events) -> None:
     """Write a bag as a robot records it: events, and messages of other topics, among them an unknown type."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    latched = Qos(
+        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, QosTime(0, 0), QosTime(1, 2),
+        QosLiveliness.AUTOMATIC, QosTime(3, 4), False,
+    )  # fmt: skip
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(PACKET_DEFINITION, "event_camera_msgs/msg/EventPacket"))
     store.register(get_types_from_msg("float64[] values\nstring name", "rig_msgs/msg/State"))
@@ -399,7 +398,7 @@ def write_bag(path: Path, events: Events) -> None:
         topics = {
             topic: writer.add_connection(
                 topic, message.__msgtype__, typestore=store,
-                offered_qos_profiles=[LATCHED] if topic == "/note" else [],
+                offered_qos_profiles=[latched] if topic == "/note" else [],
             )
             for topic, message in {topic: message for _, topic, message in messages}.items()
         }  # fmt: skip
@@ -423,6 +422,8 @@ def bag_of_rosbags(path: Path) -> tuple[dict[str, Any], dict[str, list[tuple[int
 def test_a_bag_is_compensated_and_keeps_its_other_topics(
     recording: Recording, exact: Calibration, tmp_path: Path, source: str, target: str
 ) -> None:
+    from rosbags.highlevel import AnyReader
+
     events, encoder = recording.events.slice(0, 60_000), recording.encoder
     assert encoder is not None
     write_bag(tmp_path / source, events)

@@ -16,10 +16,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import distributed
 import matplotlib.pyplot as plt
 import numpy as np
-import pyarrow.parquet
 import pytest
 from PIL import Image
 from typer.testing import CliRunner, Result
@@ -148,6 +146,8 @@ def test_manifest_describes_every_file(place: Path) -> None:
 
 
 def test_parquet_equals_json(place: Path) -> None:
+    import pyarrow.parquet
+
     make(place)
     rows = pyarrow.parquet.read_table(place / "out" / TABLE).to_pylist()
     items = manifest(place)["items"]
@@ -287,6 +287,8 @@ def test_a_dry_run_makes_nothing(place: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
 def test_a_cluster_makes_the_same_files(place: Path) -> None:
+    import distributed
+
     make(place)
     alone = checksums(place)
     with distributed.LocalCluster(

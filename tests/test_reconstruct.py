@@ -5,7 +5,6 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 import warp as wp
@@ -334,6 +333,8 @@ def test_files_of_each_ending(picture: Picture, tmp_path: Path) -> None:
 
 
 def test_video(recording: Recording, truth: NDArray[np.float32], tmp_path: Path) -> None:
+    import av
+
     work = Reconstruction(recording, model=MODEL)
     pictures = list(work.windows(START, TURN_US, step_us=20_000.0))
     assert len(pictures) == work.count(START, TURN_US, step_us=20_000.0) == 5
@@ -350,6 +351,8 @@ def test_video(recording: Recording, truth: NDArray[np.float32], tmp_path: Path)
 
 def test_a_film_in_colour_keeps_its_place_if_its_size_is_odd(tmp_path: Path) -> None:
     """The codec needs even sizes: the last row and column are repeated."""
+    import av
+
     grey = np.full((31, 45), 200, np.uint8)
     colour = np.stack([grey, grey // 4, np.zeros_like(grey)], axis=2)
     colour[:16] = 0
