@@ -12,8 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from amiwarp import Vote
 from amiwarp.calib.settings import STAGES
-from amiwarp.choices import Vote
 from benchmarks import libraries, ours
 from benchmarks.job import Job
 from benchmarks.peers import image

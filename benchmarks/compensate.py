@@ -35,16 +35,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.calib import Calibration
-from amiwarp.compensation.recordings import PIECE, BlockCompensator, compensate
+from amiwarp import Calibration, Camera, Encoder, Events, Model, Prism, RecordingWriter, compensate, open_recording
+from amiwarp.compensation.recordings import PIECE, BlockCompensator
 from amiwarp.cpu_threads import cpu_threads
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, inside_image
-from amiwarp.io import RecordingWriter, open_recording
+from amiwarp.events.events import inside_image
 from amiwarp.io.chunks import in_order
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, Model
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.models import MODELS
 from benchmarks.simulate import FOV, HEIGHT, INDEX, WIDTH, blocks_picture
 from reference import optics as oracle
 

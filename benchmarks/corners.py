@@ -30,12 +30,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.choices import CornerMethod
+from amiwarp import CornerDetector, CornerMethod, DeviceEvents, Events, open_recording
 from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
-from amiwarp.events.device_events import DeviceEvents
-from amiwarp.events.events import Events
-from amiwarp.imaging.corners import CornerDetector
-from amiwarp.io import open_recording
 from amiwarp.studies.cluster import machine, versions
 from reference import corners as oracle
 

@@ -28,8 +28,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from amiwarp import AmiwarpError
 from amiwarp.cpu_threads import cpu_threads
-from amiwarp.errors import AmiwarpError
 
 LONGEST_S = 300.0
 """Time after which a decoder that still works on one input is considered hanging [s]."""

@@ -13,12 +13,21 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
-from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import ModelError, predicted_error
-from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
+from amiwarp import (
+    Camera,
+    CircleModel,
+    Distortion,
+    EllipseModel,
+    ExactModel,
+    Fisheye,
+    FlatSide,
+    ModelError,
+    Prism,
+    RadialCircleModel,
+    RadialTangential,
+    apex_from_deflection,
+    predicted_error,
+)
 from reference import optics as oracle
 
 INDEX = 1.55

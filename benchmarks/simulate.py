@@ -21,13 +21,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
+from amiwarp import Camera, EncoderModel, ExactModel, Prism, Scene, Simulation
 from amiwarp.simulation.engine import Engine
-from amiwarp.simulation.motion import EncoderModel
-from amiwarp.simulation.scenery import Scene, step_us
-from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.scenery import step_us
 
 WIDTH, HEIGHT, FOV, INDEX = 640, 480, math.radians(60.0), 1.55
 

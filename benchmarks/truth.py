@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from amiwarp.choices import Vote
+from amiwarp import Vote
 from benchmarks.scenes import MARGIN, PHASE, Array, EventScene, in_chunks
 from reference import optics as oracle
 

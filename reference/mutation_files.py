@@ -31,23 +31,34 @@ import hdf5plugin
 import numpy as np
 from PIL import Image
 
-from amiwarp.calib import Calibration
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    Events,
+    EventTruth,
+    Fisheye,
+    FrameTruth,
+    ImuSamples,
+    Poses,
+    Prism,
+    Recording,
+    RecordingWriter,
+    Trajectory,
+    WorldLabels,
+    load_world,
+    open_recording,
+)
 from amiwarp.cli.info import describe
 from amiwarp.cli.options import _read_speed, read_camera
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, check_events
-from amiwarp.events.recording import Recording
-from amiwarp.events.sensors import ImuSamples
-from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels
-from amiwarp.io import RecordingWriter, open_recording, read_encoder_csv
+from amiwarp.events.events import check_events
+from amiwarp.events.truth import MAPS
+from amiwarp.io import read_encoder_csv
 from amiwarp.io.sealed_json import append_line, sealed
 from amiwarp.io.text import read_calib
-from amiwarp.optics.camera import Camera, Fisheye
-from amiwarp.optics.prism import Prism
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.sequences import _read_times, open_pictures
-from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.simulation.worlds.world_files import load_mesh, load_world
+from amiwarp.simulation.worlds.world_files import load_mesh
 from amiwarp.studies import stability
 from amiwarp.studies.dataset.items import Made, list_items
 from amiwarp.studies.dataset.run import JOURNAL, Journal

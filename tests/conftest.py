@@ -11,13 +11,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.settings import PhotometricSettings
-from amiwarp.events.recording import Recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.simulator import simulate
+from amiwarp import Calibration, Camera, PhotometricSettings, Prism, PrismMotion, Recording, calibrate, simulate
 
 wp.init()
 

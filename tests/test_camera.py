@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import AmiwarpError, Camera, Distortion, ExactModel, Fisheye, Prism, RadialTangential
 from amiwarp.kernels.camera import CameraParams, solve_ray
-from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential, camera_params, fold_radius
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.camera import camera_params, fold_radius
 from reference import optics as oracle
 
 # as in the package's kernels; otherwise a GPU would fuse multiplications and additions in this module only

@@ -16,19 +16,26 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 import benchmarks.chart
-from amiwarp.calib import Calibration, Settings
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    ExactModel,
+    FlatSide,
+    MemoryEvents,
+    Prism,
+    RadialTangential,
+    Recording,
+    Settings,
+    Vote,
+    iwe,
+    open_recording,
+    predicted_error,
+    save_recording,
+)
 from amiwarp.calib.presets import Preset, check, settings_from, settings_to, simplified
-from amiwarp.choices import Vote
 from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.iwe import iwe
-from amiwarp.io import open_recording, save_recording
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import MODELS, predicted_error
-from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.optics.models import MODELS
 from amiwarp.plotting import figures
 from amiwarp.progress import silent
 from amiwarp.studies.chart import Charts, calibration, compensation

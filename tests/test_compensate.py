@@ -14,28 +14,42 @@ import pytest
 import warp as wp
 from typer.testing import CliRunner
 
-from amiwarp.calib import Calibration
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    CircleModel,
+    Encoder,
+    Events,
+    ExactModel,
+    Fisheye,
+    FlatSide,
+    MemoryEvents,
+    Prism,
+    RadialTangential,
+    Recording,
+    compensate,
+    compensate_events,
+    convert,
+    edge_blur,
+    iwe,
+    open_recording,
+    save_recording,
+    sharpness,
+    truth_model,
+)
 from amiwarp.cli.app import app
-from amiwarp.compensation.recordings import compensate, compensate_events, compensated_blocks
-from amiwarp.errors import AmiwarpError
+from amiwarp.compensation.recordings import compensated_blocks
 from amiwarp.events.device_events import encoder_params
-from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.events import Events, MemoryEvents, inside_image
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.iwe import iwe
-from amiwarp.imaging.metrics import edge_blur, truth_model
-from amiwarp.imaging.sharpness import sharpness
-from amiwarp.io import convert, open_recording, read_encoder_csv, save_recording
+from amiwarp.events.encoder import TWO_PI
+from amiwarp.events.events import inside_image
+from amiwarp.io import read_encoder_csv
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.prophesee import Evt3Encoder
 from amiwarp.io.ros import PACKET_DEFINITION, opened_bag
 from amiwarp.kernels.events import EncoderParams, theta_u32_at
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
-from amiwarp.optics.circle_models import CircleModel
-from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import FlatSide, Prism
 from reference import optics as oracle
 from reference.calibration_sample import exact_calibration
 from tests.conftest import TRUE_PRISM

@@ -11,8 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 import amiwarp
-from amiwarp.choices import CornerMethod
-from amiwarp.events.events import Events
+from amiwarp import CornerMethod, Events
 from amiwarp.imaging import corners
 from reference.corners import corners as reference_corners
 from reference.corners import corners_of_dv_processing, table

@@ -23,8 +23,8 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 import amiwarp
+from amiwarp import AmiwarpError, DatasetSummary, make_dataset
 from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
 from amiwarp.io.sealed_json import append_line, create_journal, read_journal
 from amiwarp.kernels import launch
 from amiwarp.studies import cluster
@@ -32,15 +32,7 @@ from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker
 from amiwarp.studies.dataset import items, specification
 from amiwarp.studies.dataset import specification as sources
 from amiwarp.studies.dataset.items import list_items, simulation_of
-from amiwarp.studies.dataset.run import (
-    JOURNAL,
-    MANIFEST,
-    TABLE,
-    DatasetSummary,
-    duration_text,
-    make_dataset,
-    threads_of_worker,
-)
+from amiwarp.studies.dataset.run import JOURNAL, MANIFEST, TABLE, duration_text, threads_of_worker
 from amiwarp.studies.dataset.specification import load_specification
 
 HEAD = 'format = "amiwarp-dataset-specification"\nversion = 1\n'

@@ -16,13 +16,11 @@ import numpy as np
 import pytest
 from faery.extension import aedat, evt
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.io import convert, open_recording, read_encoder_triggers
+from amiwarp import AmiwarpError, Camera, Events, MemoryEvents, RadialTangential, convert, open_recording
 from amiwarp.io import file_scan as scan
+from amiwarp.io import read_encoder_triggers
 from amiwarp.io.prophesee import Evt2Decoder, Evt3Decoder, words_of
 from amiwarp.io.ros import read_packets
-from amiwarp.optics.camera import Camera, RadialTangential
 from reference.io_samples import make_events, refusal, to_faery, write_aedat4
 from reference.io_samples_extra import (
     ENCODERS,

@@ -13,8 +13,8 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.io import open_recording, reading_process
+from amiwarp import AmiwarpError, open_recording
+from amiwarp.io import reading_process
 from amiwarp.io.chunks import CHUNK, checksum, decode
 from amiwarp.io.reading_process import borrow, give_back, run
 from amiwarp.io.reading_server import Reply

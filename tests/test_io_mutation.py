@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from amiwarp.io import convert, open_recording
+from amiwarp import convert, open_recording
 from reference.io_samples import WRITERS, make_events, refusal, write_sample
 from reference.mutation_files import KINDS, Checker, check, mutated, sample
 

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from amiwarp import AmiwarpError
 from amiwarp.cli import motor as command
-from amiwarp.errors import AmiwarpError
 from amiwarp.live.link import follower as following
 from amiwarp.live.link import follower as updates
 from amiwarp.live.link import link as link_module

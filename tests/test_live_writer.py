@@ -15,14 +15,19 @@ import hdf5plugin  # noqa: F401
 import numpy as np
 import pytest
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.io import RecordingWriter, open_recording
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Encoder,
+    Events,
+    FlatSide,
+    Prism,
+    RadialTangential,
+    RecordingWriter,
+    open_recording,
+)
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.live_writer import MAX_WASTE_BYTES, LiveWriter
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.prism import FlatSide, Prism
 from reference.io_samples import refusal
 
 SIZE = (320, 240)

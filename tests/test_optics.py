@@ -9,16 +9,27 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    CameraRotation,
+    CircleModel,
+    EllipseModel,
+    ExactModel,
+    Fisheye,
+    FlatSide,
+    Model,
+    Prism,
+    RadialCircleModel,
+    RadialTangential,
+    apex_from_deflection,
+    deflection_from_apex,
+    predicted_error,
+)
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential, camera_params, pinhole_params
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
+from amiwarp.optics.camera import camera_params, pinhole_params
 from amiwarp.optics.displacement import compensate_by_each, wrap_angle
-from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import MODELS, Model, predicted_error
-from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection, deflection_from_apex
+from amiwarp.optics.models import MODELS
 from reference import optics as oracle
 
 ATOL = 1e-3  # px, the documented limit; docs/explanation/optics.md has the measured values

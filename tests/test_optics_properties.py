@@ -7,11 +7,21 @@ import hypothesis.strategies as st
 import numpy as np
 from hypothesis import HealthCheck, assume, given, settings
 
-from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import MODELS, predicted_error
-from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection, deflection_from_apex
+from amiwarp import (
+    Camera,
+    CircleModel,
+    Distortion,
+    ExactModel,
+    Fisheye,
+    FlatSide,
+    Prism,
+    RadialCircleModel,
+    RadialTangential,
+    apex_from_deflection,
+    deflection_from_apex,
+    predicted_error,
+)
+from amiwarp.optics.models import MODELS
 from reference import optics as oracle
 
 ATOL = 1e-3  # px, the documented limit for float32

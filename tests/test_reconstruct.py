@@ -13,33 +13,35 @@ from PIL import Image
 from scipy import ndimage
 from typer.testing import CliRunner
 
-from amiwarp.brightness.event_pairs import EventTable
-from amiwarp.calib.result import Calibration
-from amiwarp.choices import Fill, Tone
-from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.io import open_recording, save_recording
-from amiwarp.io.text import read_calib
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
-from amiwarp.reconstruction.export import save_film, save_picture, save_video, tones
-from amiwarp.reconstruction.picture import (
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    CameraMotion,
+    CameraRotation,
+    Encoder,
+    Events,
+    ExactModel,
+    Fill,
+    MemoryEvents,
     Picture,
+    Prism,
+    PrismMotion,
     Reconstruction,
-    nodes_near,
+    Recording,
+    Scene,
+    SensorModel,
+    Simulation,
+    open_recording,
     reconstruct,
-    without_small_holes,
-    without_small_regions,
+    save_recording,
 )
-from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation
+from amiwarp.brightness.event_pairs import EventTable
+from amiwarp.choices import Tone
+from amiwarp.cli.app import app
+from amiwarp.io.text import read_calib
+from amiwarp.reconstruction.export import save_film, save_picture, save_video, tones
+from amiwarp.reconstruction.picture import nodes_near, without_small_holes, without_small_regions
 from reference.calibration_sample import exact_calibration
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))

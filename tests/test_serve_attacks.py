@@ -23,11 +23,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import simulate
+from amiwarp import AmiwarpError, Camera, Prism, Recording, simulate
 from amiwarp.viewer import serve as server_module
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.panel import MOST_IN_FLIGHT, SETTABLE

@@ -16,11 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amiwarp.compensation.streams import Compensated, Compensator, held_bytes
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events, EventSource
+from amiwarp import AmiwarpError, Compensated, Compensator, Encoder, EncoderStream, Events, EventSource
+from amiwarp.compensation.streams import held_bytes
 from amiwarp.live.link.emulator import (
     MOST_OUT_BYTES,
     MOST_SEGMENTS,

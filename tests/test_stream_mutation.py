@@ -7,7 +7,7 @@ import tracemalloc
 
 import pytest
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import AmiwarpError
 from amiwarp.live.link.follower import MOST_UPDATES, Follower
 from amiwarp.live.link.protocol import LONGEST, ControllerStatus, FrameDecoder, Samples, Sync, encode
 from amiwarp.live.stream.packets import HEADER, HELLO, LONGEST_HELLO, MAGIC, Hello, PacketDecoder

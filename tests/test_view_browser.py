@@ -15,14 +15,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from amiwarp.calib import Calibration, calibrate
-from amiwarp.events.events import MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.io import open_recording, save_recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.simulator import simulate
+from amiwarp import (
+    Calibration,
+    Camera,
+    MemoryEvents,
+    Prism,
+    PrismMotion,
+    Recording,
+    calibrate,
+    open_recording,
+    save_recording,
+    simulate,
+)
 from amiwarp.viewer import exports, jobs
 from amiwarp.viewer import jobs as selected_calibration
 from amiwarp.viewer.inspector import Inspector, Library

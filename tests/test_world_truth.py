@@ -20,8 +20,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import amiwarp
+from amiwarp import AmiwarpError
 from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import MAPS
 from amiwarp.io.chunks import CHUNK
 from amiwarp.simulation.worlds import world_files

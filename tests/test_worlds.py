@@ -10,18 +10,28 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
+from amiwarp import (
+    AmiwarpError,
+    Body,
+    Camera,
+    Lamp,
+    Material,
+    Mesh,
+    Prism,
+    Scene,
+    SensorModel,
+    Simulation,
+    Sky,
+    Sun,
+    Trajectory,
+    TruthRenderer,
+    World,
+    WorldScene,
+)
 from amiwarp.simulation.engine import Engine
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.renderer import WorldMapRing, pixel_rays, surfaces_at
-from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
-from amiwarp.simulation.worlds.world import Body, Lamp, Material, Mesh, Sky, Sun, World, WorldScene
-from amiwarp.simulation.worlds.world_truth import TruthRenderer
+from amiwarp.simulation.worlds.trajectory import looking_at
 from reference import optics as oracle
 
 CAMERA = Camera.from_fov(64, 48, math.radians(60.0))
