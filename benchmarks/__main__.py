@@ -35,7 +35,7 @@ from benchmarks.job import Job
 from benchmarks.libraries import Missing
 
 ROOT = Path(__file__).parents[1]
-LIBRARIES = ("warp-lang", "numpy", "numba", "torch", "cupy", "dv_processing")
+LIBRARIES = ("warp-lang", "numpy", "numba", "torch", "cupy")
 REST_S = 0.02
 """Pause before each pass on a CPU [s], because other libraries' idle threads spin for a while before they sleep."""
 

@@ -23,13 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.calib.result import Calibration
+from amiwarp import Calibration, Events, ExactModel, Prism, model_error, open_recording
 from amiwarp.cpu_threads import cpu_threads
-from amiwarp.events.events import Events
-from amiwarp.imaging.metrics import model_error
-from amiwarp.io import open_recording
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
 from amiwarp.studies.cluster import processor
 from benchmarks.compensate import CAMERA, PRISM, SAMPLE, SAMPLES, error_of, make, pieces
 from benchmarks.simulate import blocks_picture

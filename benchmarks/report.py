@@ -17,14 +17,14 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cases import AIMS, IMAGE, MOVED, PREPARED, UNMOVED, Aim
+from benchmarks.cases import AIMS, IMAGE, MOVED, PREPARED, Aim
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "benchmarks" / "results" / "speed.md"
 FILES = {kind: ROOT / "benchmarks" / "results" / f"speed_{kind}.json" for kind in ("cpu", "cuda")}
 BEGIN, END = "<!-- speed: from here on by python -m benchmarks.report -->", "<!-- speed: to here -->"
-IMAGES = (IMAGE, UNMOVED, PREPARED)
-RATES = {IMAGE: "Mev/s", UNMOVED: "Mev/s", PREPARED: "Mvotes/s", MOVED: "Mev/s"}
+IMAGES = (IMAGE, PREPARED)
+RATES = {IMAGE: "Mev/s", PREPARED: "Mvotes/s", MOVED: "Mev/s"}
 """Unit of the rate that tables show instead of the time, by task."""
 ERRORS = {
     "model_px": "model error [px]",
@@ -57,8 +57,7 @@ def head(row: Row) -> list[str]:
     """Return the heading of the table to which the result belongs."""
     start = ["method", RATES.get(row["what"], "ms"), "quartiles"]
     if row["what"] in IMAGES:
-        moved = ["px from exact"] if "exact_px" in row["errors"] else []
-        return [*start, "rms / worst pixel [events]", "misplaced", *moved]
+        return [*start, "rms / worst pixel [events]", "misplaced", "px from exact"]
     return [*start, *(text for name, text in (ERRORS | ALSO).items() if name in row["errors"] | row["also"])]
 
 
@@ -77,7 +76,7 @@ def row_cells(row: Row) -> list[str]:
     if row["what"] in IMAGES:
         return [
             *start, f"{errors['rms_events']:.2g} / {errors['max_events']:.2g}", f"{100 * errors['misplaced']:.2g} %",
-            *([f"{errors['exact_px']:.2g}"] if "exact_px" in errors else []),
+            f"{errors['exact_px']:.2g}",
         ]  # fmt: skip
     values = errors | row["also"]
     return [*start, *(f"{values[name]:.3g}" for name in ERRORS | ALSO if name in values)]

@@ -9,10 +9,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import COARSE
 from scipy.optimize import minimize
 
-from amiwarp.calib import Calibration, Settings, model_choice
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    CircleModel,
+    Encoder,
+    EncoderModel,
+    Events,
+    ExactModel,
+    FlatSide,
+    Prism,
+    PrismMotion,
+    Recording,
+    Settings,
+    simulate,
+    truth_model,
+)
+from amiwarp.calib import model_choice
 from amiwarp.calib import model_choice as auto
 from amiwarp.calib.calibration_events import CalibrationEvents
 from amiwarp.calib.model_choice import (
@@ -30,19 +46,9 @@ from amiwarp.calib.model_choice import (
     trial_for,
 )
 from amiwarp.calib.sharpness import split_turns
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.metrics import truth_model
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.circle_models import CircleModel
 from amiwarp.optics.displacement import rms
-from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.motion import EncoderModel, PrismMotion
-from amiwarp.simulation.simulator import simulate
+from tests.conftest import COARSE
 
 BOTH = Settings(events=120_000, photometric=COARSE)
 SHARPNESS = Settings(events=120_000, stages=("sharpness",))

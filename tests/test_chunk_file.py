@@ -13,8 +13,7 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from amiwarp.events.events import Events
-from amiwarp.io import RecordingWriter
+from amiwarp import Events, RecordingWriter
 from amiwarp.io.chunks import CHUNK, encode, encode_parts
 from amiwarp.io.native_layout import make_dataset
 from amiwarp.io.native_writer import ChunkFile, EncodedChunk

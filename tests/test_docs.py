@@ -70,7 +70,7 @@ def test_what_the_site_makes_is_not_checked_as_a_source() -> None:
 
 
 CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
-PLACE = re.compile(r"(?:amiwarp|benchmarks|docs|examples|tests)/[\w./-]*|[\w./-]+\.pyi?")
+PLACE = re.compile(r"(?:amiwarp|benchmarks|docs|examples|reference|tests)/[\w./-]*|[\w./-]+\.pyi?")
 PLACEHOLDERS = ("NAME.py", "NAME_writer.py")
 
 
@@ -93,8 +93,13 @@ def unknown_names(text: str, source: str) -> list[str]:
 
 
 def source_text() -> str:
-    """Return the text of the package, its tests and its settings."""
-    files = [ROOT / "pyproject.toml", *(ROOT / "amiwarp").rglob("*.py*"), *(ROOT / "tests").rglob("*.py")]
+    """Return the text of the package, its tests, what they compare with, and its settings."""
+    files = [
+        ROOT / "pyproject.toml",
+        *(ROOT / "amiwarp").rglob("*.py*"),
+        *(ROOT / "tests").rglob("*.py"),
+        *(ROOT / "reference").rglob("*.py"),
+    ]
     own = [file for file in files if file.suffix in (".py", ".pyi", ".toml") and file != Path(__file__)]
     return "\n".join(file.read_text() for file in own)
 

@@ -7,6 +7,7 @@ import gc
 import numpy as np
 import pytest
 
+from amiwarp import Events
 from amiwarp.compensation import packet_copy
 from amiwarp.compensation.packet_copy import (
     PIECE,
@@ -19,7 +20,6 @@ from amiwarp.compensation.packet_copy import (
     listed_pointers,
     pointers_in_place,
 )
-from amiwarp.events.events import Events
 
 WAYS = pytest.mark.parametrize("find_pointers", [pointers_in_place, listed_pointers])
 

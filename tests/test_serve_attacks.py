@@ -22,17 +22,13 @@ import aiohttp
 import msgpack
 import numpy as np
 import pytest
-from test_serve import COUNT, TOKEN, WAIT_S, Counters, get, origin_of, served, until
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import simulate
+from amiwarp import AmiwarpError, Camera, Prism, Recording, simulate
 from amiwarp.viewer import serve as server_module
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.panel import MOST_IN_FLIGHT, SETTABLE
 from amiwarp.viewer.serve import MOST_BYTES, HostNames, MessageFilter, address, is_local, reachable, serve, warning
+from tests.test_serve import COUNT, TOKEN, WAIT_S, Counters, get, origin_of, served, until
 
 pytest.importorskip("trame_client")
 

@@ -14,22 +14,26 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from test_serve import WAIT_S, served, until
 
-from amiwarp.calib import Calibration, calibrate
-from amiwarp.events.events import MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.io import open_recording, save_recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.simulator import simulate
+from amiwarp import (
+    Calibration,
+    Camera,
+    MemoryEvents,
+    Prism,
+    PrismMotion,
+    Recording,
+    calibrate,
+    open_recording,
+    save_recording,
+    simulate,
+)
 from amiwarp.viewer import exports, jobs
 from amiwarp.viewer import jobs as selected_calibration
 from amiwarp.viewer.inspector import Inspector, Library
 from amiwarp.viewer.jobs import LiveFigures, LiveSource, estimate_phase
 from amiwarp.viewer.layout import KEYS
 from amiwarp.viewer.panel import SETTABLE
+from tests.test_serve import WAIT_S, served, until
 
 pytest.importorskip("trame_client")
 APEX_DEG, NOMINAL_DEG, RPM, PHASE = 1.0, 1.2, 720.0, 2.0

@@ -14,22 +14,27 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from amiwarp.calib import Settings
-from amiwarp.choices import Axis, Colour, Sharpness, View
-from amiwarp.compensation.recordings import compensate_events
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.corners import find_background_activity
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Encoder,
+    Events,
+    MemoryEvents,
+    Prism,
+    Recording,
+    Settings,
+    Sharpness,
+    compensate_events,
+    find_background_activity,
+    open_recording,
+    reconstruct,
+    sharpness,
+    simulate,
+)
+from amiwarp.choices import Axis, Colour, View
 from amiwarp.imaging.iwe import Votes
-from amiwarp.imaging.sharpness import random_variance, relative_variance, sharpness
+from amiwarp.imaging.sharpness import random_variance, relative_variance
 from amiwarp.imaging.votes import CanvasShape
-from amiwarp.io import open_recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.reconstruction.picture import reconstruct
-from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import exports, timeline
 from amiwarp.viewer import images as log_intensity
 from amiwarp.viewer import images as selected_part

@@ -12,13 +12,19 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 from typer.testing import CliRunner
 
+from amiwarp import (
+    AmiwarpError,
+    Cause,
+    Events,
+    MemoryEvents,
+    Recording,
+    Truth,
+    WorldLabels,
+    open_recording,
+    save_recording,
+)
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording, Truth
-from amiwarp.events.truth import Cause, WorldLabels
-from amiwarp.io import open_recording, save_recording
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer import window
 from amiwarp.viewer.clouds import CAUSE_COLOURS, GREY, Look, Scene, colours_of, event_text, legend_of
