@@ -127,8 +127,9 @@ def summary(results: Results) -> Iterator[str]:
     yield ""
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in results["rows"]:
-        shown = row["what"] != UNMOVED and (row["what"] != IMAGE or row["name"] in SUMMED)
-        if shown and "skipped" not in row:
+        if "skipped" in row or (row["what"] == IMAGE and row["name"] not in SUMMED):
+            continue
+        if SUMMED_ERRORS.keys() & row["errors"].keys():
             groups.setdefault((row["what"], row["name"]), []).append(row)
     rows = [[what, name, summed_speed(what, same), summed_error(same)] for (what, name), same in groups.items()]
     yield from table(["task", "method", "speed", "error"], rows)
