@@ -227,7 +227,7 @@ def main(arguments: list[str] | None = None) -> int:
     if out is not None:
         write(out, results)
     if out in report.FILES.values():
-        report.PAGE.write_text(report.refreshed())
+        report.write_pages()
     bad = [f"{row['scene']}, {row['name']}: {'; '.join(row['wrong'])}" for row in results["rows"] if row.get("wrong")]
     print("wrong answers:\n" + "\n".join(bad) if bad else "all answers are correct")
     return 1 if bad else 0

@@ -44,7 +44,6 @@ from amiwarp.kernels.launch import launch
 from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_orbit, prism_path
 from amiwarp.optics.camera import camera_params
 from amiwarp.plotting.figures import save
-from amiwarp.simulation.description import Scene
 from amiwarp.simulation.scenery import MapRing, place_scene, step_us
 from amiwarp.studies.cluster import machine, versions
 from amiwarp.studies.demo import earth

@@ -64,7 +64,6 @@ from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maxi
 from amiwarp.calib.parameters import RATES
 from amiwarp.calib.settings import GAUSS_NEWTON, STAGES
 from amiwarp.calib.single_model import prepare
-from amiwarp.simulation.description import Scene
 
 APEXES_DEG = (0.5, 1.0, 2.0)
 NOMINAL = 1.15

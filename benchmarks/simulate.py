@@ -22,7 +22,6 @@ import numpy as np
 import warp as wp
 
 from amiwarp import Camera, EncoderModel, ExactModel, Prism, Scene, Simulation
-from amiwarp.simulation.description import Scene
 from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.scenery import step_us
 

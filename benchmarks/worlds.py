@@ -20,7 +20,6 @@ import numpy as np
 import warp as wp
 
 from amiwarp import Camera, Events, EventTruth, Prism, Scene, Simulation, TruthRenderer, WorldScene, named_world
-from amiwarp.simulation.description import Scene
 from amiwarp.simulation.engine import Engine
 
 CAMERA, PRISM = Camera.from_fov(640, 480, math.radians(60.0)), Prism(math.radians(1.0))

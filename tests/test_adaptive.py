@@ -19,7 +19,6 @@ from amiwarp import (
     compensate_events,
 )
 from amiwarp.live.stream.adaptive import DIRECTIONS, Coverage, CoverageMeter, SpeedController, prism_path
-from amiwarp.simulation.description import Scene
 from amiwarp.studies.stability.conditions import SceneKind, draw
 
 WINDOW_US = 33_000

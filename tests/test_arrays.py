@@ -35,7 +35,6 @@ from amiwarp import (
     validation,
 )
 from amiwarp.events.device_events import converted, import_array
-from amiwarp.simulation.description import Scene
 
 WIDTH, HEIGHT = 64, 48
 CAMERA, PRISM = Camera.from_fov(WIDTH, HEIGHT, math.radians(60)), Prism(math.radians(2.0))

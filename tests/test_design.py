@@ -32,7 +32,6 @@ from amiwarp.calib.model_choice import QUANTISATION_PX
 from amiwarp.cli import design as command_line
 from amiwarp.cli.console import report
 from amiwarp.cli.options import Common, command
-from amiwarp.simulation.description import Scene
 from amiwarp.studies.design import Design, Limits, Timing, design
 from amiwarp.studies.design.choice import (
     ACROSS,

@@ -36,7 +36,6 @@ from amiwarp.calib.calibration_events import thin
 from amiwarp.calib.first_guess import estimate_rates
 from amiwarp.calib.parameters import RATES
 from amiwarp.io.text import read_calib
-from amiwarp.simulation.description import Scene
 from amiwarp.simulation.pictures import linear_luminance
 from tests.conftest import TRUE_PRISM
 

@@ -34,7 +34,6 @@ from amiwarp.calib.bad_pixels import (
     unrepeated_counts,
     without_pixels,
 )
-from amiwarp.simulation.description import Scene
 from amiwarp.simulation.pictures import linear_luminance
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))

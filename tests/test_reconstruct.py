@@ -42,7 +42,6 @@ from amiwarp.cli.app import app
 from amiwarp.io.text import read_calib
 from amiwarp.reconstruction.export import save_film, save_picture, save_video, tones
 from amiwarp.reconstruction.picture import nodes_near, without_small_holes, without_small_regions
-from amiwarp.simulation.description import Scene
 from reference.calibration_sample import exact_calibration
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))

@@ -25,7 +25,6 @@ from amiwarp import (
 )
 from amiwarp.cli.options import SensorOptions
 from amiwarp.kernels import pixels
-from amiwarp.simulation.description import Scene
 from amiwarp.simulation.pictures import DARK
 
 CAMERA = Camera.from_fov(64, 48, math.radians(50.0))

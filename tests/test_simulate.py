@@ -31,7 +31,6 @@ from amiwarp import (
 )
 from amiwarp.kernels import launch as launching
 from amiwarp.kernels import pixels as kernels
-from amiwarp.simulation.description import Scene
 from amiwarp.simulation.pictures import DARK, Placement, linear_luminance, log_map, place_picture, read_picture
 from amiwarp.simulation.scenery import step_us
 

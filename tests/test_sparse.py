@@ -22,7 +22,6 @@ from amiwarp import (
     model_error,
     truth_model,
 )
-from amiwarp.simulation.description import Scene
 
 CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
 COARSE = PhotometricSettings(density=1.0)

@@ -36,7 +36,6 @@ from amiwarp import (
 )
 from amiwarp.cli.app import app
 from amiwarp.events.truth import MemoryMasks
-from amiwarp.simulation.description import Scene
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.sequences import open_pictures
 from amiwarp.translation.datasets import SACCADE_US, SACCADES_PX, open_mvsec, saccades

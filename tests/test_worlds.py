@@ -28,7 +28,6 @@ from amiwarp import (
     World,
     WorldScene,
 )
-from amiwarp.simulation.description import Scene
 from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.renderer import WorldMapRing, pixel_rays, surfaces_at
