@@ -178,11 +178,11 @@ def _column_names(path: Path, header: str) -> list[str]:
 
 READERS = {
     Format.EVT: "prophesee",
-    Format.AEDAT4: "aedat",
+    Format.AEDAT4: "aedat4",
     Format.AEDAT3: "aedat3",
     Format.AEDAT2: "aedat2",
-    Format.ROSBAG: "rosbag",
-    Format.HDF5: "hdf5_rows",
+    Format.ROSBAG: "ros",
+    Format.HDF5: "hdf5",
 }
 """Modules of amiwarp.io whose ``trigger_packets`` reads the edges of a format."""
 

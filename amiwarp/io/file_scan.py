@@ -408,7 +408,7 @@ def read_sensors(
 ) -> tuple[ImuSamples | None, StreamedImages | None, dict[str, MetadataValue]]:
     """Return the IMU samples and frames that were counted, and for those that cannot be read a note that says why.
 
-    ``module`` has the functions ``read_imu``, ``read_heads`` and ``read_images``, which run in the reading process and
+    ``module`` is the name of one with the functions ``read_imu``, ``read_heads`` and ``read_images``, which run in the reading process and
     get the absolute path and ``arguments``.
     """
     notes: dict[str, MetadataValue] = {}
@@ -416,7 +416,7 @@ def read_sensors(
         return None, None, notes
 
     def start(function: str) -> Packets:
-        return packets(f"amiwarp.io.{module}:{function}", path.absolute(), *arguments, {})
+        return packets(f"{module}:{function}", path.absolute(), *arguments, {})
 
     imu = frames = None
     if counts.get("imu_samples"):

@@ -159,16 +159,12 @@ def _give_back(process: list[ReadingProcess]) -> None:
 
 # Reader of HDF5 files that store one row per event: MVSEC's and Prophesee's. They are read from the beginning.
 
-READ = "amiwarp.io.hdf5_server:read_rows"
-"""Function of the reading process."""
-
-
 def open_rows(path: Path, layout: str, group: str) -> Recording:
     """Open the events of a group, which :func:`amiwarp.io.hdf5_server.find_layout` has found."""
     source = path.absolute()
-    about = run("amiwarp.io.hdf5_server:read_head", source, group)
-    events = FileEvents(path, partial(packets, READ, source, f"{group}/events"), size=_size(about["size"]))
-    imu, frames, notes = read_sensors(path, about["counts"], "hdf5_sensors", group)
+    about = run(f"{SERVER}:read_head", source, group)
+    events = FileEvents(path, partial(packets, f"{SERVER}:read_rows", source, f"{group}/events"), size=_size(about["size"]))
+    imu, frames, notes = read_sensors(path, about["counts"], SERVER, group)
     metadata = {"format": layout, "topic": group, **about["counts"], **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
 
@@ -179,4 +175,4 @@ def _size(given: list[int] | None) -> tuple[int, int] | None:
 
 def trigger_packets(path: Path) -> Iterator[Packet]:
     """Yield the edges of the external triggers in Prophesee's file."""
-    return packets(READ, path.absolute(), "EXT_TRIGGER/events", {})
+    return packets(f"{SERVER}:read_rows", path.absolute(), "EXT_TRIGGER/events", {})

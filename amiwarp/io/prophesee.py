@@ -196,7 +196,7 @@ def open_evt(path: Path) -> Recording:
     if word == 8:
         version, source = "2.1", partial(_evt21_packets, path, offset, swapped, False)
     else:
-        source = partial(packets, "amiwarp.io.prophesee:read_evt_packets", path.absolute(), False)
+        source = partial(packets, read_evt_packets, path.absolute(), False)
     last = None if word == 2 else partial(_last_evt_time, path, offset, word, swapped)
     events = FileEvents(path, source, size=_evt_size(fields), last_time=last)
     truncated = (path.stat().st_size - offset) % word
@@ -238,7 +238,7 @@ def trigger_packets(path: Path) -> Iterator[Packet]:
     fields, offset = _read_header(path)
     if fields.get("evt", fields.get("format", "")).startswith(("2.1", "EVT21")):
         return _evt21_packets(path, offset, _is_swapped(path, offset, fields.get("format", "")), True, {})
-    return packets("amiwarp.io.prophesee:read_evt_packets", path.absolute(), True, {})
+    return packets(read_evt_packets, path.absolute(), True, {})
 
 
 def _evt21_packets(path: Path, offset: int, swapped: bool, triggers: bool, notes: dict[str, int]) -> Iterator[Packet]:

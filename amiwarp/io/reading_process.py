@@ -17,9 +17,9 @@ import subprocess
 import sys
 import threading
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,10 @@ switches."""
 
 START = "import sys; sys.path[:] = sys.argv[1:]; from amiwarp.io.reading_server import serve; serve()"
 """Python program that the reading process runs."""
+
+
+Function: TypeAlias = str | Callable[..., Any]
+"""Function of amiwarp that the process runs: itself, or ``module:function`` if only the process imports its module."""
 
 
 class ReadingProcess:
@@ -74,8 +78,8 @@ class ReadingProcess:
         """Whether the process is alive and was started by this process. A fork of its owner cannot use it."""
         return self.close.alive and self.owner == os.getpid() and self._child.poll() is None
 
-    def call(self, function: str, *arguments: Any) -> tuple[Any, list[NDArray[Any]]]:
-        """Run ``module:function`` of amiwarp, and return its JSON value and its arrays, each of shape ``(n,)``.
+    def call(self, function: Function, *arguments: Any) -> tuple[Any, list[NDArray[Any]]]:
+        """Run a function of amiwarp, and return its JSON value and its arrays, each of shape ``(n,)``.
 
         Raises
         ------
@@ -90,7 +94,7 @@ class ReadingProcess:
         self.send("amiwarp.io.reading_server:prepare", module)
         self._preparing = True
 
-    def send(self, function: str, *arguments: Any) -> None:
+    def send(self, function: Function, *arguments: Any) -> None:
         """Send a call to the process; :meth:`receive` returns its result.
 
         A path among the arguments is an input: it is checked and noted here, and sent as an absolute path.
@@ -100,7 +104,7 @@ class ReadingProcess:
             self.receive()
         arguments = tuple(_absolute(value) if isinstance(value, Path) else value for value in arguments)
         limits = {"cpu_s": CPU_SECONDS, "memory_bytes": MEMORY_BYTES}
-        request = json.dumps({"function": function, "arguments": arguments, **limits}).encode()
+        request = json.dumps({"function": _name_of(function), "arguments": arguments, **limits}).encode()
         try:
             self._requests.write(request + b"\n")
             self._requests.flush()
@@ -140,6 +144,10 @@ class ReadingProcess:
             return AmiwarpError(f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged")
         remedy = f"check that '{sys.executable}' is Python and that enough memory is free"
         return AmiwarpError(f"the reading process ended with code {code}; {remedy}")
+
+
+def _name_of(function: Function) -> str:
+    return function if isinstance(function, str) else f"{function.__module__}:{function.__name__}"
 
 
 def _absolute(path: Path) -> str:
@@ -197,7 +205,7 @@ def _keep_idle(process: ReadingProcess) -> None:
     process.close()
 
 
-def run(function: str, *arguments: Any) -> Any:
+def run(function: Function, *arguments: Any) -> Any:
     """Run one function in a reading process, and return its JSON value."""
     process = borrow()
     try:
@@ -206,8 +214,8 @@ def run(function: str, *arguments: Any) -> Any:
         give_back(process)
 
 
-def packets(function: str, *arguments: Any) -> Iterator[Any]:
-    """Yield the packets of a generator ``module:function`` that runs in a reading process.
+def packets(function: Function, *arguments: Any) -> Iterator[Any]:
+    """Yield the packets of a generator that runs in a reading process.
 
     A packet is a tuple of arrays. Small packets are joined to larger ones. The process decodes one packet ahead. The
     last argument is a dictionary of counts, which is updated from the dictionary that the generator gets first.
@@ -215,7 +223,7 @@ def packets(function: str, *arguments: Any) -> Iterator[Any]:
     *given, notes = arguments
     process = borrow()
     try:
-        process.call("amiwarp.io.reading_server:begin", function, *given)
+        process.call("amiwarp.io.reading_server:begin", _name_of(function), *given)
         process.send("amiwarp.io.reading_server:advance")
         waiting = True
         try:

@@ -217,11 +217,11 @@ def open_rosbag(path: Path, topic: str | None = None) -> Recording:
     """Open the events of a topic of a bag: a file, or the folder of a ROS 2 bag."""
     source = path.absolute()
     with errors_name(path, lambda: "opening the bag"):
-        about = run("amiwarp.io.ros:read_head", source, topic)
-    read = partial(packets, "amiwarp.io.ros:read_packets", source, about["topic"], False)
+        about = run(read_head, source, topic)
+    read = partial(packets, read_packets, source, about["topic"], False)
     size = tuple(about["size"]) if min(about["size"]) else None
     events = FileEvents(path, read, size=size)
-    imu, frames, notes = read_sensors(path, about["counts"], "ros_sensors", about["topic"])
+    imu, frames, notes = read_sensors(path, about["counts"], __name__, about["topic"])
     metadata = {"format": about["format"], "topic": about["topic"], **about["counts"], **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
 
@@ -229,8 +229,8 @@ def open_rosbag(path: Path, topic: str | None = None) -> Recording:
 def trigger_packets(path: Path, topic: str | None = None) -> Iterator[Packet]:
     """Yield the trigger edges of the packets of a topic."""
     source = path.absolute()
-    about = run("amiwarp.io.ros:read_head", source, topic)
-    return packets("amiwarp.io.ros:read_packets", source, about["topic"], True, {})
+    about = run(read_head, source, topic)
+    return packets(read_packets, source, about["topic"], True, {})
 
 
 def read_head(path: str, topic: str | None) -> Reply:
@@ -567,7 +567,7 @@ class _Clock:
         """Read the times of the messages of a bag."""
         parts = [(np.zeros(1, np.int64),) * 3]
         if bag is not None:
-            parts = list(packets("amiwarp.io.ros:read_stamps", bag.path, bag.topic, {}))
+            parts = list(packets(read_stamps, bag.path, bag.topic, {}))
         t, self._recorded, self._stamps = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         self._t = np.maximum.accumulate(t)
 
@@ -591,8 +591,8 @@ class _Clock:
 def _others(writer: Any, bag: Bag) -> Generator[tuple[int, Any, Any], None, None]:
     """Add the other topics of a bag to a writer, and yield their messages: time of the recording [ns], topic, bytes."""
     path = bag.path
-    topics = [_add_topic(writer, about) for about in run("amiwarp.io.ros:read_topics", path, bag.topic)]
-    source = packets("amiwarp.io.ros:read_others", path, bag.topic, {})
+    topics = [_add_topic(writer, about) for about in run(read_topics, path, bag.topic)]
+    source = packets(read_others, path, bag.topic, {})
     for data, lengths, recorded, places in source:
         ends = np.cumsum(lengths).tolist()
         for end, length, time, at in zip(ends, lengths.tolist(), recorded.tolist(), places.tolist(), strict=True):
