@@ -17,8 +17,7 @@ from io_samples import make_events, refusal, to_faery, write_dsec, write_native
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording, reading_process
 from amiwarp.io.chunks import CHUNK, checksum, decode
-from amiwarp.io.reading_process import borrow, give_back, run
-from amiwarp.io.reading_server import Reply
+from amiwarp.io.reading_process import Reply, borrow, give_back, run
 
 EVENTS = make_events(600)
 SERVED = "test_io_hdf5"

@@ -14,7 +14,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, EventSource, MemoryEvents
 from amiwarp.io import ConversionSummary, Format, convert, detect_format, open_recording
 from amiwarp.io import file_scan as scan
-from amiwarp.io.output_formats import OutputFormat
+from amiwarp.io.formats import OutputFormat
 from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.prism import Prism
 

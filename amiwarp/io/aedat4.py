@@ -17,10 +17,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import GRAVITY, FileEvents, Packet, read_sensors
+from amiwarp.io.formats import Outline
 from amiwarp.io.input_files import errors_name, open_input
-from amiwarp.io.output_formats import Outline
-from amiwarp.io.reading_process import packets, run
-from amiwarp.io.reading_server import Reply, noting_progress
+from amiwarp.io.reading_process import Reply, noting_progress, packets, run
 
 # Reader of iniVation's AEDAT 4.0 files, with faery: the first streams of events, frames and IMU samples.
 #

@@ -10,8 +10,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name
-from amiwarp.io.reading_process import packets, run
-from amiwarp.io.reading_server import Reply, noting_progress
+from amiwarp.io.reading_process import Reply, noting_progress, packets, run
 
 
 def open_es(path: Path) -> Recording:

@@ -408,8 +408,8 @@ def read_sensors(
 ) -> tuple[ImuSamples | None, StreamedImages | None, dict[str, MetadataValue]]:
     """Return the IMU samples and frames that were counted, and for those that cannot be read a note that says why.
 
-    ``module`` is the name of one with the functions ``read_imu``, ``read_heads`` and ``read_images``, which run in the reading process and
-    get the absolute path and ``arguments``.
+    ``module`` is the name of the module with ``read_imu``, ``read_heads`` and ``read_images``, which run in the reading
+    process and get the absolute path and ``arguments``.
     """
     notes: dict[str, MetadataValue] = {}
     if head_limit() is not None:

@@ -17,10 +17,9 @@ from amiwarp.events.events import DEFAULT_BLOCK, Events
 from amiwarp.events.recording import Recording
 from amiwarp.io.encoder_files import last_word, nearest, unwrapped
 from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.formats import LONGEST_US, Outline
 from amiwarp.io.input_files import errors_name, open_input
-from amiwarp.io.output_formats import LONGEST_US, Outline
-from amiwarp.io.reading_process import packets
-from amiwarp.io.reading_server import noting_progress
+from amiwarp.io.reading_process import noting_progress, packets
 
 # Decoders of Prophesee's EVT words with NumPy: EVT 2.0, 2.1 and 3.0, for streams that arrive in pieces.
 #

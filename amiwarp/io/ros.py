@@ -21,11 +21,10 @@ from amiwarp.events.events import Events, regroup
 from amiwarp.events.recording import Recording
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.io.file_scan import FileEvents, Packet, read_sensors
+from amiwarp.io.formats import Bag, Outline
 from amiwarp.io.input_files import errors_name
-from amiwarp.io.output_formats import Bag, Outline
 from amiwarp.io.prophesee import Columns, Evt2Decoder, Evt3Decoder, Evt3Encoder, origin_of, swap_halves, words_of
-from amiwarp.io.reading_process import packets, run
-from amiwarp.io.reading_server import Reply
+from amiwarp.io.reading_process import Reply, packets, run
 
 # Decoders of the ROS messages that hold events: arrays of events, and packets of a sensor's own words.
 #
