@@ -34,7 +34,6 @@ from .events.events import Events as Events
 from .events.events import EventSource as EventSource
 from .events.events import MemoryEvents as MemoryEvents
 from .events.recording import MetadataValue as MetadataValue
-from .events.recording import PointStore as PointStore
 from .events.recording import Recording as Recording
 from .events.recording import Truth as Truth
 from .events.sensors import ImageStore as ImageStore
@@ -46,6 +45,7 @@ from .events.truth import EventValues as EventValues
 from .events.truth import FrameStore as FrameStore
 from .events.truth import FrameTruth as FrameTruth
 from .events.truth import KnownStore as KnownStore
+from .events.truth import PointStore as PointStore
 from .events.truth import Poses as Poses
 from .events.truth import PoseStore as PoseStore
 from .events.truth import WorldLabels as WorldLabels
@@ -57,15 +57,15 @@ from .imaging.metrics import edge_blur as edge_blur
 from .imaging.metrics import model_error as model_error
 from .imaging.metrics import truth_model as truth_model
 from .imaging.sharpness import sharpness as sharpness
-from .io.chunks import Codec as Codec
 from .io.export import ConversionSummary as ConversionSummary
 from .io.export import convert as convert
+from .io.formats import Codec as Codec
 from .io.formats import Format as Format
+from .io.formats import OutputFormat as OutputFormat
+from .io.formats import Rounding as Rounding
 from .io.formats import open_recording as open_recording
 from .io.native_writer import RecordingWriter as RecordingWriter
 from .io.native_writer import save_recording as save_recording
-from .io.output_formats import OutputFormat as OutputFormat
-from .io.output_formats import Rounding as Rounding
 from .io.recorded_dataset import RecordedDataset as RecordedDataset
 from .io.truth_export import save_flow_dsec as save_flow_dsec
 from .io.truth_export import save_flow_mvsec as save_flow_mvsec

@@ -16,8 +16,7 @@ import pytest
 from amiwarp import AmiwarpError, open_recording
 from amiwarp.io import reading_process
 from amiwarp.io.chunks import CHUNK, checksum, decode
-from amiwarp.io.reading_process import borrow, give_back, run
-from amiwarp.io.reading_server import Reply
+from amiwarp.io.reading_process import Reply, borrow, give_back, run
 from reference.io_samples import make_events, refusal, to_faery, write_dsec, write_native
 
 EVENTS = make_events(600)

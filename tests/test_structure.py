@@ -200,8 +200,8 @@ OPENED_OTHERWISE = {
     "amiwarp.io.ros: bag.open()": "reading process",
     # Files of the system and of the package.
     "amiwarp.io.atomic_output: Path('/proc/sys/kernel/random/boot_id').read_text()": "system",
-    "amiwarp.io.reading_server: open('/proc/self/statm')": "system",
-    "amiwarp.io.reading_server: open(f'/proc/self/fdinfo/{number}')": "system",
+    "amiwarp.io.reading_process: open('/proc/self/statm')": "system",
+    "amiwarp.io.reading_process: open(f'/proc/self/fdinfo/{number}')": "system",
     "amiwarp.studies.cluster: info.read_text()": "system",
     "amiwarp.live.stream.sources: open(0, 'rb', buffering=0, closefd=False)": "standard input",
     "amiwarp.viewer.serve: path.read_text(encoding='utf-8')": "file of the package",

@@ -15,9 +15,9 @@ from amiwarp.calib.parameters import EXACT_PARAMETERS, size_name
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
+from amiwarp.io.formats import check_ending
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import fields_of, read_json
-from amiwarp.io.output_formats import check_ending
 from amiwarp.optics.models import MODELS
 from amiwarp.validation import check_names, one_of, shown
 

@@ -18,9 +18,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.io.atomic_output import write_text
 from amiwarp.io.camera_files import camera_from_json, camera_to_json
+from amiwarp.io.formats import check_ending
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import build, fields_of, read_json
-from amiwarp.io.output_formats import check_ending
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.models import MODELS

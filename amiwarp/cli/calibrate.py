@@ -17,7 +17,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import MemoryEvents
 from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import check_output
-from amiwarp.io.output_formats import check_ending
+from amiwarp.io.formats import check_ending
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,28 +29,21 @@ AVERAGE_S = 600.0
 minutes."""
 
 
+_in_scene = partial(typer.Option, rich_help_panel="Scene")
+
+
 @dataclass(frozen=True)
 class SceneOptions:
     """Options for the picture and the camera's rotation in front of it."""
 
     scene_fov_deg: Annotated[
         float | None,
-        typer.Option(
-            help="Horizontal extent of the picture (deg). Default: it fills the field of view at all times.",
-            rich_help_panel="Scene",
-        ),
+        _in_scene(help="Horizontal extent of the picture (deg). Default: it fills the field of view at all times."),
     ] = None
-    blur_px: Annotated[
-        float, typer.Option(help="Standard deviation of the optical blur (px).", rich_help_panel="Scene")
-    ] = 0.5
+    blur_px: Annotated[float, _in_scene(help="Standard deviation of the optical blur (px).")] = 0.5
 
     rotate_deg_s: Annotated[
-        str,
-        typer.Option(
-            help="Angular velocity of the camera about its x, y and z axes (deg/s).",
-            metavar="X,Y,Z",
-            rich_help_panel="Scene",
-        ),
+        str, _in_scene(help="Angular velocity of the camera about its x, y and z axes (deg/s).", metavar="X,Y,Z")
     ] = "0,0,0"
 
     @property

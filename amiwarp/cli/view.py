@@ -18,7 +18,7 @@ from amiwarp.cli.live import SourceOptions, check_angles
 from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, parse_size, span
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.io.output_formats import check_ending
+from amiwarp.io.formats import check_ending
 from amiwarp.viewer.serve import warning
 
 if TYPE_CHECKING:

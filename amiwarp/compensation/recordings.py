@@ -17,15 +17,23 @@ import warp as wp
 
 from amiwarp.compensation.launch_plan import LaunchPlan
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, check_order, device_for, encoder_params, limits, wait
-from amiwarp.events.events import Events, check_sensor
+from amiwarp.events.device_events import (
+    DeviceEvents,
+    check_order,
+    check_sensor,
+    device_for,
+    encoder_params,
+    limits,
+    wait,
+)
+from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.io.atomic_output import check_output
-from amiwarp.io.chunks import CHUNK, Codec, compile_checksums, in_order
+from amiwarp.io.chunks import CHUNK, compile_checksums, in_order
 from amiwarp.io.export import bag_of, export, left_out
-from amiwarp.io.native_reader import NativeEvents
+from amiwarp.io.formats import Codec, OutputFormat, Rounding, check_codec, check_rounding, output_format
+from amiwarp.io.hdf5_reader import NativeEvents
 from amiwarp.io.native_writer import FlaggedEvents
-from amiwarp.io.output_formats import OutputFormat, Rounding, check_codec, check_rounding, output_format
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import join_columns
 from amiwarp.kernels.launch import RecordedLaunch, launch

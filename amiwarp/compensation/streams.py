@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from amiwarp.compensation.launch_plan import LaunchPlan
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, encoder_pieces, limits, wait
-from amiwarp.events.events import TIME_LIMIT, Events, check_sensor
+from amiwarp.events.device_events import DeviceEvents, check_sensor, encoder_pieces, limits, wait
+from amiwarp.events.events import TIME_LIMIT, Events
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.votes import CanvasShape
 from amiwarp.kernels.compensation import Columns

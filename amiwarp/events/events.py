@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,10 +19,6 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import array as as_numbers
 from amiwarp.validation import guarded, instance, one_of, whole
-
-if TYPE_CHECKING:
-    from amiwarp.events.device_events import DeviceEvents
-
 
 # Conversion and checks of event arrays: types, time limits, frame and order.
 
@@ -120,12 +116,6 @@ def check_order(events: Events, *, where: str, first_index: int = 0) -> None:
     if falls.any():
         falls = np.concatenate([[False], falls])
         _fail(events, where, first_index, falls, "is earlier than the one before; sort by time")
-
-
-def check_sensor(events: Events | DeviceEvents) -> None:
-    """Raise :class:`AmiwarpError` for compensated events; events from a sensor have uint16 coordinates."""
-    if not events.whole_pixels:
-        raise AmiwarpError("event coordinates are float32, already compensated; give events from a sensor (uint16)")
 
 
 def check_events(

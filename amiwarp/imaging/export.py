@@ -21,7 +21,7 @@ from amiwarp.imaging.iwe import PIECE, Votes
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
 from amiwarp.imaging.votes import CanvasShape
 from amiwarp.io.atomic_output import NewFile, allocate, check_output
-from amiwarp.io.output_formats import check_ending
+from amiwarp.io.formats import check_ending
 from amiwarp.validation import choice
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ import warp as wp
 from amiwarp.choices import Vote
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, azimuths, encoder_params, time_span
-from amiwarp.events.events import check_sensor
+from amiwarp.events.device_events import DeviceEvents, azimuths, check_sensor, encoder_params, time_span
 from amiwarp.kernels import tiles as kernels
 from amiwarp.kernels.camera import CameraRotationParams
 from amiwarp.kernels.iwe import CPU_WIDTH, Frame, add_sums, add_totals, empty_words, read_sums, read_votes

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 from array import array
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder, UnwrapError
-from amiwarp.io.formats import Format, detect_format
+from amiwarp.io.formats import OPENERS, TRIGGERS, Format, detect_format, io_function
 from amiwarp.io.input_files import errors_name, open_input, text_lines
 from amiwarp.validation import whole
 
@@ -176,16 +175,6 @@ def _column_names(path: Path, header: str) -> list[str]:
 
 # The prism's encoder from the external trigger edges that a camera recorded with its events.
 
-READERS = {
-    Format.EVT: "prophesee",
-    Format.AEDAT4: "aedat",
-    Format.AEDAT3: "aedat3",
-    Format.AEDAT2: "aedat2",
-    Format.ROSBAG: "rosbag",
-    Format.HDF5: "hdf5_rows",
-}
-"""Modules of amiwarp.io whose ``trigger_packets`` reads the edges of a format."""
-
 MOST_EDGES = 1 << 26
 """Largest number of edges that is read: 5 hours at 3.6 kHz."""
 
@@ -210,8 +199,8 @@ def read_encoder_triggers(
     if direction not in (1, -1):
         raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
     found = detect_format(path)
-    if found not in READERS:
-        formats = ", ".join(one.value for one in READERS)
+    if found not in TRIGGERS:
+        formats = ", ".join(one.value for one in TRIGGERS)
         raise AmiwarpError(f"{path}: files of the format {found.value} store no triggers; expected one of {formats}")
     with errors_name(path, lambda: "reading the triggers"):
         channels, t, rising = _edges(path, found, topic)
@@ -227,9 +216,8 @@ def read_encoder_triggers(
 
 def _edges(path: Path, found: Format, topic: str | None) -> tuple[Any, Any, Any]:
     """Return channel, time [us] and whether it rises, of each edge."""
-    module: Any = importlib.import_module(f"amiwarp.io.{READERS[found]}")
-    chosen = (topic,) if found is Format.ROSBAG else ()
-    source: Any = module.trigger_packets(path, *chosen)
+    read = io_function(f"{OPENERS[found].partition(':')[0]}:trigger_packets")
+    source: Any = read(path, *((topic,) if found is Format.ROSBAG else ()))
     parts: list[tuple[Any, ...]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.bool_))]
     count = 0
     with contextlib.closing(source):

@@ -408,15 +408,15 @@ def read_sensors(
 ) -> tuple[ImuSamples | None, StreamedImages | None, dict[str, MetadataValue]]:
     """Return the IMU samples and frames that were counted, and for those that cannot be read a note that says why.
 
-    ``module`` has the functions ``read_imu``, ``read_heads`` and ``read_images``, which run in the reading process and
-    get the absolute path and ``arguments``.
+    ``module`` is the name of the module with ``read_imu``, ``read_heads`` and ``read_images``, which run in the reading
+    process and get the absolute path and ``arguments``.
     """
     notes: dict[str, MetadataValue] = {}
     if head_limit() is not None:
         return None, None, notes
 
     def start(function: str) -> Packets:
-        return packets(f"amiwarp.io.{module}:{function}", path.absolute(), *arguments, {})
+        return packets(f"{module}:{function}", path.absolute(), *arguments, {})
 
     imu = frames = None
     if counts.get("imu_samples"):

@@ -17,10 +17,9 @@ from amiwarp.events.events import DEFAULT_BLOCK, Events
 from amiwarp.events.recording import Recording
 from amiwarp.io.encoder_files import last_word, nearest, unwrapped
 from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.formats import LONGEST_US, Outline
 from amiwarp.io.input_files import errors_name, open_input
-from amiwarp.io.output_formats import LONGEST_US, Outline
-from amiwarp.io.reading_process import packets
-from amiwarp.io.reading_server import noting_progress
+from amiwarp.io.reading_process import noting_progress, packets
 
 # Decoders of Prophesee's EVT words with NumPy: EVT 2.0, 2.1 and 3.0, for streams that arrive in pieces.
 #
@@ -196,7 +195,7 @@ def open_evt(path: Path) -> Recording:
     if word == 8:
         version, source = "2.1", partial(_evt21_packets, path, offset, swapped, False)
     else:
-        source = partial(packets, "amiwarp.io.prophesee:read_evt_packets", path.absolute(), False)
+        source = partial(packets, read_evt_packets, path.absolute(), False)
     last = None if word == 2 else partial(_last_evt_time, path, offset, word, swapped)
     events = FileEvents(path, source, size=_evt_size(fields), last_time=last)
     truncated = (path.stat().st_size - offset) % word
@@ -238,7 +237,7 @@ def trigger_packets(path: Path) -> Iterator[Packet]:
     fields, offset = _read_header(path)
     if fields.get("evt", fields.get("format", "")).startswith(("2.1", "EVT21")):
         return _evt21_packets(path, offset, _is_swapped(path, offset, fields.get("format", "")), True, {})
-    return packets("amiwarp.io.prophesee:read_evt_packets", path.absolute(), True, {})
+    return packets(read_evt_packets, path.absolute(), True, {})
 
 
 def _evt21_packets(path: Path, offset: int, swapped: bool, triggers: bool, notes: dict[str, int]) -> Iterator[Packet]:

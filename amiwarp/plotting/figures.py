@@ -21,7 +21,7 @@ from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
 from amiwarp.io.atomic_output import write_text
-from amiwarp.io.output_formats import check_ending
+from amiwarp.io.formats import check_ending
 from amiwarp.plotting import clouds
 from amiwarp.reconstruction.export import limits, tones
 

@@ -20,7 +20,7 @@ from amiwarp.imaging.export import encode_image, encode_png
 from amiwarp.io import RecordingWriter
 from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.file_scan import FileEvents
-from amiwarp.io.output_formats import check_ending
+from amiwarp.io.formats import check_ending
 from amiwarp.reconstruction.export import save_film
 from amiwarp.viewer.clouds import Scene, orbit_lines
 from amiwarp.viewer.window import kept
