@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.calib import Calibration, Settings
-from amiwarp.calib.model_choice import Places, calibrate_auto, candidate_space, fit, linear_motions
+from amiwarp.calib import Calibration, calibrate
+from amiwarp.calib.model_choice import Places, candidate_space, fit, linear_motions
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error, truth_model
@@ -93,7 +93,7 @@ def row_of(recording: Recording, args: argparse.Namespace) -> dict[str, Any]:
     assert recording.camera is not None
     assert recording.truth is not None
     try:
-        c = calibrate_auto(recording, Settings(), device=args.device)
+        c = calibrate(recording, device=args.device)
     except AmiwarpError as error:
         return {"refused": str(error)}
     assert c.ladder is not None

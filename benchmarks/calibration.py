@@ -37,10 +37,10 @@ import warp as wp
 
 from amiwarp.brightness.event_pairs import SensorTiming
 from amiwarp.calib import Calibration, Settings, calibrate
+from amiwarp.calib.calibration import prepare
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
 from amiwarp.calib.parameters import RATES
 from amiwarp.calib.settings import GAUSS_NEWTON, STAGES, PhotometricSettings
-from amiwarp.calib.single_model import prepare
 from amiwarp.choices import Sharpness
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError

@@ -19,8 +19,8 @@ from PIL import Image
 from amiwarp.brightness.event_pairs import off_excess
 from amiwarp.brightness.solver import BrightnessMap
 from amiwarp.calib import Settings
+from amiwarp.calib.calibration import prepare
 from amiwarp.calib.photometric.cost import Cost, collect_pairs
-from amiwarp.calib.single_model import prepare
 from amiwarp.imaging.export import save_png
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism

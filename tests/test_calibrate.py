@@ -11,11 +11,11 @@ from conftest import NOMINAL_PRISM, TRUE_PRISM
 
 from amiwarp import calib
 from amiwarp.calib import Calibration, Settings
+from amiwarp.calib.calibration import prepare
 from amiwarp.calib.calibration_events import RUN, thin
 from amiwarp.calib.first_guess import estimate_rpm
 from amiwarp.calib.parameters import make_space
 from amiwarp.calib.sharpness import PARTS
-from amiwarp.calib.single_model import prepare
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder

@@ -9,12 +9,12 @@ import pytest
 from conftest import COARSE, TRUE_PRISM
 
 from amiwarp.calib import calibrate
+from amiwarp.calib.calibration import prepare
 from amiwarp.calib.checks import check_pulses, check_texture
 from amiwarp.calib.first_guess import encoder_turns_per_period
 from amiwarp.calib.model_choice import LARGEST_MOTION_PX, in_pixels
-from amiwarp.calib.photometric.answer_search import judge_optimum
+from amiwarp.calib.photometric.stage import judge_optimum
 from amiwarp.calib.settings import Settings
-from amiwarp.calib.single_model import prepare
 from amiwarp.cli.options import interval, number
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
