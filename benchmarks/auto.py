@@ -12,36 +12,36 @@ more than 5 % of the recordings are refused.
 
 from __future__ import annotations
 
-import argparse
-import json
-import math
-import sys
+from amiwarp import AmiwarpError
+from amiwarp import Calibration
+from amiwarp import Camera
+from amiwarp import EllipseModel
+from amiwarp import EncoderModel
+from amiwarp import FlatSide
+from amiwarp import Prism
+from amiwarp import PrismMotion
+from amiwarp import Recording
+from amiwarp import Settings
+from amiwarp import model_error
+from amiwarp import simulate
+from amiwarp import truth_model
+from amiwarp.calib import calibrate
+from amiwarp.calib.model_choice import Places
+from amiwarp.calib.model_choice import candidate_space
+from amiwarp.calib.model_choice import fit
+from amiwarp.calib.model_choice import linear_motions
+from amiwarp.optics.models import MODELS
+from amiwarp.studies.cluster import machine
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
+import argparse
+import json
+import math
 import numpy as np
-
-from amiwarp import (
-    AmiwarpError,
-    Calibration,
-    Camera,
-    EllipseModel,
-    EncoderModel,
-    FlatSide,
-    Prism,
-    PrismMotion,
-    Recording,
-    Settings,
-    model_error,
-    simulate,
-    truth_model,
-)
-from amiwarp.calib.model_choice import Places, calibrate_auto, candidate_space, fit, linear_motions
-from amiwarp.optics.models import MODELS
-from amiwarp.studies.cluster import machine
+import sys
 
 FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
 NOMINAL = 1.1
@@ -99,7 +99,7 @@ def row_of(recording: Recording, args: argparse.Namespace) -> dict[str, Any]:
     assert recording.camera is not None
     assert recording.truth is not None
     try:
-        c = calibrate_auto(recording, Settings(), device=args.device)
+        c = calibrate(recording, device=args.device)
     except AmiwarpError as error:
         return {"refused": str(error)}
     assert c.ladder is not None
