@@ -12,36 +12,36 @@ more than 5 % of the recordings are refused.
 
 from __future__ import annotations
 
-from amiwarp import AmiwarpError
-from amiwarp import Calibration
-from amiwarp import Camera
-from amiwarp import EllipseModel
-from amiwarp import EncoderModel
-from amiwarp import FlatSide
-from amiwarp import Prism
-from amiwarp import PrismMotion
-from amiwarp import Recording
-from amiwarp import Settings
-from amiwarp import model_error
-from amiwarp import simulate
-from amiwarp import truth_model
-from amiwarp.calib import calibrate
-from amiwarp.calib.model_choice import Places
-from amiwarp.calib.model_choice import candidate_space
-from amiwarp.calib.model_choice import fit
-from amiwarp.calib.model_choice import linear_motions
-from amiwarp.optics.models import MODELS
-from amiwarp.studies.cluster import machine
+import argparse
+import json
+import math
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-import argparse
-import json
-import math
+
 import numpy as np
-import sys
+
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    EllipseModel,
+    EncoderModel,
+    FlatSide,
+    Prism,
+    PrismMotion,
+    Recording,
+    calibrate,
+    model_error,
+    simulate,
+    truth_model,
+)
+from amiwarp.calib.model_choice import Places, candidate_space, fit, linear_motions
+from amiwarp.optics.models import MODELS
+from amiwarp.studies.cluster import machine
 
 FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
 NOMINAL = 1.1

@@ -21,48 +21,49 @@ The results are one JSON object. The exit status is 1 if a row exceeds its limit
 
 from __future__ import annotations
 
-from amiwarp import AmiwarpError
-from amiwarp import Calibration
-from amiwarp import Camera
-from amiwarp import CameraMotion
-from amiwarp import Events
-from amiwarp import FlatSide
-from amiwarp import MemoryEvents
-from amiwarp import PhotometricSettings
-from amiwarp import Prism
-from amiwarp import PrismMotion
-from amiwarp import Recording
-from amiwarp import Scene
-from amiwarp import SensorModel
-from amiwarp import SensorTiming
-from amiwarp import Settings
-from amiwarp import Sharpness
-from amiwarp import Simulation
-from amiwarp import Truth
-from amiwarp import calibrate
-from amiwarp import compensate_events
-from amiwarp import edge_blur
-from amiwarp import model_error
-from amiwarp import truth_model
-from amiwarp.calib.calibration import prepare
-from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS
-from amiwarp.calib.nlopt_solver import LOCAL_ALGORITHMS
-from amiwarp.calib.nlopt_solver import maximise
-from amiwarp.calib.parameters import RATES
-from amiwarp.calib.settings import GAUSS_NEWTON
-from amiwarp.calib.settings import STAGES
+import argparse
+import json
+import math
+import platform
+import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-import argparse
-import json
-import math
+
 import numpy as np
-import platform
-import sys
-import time
 import warp as wp
+
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    CameraMotion,
+    Events,
+    FlatSide,
+    MemoryEvents,
+    PhotometricSettings,
+    Prism,
+    PrismMotion,
+    Recording,
+    Scene,
+    SensorModel,
+    SensorTiming,
+    Settings,
+    Sharpness,
+    Simulation,
+    Truth,
+    calibrate,
+    compensate_events,
+    edge_blur,
+    model_error,
+    truth_model,
+)
+from amiwarp.calib.calibration import prepare
+from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
+from amiwarp.calib.parameters import RATES
+from amiwarp.calib.settings import GAUSS_NEWTON, STAGES
 
 APEXES_DEG = (0.5, 1.0, 2.0)
 NOMINAL = 1.15

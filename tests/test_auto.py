@@ -1,47 +1,53 @@
 """Automatic choice of the model and of the free parameters, on simulated recordings."""
 
-from amiwarp import AmiwarpError
-from amiwarp import Calibration
-from amiwarp import Camera
-from amiwarp import CircleModel
-from amiwarp import Encoder
-from amiwarp import EncoderModel
-from amiwarp import Events
-from amiwarp import ExactModel
-from amiwarp import FlatSide
-from amiwarp import Prism
-from amiwarp import PrismMotion
-from amiwarp import Recording
-from amiwarp import Settings
-from amiwarp import simulate
-from amiwarp import truth_model
-from amiwarp.calib import calibrate
-from amiwarp.calib import model_choice
-from amiwarp.calib.calibration_events import CalibrationEvents
-from amiwarp.calib.model_choice import CONVERSION_FACTOR
-from amiwarp.calib.model_choice import Groundwork
-from amiwarp.calib.model_choice import Places
-from amiwarp.calib.model_choice import SAMPLED
-from amiwarp.calib.model_choice import TILT
-from amiwarp.calib.model_choice import candidate_space
-from amiwarp.calib.model_choice import compare_models
-from amiwarp.calib.model_choice import encoder_noise
-from amiwarp.calib.model_choice import fit
-from amiwarp.calib.model_choice import linear_motions
-from amiwarp.calib.model_choice import trial_for
-from amiwarp.calib.sharpness import split_turns
-from amiwarp.optics.displacement import rms
-from amiwarp.optics.models import MODELS
+import json
+import math
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
-from scipy.optimize import minimize
-from tests.conftest import COARSE
 from typing import Any
-import json
-import math
+
 import numpy as np
 import pytest
+from scipy.optimize import minimize
+
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    CircleModel,
+    Encoder,
+    EncoderModel,
+    Events,
+    ExactModel,
+    FlatSide,
+    Prism,
+    PrismMotion,
+    Recording,
+    Settings,
+    calibrate,
+    simulate,
+    truth_model,
+)
+from amiwarp.calib import model_choice
+from amiwarp.calib.calibration_events import CalibrationEvents
+from amiwarp.calib.model_choice import (
+    CONVERSION_FACTOR,
+    SAMPLED,
+    TILT,
+    Groundwork,
+    Places,
+    candidate_space,
+    compare_models,
+    encoder_noise,
+    fit,
+    linear_motions,
+    trial_for,
+)
+from amiwarp.calib.sharpness import split_turns
+from amiwarp.optics.displacement import rms
+from amiwarp.optics.models import MODELS
+from tests.conftest import COARSE
 
 BOTH = Settings(events=120_000, photometric=COARSE)
 SHARPNESS = Settings(events=120_000, stages=("sharpness",))

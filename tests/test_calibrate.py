@@ -1,41 +1,43 @@
 """Contrast maximisation without an initial guess, on simulated recordings, and its refusals."""
 
-from amiwarp import AmiwarpError
-from amiwarp import Calibration
-from amiwarp import Camera
-from amiwarp import Encoder
-from amiwarp import EncoderModel
-from amiwarp import Events
-from amiwarp import FlatSide
-from amiwarp import MemoryEvents
-from amiwarp import Prism
-from amiwarp import PrismMotion
-from amiwarp import Recording
-from amiwarp import SensorModel
-from amiwarp import Settings
-from amiwarp import Sharpness
-from amiwarp import calib
-from amiwarp import model_error
-from amiwarp import open_recording
-from amiwarp import predicted_error
-from amiwarp import simulate
-from amiwarp import truth_model
+import functools
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    Encoder,
+    EncoderModel,
+    Events,
+    FlatSide,
+    MemoryEvents,
+    Prism,
+    PrismMotion,
+    Recording,
+    SensorModel,
+    Settings,
+    Sharpness,
+    calib,
+    model_error,
+    open_recording,
+    predicted_error,
+    simulate,
+    truth_model,
+)
 from amiwarp.calib.calibration import prepare
-from amiwarp.calib.calibration_events import RUN
-from amiwarp.calib.calibration_events import thin
+from amiwarp.calib.calibration_events import RUN, thin
 from amiwarp.calib.first_guess import estimate_rpm
 from amiwarp.calib.parameters import make_space
 from amiwarp.calib.sharpness import PARTS
 from amiwarp.optics.displacement import wrap_angle
 from amiwarp.optics.models import MODELS
-from dataclasses import replace
-from pathlib import Path
-from tests.conftest import NOMINAL_PRISM
-from tests.conftest import TRUE_PRISM
-import functools
-import math
-import numpy as np
-import pytest
+from tests.conftest import NOMINAL_PRISM, TRUE_PRISM
 
 calibrate = functools.partial(calib.calibrate, stages=("sharpness",))
 

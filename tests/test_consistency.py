@@ -1,30 +1,30 @@
 """The photometric answer must hold everywhere in the image and over time; a wrong camera or flat side is corrected."""
 
-from amiwarp import Calibration
-from amiwarp import Camera
-from amiwarp import CameraMotion
-from amiwarp import Encoder
-from amiwarp import FlatSide
-from amiwarp import PhotometricSettings
-from amiwarp import Prism
-from amiwarp import RadialTangential
-from amiwarp import Recording
-from amiwarp import calibrate
-from amiwarp import model_error
-from amiwarp import simulate
-from amiwarp import truth_model
-from amiwarp.calib.photometric.consistency import Consistency
-from amiwarp.calib.photometric.consistency import Finding
-from amiwarp.calib.photometric.consistency import LinearFit
-from amiwarp.calib.photometric.cost import CAUSES
-from amiwarp.calib.photometric.stage import LARGEST_ROTATION_GAIN
-from amiwarp.calib.photometric.stage import LARGEST_STILL_COST
-from amiwarp.calib.photometric.stage import judge_consistency
+import math
 from dataclasses import replace
 from typing import Any
-import math
+
 import numpy as np
 import pytest
+
+from amiwarp import (
+    Calibration,
+    Camera,
+    CameraMotion,
+    Encoder,
+    FlatSide,
+    PhotometricSettings,
+    Prism,
+    RadialTangential,
+    Recording,
+    calibrate,
+    model_error,
+    simulate,
+    truth_model,
+)
+from amiwarp.calib.photometric.consistency import Consistency, Finding, LinearFit
+from amiwarp.calib.photometric.cost import CAUSES
+from amiwarp.calib.photometric.stage import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
 
 CAMERA = Camera.from_fov(160, 120, math.radians(90.0))
 PRISM = Prism(math.radians(2.0))

@@ -24,7 +24,6 @@ from amiwarp import (
 )
 from amiwarp.io import detect_format
 from amiwarp.io import file_scan as scan
-from amiwarp.io.formats import OutputFormat
 from reference.io_samples import SIZE, WRITERS, make_events, refusal, write_evt, write_sample
 from reference.io_samples_extra import write_evimo, write_mvsec
 

@@ -36,7 +36,6 @@ from amiwarp import (
 )
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.export import export
-from amiwarp.io.formats import Codec, OutputFormat, Rounding
 from amiwarp.io.prophesee import Evt3Encoder
 from reference.io_samples import SIZE, make_events
 

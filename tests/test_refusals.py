@@ -1,32 +1,21 @@
 """Recordings that cannot be calibrated are refused with the reason: wrong encoder scales and useless events."""
 
-from amiwarp import AmiwarpError
-from amiwarp import Camera
-from amiwarp import Encoder
-from amiwarp import Events
-from amiwarp import MemoryEvents
-from amiwarp import Prism
-from amiwarp import Recording
-from amiwarp import Settings
-from amiwarp import calibrate
-from amiwarp import simulate
-from amiwarp.calib.calibration import prepare
-from amiwarp.calib.checks import check_pulses
-from amiwarp.calib.checks import check_texture
-from amiwarp.calib.first_guess import encoder_turns_per_period
-from amiwarp.calib.model_choice import LARGEST_MOTION_PX
-from amiwarp.calib.model_choice import in_pixels
-from amiwarp.calib.photometric.stage import judge_optimum
-from amiwarp.cli.options import interval
-from amiwarp.cli.options import number
-from amiwarp.events.encoder import TWO_PI
+import math
 from collections.abc import Callable
 from dataclasses import replace
-from tests.conftest import COARSE
-from tests.conftest import TRUE_PRISM
-import math
+
 import numpy as np
 import pytest
+
+from amiwarp import AmiwarpError, Camera, Encoder, Events, MemoryEvents, Prism, Recording, Settings, calibrate, simulate
+from amiwarp.calib.calibration import prepare
+from amiwarp.calib.checks import check_pulses, check_texture
+from amiwarp.calib.first_guess import encoder_turns_per_period
+from amiwarp.calib.model_choice import LARGEST_MOTION_PX, in_pixels
+from amiwarp.calib.photometric.stage import judge_optimum
+from amiwarp.cli.options import interval, number
+from amiwarp.events.encoder import TWO_PI
+from tests.conftest import COARSE, TRUE_PRISM
 
 WIDTH, HEIGHT, LENGTH_US = 96, 72, 500_000
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, math.radians(50.0))
