@@ -102,6 +102,7 @@ from .simulation.sequences import PictureFolder as PictureFolder
 from .simulation.sequences import Pictures as Pictures
 from .simulation.sequences import PictureStack as PictureStack
 from .simulation.sequences import VideoFile as VideoFile
+from .simulation.description import SimulationValues as SimulationValues
 from .simulation.simulator import Simulation as Simulation
 from .simulation.simulator import simulate as simulate
 from .simulation.worlds.named.catalogue import named_world as named_world

@@ -99,7 +99,7 @@ LEAST_FOV = 1e-9
 CAMERA_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
 """Names of the fields of :class:`Camera` without the distortion, in the order in which files and streams use them."""
 
-Rows = TypeVar("Rows")
+Vectors = TypeVar("Vectors")
 """Type of the rows of vectors given to a camera: NumPy array (n, 2) or (n, 3), or Warp array of vec2 or vec3. Results
 have the same type."""
 
@@ -193,7 +193,7 @@ class Camera:
         """Horizontal field of view without distortion [rad]."""
         return 2.0 * math.atan(self.width / (2.0 * self.fx))
 
-    def pixels_to_rays(self, xy: Rows) -> Rows:
+    def pixels_to_rays(self, xy: Vectors) -> Vectors:
         """Return the unit bearing vector of each pixel.
 
         Parameters
@@ -219,7 +219,7 @@ class Camera:
         """
         return _run("pixels_to_rays", self, xy, (2, 3))
 
-    def rays_to_pixels(self, rays: Rows) -> Rows:
+    def rays_to_pixels(self, rays: Vectors) -> Vectors:
         """Return the pixel of each bearing vector.
 
         Parameters
