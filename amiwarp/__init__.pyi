@@ -94,6 +94,7 @@ from .reconstruction.picture import Reconstruction as Reconstruction
 from .reconstruction.picture import reconstruct as reconstruct
 from .simulation.description import Frames as Frames
 from .simulation.description import Scene as Scene
+from .simulation.description import SimulationValues as SimulationValues
 from .simulation.motion import CameraMotion as CameraMotion
 from .simulation.motion import EncoderModel as EncoderModel
 from .simulation.motion import PrismMotion as PrismMotion
@@ -102,7 +103,6 @@ from .simulation.sequences import PictureFolder as PictureFolder
 from .simulation.sequences import Pictures as Pictures
 from .simulation.sequences import PictureStack as PictureStack
 from .simulation.sequences import VideoFile as VideoFile
-from .simulation.description import SimulationValues as SimulationValues
 from .simulation.simulator import Simulation as Simulation
 from .simulation.simulator import simulate as simulate
 from .simulation.worlds.named.catalogue import named_world as named_world
@@ -117,10 +117,10 @@ from .simulation.worlds.world import World as World
 from .simulation.worlds.world import WorldScene as WorldScene
 from .simulation.worlds.world_files import load_world as load_world
 from .simulation.worlds.world_truth import TruthRenderer as TruthRenderer
-from .studies.dataset.plan import DatasetPlan as DatasetPlan
-from .studies.dataset.plan import plan_dataset as plan_dataset
-from .studies.dataset.run import DatasetSummary as DatasetSummary
-from .studies.dataset.run import make_dataset as make_dataset
+from .studies.dataset.making import DatasetPlan as DatasetPlan
+from .studies.dataset.making import DatasetSummary as DatasetSummary
+from .studies.dataset.making import make_dataset as make_dataset
+from .studies.dataset.making import plan_dataset as plan_dataset
 from .studies.evaluate.run import EvaluationSummary as EvaluationSummary
 from .studies.evaluate.run import evaluate as evaluate
 from .translation.datasets import DataSet as DataSet

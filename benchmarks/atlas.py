@@ -17,6 +17,7 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
+from amiwarp.studies.cluster import Workers
 from amiwarp.studies.stability.cells import QUICK_METHODS, Cell, Store, chosen, quick_axes, run, run_cell
 from amiwarp.studies.stability.conditions import AXES
 
@@ -62,7 +63,8 @@ def main() -> int:
         one.submit(run_cell, Cell(axes[0].conditions()[0], 0), methods, args.device).result()
     print(f"{time.perf_counter() - began:6.0f} s  compiled", flush=True)
     with ProcessPoolExecutor(args.workers, **start) as pool:
-        run(axes, args.seeds, methods, Store(cells), pool, device=args.device, progress=show_progress,
+        workers = Workers(pool, lambda: args.workers)
+        run(axes, args.seeds, methods, Store(cells), workers, device=args.device, progress=show_progress,
             until=lambda: time.perf_counter() - began > args.limit_s)  # fmt: skip
     with tarfile.open(args.out / "cells.tar", "w") as tar:
         tar.add(cells, arcname="cells")

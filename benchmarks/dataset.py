@@ -35,10 +35,9 @@ from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.io.sealed_json import read_journal
 from amiwarp.kernels.launch import start_quietly
 from amiwarp.simulation.engine import Engine
-from amiwarp.studies.cluster import ANY_GPU, machine, versions
-from amiwarp.studies.dataset import run
-from amiwarp.studies.dataset.items import Item, list_items, simulation_of
-from amiwarp.studies.dataset.run import threads_of_worker
+from amiwarp.studies.cluster import ANY_GPU, machine, threads_of_worker, versions
+from amiwarp.studies.dataset import making
+from amiwarp.studies.dataset.making import DatasetSummary, Item, list_items, make_dataset, simulation_of
 from amiwarp.studies.dataset.specification import content_digest, load_specification
 
 RESULTS = Path(__file__).parent / "results"
@@ -114,9 +113,9 @@ def measure(specification: Path, out: Path, device: str, workers: int) -> tuple[
     )
     warm = min(2 * workers, len(finished) - 2)
     steady_s = finished[-1] - finished[warm]
-    found = json.loads((out / run.MANIFEST).read_text())
+    found = json.loads((out / making.MANIFEST).read_text())
     # the median leaves out each worker's first recording, which imports and compiles
-    times = [line["processor_s"] for line in read_journal(out / run.JOURNAL, dict, [])]
+    times = [line["processor_s"] for line in read_journal(out / making.JOURNAL, dict, [])]
     per_s = (len(finished) - 1 - warm) / steady_s
     row = {
         "device": device, "gpus": gpus, "workers": workers, "items": done.made, "failed": len(done.failed),
@@ -214,9 +213,8 @@ def plan(rows: list[dict[str, Any]], of: list[dict[str, Any]], kind: str) -> dic
 
 def leave_out_tables() -> None:
     """Leave out the Parquet tables on a machine without pyarrow."""
-    run.require_pyarrow = lambda: None
-    sys.modules["amiwarp.studies.dataset.run"].require_pyarrow = lambda: None  # type: ignore[attr-defined]
-    run._write_table = lambda path, rows: None
+    making.require_pyarrow = lambda: None
+    making._write_table = lambda path, rows: None
 
 
 def main() -> int:
@@ -228,7 +226,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
     try:
-        run.require_pyarrow()
+        making.require_pyarrow()
     except ValueError:
         leave_out_tables()
     seeds = -(-(args.items or {"cpu": 40, "cuda": 400}[args.device]) // 20)

@@ -35,11 +35,11 @@ from amiwarp import compensate, make_dataset, open_recording
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.kernels.launch import start_quietly
 from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, machine, processor, run_jobs, start_workers, versions
-from amiwarp.studies.dataset import run
-from amiwarp.studies.dataset.items import Item, list_items, simulation_of, write_recording
+from amiwarp.studies.dataset import making
+from amiwarp.studies.dataset.making import Item, list_items, make_dataset, simulation_of, write_recording
 from amiwarp.studies.dataset.specification import content_digest, load_specification
-from amiwarp.studies.stability import cells as run_cells
-from amiwarp.studies.stability.cells import METHODS, Cell, Stored, run_cell
+from amiwarp.studies.stability.cells import METHODS, Cell, Store, Stored, run_cell
+from amiwarp.studies.stability.cells import run as run_cells
 from amiwarp.studies.stability.conditions import AXES, Axis
 from benchmarks import compensate as file_benchmark
 from benchmarks import simulate
@@ -152,7 +152,7 @@ def run_atlas(place: Place, scheduler: str, tasks: int) -> Done:
     cells.mkdir()
     with start_workers("benchmarks.two_gpus", "cluster", scheduler, 0, place.device) as workers:
         began = time.perf_counter()
-        done = run_cells([axis()], tasks // VALUES, METHODS[:1], cells, workers.executor, device=place.device)
+        done = run_cells([axis()], tasks // VALUES, METHODS[:1], Store(cells), workers, device=place.device)
         seconds = time.perf_counter() - began
     shutil.rmtree(cells)
     return Done(seconds, sum(c.events for c in done), {c.cell.name: known(c) for c in done})
@@ -165,7 +165,7 @@ def run_dataset(place: Place, scheduler: str, tasks: int) -> Done:
     seconds = time.perf_counter() - began
     if done.failed:
         raise SystemExit(f"recordings failed: {done.failed}")
-    items = json.loads((out / run.MANIFEST).read_text())["items"]
+    items = json.loads((out / making.MANIFEST).read_text())["items"]
     shutil.rmtree(out)
     return Done(seconds, done.events, {item["file"]: item["sha256"] for item in items})
 
@@ -331,7 +331,7 @@ def main() -> int:
     args = parser.parse_args()
     began = time.perf_counter()
     try:
-        run.require_pyarrow()
+        making.require_pyarrow()
     except ValueError:
         leave_out_tables()
     start_quietly()

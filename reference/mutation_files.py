@@ -60,14 +60,12 @@ from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.sequences import _read_times, open_pictures
 from amiwarp.simulation.worlds.world_files import load_mesh
 from amiwarp.studies import stability
-from amiwarp.studies.dataset.items import Made, list_items
-from amiwarp.studies.dataset.run import JOURNAL, Journal
+from amiwarp.studies.dataset.making import JOURNAL, Journal, Made, list_items
 from amiwarp.studies.dataset.specification import load_specification
-from amiwarp.studies.evaluate.conditions import Condition, Stream
-from amiwarp.studies.evaluate.measures import THRESHOLDS
+from amiwarp.studies.evaluate.edges import THRESHOLDS
 from amiwarp.studies.evaluate.report import CHANCE, section
-from amiwarp.studies.evaluate.results import QUICK, CellResult, encode_picture
 from amiwarp.studies.evaluate.run import Store
+from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, encode_picture
 from reference.calibration_sample import exact_calibration
 from reference.io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
 from reference.io_samples_extra import MORE_WRITERS, packets, small, write_bin, write_ros2

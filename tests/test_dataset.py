@@ -28,11 +28,20 @@ from amiwarp.cli.app import app
 from amiwarp.io.sealed_json import append_line, create_journal, read_journal
 from amiwarp.kernels import launch
 from amiwarp.studies import cluster
-from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker
-from amiwarp.studies.dataset import items, specification
+from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker, threads_of_worker
+from amiwarp.studies.dataset import making as recordings
+from amiwarp.studies.dataset import specification
 from amiwarp.studies.dataset import specification as sources
-from amiwarp.studies.dataset.items import list_items, simulation_of
-from amiwarp.studies.dataset.run import JOURNAL, MANIFEST, TABLE, duration_text, threads_of_worker
+from amiwarp.studies.dataset.making import (
+    JOURNAL,
+    MANIFEST,
+    TABLE,
+    DatasetSummary,
+    duration_text,
+    list_items,
+    make_dataset,
+    simulation_of,
+)
 from amiwarp.studies.dataset.specification import load_specification
 
 HEAD = 'format = "amiwarp-dataset-specification"\nversion = 1\n'
@@ -469,7 +478,7 @@ def test_large_specifications_are_refused_or_read_in_linear_time(place: Path, mo
         load_specification(path)
     path.write_text("seeds = 1000000\n" + BASE + PICTURES)
     made: list[object] = []
-    monkeypatch.setattr(items, "Item", lambda *values: made.append(values))
+    monkeypatch.setattr(recordings, "Item", lambda *values: made.append(values))
     with pytest.raises(AmiwarpError, match=r"spec\.toml: describes 12,000,000 recordings; divide it among"):
         list_items(load_specification(path))
     assert not made

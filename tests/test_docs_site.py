@@ -133,7 +133,7 @@ def test_rows_are_selected_and_summarised(extension: Any) -> None:
 
 def test_a_report_of_evaluations_becomes_a_page(extension: Any, tmp_path: Path) -> None:
     from amiwarp.studies.evaluate.report import write
-    from amiwarp.studies.evaluate.results import QUICK, Chart, Claim, Table
+    from amiwarp.studies.evaluate.study import QUICK, Chart, Claim, Table
 
     report, page = extension("amiwarp.studies.evaluate.report"), extension("paper_results")
     chart = Chart("x", "y", "s", panels=("p",))

@@ -24,39 +24,30 @@ from amiwarp.io.sealed_json import sealed
 from amiwarp.progress import silent
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.evaluate import apex_speed, corners, fading, texture
-from amiwarp.studies.evaluate.conditions import (
+from amiwarp.studies.evaluate.edges import Counts, best_f, binary_entropy, geometric_edges, match
+from amiwarp.studies.evaluate.report import EVALUATIONS, load, refused, section, write
+from amiwarp.studies.evaluate.run import Job, Store, _run, plan, run_job
+from amiwarp.studies.evaluate.study import (
     DISCS,
     IDEAL,
+    QUICK,
+    CellResult,
+    Claim,
     Condition,
     DiscTarget,
     RecordedStreams,
     Stream,
     Streams,
-    robust_spread,
-)
-from amiwarp.studies.evaluate.measures import (
-    Counts,
-    best_f,
-    binary_entropy,
-    density_variance,
-    event_counts,
-    geometric_edges,
-    match,
-)
-from amiwarp.studies.evaluate.report import EVALUATIONS, load, refused, section, write
-from amiwarp.studies.evaluate.results import (
-    QUICK,
-    CellResult,
-    Claim,
     Table,
     Verdict,
     by_case,
     compared,
     encode_picture,
     grouped,
+    robust_spread,
     where_calibrated,
 )
-from amiwarp.studies.evaluate.run import Job, Store, _run, plan, run_job
+from amiwarp.studies.evaluate.texture import density_variance, event_counts
 from reference.mutation_files import stored_edges, stored_fading
 
 SMALL = replace(QUICK, width=64, height=48, duration_s=0.1, seeds=1)
@@ -434,7 +425,7 @@ def test_damaged_cells_are_run_again_and_said(tmp_path: Path) -> None:
 
 def test_a_table_without_values_has_no_chart() -> None:
     from amiwarp.studies.evaluate.report import draw
-    from amiwarp.studies.evaluate.results import Chart
+    from amiwarp.studies.evaluate.study import Chart
 
     empty = Table("t", "t", ("x", "y", "s"), [(1, None, "a")], chart=Chart("x", "y", "s"))
     assert draw(empty) is None

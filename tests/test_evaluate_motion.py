@@ -28,13 +28,11 @@ from amiwarp import (
 )
 from amiwarp.simulation.worlds.trajectory import looking_at
 from amiwarp.studies.evaluate import contrast_motion, flow, pictures, pose, segmentation
-from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
 from amiwarp.studies.evaluate.contrast_motion import estimate_rotation, rotated_back
-from amiwarp.studies.evaluate.flow import flow_by_contrast, flow_by_dis, rotation_flow
-from amiwarp.studies.evaluate.measures import flow_error
+from amiwarp.studies.evaluate.flow import flow_by_contrast, flow_by_dis, flow_error, rotation_flow
 from amiwarp.studies.evaluate.pose import PROPORTIONS
-from amiwarp.studies.evaluate.results import QUICK, CellResult, Table, Verdict
 from amiwarp.studies.evaluate.segmentation import SegmentationSettings, moving_events
+from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, Streams, Table, Verdict
 
 CAMERA = Camera.from_fov(160, 120, math.radians(40.0))
 RPM, DURATION_S = 1800.0, 0.05

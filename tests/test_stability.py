@@ -1,7 +1,6 @@
 """Recordings of the stability study, the methods that run on them, and calibration of formerly failing cases."""
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,8 @@ import pytest
 
 from amiwarp import AmiwarpError, ExactModel, calibrate, model_error
 from amiwarp.calib.paper_method import calibrate_as_paper
-from amiwarp.studies.stability import AXES, Condition, Outcome, cells, chosen, identity, make, quick_axes, sensible
+from amiwarp.studies.cluster import single_worker
+from amiwarp.studies.stability import AXES, Condition, Outcome, chosen, identity, make, quick_axes, run, sensible
 from amiwarp.studies.stability.cells import Store, best_fit, conditions
 from amiwarp.studies.stability.conditions import SceneKind, draw
 from tests.conftest import COARSE
@@ -165,11 +165,11 @@ def test_cells_are_kept_and_only_what_misses_is_run(tmp_path: Path) -> None:
     methods = chosen(("sharpness",))
     assert [m.name for m in methods] == ["default", "paper", "sharpness"]
     calls: list[tuple[str, float]] = []
-    with ThreadPoolExecutor(1) as pool:
-        some = cells(small, 1, methods[:1], Store(tmp_path), pool, progress=lambda *a: calls.append(a))
+    with single_worker() as worker:
+        some = run(small, 1, methods[:1], Store(tmp_path), worker, progress=lambda *a: calls.append(a))
         assert calls == [("1 of 2 cells", 0.5), ("2 of 2 cells", 1.0)]
-        every = cells(small, 1, methods, Store(tmp_path), pool)
-        again = cells(small, 1, methods, Store(tmp_path), pool, progress=lambda *a: calls.append(a))
+        every = run(small, 1, methods, Store(tmp_path), worker)
+        again = run(small, 1, methods, Store(tmp_path), worker, progress=lambda *a: calls.append(a))
     assert len(calls) == 2
     name = identity(methods[0])
     for a, b, c in zip(some, every, again, strict=True):

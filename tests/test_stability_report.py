@@ -36,8 +36,7 @@ from amiwarp.studies.stability import (
     load,
 )
 from amiwarp.studies.stability import Result as Found
-from amiwarp.studies.stability.figures import OVERVIEW, _overview, _page, draw
-from amiwarp.studies.stability.report import Rate, most_common_message, value_label
+from amiwarp.studies.stability.report import OVERVIEW, Rate, _overview, _page, draw, most_common_message, value_label
 
 METHOD = {m.name: m for m in METHODS}
 NOISE = Axis("background noise", "noise", (0.0, 0.25, 0.5, 0.8), "of all events")

@@ -220,7 +220,7 @@ OPENED_OTHERWISE = {
     "amiwarp.simulation.worlds.world_files: Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)": "bytes",
     "amiwarp.simulation.worlds.world_files: trimesh.load(file, file_type=kind, resolver=files, force='scene', "
     "process=False)": "open file",
-    "amiwarp.studies.evaluate.results: Image.open(io.BytesIO(base64.b64decode(text, validate=True)), "
+    "amiwarp.studies.evaluate.study: Image.open(io.BytesIO(base64.b64decode(text, validate=True)), "
     "formats=['PNG'])": "bytes",
 }
 """Calls that open a file for reading in another way, and what they open."""

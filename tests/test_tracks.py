@@ -1,4 +1,4 @@
-"""Tracks of corners: association, Lucas-Kanade, truth by projection, lifetime and error with known answers."""
+"""Tracks of corners: association, truth by projection, lifetime and error with known answers."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 import amiwarp
-from amiwarp.studies.evaluate import measures
-from amiwarp.studies.evaluate.measures import Tracks
+from amiwarp.studies.evaluate import corners
+from amiwarp.studies.evaluate.corners import Tracks
 
 
 def two_lines(step_us: int = 1000, count: int = 50) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -24,7 +24,7 @@ def two_lines(step_us: int = 1000, count: int = 50) -> tuple[NDArray[np.int64], 
 
 def test_corner_events_are_linked_to_their_tracks() -> None:
     t, xy = two_lines()
-    found = measures.link_corners(t, xy)
+    found = corners.link_corners(t, xy)
     np.testing.assert_array_equal(found.number, np.repeat([0, 1], 50))
     np.testing.assert_array_equal(found.index, np.concatenate([np.arange(0, 100, 2), np.arange(1, 100, 2)]))
     np.testing.assert_array_equal(found.xy, xy[found.index])
@@ -35,20 +35,20 @@ def test_corner_events_are_linked_to_their_tracks() -> None:
 def test_a_gap_or_a_jump_starts_a_new_track() -> None:
     t, xy = two_lines()
     late = t + np.where(t > 25_000, 30_000, 0)
-    assert len(measures.link_corners(late, xy).first) == 4
+    assert len(corners.link_corners(late, xy).first) == 4
     jumped = xy + np.where(t > 25_000, 7.0, 0.0)[:, None]
-    assert len(measures.link_corners(t, jumped).first) == 4
-    assert len(measures.link_corners(t, jumped, radius_px=12.0).first) == 2
+    assert len(corners.link_corners(t, jumped).first) == 4
+    assert len(corners.link_corners(t, jumped, radius_px=12.0).first) == 2
     lost = xy.copy()
     lost[10:20] = np.nan
-    found = measures.link_corners(t, lost)
+    found = corners.link_corners(t, lost)
     assert len(found.first) == 2
     assert len(found.t) == 90
 
 
 def test_the_nearest_track_is_chosen() -> None:
     xy = np.array([[10.0, 10.0], [14.0, 10.0], [12.5, 10.0], [10.5, 10.0]])
-    found = measures.link_corners(np.arange(4), xy)
+    found = corners.link_corners(np.arange(4), xy)
     assert found.number.tolist() == [0, 0, 1, 1]
     assert found.index.tolist() == [0, 3, 1, 2]
 
@@ -59,23 +59,23 @@ def test_random_corners_agree_with_a_search_through_all_tracks() -> None:
     last: list[int] = []
     expected = np.zeros(600, int)
     for i in range(600):
-        away = [math.inf if t[i] - t[k] > measures.GAP_US else math.hypot(*(xy[k] - xy[i])) for k in last]
+        away = [math.inf if t[i] - t[k] > corners.GAP_US else math.hypot(*(xy[k] - xy[i])) for k in last]
         best = int(np.argmin(away)) if away else 0
-        if not away or away[best] > measures.RADIUS_PX:
+        if not away or away[best] > corners.RADIUS_PX:
             best = len(last)
             last.append(i)
         last[best], expected[i] = i, best
     kept = np.bincount(expected)[expected] >= 2
-    found = measures.link_corners(t, xy)
+    found = corners.link_corners(t, xy)
     assert len(found.t) == kept.sum() > 300
     numbers = np.unique(expected[kept])
     np.testing.assert_array_equal(numbers[found.number], expected[found.index])
 
 
 def test_no_corners_give_no_tracks() -> None:
-    found = measures.link_corners(np.zeros(0, np.int64), np.zeros((0, 2)))
+    found = corners.link_corners(np.zeros(0, np.int64), np.zeros((0, 2)))
     assert len(found.first) == 0
-    quality = measures.track_quality(found, np.zeros((0, 2)), 5.0)
+    quality = corners.track_quality(found, np.zeros((0, 2)), 5.0)
     assert quality.number == 0
     assert math.isnan(quality.lifetime_s)
 
@@ -93,13 +93,13 @@ def test_lifetime_error_and_rate_are_known() -> None:
     tracks, truth = drifting()
     for limit in (2.05, 5.05):
         updates = math.floor(limit * 10)
-        np.testing.assert_allclose(measures.lifetimes(tracks, truth, limit), [updates * 1e-3, 0.060], rtol=0, atol=1e-9)
-        quality = measures.track_quality(tracks, truth, limit)
+        np.testing.assert_allclose(corners.lifetimes(tracks, truth, limit), [updates * 1e-3, 0.060], rtol=0, atol=1e-9)
+        quality = corners.track_quality(tracks, truth, limit)
         assert quality.number == 2
         assert quality.lifetime_s == pytest.approx((updates * 1e-3 + 0.060) / 2)
         assert quality.update_hz == pytest.approx(1000.0)
         assert quality.error_px == pytest.approx(0.1 * updates * (updates + 1) / 2 / (updates + 60))
-    curve = measures.quality_curve(tracks, truth)
+    curve = corners.quality_curve(tracks, truth)
     assert [quality.limit_px for quality in curve] == [2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0]
     assert (np.diff([quality.lifetime_s for quality in curve]) > 0).all()
 
@@ -109,44 +109,12 @@ def test_a_track_does_not_return_from_its_end() -> None:
         np.zeros(4, np.int64), np.arange(4) * 1000, np.array([[0, 0], [9, 0], [0, 0], [0, 0]], float), np.arange(4)
     )
     truth = np.zeros((4, 2))
-    assert measures.lives(tracks, truth, 5.0).tolist() == [True, False, False, False]
-    assert measures.lifetimes(tracks, truth, 5.0).tolist() == [0.0]
-    assert measures.track_quality(tracks, truth, 5.0).number == 0
-    assert measures.lifetimes(tracks, truth, 10.0).tolist() == [0.003]
+    assert corners.lives(tracks, truth, 5.0).tolist() == [True, False, False, False]
+    assert corners.lifetimes(tracks, truth, 5.0).tolist() == [0.0]
+    assert corners.track_quality(tracks, truth, 5.0).number == 0
+    assert corners.lifetimes(tracks, truth, 10.0).tolist() == [0.003]
     with pytest.raises(amiwarp.AmiwarpError, match="expected that of the tracks"):
-        measures.lives(tracks, truth[:2], 5.0)
-
-
-def test_images_are_followed_with_subpixel_error() -> None:
-    """Blurred discs on a smooth ground move by (1.3, -0.7) px per image."""
-    rng = np.random.default_rng(3)
-    centres = np.array([[30 + 34 * i, 60 + 30 * j] for i in range(4) for j in range(3)], float) + rng.uniform(
-        -4, 4, (12, 2)
-    )
-    rows, columns = np.mgrid[:180, :240]
-    speed, count = np.array([1.3, -0.7]), 12
-    images = []
-    for k in range(count):
-        image = np.zeros((180, 240))
-        for x, y in centres + k * speed:
-            image += np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / 18.0)
-        images.append(image)
-    found = measures.follow_images(images, np.arange(count) * 20_833)
-    first = found.first
-    steps = found.index - found.index[first][found.number]
-    truth = found.xy[first][found.number] + steps[:, None] * speed
-    quality = measures.track_quality(found, truth, 1.0)
-    assert quality.number >= 12
-    assert quality.error_px < 0.2
-    assert measures.lifetimes(found, truth, 1.0).max() == pytest.approx((count - 1) * 20_833e-6)
-    assert quality.update_hz == pytest.approx(1e6 / 20_833)
-
-
-def test_images_without_texture_and_wrong_times() -> None:
-    assert len(measures.follow_images([np.zeros((40, 50))] * 3, [0, 1, 2]).first) == 0
-    assert len(measures.follow_images([], []).first) == 0
-    with pytest.raises(amiwarp.AmiwarpError, match="2 images and 3 times"):
-        measures.follow_images([np.zeros((40, 50))] * 2, [0, 1, 2])
+        corners.lives(tracks, truth[:2], 5.0)
 
 
 def test_a_point_is_projected_where_the_camera_sees_it() -> None:
@@ -163,15 +131,15 @@ def test_a_point_is_projected_where_the_camera_sees_it() -> None:
     t = np.arange(0, 400_001, 20_000)
     tracks = Tracks(np.zeros(len(t), np.int64), t, np.zeros((len(t), 2)), np.arange(len(t)))
     place = np.array([[0.4, 2.0, 0.0]])
-    truth = measures.true_paths(tracks, place, camera, way)
+    truth = corners.true_paths(tracks, place, camera, way)
     np.testing.assert_allclose(truth[:, 0], 31.5 + focal * (0.4 - t * 1e-6) / 2.0, rtol=0, atol=1e-3)  # px
     np.testing.assert_allclose(truth[:, 1], 23.5, rtol=0, atol=1e-3)
-    seen = measures.true_paths(tracks, place, camera, way, [renderer.at(int(k)) for k in t])
+    seen = corners.true_paths(tracks, place, camera, way, [renderer.at(int(k)) for k in t])
     crossing = 0.5 * (t * 1e-6 + 0.4)  # where the line of sight crosses the post's plane, at half way [m]
     hidden = np.isnan(seen[:, 0])
     assert hidden[abs(crossing - 0.3) < 0.02].all()
     assert not hidden[abs(crossing - 0.3) > 0.08].any()
     assert hidden.sum() >= 3
     np.testing.assert_array_equal(seen[~hidden], truth[~hidden])
-    unknown = measures.true_paths(tracks, np.full((1, 3), np.nan), camera, way)
+    unknown = corners.true_paths(tracks, np.full((1, 3), np.nan), camera, way)
     assert np.isnan(unknown).all()

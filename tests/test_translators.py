@@ -39,10 +39,9 @@ from amiwarp.events.truth import MemoryMasks
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.sequences import open_pictures
 from amiwarp.translation.datasets import SACCADE_US, SACCADES_PX, open_mvsec, saccades
-from amiwarp.translation.inputs import translator_input
 from amiwarp.translation.pictures_between import READ_US, EventPictures, MotionPictures, PicturePair
 from amiwarp.translation.reconstructed_pictures import find_motion
-from amiwarp.translation.translator import translation
+from amiwarp.translation.translator import translation, translator_input
 
 WEDGE = Prism(math.radians(1.0))
 SIZE = (48, 64)

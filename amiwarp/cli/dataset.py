@@ -14,8 +14,7 @@ from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
 
 if TYPE_CHECKING:
-    from amiwarp.studies.dataset.plan import DatasetPlan
-    from amiwarp.studies.dataset.run import DatasetSummary
+    from amiwarp.studies.dataset.making import DatasetPlan, DatasetSummary
 
 EXAMPLE = "amiwarp dataset shapes.toml shapes --dry-run"
 AVERAGE_S = 600.0
@@ -51,13 +50,13 @@ def run(
     if dry_run:
         if scheduler is not None:
             raise AmiwarpError("--dry-run samples on this machine; leave --scheduler out, and give --workers instead")
-        from amiwarp.studies.dataset.plan import plan_dataset
+        from amiwarp.studies.dataset.making import plan_dataset
 
         with progress("sampling") as advance:
             plan = plan_dataset(specification, out, workers=workers, device=device, progress=advance)
         report(common, asdict(plan) | {"seconds": plan.seconds}, _plan_lines(plan))
         return
-    from amiwarp.studies.dataset.run import make_dataset
+    from amiwarp.studies.dataset.making import make_dataset
 
     try:
         with progress("starting workers", average_s=AVERAGE_S) as advance:
@@ -81,7 +80,7 @@ def _default_device() -> str:
 
 
 def _plan_lines(plan: DatasetPlan) -> list[str]:
-    from amiwarp.studies.dataset.run import duration_text
+    from amiwarp.studies.dataset.making import duration_text
 
     by = ", ".join(f"{count:,} of {kind}" for kind, count in plan.sources.items())
     lines = [

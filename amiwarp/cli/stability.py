@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,7 +16,7 @@ from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import make_folder, own_folder
-from amiwarp.studies.cluster import start_workers
+from amiwarp.studies.cluster import start_workers, versions
 
 if TYPE_CHECKING:
     from amiwarp.studies.stability import Atlas, Axis, Method, Store, Stored
@@ -138,8 +137,11 @@ def _run(
         advance(what, share)
 
     try:
-        with progress("starting workers") as advance, _executor(scheduler, device) as executor:
-            cells = run(axes, seeds, methods, store, executor, device=device, first=first, progress=count,
+        with (
+            progress("starting workers") as advance,
+            start_workers("amiwarp stability", "cluster", scheduler, cpu_threads(), device) as workers,
+        ):
+            cells = run(axes, seeds, methods, store, workers, device=device, first=first, progress=count,
                         until=None if end is None else lambda: time.monotonic() > end)  # fmt: skip
     except KeyboardInterrupt:
         say(f"amiwarp: finished cells are kept in {store.folder}; run the same command again to continue")
@@ -147,25 +149,7 @@ def _run(
     return cells, new
 
 
-@contextlib.contextmanager
-def _executor(scheduler: str | None, device: str) -> Iterator[Executor]:
-    """Yield an executor on the scheduler's workers, or on one local process per core.
-
-    Raises :class:`AmiwarpError` if Dask is not installed, the scheduler does not answer, or workers die.
-    """
-    with start_workers("amiwarp stability", "cluster", scheduler, cpu_threads(), device) as workers:
-        from distributed import KilledWorker
-
-        try:
-            yield workers.executor
-        except KilledWorker as error:
-            raise AmiwarpError(f"workers died during a single run (cell), out of memory or killed: {error}; "
-                               "run the same command again to continue") from error  # fmt: skip
-
-
 def _about(cells: Sequence[Stored]) -> dict[str, Any]:
-    from amiwarp.studies.cluster import versions
-
     machines = sorted({r.machine for c in cells for r in c.results.values() if r.machine})
     return {"date": time.strftime("%Y-%m-%d"), "machine": ", ".join(machines), "versions": versions(())}
 

@@ -63,9 +63,8 @@ def run(
     camera has the size of the source unless --size or --camera gives another one.
     """
     from amiwarp.translation.datasets import DataSet
-    from amiwarp.translation.inputs import translator_input
     from amiwarp.translation.pictures_between import Interpolation
-    from amiwarp.translation.translator import translation
+    from amiwarp.translation.translator import translation, translator_input
     from amiwarp.validation import choice
 
     device = choose_device(common.device)

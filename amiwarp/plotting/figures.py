@@ -69,7 +69,8 @@ class Images:
 
 def draw_calibration(path: Path, recording: Recording, calibration: Calibration, *, device: Any) -> None:
     """Draw the images before and after compensation, and the cost surface with the samples of all stages."""
-    figure, axes = _figure((14.0, 4.2), 1, 3, (1.0, 1.0, 0.8))
+    figure = blank((14.0, 4.2), layout="compressed")
+    axes = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 0.8))
     draw_images(axes[:2], images(thin(recording, EVENTS), recording, calibration, device=device))
     draw_cost(figure, axes[2], calibration)
     save(figure, path)
@@ -333,12 +334,6 @@ def _box(xy: NDArray[np.float32], height: NDArray[np.float64], corner: tuple[int
     """Return pixel coordinates relative to the centre of the region, in units of the region's longer side."""
     centred = (xy - np.array(corner) - np.array(REGION) / 2.0) / max(REGION)
     return np.column_stack([centred[:, 0], -centred[:, 1], height]).astype(np.float32)
-
-
-def _figure(size: tuple[float, float], rows: int, columns: int, widths: tuple[float, ...]) -> tuple[Any, Any]:
-    """Return a figure and its grid of axes."""
-    figure = blank(size, layout="compressed")
-    return figure, figure.subplots(rows, columns, width_ratios=widths)
 
 
 def blank(size: tuple[float, float], layout: Literal["compressed"] | None = None, dpi: int = 110) -> Any:

@@ -1,4 +1,4 @@
-"""Workers that run jobs in parallel: local processes, or a Dask cluster by its address."""
+"""Workers that run the jobs of every study in parallel: a thread, local processes, or a Dask cluster by its address."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from amiwarp._version import __version__
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
+from amiwarp.kernels import launch
+from amiwarp.validation import whole
 
 if TYPE_CHECKING:
     from concurrent.futures import Future
@@ -32,6 +34,8 @@ WAITING = 2
 """Number of jobs that each worker holds at a time: a running job and the next one."""
 ANY_GPU = "cuda"
 """Name of the device for all CUDA GPUs: each local worker uses one of them."""
+MOST_WORKERS = 4096
+"""Largest number of local workers."""
 
 LOCAL_CONFIGURATION = {
     "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1},
@@ -63,13 +67,17 @@ def single_worker() -> Iterator[Workers]:
 
 @contextlib.contextmanager
 def start_workers(command: str, extra: str, scheduler: str | None, count: int, device: str) -> Iterator[Workers]:
-    """Yield the workers of a scheduler, or ``count`` local processes without one.
+    """Yield the workers of a scheduler, or ``count`` local processes without one; a single one is a thread.
 
     With the device :data:`ANY_GPU`, local workers share the GPUs evenly, and each sees one, as ``cuda:0``. A local
     worker that uses more than its share of the memory is restarted. ``command`` and ``extra`` are the names of the
     command and of its optional dependency for messages. Raises :class:`AmiwarpError` if Dask is not installed or the
     scheduler does not answer.
     """
+    if scheduler is None and count == 1:
+        with single_worker() as alone:
+            yield alone
+        return
     try:
         distributed: Any = importlib.import_module("distributed")  # distributed has no type hints
     except ModuleNotFoundError as error:
@@ -95,11 +103,28 @@ def start_workers(command: str, extra: str, scheduler: str | None, count: int, d
 
 def _visible_gpus() -> tuple[str, ...]:
     """Return the GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
-    from amiwarp.kernels.launch import start_quietly
-
     given = os.environ.get("CUDA_VISIBLE_DEVICES", "")
-    count = gpu_count(start_quietly())
+    count = gpu_count(launch.start_quietly())
     return tuple(given.split(",")[:count]) if given else tuple(map(str, range(count)))
+
+
+def worker_count(workers: int | None, device: str) -> int:
+    """Return the number of local workers; by default one for each GPU or each core."""
+    if workers is not None:
+        return whole(workers, "workers", 1, MOST_WORKERS)
+    if device != ANY_GPU:
+        return cpu_threads() if device == "cpu" else 1
+    return max(1, gpu_count(launch.start_quietly()))
+
+
+def threads_of_worker(device: str, workers: int | None) -> int | None:
+    """Return the number of CPU threads of each of ``workers`` local workers; None for all, in a cluster.
+
+    On the CPU each worker runs on one thread. Workers with a GPU share the cores, which encode and write the events.
+    """
+    if device == "cpu":
+        return 1
+    return None if workers is None else max(1, cpu_threads() // workers)
 
 
 def gpu_count(devices: Iterable[str]) -> int:
@@ -113,9 +138,7 @@ def _prepare(gpus: tuple[str, ...], local: bool, dask_worker: Any) -> None:
         os.environ["CUDA_VISIBLE_DEVICES"] = gpus[int(dask_worker.name) % len(gpus)]
     if local:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    from amiwarp.kernels.launch import start_quietly
-
-    start_quietly()
+    launch.start_quietly()
 
 
 def run_jobs(
@@ -141,6 +164,17 @@ def run_jobs(
     finally:
         for future in waiting:
             future.cancel()
+
+
+def result_of(future: Future[Result]) -> Result:
+    """Return the result of a finished job. Raises :class:`AmiwarpError` if the job was dropped or its workers died."""
+    if future.cancelled():
+        raise AmiwarpError("the scheduler stopped or dropped the work; run the same command again to continue")
+    error = future.exception()
+    if type(error).__name__ == "KilledWorker":  # of Dask, which need not be installed
+        raise AmiwarpError(f"workers died during a single run (cell), out of memory or killed: {error}; "
+                           "run the same command again to continue") from error  # fmt: skip
+    return future.result()
 
 
 # Description of the machine of a measurement: processor or GPU, and versions of the relevant packages.

@@ -45,11 +45,10 @@ def load_opencv() -> Any:
 
 
 @contextlib.contextmanager
-def one_thread() -> Iterator[Any]:
-    """Give OpenCV with a single thread: its flow depends on the number of threads."""
-    cv2 = load_opencv()
+def limited_opencv(cv2: Any, threads: int = 1) -> Iterator[Any]:
+    """Yield OpenCV, which uses a number of threads within the block. Its flow depends on that number."""
     before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
+    cv2.setNumThreads(threads)
     try:
         yield cv2
     finally:
@@ -69,7 +68,7 @@ def flows(
         none = np.zeros((*first.shape, 2), np.float32)
         return none, none, np.ones(first.shape, np.bool_)
     white = max(float(np.percentile(first, WHITE_PERCENTILE)), float(np.percentile(second, WHITE_PERCENTILE)), 1e-6)
-    with one_thread() as cv2:
+    with limited_opencv(load_opencv()) as cv2:
         bytes_ = [
             (255.0 * np.clip(light / white, 0.0, 1.0) ** (1.0 / 2.2)).astype(np.uint8) for light in (first, second)
         ]
@@ -86,7 +85,7 @@ def flows(
 def warped(picture: NDArray[np.float32], offset: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the picture seen at each pixel plus ``offset``, shape (height, width, 2) [px]; its border is repeated."""
     y, x = np.indices(picture.shape, np.float32)
-    with one_thread() as cv2:
+    with limited_opencv(load_opencv()) as cv2:
         at = (x + offset[..., 0], y + offset[..., 1])
         out = cv2.remap(np.ascontiguousarray(picture), *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(out, np.float32)
@@ -127,14 +126,29 @@ class Interpolation(enum.StrEnum):
     """Each pixel's log intensity changes linearly. An edge that moves by more than a pixel fades out and in again."""
 
 
-class MotionPictures:
-    """Pictures of a sequence, and pictures in between that follow the optical flow (:class:`amiwarp.Frames`)."""
+class KnownPictures:
+    """Pictures that note which of their pixels are known while they are read (base class)."""
+
+    def __init__(self) -> None:
+        self._known: list[tuple[int, NDArray[np.bool_]]] = []
+
+    def take_known(self) -> list[tuple[int, NDArray[np.bool_]]]:
+        """Return, and forget, the masks of known pixels of the pictures read so far, with their times."""
+        taken, self._known = self._known, []
+        return taken
+
+
+class MotionPictures(KnownPictures):
+    """Pictures of a sequence, and pictures in between that follow the optical flow (:class:`amiwarp.Frames`).
+
+    Pixels are known where the flow of a pair of pictures is consistent.
+    """
 
     def __init__(self, pictures: Pictures, way: Interpolation = Interpolation.AUTO) -> None:
         """Find out how much the pictures move."""
         self._pictures, self._way = pictures, way
         self._parts = _parts(sampled_motion(pictures, way))
-        self._known: list[tuple[int, NDArray[np.bool_]]] = []
+        super().__init__()
 
     @property
     def size(self) -> tuple[int, int]:
@@ -159,11 +173,6 @@ class MotionPictures:
                     yield last[0] + (t - last[0]) * k // count, light_of(pair.at(k / count))
             yield t, light
             last = (t, light)
-
-    def take_known(self) -> list[tuple[int, NDArray[np.bool_]]]:
-        """Return, and forget, where the flow of the pairs of pictures read so far is consistent, with their times."""
-        taken, self._known = self._known, []
-        return taken
 
 
 class PicturePair:
@@ -250,12 +259,13 @@ BAND = 0.75
 """Largest departure of the log intensity from what the events say [thresholds]: between two events it is not known."""
 
 
-class EventPictures:
+class EventPictures(KnownPictures):
     """Pictures of a sequence, and fast pictures in between that follow the events (:class:`amiwarp.Frames`).
 
     Between the pictures k and k + 1, the log intensity of each pixel is integrated from the events forward from picture
     k and backward from picture k + 1, and the two are blended linearly in time. This is right up to a threshold. The
-    pictures interpolated by motion are used within that band, since they have no steps.
+    pictures interpolated by motion are used within that band, since they have no steps. Pixels are known where the
+    events explain the change between two pictures.
     """
 
     def __init__(
@@ -275,7 +285,7 @@ class EventPictures:
                 "pictures; give times.csv with times on the clock of the events"
             )
         self._pictures, self._events, self._start_us, self._way = pictures, events, start_us, way
-        self._known: list[tuple[int, NDArray[np.bool_]]] = []
+        super().__init__()
         self.contrasts = self._fit_contrasts()
         """Fitted contrasts of ON and OFF events [log intensity]."""
 
@@ -303,11 +313,6 @@ class EventPictures:
                 yield from self._between(last[0], t, PicturePair(last[1], light, self._way))
             yield t, light
             last = (t, light)
-
-    def take_known(self) -> list[tuple[int, NDArray[np.bool_]]]:
-        """Return, and forget, where events explain the change of the pictures read so far, with the times."""
-        taken, self._known = self._known, []
-        return taken
 
     def _between(self, start: int, stop: int, pair: PicturePair) -> Iterator[tuple[int, NDArray[np.float32]]]:
         """Yield time and linear luminance between two pictures."""

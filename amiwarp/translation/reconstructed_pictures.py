@@ -24,7 +24,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.simulation.motion import CameraMotion
-from amiwarp.translation.pictures_between import light_of, warped
+from amiwarp.translation.pictures_between import KnownPictures, light_of, warped
 
 if TYPE_CHECKING:
     from amiwarp.events.events import Events
@@ -265,7 +265,7 @@ View = tuple[int, NDArray[np.float32], NDArray[np.bool_]]
 """Time [us], log intensity and mask of known pixels of a picture."""
 
 
-class ReconstructedPictures:
+class ReconstructedPictures(KnownPictures):
     """Pictures of a recording of a plain event camera that rotates in front of a still scene (:class:`amiwarp.Frames`).
 
     Each window gives one picture at its middle by linear least squares (:class:`amiwarp.Reconstruction`). In between,
@@ -288,7 +288,7 @@ class ReconstructedPictures:
         encoder = still_encoder(recording.events.t_first, recording.events.t_last)
         model = ExactModel(camera, Prism(0.0))
         self._work = Reconstruction(recording, model=model, encoder=encoder, device=device)
-        self._known: list[tuple[int, NDArray[np.bool_]]] = []
+        super().__init__()
         self._rays = np.asarray(self._view.pixels_to_rays(pixel_grid(camera)))
 
     @property
@@ -313,11 +313,6 @@ class ReconstructedPictures:
                 part = np.float32(np.clip((t - first[0]) / (second[0] - first[0]), 0.0, 1.0))
                 yield t, light_of((np.float32(1.0) - part) * before + part * after)
                 k += 1
-
-    def take_known(self) -> list[tuple[int, NDArray[np.bool_]]]:
-        """Return, and forget, where the events determine the pictures read so far, with the times."""
-        taken, self._known = self._known, []
-        return taken
 
     def _views(self) -> Iterator[View]:
         """Yield the pictures of all windows, and the last one again at the end."""

@@ -15,7 +15,7 @@ from generated_files import write_page
 from sphinx.application import Sphinx
 
 from amiwarp.studies.evaluate.report import draw, pivoted, save
-from amiwarp.studies.evaluate.results import Chart, ChartKind, Table
+from amiwarp.studies.evaluate.study import Chart, ChartKind, Table
 
 FOLDER = "paper-results"
 """Name of the folder of the figures and of the text."""

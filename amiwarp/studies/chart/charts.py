@@ -151,7 +151,7 @@ class ChartPanel:
             arrowprops={"arrowstyle": "-", "linewidth": 0.6, "color": "#707070", "shrinkA": 1.0, "shrinkB": 4.0,
                         "relpos": (0.5, 0.5)}, **style,
         )  # fmt: skip
-        half = Text.get_window_extent(label).size / 2.0
+        half = np.array(Text.get_window_extent(label).size) / 2.0
         near = half + (9.0 if row.default else 5.0) * self.unit
         inner = self.ax.get_window_extent().padded(-3.0)
 

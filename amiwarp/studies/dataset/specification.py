@@ -106,32 +106,7 @@ class SourceGroup:
     labels: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Specification:
-    """Content of a specification file."""
-
-    path: Path
-    data: Mapping[str, Any]
-    """Fields of the file, unchanged."""
-    name: str
-    duration_s: float
-    camera: CameraEntry
-    prisms: tuple[PrismEntry, ...]
-    speeds_rpm: tuple[float, ...]
-    sensors: Mapping[str, SensorModel]
-    seeds: tuple[int, ...]
-    splits: Mapping[str, float]
-    split_seed: int
-    truth_hz: float | None
-    sources: tuple[SourceGroup, ...]
-
-    @property
-    def folder(self) -> Path:
-        """Absolute path of the folder of the file; names of files in it are relative to this folder."""
-        return self.path.parent.resolve()
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Plain:
     """Fields of the file that need no conversion."""
 
@@ -143,6 +118,23 @@ class _Plain:
     splits: Mapping[str, float] = field(default_factory=lambda: dict(SPLITS))
     split_seed: int = 0
     truth_hz: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Specification(_Plain):
+    """Content of a specification file."""
+
+    path: Path
+    data: Mapping[str, Any]
+    """Fields of the file, unchanged."""
+    sensors: Mapping[str, SensorModel]
+    seeds: tuple[int, ...]
+    sources: tuple[SourceGroup, ...]
+
+    @property
+    def folder(self) -> Path:
+        """Absolute path of the folder of the file; names of files in it are relative to this folder."""
+        return self.path.parent.resolve()
 
 
 _OWN = ("sensors", "seeds", "sources")
@@ -163,18 +155,11 @@ def load_specification(path: str | Path) -> Specification:
         values = build(_Plain, {name: data[name] for name in plain if name in data}, "")
         _check(values)
         return Specification(
+            **vars(values) | {"name": values.name or path.stem},
             path=path,
             data=data,
-            name=values.name or path.stem,
-            duration_s=real(values.duration_s, "field duration_s", 1e-3, LONGEST_S, " s"),
-            camera=values.camera,
-            prisms=values.prisms,
-            speeds_rpm=values.speeds_rpm,
             sensors=_sensors(data.get("sensors", ["default"])),
             seeds=_seeds(data.get("seeds", 1)),
-            splits=values.splits,
-            split_seed=values.split_seed,
-            truth_hz=values.truth_hz,
             sources=tuple(_source(entry, f"sources[{k}]") for k, entry in enumerate(_entries(data, "sources"))),
         )
 
@@ -189,6 +174,7 @@ def _entries(data: Mapping[str, Any], name: str) -> list[Any]:
 
 def _check(values: _Plain) -> None:
     """Raise :class:`AmiwarpError` for values out of range and for repeated ones."""
+    real(values.duration_s, "field duration_s", 1e-3, LONGEST_S, " s")
     at_field("camera", values.camera.build)
     for name in ("prisms", "speeds_rpm"):
         _check_distinct(getattr(values, name), name)

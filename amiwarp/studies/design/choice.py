@@ -464,56 +464,36 @@ def reasons(design: Design) -> list[str]:
     if chosen is None:
         return _refusals(design)
     kept = sum(not c.misses for c in design.choices)
-    lines = [
-        f"events: {rate(chosen.events_per_s)}, the fewest of the {kept} choices of {len(design.choices)} "
-        "that keep all limits" + _dearer(design, chosen),
+    count = f"{kept} choices of {len(design.choices)}"
+    events = f"events: {rate(chosen.events_per_s)}, the fewest of the {count} that keep all limits"
+    if larger := [c for c in design.choices if c.rpm == chosen.rpm and c.orbit.apex > chosen.orbit.apex]:
+        more = larger[0].events_per_s / chosen.events_per_s
+        events += f"; {degrees(larger[0].orbit.apex)} generates {more:.1f} times as many"
+    edges = (
         f"edges: a quarter turn displaces edges of every direction by at least {chosen.orbit.swing:.2f} px "
-        f"across themselves (required: {LEAST_SWING:g} px)" + _smaller(design, chosen),
-        f"window: a quarter turn takes {chosen.window_ms:.1f} ms (allowed: {design.limits.window_ms:.1f} ms)"
-        + _slower(design, chosen),
+        f"across themselves (required: {LEAST_SWING:g} px)"
+    )
+    if short := [o for o in design.orbits if o.swing < LEAST_SWING]:
+        edges += f"; {degrees(short[-1].apex)} displaces them by only {short[-1].swing:.2f} px"
+    window = f"window: a quarter turn takes {chosen.window_ms:.1f} ms (allowed: {design.limits.window_ms:.1f} ms)"
+    if slow := [rpm for rpm in design.rpms if rpm < chosen.rpm]:
+        window += f"; at {slow[-1]:g} rpm it takes {15e3 / slow[-1]:.1f} ms"
+    blur = (
         f"blur: {chosen.error_px:.3f} px across an edge (tolerance: {design.limits.tolerance_px:g} px), from pixels "
-        f"{QUANTISATION_PX:.2f}, clock {chosen.clock_px:.3f}, encoder {chosen.encoder_px:.3f}",
-        f"model: {chosen.model}, with an error of {_px(chosen.orbit.errors[chosen.model])} "
-        f"(allowed: {_px(chosen.budget_px)})" + _simpler(chosen),
-    ]
+        f"{QUANTISATION_PX:.2f}, clock {chosen.clock_px:.3f}, encoder {chosen.encoder_px:.3f}"
+    )
+    errors = chosen.orbit.errors
+    model = (
+        f"model: {chosen.model}, with an error of {errors[chosen.model]:.2g} px (allowed: {chosen.budget_px:.2g} px)"
+    )
+    model += "".join(f"; {name} has {error:.2g} px" for name, error in errors.items() if error > chosen.budget_px)
+    lines = [events, edges, window, blur, model]
     if design.limits.bandwidth is not None:
         lines.append(f"bandwidth: {rate(chosen.events_per_s)} (limit: {rate(design.limits.bandwidth)})")
-    return [*lines, _range(design, chosen)]
-
-
-def _dearer(design: Design, chosen: Choice) -> str:
-    """Return text about the event rate with the next larger apex."""
-    larger = [c for c in design.choices if c.rpm == chosen.rpm and c.orbit.apex > chosen.orbit.apex]
-    if not larger:
-        return ""
-    more = larger[0].events_per_s / chosen.events_per_s
-    return f"; {degrees(larger[0].orbit.apex)} generates {more:.1f} times as many"
-
-
-def _smaller(design: Design, chosen: Choice) -> str:
-    """Return text about the displacement across edges by the largest apex that is too small."""
-    short = [o for o in design.orbits if o.swing < LEAST_SWING]
-    return f"; {degrees(short[-1].apex)} displaces them by only {short[-1].swing:.2f} px" if short else ""
-
-
-def _slower(design: Design, chosen: Choice) -> str:
-    """Return text about the duration of a quarter turn at the next lower speed."""
-    slow = [rpm for rpm in design.rpms if rpm < chosen.rpm]
-    return f"; at {slow[-1]:g} rpm it takes {15e3 / slow[-1]:.1f} ms" if slow else ""
-
-
-def _simpler(chosen: Choice) -> str:
-    """Return text about the errors of the models that exceed the error budget."""
-    worse = {n: e for n, e in chosen.orbit.errors.items() if e > chosen.budget_px}
-    return "".join(f"; {name} has {_px(error)}" for name, error in worse.items())
-
-
-def _range(design: Design, chosen: Choice) -> str:
-    """Return text about the range of apex angles that keep the limits of edges and blur."""
     low, high = design.range_at(chosen.rpm)
-    largest = design.orbits[-1].apex
-    ends = f"from {degrees(low)}" + (f" to {degrees(high)}" if high <= largest else " upwards")
-    return f"range: at {chosen.rpm:g} rpm every apex {ends} keeps the limits of edges and blur, also off the grid"
+    ends = f"from {degrees(low)}" + (f" to {degrees(high)}" if high <= design.orbits[-1].apex else " upwards")
+    ends += " keeps the limits of edges and blur, also off the grid"
+    return [*lines, f"range: at {chosen.rpm:g} rpm every apex {ends}"]
 
 
 def _refusals(design: Design) -> list[str]:
@@ -553,8 +533,3 @@ def degrees(angle: float) -> str:
 def rate(events_per_s: float) -> str:
     """Return an event rate [events/s] as text."""
     return f"{events_per_s / 1e6:.3g} Mev/s"
-
-
-def _px(error: float) -> str:
-    """Return an error [px] as text."""
-    return f"{error:.2g} px"

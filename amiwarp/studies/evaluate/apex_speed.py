@@ -10,31 +10,8 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import edge_blur
-from amiwarp.studies.evaluate.conditions import (
-    BACKGROUND,
-    BANDWIDTH,
-    DISCS,
-    IDEAL,
-    LIMITS,
-    Condition,
-    DiscTarget,
-    Stream,
-    Streams,
-    robust_spread,
-)
-from amiwarp.studies.evaluate.results import (
-    NO_RESULT,
-    Amount,
-    CellResult,
-    Chart,
-    Claim,
-    Count,
-    Settings,
-    Table,
-    Value,
-    grouped,
-    rows_of,
-)
+from amiwarp.studies.evaluate import study
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 TITLE = "Apex angle and speed"
 PROTOCOL = (
@@ -75,19 +52,19 @@ SURGE = 1.25
 
 
 class _Row(TypedDict):
-    degrees: Amount
-    blur: Amount | None
-    delay: Count
-    edge_blur: Amount | None
-    mev_per_s: Amount
+    degrees: study.Amount
+    blur: study.Amount | None
+    delay: study.Count
+    edge_blur: study.Amount | None
+    mev_per_s: study.Amount
 
 
 class _Light(TypedDict):
-    degrees: Amount
+    degrees: study.Amount
     light: Literal["bright", "dark"]
-    blur: Amount | None
-    own_delay: Count
-    own_blur: Amount | None
+    blur: study.Amount | None
+    own_delay: study.Count
+    own_blur: study.Amount | None
 
 
 class Values(TypedDict):
@@ -102,14 +79,14 @@ def conditions(settings: Settings) -> list[Condition]:
     speeds, bandwidths = (QUICK_SPEEDS, QUICK_BANDWIDTHS) if settings.quick else (SPEEDS, BANDWIDTHS)
     size = replace(settings, width=min(settings.width, 320), height=min(settings.height, 240))
     grid: list[dict[str, Any]] = [{"apex": a, "cutoff_hz": hz} for a in APEX_DEG for hz in bandwidths]
-    grid += [{"apex": USUAL_DEG, "only": limit} for limit in (IDEAL, *LIMITS)]
-    grid.append({"apex": USUAL_DEG, "only": BANDWIDTH, "cutoff_hz": min(bandwidths[1:])})
+    grid += [{"apex": USUAL_DEG, "only": limit} for limit in (study.IDEAL, *study.LIMITS)]
+    grid.append({"apex": USUAL_DEG, "only": study.BANDWIDTH, "cutoff_hz": min(bandwidths[1:])})
     return [
         replace(condition, rpm=rpm, duration_s=60.0 / rpm)
         for values in grid
         for rpm in speeds
         for condition in size.conditions(
-            world=DISCS, trajectory="still", **{**values, "apex": float(np.radians(values["apex"]))}
+            world=study.DISCS, trajectory="still", **{**values, "apex": float(np.radians(values["apex"]))}
         )
     ]
 
@@ -119,7 +96,7 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
 
     The blur is also given for the edges of bright and of dark discs alone, with the delay of both and with their own.
     """
-    discs = DiscTarget.of_seed(streams.size, streams.condition.seed)
+    discs = study.DiscTarget.of_seed(streams.size, streams.condition.seed)
     blur = {delay: _blur(streams, discs, delay) for delay in DELAYS_US[::COARSE].tolist()}
     for name in ("all", "bright", "dark"):
         rough = min(blur, key=lambda d: blur[d][name])
@@ -140,14 +117,14 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _blur(streams: Streams, discs: DiscTarget, delay_us: int) -> dict[str, float]:
+def _blur(streams: Streams, discs: study.DiscTarget, delay_us: int) -> dict[str, float]:
     """Return the blur of all edges, and of those of bright and of dark discs, of events that are ``delay_us`` late."""
     distance, luminance = discs.distances(streams.compensated_late(delay_us, BLUR_EVENTS))
-    bright = luminance > BACKGROUND
+    bright = luminance > study.BACKGROUND
     return {
-        "all": robust_spread(distance, luminance),
-        "bright": robust_spread(distance[bright], luminance[bright]),
-        "dark": robust_spread(distance[~bright], luminance[~bright]),
+        "all": study.robust_spread(distance, luminance),
+        "bright": study.robust_spread(distance[bright], luminance[bright]),
+        "dark": study.robust_spread(distance[~bright], luminance[~bright]),
     }
 
 
@@ -168,7 +145,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     def over_speed(name: str, title: str, value: str, label: str, caption: str) -> Table:
         chart = Chart("speed [rpm]", label, "bandwidth", "std", panels=("apex",), log_x=True)
         return Table(name, title, (*columns, "seeds", label, "std"),
-                     grouped(whole, ("apex_name", "bandwidth", "rpm"), [value]), caption, chart)  # fmt: skip
+                     study.grouped(whole, ("apex_name", "bandwidth", "rpm"), [value]), caption, chart)  # fmt: skip
 
     return [
         over_speed("apex_speed_blur", "Blur of edges over speed", "blur", "blur [px]",
@@ -177,13 +154,13 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
                    "Edges are found in the events themselves, and events more than 3 px away do not count."),
         Table("apex_speed_limits", "Blur of a sensor with one limit only (apex 0.5°)",
               ("limit", "speed [rpm]", "seeds", "blur [px]", "std"), _limits(rows),
-              f"An ideal sensor (limit: {IDEAL}) with one limit of the DVXplorer's model, or with a lower bandwidth; "
-              "and the model with all limits.",
+              f"An ideal sensor (limit: {study.IDEAL}) with one limit of the DVXplorer's model, or with a lower "
+              "bandwidth; and the model with all limits.",
               Chart("speed [rpm]", "blur [px]", "limit", "std", log_x=True)),
         Table("apex_speed_light", "Blur and delay of bright and dark edges (apex 0.5°)",
               ("bandwidth", "edges of discs", "speed [rpm]", "seeds", "blur [px]", "std", "own delay [us]",
                "std of delay", "blur with own delay [px]", "std of blur"),
-              grouped([r for r in _rows(results, "light") if r["only"] is None and r["degrees"] == USUAL_DEG],
+              study.grouped([r for r in _rows(results, "light") if r["only"] is None and r["degrees"] == USUAL_DEG],
                       ("bandwidth", "light", "rpm"), ["blur", "own_delay", "own_blur"]),
               "One phase for all pixels removes the mean delay, not its difference between bright and dark pixels.",
               Chart("speed [rpm]", "blur [px]", "edges of discs", "std", panels=("bandwidth",), log_x=True)),
@@ -194,18 +171,19 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     ]  # fmt: skip
 
 
-def _limits(rows: Sequence[dict[str, Any]]) -> list[tuple[Value, ...]]:
+def _limits(rows: Sequence[dict[str, Any]]) -> list[tuple[study.Value, ...]]:
     """Return the blur over limit and speed; all limits together last."""
-    chosen = [r | {"limit": f"bandwidth {r['cutoff_hz'] or USUAL_HZ:g} Hz" if r["only"] == BANDWIDTH else r["only"]}
+    bandwidth = study.BANDWIDTH
+    chosen = [r | {"limit": f"bandwidth {r['cutoff_hz'] or USUAL_HZ:g} Hz" if r["only"] == bandwidth else r["only"]}
               for r in rows if r["only"] is not None]  # fmt: skip
     chosen += [r | {"limit": "all"} for r in rows
                if (r["only"], r["cutoff_hz"], r["degrees"]) == (None, USUAL_HZ, USUAL_DEG)]  # fmt: skip
-    return grouped(chosen, ("limit", "rpm"), ["blur"])
+    return study.grouped(chosen, ("limit", "rpm"), ["blur"])
 
 
 def _rows(results: Sequence[CellResult], name: str) -> list[dict[str, Any]]:
     """Return rows with the names of apex and bandwidth; those without events are left out."""
-    rows = [r for r in rows_of(results, name) if r["blur"] is not None]
+    rows = [r for r in study.rows_of(results, name) if r["blur"] is not None]
     return [{**r, "bandwidth": _name(r["cutoff_hz"]), "apex_name": f"apex {r['degrees']:g}°"} for r in rows]
 
 
@@ -228,7 +206,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
     known = small is not None and large is not None
     found.append(Claim.judge(
         "A prism of 2° is impractical: it gives too many events.", "text",
-        f"{large:.2f} Mev/s at 2°, {small:.2f} at 0.5°" if known else NO_RESULT,
+        f"{large:.2f} Mev/s at 2°, {small:.2f} at 0.5°" if known else study.NO_RESULT,
         large > 2.0 * small if small is not None and large is not None else None,
         "the event rate at 2° is more than twice that at 0.5° (720 rpm, unlimited bandwidth)",
     ))  # fmt: skip
@@ -240,7 +218,7 @@ def _surge(rows: Sequence[dict[str, Any]], text: str, paper: str, measure: str =
     below, above = (_mean(rows, measure, rpm=rpm, degrees=0.5, **where) for rpm in (USUAL_RPM, 2 * USUAL_RPM))
     rule = f"the mean blur at 1440 rpm is more than {SURGE:g} times that at 720 rpm"
     if below is None or above is None:
-        return Claim.judge(text, paper, NO_RESULT, None, rule)
+        return Claim.judge(text, paper, study.NO_RESULT, None, rule)
     return Claim.judge(
         text, paper, f"{below:.2f} px at 720 rpm, {above:.2f} px at 1440 rpm", above > SURGE * below, rule
     )

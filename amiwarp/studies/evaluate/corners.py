@@ -4,32 +4,219 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.choices import CornerMethod
+from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.corners import detect_corners
+from amiwarp.kernels import corners, launch
 from amiwarp.simulation.worlds.world import WorldScene
-from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
-from amiwarp.studies.evaluate.measures import GAP_US, LIMITS_PX, link_corners, quality_curve, true_paths
-from amiwarp.studies.evaluate.results import (
-    Amount,
-    CellResult,
-    Chart,
-    ChartKind,
-    Claim,
-    Settings,
-    Table,
-    by_case,
-    compared,
-    grouped,
-    rows_of,
-)
+from amiwarp.studies.evaluate import study
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from amiwarp.events.truth import FrameTruth
+    from amiwarp.optics.camera import Camera
+    from amiwarp.simulation.worlds.trajectory import Trajectory
+
+
+# Tracks of corner events, and their lifetime, error and update rate against truth.
+
+LIMITS_PX = tuple(float(limit) for limit in range(2, 11))
+"""Distances from the truth at which a track ends, for the curves [px]."""
+RADIUS_PX = 3.0
+"""Largest step of a track of corner events [px]."""
+GAP_US = 25_000
+"""Largest time between two corner events of a track [us]: a little more than a quarter turn at 720 turns/min."""
+OCCLUDED = 0.95
+"""A point is occluded where the surface in its direction is nearer than this part of its depth."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """Points of tracks, sorted by track, then by time."""
+
+    number: NDArray[np.int64]
+    """Number of the track of each point, from 0 without gaps, shape ``(n,)``."""
+    t: NDArray[np.int64]
+    """Times [us], shape ``(n,)``."""
+    xy: NDArray[np.float64]
+    """Places [px], shape ``(n, 2)``."""
+    index: NDArray[np.int64]
+    """Index of the corner event of each point, shape ``(n,)``."""
+
+    @property
+    def first(self) -> NDArray[np.int64]:
+        """Position of the first point of each track, shape ``(tracks,)``."""
+        return np.flatnonzero(np.diff(self.number, prepend=-1))
+
+
+def sorted_tracks(number: ArrayLike, t: ArrayLike, xy: ArrayLike, index: ArrayLike) -> Tracks:
+    """Return the points of tracks of at least two points, sorted and numbered anew. Points are given in time order."""
+    numbers = np.asarray(number, np.int64)
+    counts = np.bincount(numbers, minlength=1)
+    order = np.argsort(numbers, kind="stable")
+    order = order[counts[numbers[order]] >= 2]
+    new = np.cumsum(counts >= 2) - 1
+    places = np.asarray(xy, np.float64).reshape(-1, 2)
+    return Tracks(
+        new[numbers[order]], np.asarray(t, np.int64)[order], places[order], np.asarray(index, np.int64)[order]
+    )
+
+
+def link_corners(
+    t: NDArray[np.int64], xy: NDArray[np.floating], *, radius_px: float = RADIUS_PX, gap_us: int = GAP_US
+) -> Tracks:
+    """Join corner events to tracks: each to the track whose last point is nearest, or to a new one.
+
+    ``t``: rising times [us]. ``xy``: places [px], shape (n, 2); NaN for corners without a place, which are left out.
+    A track takes corners up to ``radius_px`` from its last point and ``gap_us`` after it.
+    """
+    kept = np.flatnonzero(np.isfinite(xy).all(axis=1))
+    number = wp.empty(len(kept), dtype=int, device="cpu")
+    chains = _chains(np.asarray(t, np.int64)[kept], np.asarray(xy, np.float64)[kept], radius_px, gap_us)
+    launch.load(corners.link_events, number.device)
+    wp.launch(corners.link_events, 1, [chains], [number], device="cpu")
+    return sorted_tracks(number.numpy(), np.asarray(t)[kept], np.asarray(xy)[kept], kept)
+
+
+def _chains(t: NDArray[np.int64], xy: NDArray[np.float64], radius_px: float, gap_us: int) -> Any:
+    """Return corner events and empty lists of tracks as the struct that the kernel takes."""
+    column, row = np.floor(xy / radius_px).astype(np.int64).T
+    if len(t):
+        column, row = column - column.min() + 1, row - row.min() + 1  # a border of empty cells
+    columns, rows = (int(v.max(initial=0)) + 2 for v in (column, row))
+    chains = corners.CornerChains()
+    chains.x, chains.y = (wp.array(v, dtype=wp.float64, device="cpu") for v in xy.T)
+    chains.t, chains.cell = wp.array(t, device="cpu"), wp.array((row * columns + column).astype(np.int32), device="cpu")
+    chains.columns, chains.radius, chains.gap = columns, radius_px, gap_us
+    chains.head = wp.full(columns * rows, -1, dtype=int, device="cpu")
+    chains.after, chains.last = (wp.zeros(len(t), dtype=int, device="cpu") for _ in range(2))
+    return chains
+
+
+def project(
+    camera: Camera, trajectory: Trajectory, places: NDArray[np.floating], t_us: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where a camera without a prism sees a resting point at each time [px], shape (n, 2), and its depth [m].
+
+    ``places``: points in the world [m], shape (n, 3), one for each time ``t_us`` [us], shape (n,). NaN if a point lies
+    behind the camera.
+    """
+    if not len(places):
+        return np.zeros((0, 2)), np.zeros(0)
+    rotation, position = trajectory.poses(np.asarray(t_us, np.float64) * 1e-6)
+    rays = np.einsum("ni,nij->nj", np.asarray(places, np.float64) - position, rotation)
+    return np.asarray(camera.rays_to_pixels(rays), np.float64), rays[:, 2]
+
+
+def true_paths(
+    tracks: Tracks,
+    places: NDArray[np.floating],
+    camera: Camera,
+    trajectory: Trajectory,
+    frames: Sequence[FrameTruth] = (),
+) -> NDArray[np.float64]:
+    """Return the true place of each point of the tracks [px], shape (n, 2); NaN where it cannot be seen.
+
+    ``places``: resting point in the world that each track begins on [m], shape (tracks, 3); NaN if unknown, such as on
+    a moving body. ``frames``: ground truth at some instants; a point is occluded if a surface in the nearest of them is
+    in front of it.
+    """
+    points = np.asarray(places, np.float64)[tracks.number]
+    truth, depth = project(camera, trajectory, points, tracks.t)
+    if not len(frames) or not len(truth):
+        return truth
+    instants = np.array([frame.t_us for frame in frames])
+    nearest = np.abs(tracks.t[:, None] - instants).argmin(axis=1)
+    for k, frame in enumerate(frames):
+        of = np.flatnonzero((nearest == k) & np.isfinite(truth).all(axis=1))
+        at, _ = project(camera, trajectory, points[of], np.full(len(of), frame.t_us))
+        truth[of[_farthest(frame.depth, at) < OCCLUDED * depth[of]]] = np.nan
+    return truth
+
+
+def _farthest(depth: NDArray[np.float32], xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the largest depth in the 3 x 3 pixels around places: infinite outside the image."""
+    padded = np.pad(depth.astype(np.float64), 2, constant_values=np.inf)
+    height, width = depth.shape
+    column, row = (
+        np.clip(np.rint(np.nan_to_num(v)), -1, n).astype(int) + 2 for v, n in zip(xy.T, (width, height), strict=True)
+    )
+    return np.max([padded[row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)], axis=0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackQuality:
+    """Quality of tracks, for one limit."""
+
+    limit_px: float
+    """Distance from the truth at which a track ends [px]."""
+    number: int
+    """Number of tracks that live at least up to their second point."""
+    lifetime_s: float
+    """Mean time from the first point of a track to the last before it ends [s], over all tracks; NaN without tracks."""
+    error_px: float
+    """Mean distance from the truth until the end, over all points after the first of each track [px]."""
+    update_hz: float
+    """Number of points after the first of each track, by the time that tracks live [1/s]."""
+
+
+def lives(tracks: Tracks, truth: NDArray[np.float64], limit_px: float) -> NDArray[np.bool_]:
+    """Return which points belong to the life of their track, shape (n,).
+
+    A track ends before its first point that is more than ``limit_px`` from the truth, or whose truth is NaN.
+    """
+    if truth.shape != tracks.xy.shape:
+        raise AmiwarpError(f"truth has shape {truth.shape}; expected that of the tracks, {tracks.xy.shape}")
+    near = np.hypot(*(tracks.xy - truth).T) <= limit_px  # false for NaN
+    ended = np.cumsum(~near)
+    before = ended[tracks.first] - ~near[tracks.first]
+    return np.asarray(ended == before[tracks.number])
+
+
+def lifetimes(tracks: Tracks, truth: NDArray[np.float64], limit_px: float) -> NDArray[np.float64]:
+    """Return the lifetime of each track [s], shape (tracks,); 0 if it ends before its second point.
+
+    :func:`lives` says when a track ends.
+    """
+    alive = lives(tracks, truth, limit_px)
+    count = np.bincount(tracks.number[alive], minlength=len(tracks.first))
+    last = tracks.first + np.maximum(count, 1) - 1
+    return np.asarray((tracks.t[last] - tracks.t[tracks.first]) * 1e-6)
+
+
+def track_quality(tracks: Tracks, truth: NDArray[np.float64], limit_px: float) -> TrackQuality:
+    """Return the quality of tracks that end more than ``limit_px`` from the truth, or where it is NaN."""
+    updates = lives(tracks, truth, limit_px)
+    updates[tracks.first] = False
+    life = lifetimes(tracks, truth, limit_px)
+    errors = np.hypot(*(tracks.xy - truth)[updates].T)
+    total = float(life.sum())
+    return TrackQuality(
+        limit_px,
+        len(np.unique(tracks.number[updates])),
+        float(life.mean()) if len(life) else float("nan"),
+        float(errors.mean()) if len(errors) else float("nan"),
+        len(errors) / total if total > 0.0 else float("nan"),
+    )
+
+
+def quality_curve(
+    tracks: Tracks, truth: NDArray[np.float64], limits_px: Sequence[float] = LIMITS_PX
+) -> list[TrackQuality]:
+    """Return the quality of tracks for each of several limits, see :func:`track_quality`."""
+    return [track_quality(tracks, truth, limit) for limit in limits_px]
+
+
+# Evaluation.
 
 TITLE = "Corners"
 PROTOCOL = (
@@ -65,12 +252,12 @@ VALUES = ("number", "lifetime_ms", "error_px", "update_hz")
 class _Row(TypedDict):
     detector: CornerMethod
     stream: Stream
-    limit: Amount
-    gap: Amount
-    number: Amount | None
-    lifetime_ms: Amount | None
-    error_px: Amount | None
-    update_hz: Amount | None
+    limit: study.Amount
+    gap: study.Amount
+    number: study.Amount | None
+    lifetime_ms: study.Amount | None
+    error_px: study.Amount | None
+    update_hz: study.Amount | None
 
 
 class Values(TypedDict):
@@ -135,14 +322,15 @@ def _quality(
     found = []
     for q in quality_curve(tracks, truth, LIMITS_PX):
         values = (float(q.number), 1e3 * q.lifetime_s, q.error_px, q.update_hz)
-        known = (value if math.isfinite(value) else None for value in values)
-        found.append({"limit": q.limit_px, "gap": gap_us / 1e3, **dict(zip(VALUES, known, strict=True))})
+        found.append(
+            {"limit": q.limit_px, "gap": gap_us / 1e3, **dict(zip(VALUES, map(study.finite, values), strict=True))}
+        )
     return found
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the quality at the limit of the comparison, and the curves of lifetime and error over the limit."""
-    rows = rows_of(results, "rows")
+    rows = study.rows_of(results, "rows")
     by = ("scene", "camera", "detector", "stream")
     names = ("seeds", "tracks", "std of tracks", "lifetime [ms]", "std", "error [px]", "std of error",
              "updates [1/s]", "std of updates")  # fmt: skip
@@ -151,20 +339,21 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
     def over_limit(name: str, value: str, shown: str) -> Table:
         return Table(name, f"{shown.partition(' ')[0].capitalize()} over the limit",
-                     (*by, "limit [px]", "seeds", shown, "std"), grouped(rows, (*by, "limit"), [value]),
+                     (*by, "limit [px]", "seeds", shown, "std"), study.grouped(rows, (*by, "limit"), [value]),
                      "A lenient limit hides errors; a strict one ends tracks early.",
                      Chart("limit [px]", shown, "stream", "std", panels=panels))  # fmt: skip
 
     return [
         Table("corners", f"Tracks of corners that end {LIMIT_PX:g} px from the truth", (*by, *names),
-              grouped(standard, by, VALUES), "Longer lifetimes and smaller errors are better. "
+              study.grouped(standard, by, VALUES), "Longer lifetimes and smaller errors are better. "
               "A plain camera at rest has no tracks.",
-              Chart("camera", "lifetime [ms]", "stream", "std", panels=("scene", "detector"), kind=ChartKind.BARS)),
+              Chart("camera", "lifetime [ms]", "stream", "std", panels=("scene", "detector"),
+                    kind=study.ChartKind.BARS)),
         over_limit("corners_lifetime", "lifetime_ms", "lifetime [ms]"),
         over_limit("corners_error", "error_px", "error [px]"),
         Table("corners_gap", "Lifetime over the largest time between two corner events of a track",
               (*by, "gap [ms]", "seeds", "lifetime [ms]", "std"),
-              grouped(rows_of(results, "gaps"), (*by, "gap"), ["lifetime_ms"]),
+              study.grouped(study.rows_of(results, "gaps"), (*by, "gap"), ["lifetime_ms"]),
               "A quarter turn at 720 rpm takes 21 ms.",
               Chart("gap [ms]", "lifetime [ms]", "stream", "std", panels=panels)),
     ]  # fmt: skip
@@ -172,7 +361,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the lifetime of tracks at the limit of the comparison, and for every limit."""
-    moving = [r for r in rows_of(results, "rows") if r["camera"] != "still"]
+    moving = [r for r in study.rows_of(results, "rows") if r["camera"] != "still"]
     standard = [r for r in moving if r["limit"] == LIMIT_PX]
     text = "Corners of the AMI-EV live substantially longer than those of the S-EV (moving camera)."
     return [
@@ -183,7 +372,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
 
 def _longer(rows: Sequence[dict[str, Any]], text: str, paper: str) -> Claim:
     """Judge whether the tracks of the calibrated AMI-EV live longer than those of the S-EV in each case."""
-    cases = by_case(rows, ("scene", "camera", "detector", "limit"), "lifetime_ms")
-    holds, ours = compared(cases, Stream.PLAIN, "longer", larger=True)
+    cases = study.by_case(rows, ("scene", "camera", "detector", "limit"), "lifetime_ms")
+    holds, ours = study.compared(cases, Stream.PLAIN, "longer", larger=True)
     rule = f"the mean lifetime of '{Stream.CALIBRATED}' exceeds that of '{Stream.PLAIN}' by more than either spread"
     return Claim.judge(text, paper, ours, holds, rule)

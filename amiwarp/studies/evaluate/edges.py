@@ -2,56 +2,158 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.imaging.iwe import iwe
-from amiwarp.studies.evaluate.conditions import ENOUGH, Condition, Stream, Streams
-from amiwarp.studies.evaluate.measures import (
-    CANNY_SIGMA,
-    THRESHOLDS,
-    Counts,
-    best_f,
-    binary_entropy,
-    canny_edges,
-    geometric_edges,
-    grey_picture,
-    match,
-    normalised,
-    skimage,
-)
+from amiwarp.studies.evaluate import study
+from amiwarp.studies.evaluate.measures import library
 from amiwarp.studies.evaluate.report import CHANCE
-from amiwarp.studies.evaluate.results import (
-    NO_RESULT,
-    Amount,
-    CellResult,
-    Chart,
-    ChartKind,
-    Claim,
-    Count,
-    Picture,
-    Score,
-    Settings,
-    Share,
-    Table,
-    check_pictures,
-    compared,
-    decode_picture,
-    encode_picture,
-    grouped,
-    rows_of,
-    where_calibrated,
-)
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.events.truth import FrameTruth
+
+
+# Agreement of edge pixels with true edges: one-to-one matches within a tolerance, precision, recall and F-score.
+
+THRESHOLDS = np.arange(1, 100) / 100.0
+"""Thresholds that are swept, relative to the scale of an event image."""
+SCALE_PERCENTILE = 99.0
+"""Percentile of the pixels with events that is the scale of an event image."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Numbers of edge pixels, added up over a set of images, for each threshold, shape (n,)."""
+
+    matched: NDArray[np.int64]
+    """Number of found pixels that match a true pixel, one to one."""
+    found: NDArray[np.int64]
+    """Number of found pixels."""
+    true: NDArray[np.int64]
+    """Number of true pixels."""
+
+    @property
+    def precision(self) -> NDArray[np.float64]:
+        """Part of the found pixels that match, 0 without any."""
+        return self.matched / np.maximum(self.found, 1)
+
+    @property
+    def recall(self) -> NDArray[np.float64]:
+        """Part of the true pixels that match, 0 without any."""
+        return self.matched / np.maximum(self.true, 1)
+
+    @property
+    def f_score(self) -> NDArray[np.float64]:
+        """Harmonic mean of precision and recall."""
+        return 2.0 * self.matched / np.maximum(self.found + self.true, 1)
+
+
+def match(found: NDArray[np.bool_], true: NDArray[np.bool_], tolerances: Sequence[float]) -> list[NDArray[np.bool_]]:
+    """Return for each tolerance [px] which of the true pixels match a found one, shape (height, width).
+
+    Pixels are matched one to one, the nearest pairs first; pairs of equal distance in the order of their offsets. On
+    event images they are 90 to 99 % of the largest possible number of pairs, which takes a hundred times as long.
+    """
+    reach = math.ceil(max(tolerances))
+    free = np.pad(true, reach)
+    stride = free.shape[1]
+    y, x = np.nonzero(found)
+    left, flat = (y + reach) * stride + x + reach, free.ravel()  # pixels without a partner; a view
+    out = []
+    offsets = _offsets(reach)
+    for tolerance in sorted(tolerances):
+        for square, dy, dx in offsets:
+            if square > tolerance**2:
+                break
+            to = left + (dy * stride + dx)
+            hit = flat[to]
+            flat[to[hit]] = False
+            left = left[~hit]
+        offsets = [offset for offset in offsets if offset[0] > tolerance**2]
+        out.append(true & ~free[reach:-reach, reach:-reach])
+    return [out[sorted(tolerances).index(tolerance)] for tolerance in tolerances]
+
+
+@functools.cache
+def _offsets(reach: int) -> list[tuple[int, int, int]]:
+    """Return the offsets (y, x) of the pixels up to ``reach`` away, after their squared distance, nearest first."""
+    line = range(-reach, reach + 1)
+    return sorted((dy * dy + dx * dx, dy, dx) for dy in line for dx in line if dy * dy + dx * dx <= reach * reach)
+
+
+def normalised(image: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return an event image relative to its scale, :data:`SCALE_PERCENTILE` of the pixels with events."""
+    positive = image[image > 0]
+    return np.asarray(image / np.percentile(positive, SCALE_PERCENTILE) if positive.size else image, np.float64)
+
+
+def best_f(counts: Counts) -> tuple[int, float]:
+    """Return the index of the threshold with the highest F-score, and the score: the ODS-F of the set."""
+    scores = counts.f_score
+    best = int(np.argmax(scores))
+    return best, float(scores[best])
+
+
+def binary_entropy(mask: NDArray[np.bool_]) -> float:
+    """Return the entropy of a binary image [bit/px]: 1 if half of its pixels are set, 0 if none or all are."""
+    p = float(mask.mean())
+    return 0.0 if p in (0.0, 1.0) else float(-p * np.log2(p) - (1 - p) * np.log2(1 - p))
+
+
+# True edges of a world: those of its grey picture by Canny, and those of its geometry.
+
+CANNY_SIGMA = 2.0
+"""Standard deviation of Canny's Gaussian [px]. At 1 px the texture of walls fills a quarter of the image with edges."""
+GAMMA = 1.0 / 2.2
+"""Exponent from luminance to the grey values of a picture."""
+DEPTH_STEP = 0.05
+"""Smallest relative step of depth at a geometric edge. A slanted surface has smaller steps."""
+CREASE_COS = 0.94
+"""Cosine of the smallest angle between the normals at a geometric edge, 20 deg."""
+
+
+def grey_picture(intensity: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return grey values 0 .. 1 of a picture of luminance, of which the brightest half percent is white."""
+    top = float(np.percentile(intensity, 99.5)) or 1.0
+    return np.asarray(np.clip(intensity / top, 0.0, 1.0) ** GAMMA, np.float64)
+
+
+def canny_edges(intensity: NDArray[np.floating], sigma: float = CANNY_SIGMA) -> NDArray[np.bool_]:
+    """Return the Canny edges of a picture of luminance, smoothed by a Gaussian of ``sigma`` [px]."""
+    return np.asarray(library("skimage.feature").canny(grey_picture(intensity), sigma=sigma), np.bool_)
+
+
+def geometric_edges(frame: FrameTruth) -> NDArray[np.bool_]:
+    """Return the pixels where instance, depth or normal change to the right or lower neighbour."""
+    edges = np.zeros(frame.depth.shape, np.bool_)
+    for here, there in (((slice(None), slice(-1)), (slice(None), slice(1, None))), ((slice(-1),), (slice(1, None),))):
+        edges[here] |= _differ(frame, here, there)
+    return np.asarray(library("skimage.morphology").skeletonize(edges), np.bool_)
+
+
+def _differ(frame: FrameTruth, here: Any, there: Any) -> NDArray[np.bool_]:
+    """Return where neighbouring pixels see different surfaces."""
+    near, far = frame.depth[here].astype(np.float64), frame.depth[there].astype(np.float64)
+    with np.errstate(invalid="ignore"):  # two pixels of the sky
+        step = np.abs(near - far) > DEPTH_STEP * np.minimum(near, far)
+    crease = np.sum(frame.normal[here] * frame.normal[there], axis=-1) < CREASE_COS
+    sky = (frame.instance[here] == 0) & (frame.instance[there] == 0)
+    return np.asarray((frame.instance[here] != frame.instance[there]) | ((step | crease) & ~sky))
+
+
+# Evaluation.
 
 TITLE = "Edges"
 PROTOCOL = (
@@ -93,22 +195,22 @@ SLOWEST = 5.0
 
 class _Summary(TypedDict):
     stream: Literal["chance", *Stream]  # type: ignore[valid-type]
-    found: list[Count]
-    entropy: list[Share]
+    found: list[study.Count]
+    entropy: list[study.Share]
 
 
 class _Row(TypedDict):
     stream: Literal["chance", *Stream]  # type: ignore[valid-type]
     truth: Literal["Canny", "geometry", "Canny, σ 1 px", "Canny, σ 3 px"]
-    tolerance: Amount
-    matched: list[Count]
-    true: Count
+    tolerance: study.Amount
+    matched: list[study.Count]
+    true: study.Count
 
 
 class _Sector(TypedDict):
     stream: Stream
-    angle: Amount
-    recall: Share
+    angle: study.Amount
+    recall: study.Share
 
 
 class _Values(TypedDict):
@@ -120,7 +222,7 @@ class _Values(TypedDict):
 
 def _checked(values: _Values, what: str) -> _Values:
     """Return the values if each row has its images, its chance and a number for each threshold."""
-    check_pictures(list(values["pictures"].values()), 2, f"{what}.pictures")
+    study.check_pictures(list(values["pictures"].values()), 2, f"{what}.pictures")
     lists = [row[name] for name in ("found", "entropy") for row in values["images"]]
     if any(len(numbers) != len(THRESHOLDS) for numbers in (*lists, *(row["matched"] for row in values["rows"]))):
         raise AmiwarpError(f"{what} has lists of other lengths than the {len(THRESHOLDS)} thresholds")
@@ -164,7 +266,7 @@ class _Image:
             above = np.asarray(self.image >= threshold, np.bool_)
             count = int(above.sum())
             if count not in known:
-                known[count] = (above, np.asarray(skimage("morphology").skeletonize(above), np.bool_))
+                known[count] = (above, np.asarray(library("skimage.morphology").skeletonize(above), np.bool_))
             out.append(known[count])
         return out
 
@@ -198,7 +300,7 @@ def _enough(streams: Streams, stream: Stream, settings: Settings) -> bool:
     if stream is not Stream.SAME_COUNT:
         return True
     spans = [(t - WINDOW_US // 2, t + WINDOW_US // 2) for t in _middles(streams, settings)]
-    return all(len(streams.window(stream, *s)) >= ENOUGH * streams.count(Stream.RAW, *s) for s in spans)
+    return all(len(streams.window(stream, *s)) >= study.ENOUGH * streams.count(Stream.RAW, *s) for s in spans)
 
 
 def _middles(streams: Streams, settings: Settings) -> list[int]:
@@ -295,14 +397,14 @@ def _angle(frame: FrameTruth) -> NDArray[np.float64]:
 
 def _shown(image: NDArray[Any]) -> str:
     """Return an image as text; black on white for events and edges."""
-    return encode_picture(np.asarray(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0, np.uint8))
+    return study.encode_picture(np.asarray(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0, np.uint8))
 
 
 def scores(results: Sequence[CellResult]) -> list[dict[str, Any]]:
     """Return the ODS-F of each world, motion, stream, kind of truth and tolerance, with its precision and recall."""
-    images = {(_recording(r), r["stream"]): r for r in rows_of(results, "images")}
+    images = {(_recording(r), r["stream"]): r for r in study.rows_of(results, "images")}
     sets: dict[tuple[Any, ...], list[tuple[Counts, list[float]]]] = {}
-    for row in rows_of(results, "rows"):
+    for row in study.rows_of(results, "rows"):
         seen = images[_recording(row), row["stream"]]
         key = tuple(row[c] for c in ("scene", "camera", "stream", "truth", "tolerance"))
         sets.setdefault(key, []).append((_counts(row, seen), seen["entropy"]))
@@ -339,7 +441,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     widths = {name: sigma for sigma, name in SIGMAS.items()}
     smoothed = [r | {"sigma": widths[r["truth"]]} for r in found
                 if r["truth"] in widths and r["tolerance"] == STRICT and r["stream"] != CHANCE]  # fmt: skip
-    sectors = grouped(rows_of(results, "sectors"), ("scene", "camera", "angle", "stream"), ["recall"])
+    sectors = study.grouped(study.rows_of(results, "sectors"), ("scene", "camera", "angle", "stream"), ["recall"])
     return [
         Table("edges", "F-score, entropy, precision and recall at two tolerances", names,
               [tuple(r[k] for k in keys) for r in usual if r["tolerance"] in (USUAL, STRICT)],
@@ -358,11 +460,11 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
               sectors, "At 90° an edge lies along the motion, and a plain event camera loses it. The threshold is the "
               "best of the recording. A still camera has no motion.",
               Chart("angle between motion and edge normal [deg]", "recall", "stream", "std",
-                    panels=("scene", "camera"), kind=ChartKind.LINES)),
+                    panels=("scene", "camera"), kind=study.ChartKind.LINES)),
     ]  # fmt: skip
 
 
-def pictures(results: Sequence[CellResult]) -> list[Picture]:
+def pictures(results: Sequence[CellResult]) -> list[study.Picture]:
     """Return the first event images of each motion, side by side."""
     out = []
     for camera in dict.fromkeys(r.condition.trajectory for r in results if isinstance(r.condition, Condition)):
@@ -372,7 +474,9 @@ def pictures(results: Sequence[CellResult]) -> list[Picture]:
             names = [n for n in ("grey picture", CANNY, GEOMETRY, Stream.PLAIN, Stream.CALIBRATED, Stream.RAW)
                      if n in given]  # fmt: skip
             caption = f"Camera {camera}. From left to right: {', '.join(names)}."
-            out.append(Picture(f"edges_{camera}", caption, [_mosaic([decode_picture(given[n]) for n in names])]))
+            out.append(
+                study.Picture(f"edges_{camera}", caption, [_mosaic([study.decode_picture(given[n]) for n in names])])
+            )
     return out
 
 
@@ -407,17 +511,17 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
                  "not in the paper"),
         _ranking(of(still, *TOLERANCES), Stream.PLAIN, "At rest the AMI-EV sees edges and the S-EV does not.",
                  "curves"),
-        _fading(where_calibrated(rows_of(results, "sectors"))),
+        _fading(study.where_calibrated(study.rows_of(results, "sectors"))),
     ]  # fmt: skip
 
 
 def _ranking(rows: Sequence[dict[str, Any]], other: Stream, text: str, paper: str) -> Claim:
     """Judge whether the calibrated AMI-EV has the larger margin over chance in each case."""
-    by: dict[tuple[Any, ...], dict[str, Score]] = {}
+    by: dict[tuple[Any, ...], dict[str, study.Score]] = {}
     for r in rows:
-        score = Score(max(r["margin"], 0.0), r["std"], r["seeds"])
+        score = study.Score(max(r["margin"], 0.0), r["std"], r["seeds"])
         by.setdefault((r["scene"], r["camera"], r["tolerance"]), {})[r["stream"]] = score
-    holds, ours = compared(by, other, "larger margin", larger=True)
+    holds, ours = study.compared(by, other, "larger margin", larger=True)
     rule = (
         f"the margin of the ODS-F over chance, at least 0, of '{Stream.CALIBRATED}' is above that of '{other}' by more "
         "than either spread in every case"
@@ -436,7 +540,7 @@ def _fading(rows: Sequence[dict[str, Any]]) -> Claim:
         )
         if along and across:
             ratio[stream] = float(np.mean(along) / max(np.mean(across), 1e-9))
-    ours = ", ".join(f"{s} {r:.2f}" for s, r in ratio.items()) or NO_RESULT
+    ours = ", ".join(f"{s} {r:.2f}" for s, r in ratio.items()) or study.NO_RESULT
     holds = ratio[Stream.PLAIN] < ratio[Stream.CALIBRATED] if len(ratio) == 2 else None
     rule = "recall at more than 60° over recall below 30° is lower for the S-EV than for the calibrated AMI-EV"
     text = "Edges along the motion fade from the S-EV, and not from the AMI-EV."

@@ -12,22 +12,8 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.prism import Prism
-from amiwarp.studies.evaluate.conditions import INDEX, Condition, Stream, Streams
-from amiwarp.studies.evaluate.results import (
-    Amount,
-    CellResult,
-    Chart,
-    Claim,
-    Count,
-    Picture,
-    Settings,
-    Table,
-    check_pictures,
-    decode_picture,
-    encode_picture,
-    grouped,
-    rows_of,
-)
+from amiwarp.studies.evaluate import study
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 from amiwarp.validation import whole
 
 if TYPE_CHECKING:
@@ -64,21 +50,21 @@ RED = (213, 94, 0)
 
 
 class _Row(TypedDict):
-    speed: Amount
-    rate: Amount
-    tiles: Count
+    speed: study.Amount
+    rate: study.Amount
+    tiles: study.Count
 
 
 class _Tiles(TypedDict):
-    part_ms: Amount
+    part_ms: study.Amount
     columns: Annotated[int, partial(whole, low=1, high=10_000)]
-    rate: list[list[Amount]]
-    speed: list[list[Amount]]
-    camera_speed: list[list[Amount]]
+    rate: list[list[study.Amount]]
+    speed: list[list[study.Amount]]
+    camera_speed: list[list[study.Amount]]
 
 
 def _checked_film(film: list[str], what: str) -> list[str]:
-    check_pictures(film, 3, what)
+    study.check_pictures(film, 3, what)
     return film
 
 
@@ -106,7 +92,7 @@ def conditions(settings: Settings) -> list[Condition]:
 
 def orbit_speed(condition: Condition) -> float:
     """Return the speed of the image behind the prism, δ·2πf [px/s]."""
-    radius = math.tan(Prism(condition.apex, INDEX).deflection) * condition.focal_px
+    radius = math.tan(Prism(condition.apex, study.INDEX).deflection) * condition.focal_px
     return radius * 2.0 * math.pi * condition.rpm / 60.0
 
 
@@ -192,12 +178,12 @@ def _frame(x: NDArray[Any], y: NDArray[Any], size: tuple[int, int], marked: NDAr
         part = picture[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
         part[[0, -1]] = RED
         part[:, [0, -1]] = RED
-    return encode_picture(picture)
+    return study.encode_picture(picture)
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the relative event rate over the relative speed, and the rate of every tile over time."""
-    rows = [{**r, "prism": f"{r['rpm']:g} rpm"} for r in rows_of(results, "rows")]
+    rows = [{**r, "prism": f"{r['rpm']:g} rpm"} for r in study.rows_of(results, "rows")]
     tiles = [{"camera": r.condition.trajectory, "rpm": r.condition.rpm, **row}
              for r in results if isinstance(r.condition, Condition) and r.values.get("tiles")
              for row in _tile_rows(r.values["tiles"])]  # fmt: skip
@@ -205,7 +191,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     return [
         Table("fading", "Event rate where camera and prism cancel",
               ("camera", "prism", x, "seeds", "relative rate", "std"),
-              grouped(rows, ("camera", "prism", "speed"), ["rate"]),
+              study.grouped(rows, ("camera", "prism", "speed"), ["rate"]),
               "Rate of a tile relative to its mean over the recording. Near 0 the motions cancel; 1 is the prism's own "
               "speed.",
               Chart(x, "relative rate", "camera", "std", panels=("prism",))),
@@ -217,21 +203,21 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     ]  # fmt: skip
 
 
-def pictures(results: Sequence[CellResult]) -> list[Picture]:
+def pictures(results: Sequence[CellResult]) -> list[study.Picture]:
     """Return the film of the first seed, ten times slower or more."""
     films = [r for r in results if r.values.get("film")]
     if not films:
         return []
-    frames = [decode_picture(text) for text in films[0].values["film"]]
+    frames = [study.decode_picture(text) for text in films[0].values["film"]]
     caption = ("Raw events of the AMI-EV moving fast, one frame for each twelfth of a turn (6.9 ms), slowed "
                "down. Red: tiles that the camera alone moves at 0.75 to 1.25 times the speed of the prism; they fade "
                "once a turn, where the motions cancel.")  # fmt: skip
-    return [Picture("fading_film", caption, frames, 0.12)]
+    return [study.Picture("fading_film", caption, frames, 0.12)]
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdict on the dip of the event rate."""
-    rows = [r for r in rows_of(results, "rows") if r["camera"] == "fast"]
+    rows = [r for r in study.rows_of(results, "rows") if r["camera"] == "fast"]
     dip, usual = ([r["rate"] for r in rows if low <= r["speed"] <= high] for low, high in (DIP, USUAL))
     known = bool(dip and usual)
     ours = "the camera never came near the prism's speed"

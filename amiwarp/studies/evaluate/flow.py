@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.iwe import iwe
-from amiwarp.studies.evaluate.conditions import FOCAL_PX, Condition, Stream, Streams
+from amiwarp.simulation.pictures import DARK
+from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.contrast_motion import (
     MOST_LOCAL,
     dithered,
@@ -19,22 +23,8 @@ from amiwarp.studies.evaluate.contrast_motion import (
     thinned,
     velocity_grid,
 )
-from amiwarp.studies.evaluate.measures import flow_error, library
-from amiwarp.studies.evaluate.results import (
-    NO_RESULT,
-    Amount,
-    CellResult,
-    Chart,
-    Claim,
-    Settings,
-    Share,
-    Table,
-    grouped,
-    mean_of,
-    rows_of,
-    where_calibrated,
-    wide_focal,
-)
+from amiwarp.studies.evaluate.measures import library
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -125,6 +115,43 @@ def rotation_flow(camera: Camera, rotation: CameraRotation) -> NDArray[np.float6
     return np.asarray((after - before) / (2.0 * moment_s)).reshape(camera.height, camera.width, 2)
 
 
+# Error of optical flow.
+
+OUTLIER_PX = 3.0
+"""Endpoint error above which a pixel is an outlier [px]."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlowError:
+    """Errors of a flow field. They are NaN if no pixel is compared."""
+
+    epe: float
+    """Mean endpoint error, in the unit of the flow."""
+    outliers: float
+    """Share of pixels with an endpoint error above the threshold."""
+    pixels: int
+    """Number of pixels compared."""
+
+
+def flow_error(
+    flow: NDArray[Any], truth: NDArray[Any], where: NDArray[np.bool_], *, outlier: float = OUTLIER_PX
+) -> FlowError:
+    """Compare a flow field with the true one, both of shape (height, width, 2), in the pixels of a mask.
+
+    Pixels at which either flow is not finite are left out. Raises :class:`AmiwarpError` for different shapes.
+    """
+    if flow.shape != truth.shape or flow.shape[:2] != where.shape:
+        raise AmiwarpError(f"flow, truth and mask have shapes {flow.shape}, {truth.shape}, {where.shape}; give "
+                           "(height, width, 2) twice and (height, width)")  # fmt: skip
+    error = np.hypot(*np.moveaxis(flow.astype(np.float64) - truth, -1, 0))[where]
+    error = error[np.isfinite(error)]
+    if not error.size:
+        return FlowError(float("nan"), float("nan"), 0)
+    return FlowError(float(error.mean()), float((error > outlier).mean()), int(error.size))
+
+
+# Evaluation.
+
 TITLE = "Optical flow"
 PROTOCOL = (
     "Flow is estimated in two ways. DIS (OpenCV, preset medium) compares the event images of two successive windows. "
@@ -148,8 +175,6 @@ STANDARD_TURNS = 0.25
 """Length of the windows of the comparison with the paper [turns]: a quarter turn, its least."""
 EDGE_CONTRAST = 0.1
 """Least slope of the true log luminance at an edge [1/px]."""
-DARK = 0.02
-"""Luminance that is added before the logarithm, as in the simulated sensor."""
 PAPER_PX = 0.19
 """Increase of the endpoint error by the prism in the paper [px]."""
 
@@ -157,11 +182,11 @@ PAPER_PX = 0.19
 class _Row(TypedDict):
     stream: Stream
     method: Literal["DIS", "contrast maximisation"]
-    turns: Amount
+    turns: study.Amount
     pixels: Literal["events", "edges"]
-    epe: Amount | None
-    outliers: Share | None
-    share: Share
+    epe: study.Amount | None
+    outliers: study.Share | None
+    share: study.Share
 
 
 class Values(TypedDict):
@@ -175,7 +200,11 @@ def conditions(settings: Settings) -> list[Condition]:
     room = settings.conditions(world="room", trajectory="handheld")
     if settings.quick:
         return room
-    more = [("room", "fast", FOCAL_PX), ("desk", "handheld", FOCAL_PX), ("ball", "handheld", wide_focal(settings))]
+    more = [
+        ("room", "fast", study.FOCAL_PX),
+        ("desk", "handheld", study.FOCAL_PX),
+        ("ball", "handheld", study.wide_focal(settings)),
+    ]
     return room + [c for world, motion, focal in more
                    for c in settings.conditions(world=world, trajectory=motion, focal_px=focal)]  # fmt: skip
 
@@ -199,13 +228,9 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
                 for pixels, where in (("events", seen & still), ("edges", edges)):
                     found = flow_error(flow * window * 1e-6, truth.flow * window * 1e-6, where)
                     rows.append({"stream": stream.value, "method": method, "turns": turns, "pixels": pixels,
-                                 "epe": _number(found.epe), "outliers": _number(found.outliers),
+                                 "epe": study.finite(found.epe), "outliers": study.finite(found.outliers),
                                  "share": float(where.mean())})  # fmt: skip
     return {"rows": rows}
-
-
-def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def _estimates(
@@ -236,17 +261,17 @@ def edge_pixels(truth: FrameTruth) -> NDArray[np.bool_]:
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the errors of the paper's protocol, and those over the length of the window."""
-    rows = rows_of(results, "rows")
+    rows = study.rows_of(results, "rows")
     names, values = ("scene", "camera", "pixels", "method", "stream"), ["epe", "outliers", "share"]
     columns = ("seeds", "EPE [px]", "std", "outliers", "std of outliers", "share of pixels", "std of share")
     standard = [r for r in rows if r["turns"] == STANDARD_TURNS]
     by_length = [r for r in rows if r["pixels"] == "edges"]
     return [
         Table("flow", "Endpoint error on still objects, windows of a quarter turn", (*names, *columns),
-              grouped(standard, names, values), "Outliers: share of pixels with an error above 3 px."),
+              study.grouped(standard, names, values), "Outliers: share of pixels with an error above 3 px."),
         Table("flow_window", "Endpoint error at edges over the length of the window",
               ("scene", "camera", "method", "stream", "window [turns]", *columns[:3]),
-              grouped(by_length, ("scene", "camera", "method", "stream", "turns"), ["epe"]),
+              study.grouped(by_length, ("scene", "camera", "method", "stream", "turns"), ["epe"]),
               "Errors in pixels grow with the length, as the motion does.",
               Chart("window [turns]", "EPE [px]", "stream", "std", panels=("scene", "camera", "method"), log_x=True)),
     ]  # fmt: skip
@@ -254,20 +279,18 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdict on the small increase of the error by the prism, for each method."""
-    rows = where_calibrated(rows_of(results, "rows"))
+    rows = study.where_calibrated(study.rows_of(results, "rows"))
     rows = [r for r in rows if r["turns"] == STANDARD_TURNS and r["pixels"] == "edges"]
     return [_claim([r for r in rows if r["method"] == method], method) for method in ("DIS", "contrast maximisation")]
 
 
 def _claim(rows: Sequence[dict[str, Any]], method: str) -> Claim:
-    ours, plain = (
-        mean_of([r for r in rows if r["stream"] == stream], "epe", lambda _: True)
-        for stream in (Stream.CALIBRATED, Stream.PLAIN)
-    )
+    means = {stream: mean for stream, _, mean, _ in study.grouped(rows, ["stream"], ["epe"])}
+    ours, plain = means.get(Stream.CALIBRATED), means.get(Stream.PLAIN)
     text = f"With the prism, compensated, the endpoint error is only slightly larger ({method})."
     rule = f"the mean of '{Stream.CALIBRATED}' is at most twice {PAPER_PX} px above that of '{Stream.PLAIN}', at edges"
     rule += ", over the recordings that could be calibrated"
-    if ours is None or plain is None:
-        return Claim.judge(text, f"+{PAPER_PX} px", NO_RESULT, None, rule)
+    if not isinstance(ours, float) or not isinstance(plain, float):
+        return Claim.judge(text, f"+{PAPER_PX} px", study.NO_RESULT, None, rule)
     shown = f"{ours - plain:+.2f} px ({plain:.2f} to {ours:.2f} px)"
     return Claim.judge(text, f"+{PAPER_PX} px", shown, ours - plain <= 2.0 * PAPER_PX, rule)

@@ -18,22 +18,11 @@ from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import Reconstruction
-from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
+from amiwarp.simulation.pictures import DARK
+from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.contrast_motion import estimate_rotation
 from amiwarp.studies.evaluate.measures import BLOCK, displayed, fitted, niqe, similarity
-from amiwarp.studies.evaluate.results import (
-    NO_RESULT,
-    Amount,
-    CellResult,
-    Chart,
-    Claim,
-    Settings,
-    Table,
-    by_case,
-    compared,
-    grouped,
-    rows_of,
-)
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 from amiwarp.validation import real
 
 if TYPE_CHECKING:
@@ -154,8 +143,6 @@ RATES_HZ, HOLD = (30.0, 100.0, 1000.0), (0.0, 0.5, 1.0)
 """Rates of the pictures in the sensitivity curve [1/s], and times of comparison as shares of the interval."""
 PICTURES = 6
 """Number of pictures over time."""
-DARK = 0.02
-"""Luminance that is added before the logarithm, as in the simulated sensor."""
 
 
 class _Quality(TypedDict):
@@ -166,17 +153,17 @@ class _Quality(TypedDict):
 
 
 class _Row(_Quality):
-    time_ms: Amount
-    niqe: Amount | None
-    niqe_truth: Amount | None
+    time_ms: study.Amount
+    niqe: study.Amount | None
+    niqe_truth: study.Amount | None
 
 
 class _OverLength(_Row):
-    turns: Amount
+    turns: study.Amount
 
 
 class _OverRate(_Quality):
-    rate: Amount
+    rate: study.Amount
 
 
 class Values(TypedDict):
@@ -270,38 +257,38 @@ def naturalness(picture: NDArray[Any]) -> float | None:
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the mean scores, and the scores over time, over the length of the window, and over the pictures' rate."""
-    over_time, over_length, over_rate = (rows_of(results, name) for name in ("time", "length", "rate"))
+    over_time, over_length, over_rate = (study.rows_of(results, name) for name in ("time", "length", "rate"))
     names = ("scene", "camera", "method", "stream")
     columns = ("seeds x pictures", "PSNR [dB]", "std of PSNR", "SSIM", "std of SSIM", "NIQE", "std of NIQE")
     scores = ["psnr", "ssim", "niqe"]
     return [
         Table("pictures", "Quality of the pictures, windows of a quarter turn", (*names, *columns, "NIQE of the truth",
-              "std of the truth"), grouped(over_time, names, [*scores, "niqe_truth"]),
+              "std of the truth"), study.grouped(over_time, names, [*scores, "niqe_truth"]),
               "PSNR and SSIM: higher is better. NIQE: lower is better."),
         Table("pictures_time", "Quality over time, 1,000 pictures/s", (*names, "time [ms]", *columns),
-              grouped(over_time, (*names, "time_ms"), scores), "The first picture is solved from scratch.",
+              study.grouped(over_time, (*names, "time_ms"), scores), "The first picture is solved from scratch.",
               Chart("time [ms]", "NIQE", "stream", "std of NIQE", panels=("scene", "camera"))),
         Table("pictures_window", "Quality over the length of the window", (*names, "window [turns]", *columns),
-              grouped(over_length, (*names, "turns"), scores), "A long window has more events and more motion.",
+              study.grouped(over_length, (*names, "turns"), scores), "A long window has more events and more motion.",
               Chart("window [turns]", "SSIM", "stream", "std of SSIM", panels=("scene", "camera"), log_x=True)),
         Table("pictures_rate", "Quality over the rate of the pictures", (*names, "rate [1/s]", *columns[:5]),
-              grouped(over_rate, (*names, "rate"), scores[:2]), "A picture is shown until the next one, and compared "
-              "with the truth at three times in between.",
+              study.grouped(over_rate, (*names, "rate"), scores[:2]), "A picture is shown until the next one, and "
+              "compared with the truth at three times in between.",
               Chart("rate [1/s]", "SSIM", "stream", "std of SSIM", panels=("scene", "camera"), log_x=True)),
     ]  # fmt: skip
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the ranking by NIQE, and by SSIM, for each motion of the camera."""
-    rows = [r for r in rows_of(results, "time") if r["method"] == "own"]
+    rows = [r for r in study.rows_of(results, "time") if r["method"] == "own"]
     return [_claim([r for r in rows if r["camera"] == camera], camera, score, larger)
             for camera in ("still", "handheld") for score, larger in (("niqe", False), ("ssim", True))]  # fmt: skip
 
 
 def _claim(rows: Sequence[dict[str, Any]], camera: str, score: str, larger: bool) -> Claim:
     direction = "higher" if larger else "lower"
-    holds, ours = compared(by_case(rows, ("scene",), score), Stream.PLAIN, direction, larger=larger)
-    if ours == NO_RESULT and rows:
+    holds, ours = study.compared(study.by_case(rows, ("scene",), score), Stream.PLAIN, direction, larger=larger)
+    if ours == study.NO_RESULT and rows:
         ours = f"the pictures of '{Stream.PLAIN}' are uniform and have no {score.upper()}"
     rule = (
         f"the mean {score.upper()} of '{Stream.CALIBRATED}' is {direction} than that of '{Stream.PLAIN}' by more than "

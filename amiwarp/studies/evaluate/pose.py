@@ -11,22 +11,10 @@ from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.simulation.worlds.world import WorldScene
-from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
-from amiwarp.studies.evaluate.measures import box_overlap, detected_joints, displayed
+from amiwarp.studies.evaluate import study
+from amiwarp.studies.evaluate.measures import displayed
 from amiwarp.studies.evaluate.pictures import PictureMaker, Window, reconstructed_streams
-from amiwarp.studies.evaluate.results import (
-    Amount,
-    CellResult,
-    Chart,
-    Claim,
-    Settings,
-    Share,
-    Table,
-    Verdict,
-    grouped,
-    rows_of,
-    wide_focal,
-)
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 # Detector of a figure's joints that only checks the plumbing of the pose evaluation. It is no pose estimator.
 
@@ -64,6 +52,46 @@ Detector = Callable[[NDArray[Any]], Mapping[str, NDArray[Any]]]
 """Function that returns the joints (x, y) [px] by name in a grey picture with values from 0 to 255; missing ones are
 left out. The names are those of the world's joints."""
 
+
+# Accuracy of detected joints.
+
+
+def detected_joints(found: NDArray[Any], truth: NDArray[Any], torso_px: float, *, fraction: float = 0.2) -> float:
+    """Return the percentage of detected joints (PDJ), as a share from 0 to 1.
+
+    A joint counts as detected if it is closer to its true place than ``fraction`` of the torso's diameter. ``found``
+    and ``truth``: joints in the same order [px], shape (n, 2). A joint that was not found is NaN and counts as not
+    detected. True joints that are NaN, as outside the view, do not count. The result is NaN if no true joint counts.
+
+    Source: B. Sapp and B. Taskar, "MODEC: Multimodal Decomposable Models for Human Pose Estimation", CVPR 2013; the
+    diameter is the distance from the left shoulder to the right hip.
+    Raises :class:`AmiwarpError` for different shapes.
+    """
+    if found.shape != truth.shape or truth.ndim != 2 or truth.shape[1] != 2:
+        raise AmiwarpError(f"found and true joints have shapes {found.shape} and {truth.shape}; give (n, 2) twice")
+    known = np.isfinite(truth).all(axis=1)
+    if not known.any():
+        return float("nan")
+    distance = np.hypot(*(found[known] - truth[known]).T)
+    return float((distance < fraction * torso_px).mean())  # a comparison with NaN is false
+
+
+def box_overlap(a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Return the intersection over union of the bounding boxes of two point sets, shapes (n, 2) and (m, 2).
+
+    Points that are not finite do not count. The result is 0 if a set has no points or a box has no area.
+    """
+    a, b = (points[np.isfinite(points).all(axis=1)] for points in (a, b))
+    if not len(a) or not len(b):
+        return 0.0
+    low, high = np.stack([a.min(axis=0), b.min(axis=0)]), np.stack([a.max(axis=0), b.max(axis=0)])
+    shared = float(np.prod(np.maximum(high.min(axis=0) - low.max(axis=0), 0.0)))
+    union = float(np.prod(high - low, axis=1).sum()) - shared
+    return shared / union if union > 0.0 else 0.0
+
+
+# Evaluation.
+
 TITLE = "Human pose"
 PROTOCOL = (
     "Our own reconstruction makes pictures at several rates, each from a window as long as the interval between "
@@ -99,10 +127,12 @@ TORSO = ("left shoulder", "right hip")
 class _Row(TypedDict):
     stream: Literal["truth", *Stream]  # type: ignore[valid-type]
     detector: Literal["blob", "true joints"]
-    rate: Amount
-    pdj: Share | None
-    iou: Share | None
-    pdj_over_fraction: tuple[Share | None, Share | None, Share | None, Share | None, Share | None]
+    rate: study.Amount
+    pdj: study.Share | None
+    iou: study.Share | None
+    pdj_over_fraction: tuple[
+        study.Share | None, study.Share | None, study.Share | None, study.Share | None, study.Share | None
+    ]
 
 
 class Values(TypedDict):
@@ -113,7 +143,7 @@ class Values(TypedDict):
 
 def conditions(settings: Settings) -> list[Condition]:
     """Return the walking figure before a moving camera. The lens sees the whole figure."""
-    return settings.conditions(world="person", trajectory="handheld", focal_px=wide_focal(settings))
+    return settings.conditions(world="person", trajectory="handheld", focal_px=study.wide_focal(settings))
 
 
 def measure(streams: Streams, settings: Settings, detectors: Mapping[str, Detector] | None = None) -> dict[str, Any]:
@@ -193,7 +223,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return PDJ and IoU over the rate of the pictures, and the PDJ over its threshold."""
     names = ("scene", "camera", "detector", "stream")
     caption = "'blob' checks the plumbing only. 'true joints' show the effect of window and rate alone."
-    rows = rows_of(results, "rows")
+    rows = study.rows_of(results, "rows")
     spread = [{**r, "fraction": f, "pdj": pdj} for r in rows if r["rate"] == FRACTION_HZ
               for f, pdj in zip(FRACTIONS, r["pdj_over_fraction"], strict=True)]  # fmt: skip
 
@@ -203,14 +233,14 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     return [
         Table("pose", "Detected joints over the rate of the pictures",
               (*names, "rate [1/s]", "comparisons", "PDJ", "std of PDJ", "IoU", "std of IoU"),
-              grouped(rows, (*names, "rate"), ["pdj", "iou"]), caption, chart("rate [1/s]")),
+              study.grouped(rows, (*names, "rate"), ["pdj", "iou"]), caption, chart("rate [1/s]")),
         Table("pose_threshold", f"Detected joints over the threshold, {FRACTION_HZ:g} pictures/s",
               (*names, "threshold [torso diameters]", "comparisons", "PDJ", "std of PDJ"),
-              grouped(spread, (*names, "fraction"), ["pdj"]), caption, chart("threshold [torso diameters]")),
+              study.grouped(spread, (*names, "fraction"), ["pdj"]), caption, chart("threshold [torso diameters]")),
     ]  # fmt: skip
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return that the paper's claim cannot be tested without a pose network."""
     return [Claim("Pose is better with the AMI-EV, above all at high picture rates.", "curves of PDJ and IoU", "–",
-                  Verdict.NOT_TESTABLE, "needs a pose network, and no weights are part of amiwarp")]  # fmt: skip
+                  study.Verdict.NOT_TESTABLE, "needs a pose network, and no weights are part of amiwarp")]  # fmt: skip

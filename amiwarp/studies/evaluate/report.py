@@ -20,14 +20,15 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import BLACK, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, VERMILION
 from amiwarp.io.atomic_output import NewFile, make_folder, write_text
 from amiwarp.studies.cluster import machine, versions
-from amiwarp.studies.evaluate.conditions import Condition, Stream
-from amiwarp.studies.evaluate.results import (
+from amiwarp.studies.evaluate.study import (
     CellResult,
     Chart,
     ChartKind,
     Claim,
+    Condition,
     Picture,
     Settings,
+    Stream,
     Table,
     Value,
     rows_of,
@@ -73,7 +74,10 @@ class Evaluation(Protocol):
         """Return the tables of all results, each with its chart. Results of failed cells have no values."""
 
     def claims(self, results: Sequence[CellResult]) -> list[Claim]:
-        """Return the paper's claims with the verdicts that follow from the results."""
+        """Return the paper's claims with the verdicts that follow from the results.
+
+        The function ``pictures(results)``, which returns the pictures of the evaluation, is optional.
+        """
 
 
 def load(name: str) -> Evaluation:
@@ -81,12 +85,6 @@ def load(name: str) -> Evaluation:
     if name not in EVALUATIONS:
         raise AmiwarpError(f"unknown evaluation {name!r}; choose among {', '.join(EVALUATIONS)}")
     return cast("Evaluation", importlib.import_module(f"amiwarp.studies.evaluate.{name}"))
-
-
-def pictures(evaluation: Evaluation, results: Sequence[CellResult]) -> list[Picture]:
-    """Return the pictures of an evaluation; its function ``pictures(results)`` is optional."""
-    draw = getattr(evaluation, "pictures", None)
-    return [] if draw is None else draw(results)
 
 
 # Charts of the tables of an evaluation, for print: drawn from the table alone.
@@ -278,9 +276,10 @@ def section(name: str, results: Sequence[CellResult]) -> Section:
     good = [r for r in results if not r.error]
     errors = [f"{r.condition}: {r.error}" for r in results if r.error]
     shown = evaluation.tables(good) if good else []
+    pictures: list[Picture] = getattr(evaluation, "pictures", lambda _: [])(good)
     return Section(
         name, evaluation.TITLE, evaluation.PROTOCOL, evaluation.DIFFERENCES, evaluation.claims(good), shown,
-        pictures(evaluation, good), len(results), errors, refused(good), sum(r.processor_s for r in results),
+        pictures, len(results), errors, refused(good), sum(r.processor_s for r in results),
     )  # fmt: skip
 
 
@@ -310,7 +309,8 @@ def write(out: Path, sections: Sequence[Section], settings: Settings, processor_
                 save(figure, out / "figures" / f"{table.name}.{kind}")
     films = {p.name: _encode(p) for s in sections for p in s.pictures}
     for picture in (p for s in sections for p in s.pictures):
-        _write_bytes(out / "figures" / f"{picture.name}.{_kind(picture)}", films[picture.name])
+        with NewFile(out / "figures" / f"{picture.name}.{_kind(picture)}") as new:
+            new.part.write_bytes(films[picture.name])
     about = _about(settings, processor_s)
     files = dict(zip(("report", "data"), (out / name for name in REPORT_FILES), strict=True))
     write_text(files["report"], _page(sections, figures, films, about))
@@ -339,11 +339,6 @@ def _write_csv(path: Path, table: Table) -> None:
     rows.writerow(table.columns)
     rows.writerows(table.rows)
     write_text(path, buffer.getvalue())
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    with NewFile(path) as new:
-        new.part.write_bytes(data)
 
 
 def _kind(picture: Picture) -> str:
@@ -400,13 +395,6 @@ def pivoted(table: Table) -> tuple[list[str], list[list[str]]]:
         return names, [[_cell(table, row, name) for name in names] for row in rows]
     chart = table.chart
     index = [c for c in dict.fromkeys((*chart.panels, chart.x)) if c in table.columns]
-    return _pivot(table, chart, rows, index)
-
-
-def _pivot(
-    table: Table, chart: Chart, rows: list[dict[str, Value]], index: list[str]
-) -> tuple[list[str], list[list[str]]]:
-    """Return the table with one column for each series of its chart."""
     series = list(dict.fromkeys(row[chart.series] for row in rows))
     found: dict[tuple[Value, ...], dict[Value, str]] = {}
     for row in rows:

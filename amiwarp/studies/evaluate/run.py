@@ -5,8 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,18 +13,27 @@ from typing import Any
 from amiwarp._version import __version__
 from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.errors import AmiwarpError
+from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import check_output, make_folder, own_folder
 from amiwarp.io.json_files import fields_of, value_of
 from amiwarp.io.sealed_json import CellStore
 from amiwarp.kernels.launch import load_all, load_kernels
 from amiwarp.progress import Progress, silent
-from amiwarp.studies.cluster import Workers, run_jobs, single_worker, start_workers
-from amiwarp.studies.dataset.run import worker_count
+from amiwarp.studies.cluster import Workers, result_of, run_jobs, start_workers, worker_count
 from amiwarp.studies.demo import EXACT_KERNELS
-from amiwarp.studies.evaluate.conditions import Condition, RecordedCondition, RecordedStreams, Streams
 from amiwarp.studies.evaluate.measures import library
 from amiwarp.studies.evaluate.report import EVALUATIONS, REPORT_FILES, SHORT, load, section, write
-from amiwarp.studies.evaluate.results import FULL, QUICK, CellResult, Settings
+from amiwarp.studies.evaluate.study import (
+    FULL,
+    QUICK,
+    CellResult,
+    Condition,
+    RecordedCondition,
+    RecordedStreams,
+    Settings,
+    Streams,
+)
+from amiwarp.translation.pictures_between import limited_opencv
 from amiwarp.validation import guarded, real, whole
 
 # Cells of the study: one evaluation under one condition. Each is a file, so that a stopped run can be continued.
@@ -61,28 +69,16 @@ class JobResult:
 def run_job(job: Job) -> JobResult:
     """Simulate the condition of a job once, or open its recording, and run its evaluations."""
     began = time.process_time()
-    with limited_cpu_threads(job.threads), _limited_opencv(cpu_threads()):
+    with limited_cpu_threads(job.threads), limited_opencv(library("cv2"), cpu_threads()):
         try:
             if isinstance(job.condition, Condition):
                 streams: RecordedStreams = Streams(job.condition, job.settings.device)
             else:
-                streams = RecordedStreams.of(job.condition, job.settings.device)
+                streams = RecordedStreams(open_recording(job.condition.path), job.settings.device)
             cells = [_run_cell(name, streams, job) for name in job.evaluations]
         except AmiwarpError as error:
             cells = [CellResult(name, job.condition, error=str(error)) for name in job.evaluations]
     return JobResult(cells, time.process_time() - began)
-
-
-@contextlib.contextmanager
-def _limited_opencv(threads: int) -> Iterator[None]:
-    """Let OpenCV use a number of threads within the block; by default it uses all cores."""
-    cv2 = library("cv2")
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(threads)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
 
 
 def compile_kernels(names: Sequence[str], device: str) -> float:
@@ -274,7 +270,7 @@ def evaluate(
     if scheduler is None:
         jobs = [replace(job, threads=max(1, cpu_threads() // count)) for job in jobs]
     store = Store(folder / "cells")
-    with _workers(scheduler, count, device) as there:
+    with start_workers("amiwarp evaluate", "cluster", scheduler, count, device) as there:
         results, new, processor_s = _run(jobs, store, there, progress or silent)
     names = [name for name in EVALUATIONS if any(r.evaluation == name for r in results)]
     sections = [section(name, [r for r in results if r.evaluation == name]) for name in names]
@@ -287,13 +283,6 @@ def evaluate(
         len(results), new, sum(bool(r.error) for r in results), {v: verdicts.count(v) for v in dict.fromkeys(verdicts)},
         files, time.perf_counter() - began, processor_s, tuple(store.damaged),
     )  # fmt: skip
-
-
-def _workers(scheduler: str | None, count: int, device: str) -> AbstractContextManager[Workers]:
-    """Return the workers: those of the scheduler, this process, or local processes."""
-    if scheduler is None and count == 1:
-        return single_worker()
-    return start_workers("amiwarp evaluate", "cluster", scheduler, count, device)
 
 
 def _run(
@@ -315,7 +304,7 @@ def _run(
         processor_s = compiling.result()
     with contextlib.closing(run_jobs(workers, run_job, todo)) as running:
         for job, future in running:
-            result = future.result()
+            result = result_of(future)
             for cell in result.cells:
                 store.save(cell, job.settings)
             results += result.cells

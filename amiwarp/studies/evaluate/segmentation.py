@@ -7,9 +7,11 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
-from amiwarp.studies.evaluate.conditions import Condition, Stream, Streams
+from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.contrast_motion import (
     MOST_LOCAL,
     dithered,
@@ -21,22 +23,8 @@ from amiwarp.studies.evaluate.contrast_motion import (
     velocity_grid,
 )
 from amiwarp.studies.evaluate.flow import moving_instances
-from amiwarp.studies.evaluate.measures import library, overlap
-from amiwarp.studies.evaluate.results import (
-    Amount,
-    CellResult,
-    Chart,
-    Claim,
-    Count,
-    Settings,
-    Share,
-    Table,
-    by_case,
-    compared,
-    grouped,
-    rows_of,
-    wide_focal,
-)
+from amiwarp.studies.evaluate.measures import library
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -134,6 +122,32 @@ def in_large_clusters(
     return np.asarray(large[label + 1][nearest] & (distance <= radius))
 
 
+# Agreement of a set of events or pixels with the true set.
+
+
+@dataclass(frozen=True, slots=True)
+class Overlap:
+    """Overlap of a found set with the true set. A ratio without a denominator is NaN."""
+
+    iou: float
+    """Intersection over union."""
+    precision: float
+    """Share of the found members that are true."""
+    recall: float
+    """Share of the true members that are found."""
+
+
+def overlap(found: NDArray[np.bool_], truth: NDArray[np.bool_]) -> Overlap:
+    """Return the overlap of two Boolean arrays of one shape. Raises :class:`AmiwarpError` for different shapes."""
+    if found.shape != truth.shape:
+        raise AmiwarpError(f"found and true masks have shapes {found.shape} and {truth.shape}; give equal shapes")
+    both = int(np.count_nonzero(found & truth))
+    counts = [int(np.count_nonzero(mask)) for mask in (found | truth, found, truth)]
+    return Overlap(*(both / n if n else float("nan") for n in counts))
+
+
+# Evaluation.
+
 TITLE = "Motion segmentation"
 PROTOCOL = (
     "In windows of a quarter turn, the camera's rotation is that of the sharpest image of the events (contrast "
@@ -166,15 +180,15 @@ NAMES = {"gain": "least gain", "least_share": "least share of a cluster", "densi
 
 class _Row(TypedDict):
     stream: Stream
-    events: Count
-    gain: Amount
-    least_share: Share
-    density: Amount
-    radius_px: Amount
-    share: Share | None
-    iou: Share | None
-    precision: Share | None
-    recall: Share | None
+    events: study.Count
+    gain: study.Amount
+    least_share: study.Share
+    density: study.Amount
+    radius_px: study.Amount
+    share: study.Share | None
+    iou: study.Share | None
+    precision: study.Share | None
+    recall: study.Share | None
 
 
 class Values(TypedDict):
@@ -185,7 +199,7 @@ class Values(TypedDict):
 
 def conditions(settings: Settings) -> list[Condition]:
     """Return the ball before a moving camera. The lens sees the whole throw."""
-    return settings.conditions(world="ball", trajectory="handheld", focal_px=wide_focal(settings))
+    return settings.conditions(world="ball", trajectory="handheld", focal_px=study.wide_focal(settings))
 
 
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
@@ -203,7 +217,7 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
             assert instance is not None
             truth = np.isin(instance, moving)
             for chosen, found in zip(choices, moving_events(events, streams.camera, choices), strict=True):
-                scores = {name: _number(value) for name, value in asdict(overlap(found, truth)).items()}
+                scores = {name: study.finite(value) for name, value in asdict(overlap(found, truth)).items()}
                 rows.append({"stream": stream.value, "events": len(events), **_values(chosen),
                              "share": float(truth.mean()) if len(truth) else None, **scores})  # fmt: skip
     return {"rows": rows}
@@ -223,23 +237,20 @@ def _curves(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def _number(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the scores of the standard settings, and those over the least gain."""
-    rows = rows_of(results, "rows")
+    rows = study.rows_of(results, "rows")
     names, scores = ("scene", "camera", "stream"), ["iou", "precision", "recall"]
     columns = ("seeds x windows", "IoU", "std of IoU", "precision", "std of precision", "recall", "std of recall")
     standard = [r for r in rows if _values(STANDARD).items() <= r.items()]
     return [
         Table("segmentation", "Segmentation of a thrown ball, per event",
-              (*names, *columns, "events of the ball", "std of share"), grouped(standard, names, [*scores, "share"]),
+              (*names, *columns, "events of the ball", "std of share"),
+              study.grouped(standard, names, [*scores, "share"]),
               "Precision is undefined for a window in which no body is found; its IoU is 0."),
         Table("segmentation_settings", "Segmentation over its settings",
               ("setting", *names, "value of the setting", *columns),
-              grouped(_curves(rows), ("setting", *names, "value of the setting"), scores),
+              study.grouped(_curves(rows), ("setting", *names, "value of the setting"), scores),
               "Gain: that in agreement of what stays blurred. The other settings are those of the clustering.",
               Chart("value of the setting", "IoU", "stream", "std of IoU", panels=("setting",))),
     ]  # fmt: skip
@@ -247,8 +258,8 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdict on the segmentation, which the paper shows in pictures."""
-    rows = [r for r in rows_of(results, "rows") if _values(STANDARD).items() <= r.items()]
-    holds, ours = compared(by_case(rows, ("scene", "camera"), "iou"), Stream.PLAIN, "higher", larger=True)
+    rows = [r for r in study.rows_of(results, "rows") if _values(STANDARD).items() <= r.items()]
+    holds, ours = study.compared(study.by_case(rows, ("scene", "camera"), "iou"), Stream.PLAIN, "higher", larger=True)
     rule = f"the mean IoU of '{Stream.CALIBRATED}' is above that of '{Stream.PLAIN}' by more than either spread"
     return [
         Claim.judge("A thrown ball is segmented better with the AMI-EV (moving camera).", "pictures", ours, holds, rule)

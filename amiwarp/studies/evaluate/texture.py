@@ -3,28 +3,72 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
-from amiwarp.studies.evaluate.conditions import ENOUGH, Condition, RecordedStreams, Stream
-from amiwarp.studies.evaluate.measures import density_variance, event_counts
-from amiwarp.studies.evaluate.results import (
-    Amount,
-    CellResult,
-    Chart,
-    ChartKind,
-    Claim,
-    Settings,
-    Table,
-    by_case,
-    compared,
-    grouped,
-    rows_of,
-)
+from amiwarp.studies.evaluate import study
+from amiwarp.studies.evaluate.measures import smoothed
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Table
 
 if TYPE_CHECKING:
     from amiwarp.events.events import Events
+
+
+# Evenness of events over the image: kernel density at each event's place, and its variance.
+
+FINENESS = 2
+"""Cells of the grid per pixel, along each axis. Pixel centres are centres of cells, so those of plain events are exact.
+
+Other places are rounded to the cell, as if the Gaussian's variance were larger by 1 / (6 FINENESS²) px²: by 4 % for a
+standard deviation of 1 px, by 0.5 % for 3 px.
+"""
+TRUNCATE = 5.0
+"""Radius at which the Gaussian kernel ends [standard deviations]."""
+
+
+def event_counts(x: NDArray[Any], y: NDArray[Any], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the number of events in each cell of a grid over the image, whose outermost cells are half outside.
+
+    ``x``, ``y``: places [px], shape (n,); those outside the image are left out. ``size``: width and height [px].
+    """
+    columns, rows = (FINENESS * n + 1 for n in size)
+    half = FINENESS // 2
+    column, row = (np.rint(FINENESS * v.astype(np.float32)).astype(np.int32) + half for v in (x, y))
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    cell = (row * columns + column)[inside]
+    return np.asarray(np.bincount(cell, minlength=rows * columns).reshape(rows, columns), np.float32)
+
+
+def density_variance(counts: NDArray[np.float32], h_px: float) -> float:
+    """Return the variance of ρ / mean ρ, where ρ is the kernel density at each event: 0 for an even distribution.
+
+    ``counts``: events in the cells of a grid, see :func:`event_counts`. ``h_px``: standard deviation of the Gaussian
+    kernel. Each event contributes to its own density, as usual for kernel density estimates. Near the border the
+    density is divided by the part of the kernel that lies in the image. NaN without events. For a Poisson process of λ
+    events/px² the variance is about λ / (4πh²) / (λ + 1 / (2πh²))².
+    """
+    number = float(counts.sum(dtype=np.float64))
+    if not number:
+        return float("nan")
+    mass = smoothed(counts, FINENESS * h_px, truncate=TRUNCATE, mirrored=False)
+    density = mass / _inside_share(counts.shape, h_px)
+    mean = float(np.sum(counts * density, dtype=np.float64)) / number
+    return float(np.sum(counts * (density / mean - 1.0) ** 2, dtype=np.float64)) / number
+
+
+@lru_cache(maxsize=16)
+def _inside_share(shape: tuple[int, int], h_px: float) -> NDArray[np.float32]:
+    """Return the part of the kernel around each cell that lies in the image."""
+    cells = np.ones(shape, np.float32)
+    for edge in (cells[0], cells[-1], cells[:, 0], cells[:, -1]):
+        edge *= 0.5
+    return smoothed(cells, FINENESS * h_px, truncate=TRUNCATE, mirrored=False)
+
+
+# Evaluation.
 
 TITLE = "Texture stability"
 PROTOCOL = (
@@ -52,14 +96,14 @@ PAPER = {"paper, AMI-EV": 0.196, "paper, S-EV": 0.425}
 
 class _Row(TypedDict):
     stream: Stream
-    h: Amount
-    window: Amount
-    variance: Amount | None
+    h: study.Amount
+    window: study.Amount
+    variance: study.Amount | None
 
 
 class _Rate(TypedDict):
     stream: Stream
-    rate: Amount
+    rate: study.Amount
 
 
 class Values(TypedDict):
@@ -74,7 +118,7 @@ def conditions(settings: Settings) -> list[Condition]:
     return settings.scenes()
 
 
-def measure(streams: RecordedStreams, settings: Settings) -> dict[str, Any]:
+def measure(streams: study.RecordedStreams, settings: Settings) -> dict[str, Any]:
     """Return the variance for each stream, kernel and window, and each stream's event rate [1/s]."""
     rows, rates = [], []
     for stream in streams.names:
@@ -90,7 +134,7 @@ def measure(streams: RecordedStreams, settings: Settings) -> dict[str, Any]:
     return {"rows": rows, "rates": rates}
 
 
-def _windows(streams: RecordedStreams, stream: Stream, window_ms: float) -> list[Events]:
+def _windows(streams: study.RecordedStreams, stream: Stream, window_ms: float) -> list[Events]:
     """Return the events of up to :data:`REPEATS` windows, spread over the recording.
 
     Windows of the stream with the same count are left out if the plain event camera recorded too few events.
@@ -101,12 +145,12 @@ def _windows(streams: RecordedStreams, stream: Stream, window_ms: float) -> list
     found = [(int(t), streams.window(stream, int(t), int(t) + length)) for t in starts]
     if stream is not Stream.SAME_COUNT:
         return [events for _, events in found]
-    return [e for t, e in found if len(e) >= ENOUGH * streams.count(Stream.RAW, t, t + length)]
+    return [e for t, e in found if len(e) >= study.ENOUGH * streams.count(Stream.RAW, t, t + length)]
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the variances of the paper's protocol, both sensitivity curves, and the event rates."""
-    rows, rates = rows_of(results, "rows"), rows_of(results, "rates")
+    rows, rates = study.rows_of(results, "rows"), study.rows_of(results, "rates")
     by = ("scene", "camera", "stream")
     names = ("scene", "camera", "stream")
     variance = ("seeds", "variance of ρ / mean ρ", "std")
@@ -118,23 +162,23 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
     kernel, window = ([r for r in rows if r[o] == v] for o, v in (("window", WINDOW_MS), ("h", H_PX)))
     return [
         Table("texture", "Variance of the event density, h = 3 px, 33 ms", (*names, *variance),
-              grouped(standard, by, ["variance"]), "Lower is more even. At rest the S-EV records noise only, which is "
-              "even, and never as many events as the AMI-EV.",
-              Chart("camera", variance[1], "stream", "std", panels=("scene",), marks=PAPER, kind=ChartKind.BARS)),
+              study.grouped(standard, by, ["variance"]), "Lower is more even. At rest the S-EV records noise only, "
+              "which is even, and never as many events as the AMI-EV.",
+              Chart("camera", variance[1], "stream", "std", panels=("scene",), marks=PAPER, kind=study.ChartKind.BARS)),
         Table("texture_kernel", "Variance over the kernel's width, windows of 33 ms", (*names, "h [px]", *variance),
-              grouped(kernel, (*by, "h"), ["variance"]), "A wide kernel hides blur; a narrow one counts noise.",
+              study.grouped(kernel, (*by, "h"), ["variance"]), "A wide kernel hides blur; a narrow one counts noise.",
               chart("h [px]")),
         Table("texture_window", "Variance over the length of the window, h = 3 px",
-              (*names, "window [ms]", *variance), grouped(window, (*by, "window"), ["variance"]),
+              (*names, "window [ms]", *variance), study.grouped(window, (*by, "window"), ["variance"]),
               "A quarter turn at 720 rpm takes 21 ms.", chart("window [ms]", log_x=True)),
-        Table("event_rate", "Event rate", (*names, "seeds", "rate [Mev/s]", "std"), grouped(rates, by, ["rate"]),
+        Table("event_rate", "Event rate", (*names, "seeds", "rate [Mev/s]", "std"), study.grouped(rates, by, ["rate"]),
               "Events of the whole recording over its duration."),
     ]  # fmt: skip
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the paper's ranking, on its robustness, and on the ranking at equal numbers of events."""
-    rows = rows_of(results, "rows")
+    rows = study.rows_of(results, "rows")
     moving = [r for r in rows if r["camera"] not in ("still", "recording")]
     standard = [r for r in moving if (r["h"], r["window"]) == (H_PX, WINDOW_MS)]
     return [
@@ -147,7 +191,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
 
 def _ranking(rows: Sequence[dict[str, Any]], other: Stream, text: str, paper: str) -> Claim:
     """Judge whether the calibrated AMI-EV is more even than ``other`` in each case."""
-    cases = by_case(rows, ("scene", "camera", "h", "window"), "variance")
-    holds, ours = compared(cases, other, "lower", larger=False)
+    cases = study.by_case(rows, ("scene", "camera", "h", "window"), "variance")
+    holds, ours = study.compared(cases, other, "lower", larger=False)
     rule = f"the mean variance of '{Stream.CALIBRATED}' is below that of '{other}' by more than either spread"
     return Claim.judge(text, paper, ours, holds, rule)

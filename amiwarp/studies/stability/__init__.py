@@ -16,8 +16,7 @@ from amiwarp.studies.stability.cells import (
     run_cell,
 )
 from amiwarp.studies.stability.conditions import AXES, Axis, Condition, make, sensible
-from amiwarp.studies.stability.figures import draw
-from amiwarp.studies.stability.report import Atlas, aggregate, load, summary
+from amiwarp.studies.stability.report import Atlas, aggregate, draw, load, summary
 
 __all__ = [
     "AXES", "METHODS", "QUICK_METHODS", "Atlas", "Axis", "Cell", "Condition", "Method", "Outcome", "Result", "Store",

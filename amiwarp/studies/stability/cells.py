@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import hashlib
 import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, as_completed
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,13 +31,11 @@ from amiwarp.io.sealed_json import CellStore
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import predicted_error
 from amiwarp.progress import Progress
-from amiwarp.studies.cluster import machine
+from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs
 from amiwarp.studies.stability.conditions import AXES, Axis, Condition, SimulatedSample, make
 from amiwarp.validation import instance, real, whole
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
-
     from amiwarp.calib import Calibration
 
 
@@ -293,10 +291,6 @@ class Store(CellStore):
         })  # fmt: skip
 
 
-# Run of the stability study by any executor, such as a Dask cluster or a process pool.
-#
-# Each cell (one recording with its results) is stored when it finishes.
-
 QUICK_METHODS = ("default", "paper", "sharpness")
 """Names of the methods of a quick run."""
 
@@ -320,7 +314,7 @@ def run(
     seeds: int,
     methods: Sequence[Method],
     store: Store,
-    executor: Executor,
+    workers: Workers,
     *,
     device: str = "cpu",
     first: int = 0,
@@ -335,14 +329,12 @@ def run(
     """
     cells = [Cell(c, seed) for seed in range(first, first + seeds) for c in conditions(axes)]
     known = {cell: store.load(cell) for cell in cells}
-    todo = [(cell, missing) for cell in cells if (missing := _missing(known[cell], methods))]
-    waiting: dict[Future[Stored], Cell] = {}
+    missing = {cell: tuple(m for m in methods if identity(m) not in known[cell].results) for cell in cells}
+    todo = [(cell, lacking) for cell, lacking in missing.items() if lacking]
     done = len(cells) - len(todo)
-    try:
-        for cell, missing in todo:
-            waiting[executor.submit(run_cell, cell, missing, device)] = cell
-        for future in as_completed(waiting):
-            found, cell = future.result(), waiting[future]
+    with contextlib.closing(run_jobs(workers, partial(_run_missing, device), todo)) as running:
+        for (cell, _), future in running:
+            found = result_of(future)
             known[cell] = replace(found, results={**known[cell].results, **found.results})
             store.save(known[cell])
             done += 1
@@ -350,15 +342,12 @@ def run(
                 progress(f"{done:,} of {len(cells):,} cells", done / len(cells))
             if until is not None and until():
                 break
-    finally:
-        for future in waiting:
-            future.cancel()
     return [known[cell] for cell in cells]
 
 
-def _missing(stored: Stored, methods: Sequence[Method]) -> tuple[Method, ...]:
-    """Return the methods for which a cell has no result."""
-    return tuple(m for m in methods if identity(m) not in stored.results)
+def _run_missing(device: str, job: tuple[Cell, tuple[Method, ...]]) -> Stored:
+    """Run the methods that a cell lacks."""
+    return run_cell(*job, device)
 
 
 def chosen(names: Sequence[str] = ()) -> tuple[Method, ...]:

@@ -572,11 +572,8 @@ class Axis:
         return [replace(Condition(), **dict(self.also), **{self.field: value}) for value in self.values]
 
 
-def _scene_values(*kinds: SceneKind) -> tuple[str, ...]:
-    """Return the names of kinds of scenes, as values of an axis."""
-    return tuple(kind.value for kind in kinds)
-
-
+SCENES = tuple(kind.value for kind in SceneKind)
+"""Names of all kinds of scenes."""
 WIDE = (("fov_deg", 90.0), ("apex_deg", 2.0))
 """Condition in which a wrong camera shows: a wide view and a large orbit."""
 
@@ -608,14 +605,14 @@ AXES = (
     Axis("focal length", "focal_error", (0.0, 0.01, 0.03, 0.1, 0.3), "relative error"),
     Axis("distortion ignored", "distortion", (0.0, -0.03, -0.1, -0.2), "k1"),
     Axis("start", "start", ("none", "right", "wrong")),
-    Axis("scene", "scene", _scene_values(*SceneKind)),
+    Axis("scene", "scene", SCENES),
     Axis("flickering lamp", "lamp", (0.0, 0.01, 0.05, 0.2, 0.6), "of the picture"),
     Axis("camera turning", "camera_deg_s", (0.0, 1.0, 3.0, 10.0, 30.0, 60.0), "°/s"),
     Axis("passing object", "passing", (0.0, 0.02, 0.1, 0.3, 0.6), "of the picture"),
     Axis("motion cancelled", "cancelled", (0.0, 0.3, 0.6, 0.9, 1.0), "of the prism's"),
     Axis("encoder scale", "encoder_scale", (0.0, 1e-4, 1e-3, 0.01, 0.1), "relative error"),
     Axis("principal point", "principal_px", (0.0, 2.0, 5.0, 10.0, 20.0), "px"),
-    Axis("small orbit", "scene", _scene_values(*SceneKind), "apex 0.5°", (("apex_deg", 0.5),)),
+    Axis("small orbit", "scene", SCENES, "apex 0.5°", (("apex_deg", 0.5),)),
     Axis("events, sparse edges", "window_events", (0, 50_000, 20_000, 10_000), "", (("scene", SceneKind.EDGES.value),)),
     Axis("thin lines and noise", "noise", (0.0, 0.1, 0.2, 0.35), "of all events",
          (("scene", SceneKind.LINES.value),)),
