@@ -42,7 +42,7 @@ from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.exports import as_bytes, write_events, write_image
 from amiwarp.viewer.images import ImageKind, Scale, make_images
 from amiwarp.viewer.inspector import Inspector, suggest_region
-from amiwarp.viewer.jobs import calibrate_selected, cost_surface, estimate_phase, scope_text
+from amiwarp.viewer.jobs import cost_surface, estimate_phase, find_calibration, scope_text
 from amiwarp.viewer.layout import events_text
 from amiwarp.viewer.panel import Panel
 from amiwarp.viewer.timeline import EventRates
@@ -626,7 +626,7 @@ def test_a_calibration_uses_what_is_selected(
     inspector.set(replace(truth, apex=0.5 * truth.apex))
     said: list[str] = []
     settings = Settings(model="exact", stages=("sharpness",))
-    found = calibrate_selected(inspector, settings, progress=lambda what, share: said.append(what))
+    found = find_calibration(inspector, settings, progress=lambda what, share: said.append(what))
     assert said
     assert found.calibration.camera == recording.camera
     assert found.calibration.parameters["apex"] == pytest.approx(truth.apex, abs=math.radians(0.12))
@@ -649,7 +649,7 @@ def test_a_selection_that_determines_nothing_is_refused(inspector: Inspector) ->
     assert "ON events" in scope_text(inspector)
     assert "without background activity (3 ms)" in scope_text(inspector)
     with pytest.raises(AmiwarpError, match=r"quarter turn|too few"):
-        calibrate_selected(inspector)
+        find_calibration(inspector)
 
 
 def test_the_cost_surface_has_its_top_at_the_truth(inspector: Inspector) -> None:

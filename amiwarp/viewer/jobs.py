@@ -14,7 +14,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import rpm_between
 from amiwarp.progress import Progress, silent
 from amiwarp.viewer.images import SelectedPart, select_part
-from amiwarp.viewer.window import CURVE_HALF_WIDTH, Source, WindowImager
+from amiwarp.viewer.window import CURVE_HALF_WIDTH, Source
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,7 +43,7 @@ def estimate_phase(inspector: Inspector) -> bool:
     """
     if inspector.sources["phase"] is not Source.ASSUMED or not math.isfinite(inspector.turn_us):
         return False
-    measure = inspector.sharpness_meter(WindowImager(inspector.recording.events.size, inspector.device))
+    measure = inspector.sharpness_meter()
     sharpness: dict[float, float] = {}
 
     def best(phases: list[float]) -> float:
@@ -87,54 +87,32 @@ class FoundCalibration:
 
 
 def scope_text(inspector: Inspector) -> str:
-    """Return on which events :func:`calibrate_selected` works, for the page."""
-    return _text(inspector, _part(inspector))
+    """Return which events of the selection :func:`find_calibration` uses, for the page."""
+    return _text(inspector, select_part(inspector, inspector.loaded, inspector.loaded.region))
 
 
-def calibrate_selected(
-    inspector: Inspector, settings: Settings | None = None, *, progress: Progress | None = None
+def find_calibration(
+    inspector: Inspector, settings: Settings | None = None, *, whole: bool = False, progress: Progress | None = None
 ) -> FoundCalibration:
-    """Calibrate on the events of the window and the selection.
+    """Calibrate on the events of the window and the selection, or on the whole recording as ``amiwarp calibrate`` does.
 
     Without an encoder, the search starts at the speed set on the page. Raises :class:`AmiwarpError` if these events
     cannot determine the parameters.
     """
-    part = _part(inspector)
-    scope = _text(inspector, part)
-    found = calibrate(part.recording, _started(inspector, settings), device=inspector.device, progress=progress)
-    whole = replace(found, camera=inspector.camera)
-    return _compared(inspector, whole, scope)
-
-
-def calibrate_whole(
-    inspector: Inspector, settings: Settings | None = None, *, progress: Progress | None = None
-) -> FoundCalibration:
-    """Calibrate on the whole recording, as ``amiwarp calibrate`` does.
-
-    Without an encoder, the search starts at the speed set on the page. Raises :class:`AmiwarpError` if the recording
-    cannot determine the parameters.
-    """
-    recording = inspector.recording
-    found = calibrate(recording, _started(inspector, settings), device=inspector.device, progress=progress)
-    return _compared(inspector, found, f"the whole recording, {len(recording.events):,} events")
-
-
-def _started(inspector: Inspector, settings: Settings | None) -> Settings:
-    """Return settings that start at the speed set on the page if there is no encoder."""
-    settings, rpm = settings or Settings(), inspector.knobs.rpm
-    return settings if inspector.has_encoder or not rpm else replace(settings, start={"rpm": rpm, **settings.start})
-
-
-def _compared(inspector: Inspector, found: Calibration, scope: str) -> FoundCalibration:
-    """Return a calibration with the sharpness of the shown region before and after it."""
-    sharpness = inspector.sharpness_meter(WindowImager(inspector.recording.events.size, inspector.device))
+    recording, rpm = inspector.recording, inspector.knobs.rpm
+    scope = f"the whole recording, {len(recording.events):,} events"
+    if not whole:
+        part = select_part(inspector, inspector.loaded, inspector.loaded.region)
+        recording, scope = part.recording, _text(inspector, part)
+    settings = settings or Settings()
+    if rpm and not inspector.has_encoder:
+        settings = replace(settings, start={"rpm": rpm, **settings.start})
+    found = calibrate(recording, settings, device=inspector.device, progress=progress)
+    if not whole:
+        found = replace(found, camera=inspector.camera)
+    sharpness = inspector.sharpness_meter()
     values = (sharpness(each) for each in (None, inspector.knobs, inspector.knobs_of(found)))
     return FoundCalibration(found, scope, *values)
-
-
-def _part(inspector: Inspector) -> SelectedPart:
-    window = inspector.loaded
-    return select_part(inspector, window, window.region)
 
 
 def _text(inspector: Inspector, part: SelectedPart) -> str:
@@ -181,7 +159,7 @@ def cost_surface(
     to stop it.
     """
     progress, current = progress or silent, inspector.knobs
-    sharpness = inspector.sharpness_meter(WindowImager(inspector.recording.events.size, inspector.device))
+    sharpness = inspector.sharpness_meter()
     apex = np.linspace(0.0, 2.0 * (current.apex or inspector.prism.apex), points[0])
     if inspector.has_encoder:
         names, values = ("apex", "phase"), (apex, current.phase + np.linspace(-math.pi, math.pi, points[1]))

@@ -95,7 +95,7 @@ SETTABLE: dict[str, Check] = {
 }  # fmt: skip
 """State variables that the page may set directly, with the check of their values. The page changes all others through
 :data:`CALLS`."""
-CLIENT_ONLY = ("hover", "hover_region", "measured", "tool")
+CLIENT_ONLY = ("hover", "measured", "tool")
 """State variables that the browser keeps to itself."""
 NO_SCALE = {"bar": "", "ticks": [], "title": ""}
 """Scale of an image before the first update."""
@@ -138,7 +138,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
         "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
         "views": [list(each) for each in VIEWS], "tool": "region", "tools": [list(each) for each in TOOLS],
-        "hover": "", "hover_region": "", "measured": "", "orbit_shown": True, "help_shown": False,
+        "hover": "", "measured": "", "orbit_shown": True, "help_shown": False,
         "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
         "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
         "rate_on": b"", "rate_off": b"", "rate_note": "", "picked_text": "",

@@ -449,9 +449,9 @@ class Panel:
     async def _calibrate(self, progress: JobProgress) -> None:
         """Calibrate in a thread, and show the result with a map of sharpness about it."""
         inspector, state = self.inspector, self.state
-        call = jobs.calibrate_selected if state.scope == layout.SCOPES[0] else jobs.calibrate_whole
         try:
-            found = await self._guarded_in_thread(call, inspector, progress)
+            find = partial(jobs.find_calibration, whole=state.scope != layout.SCOPES[0])
+            found = await self._guarded_in_thread(find, inspector, progress)
             if isinstance(found, str):
                 text, severity = ("calibration cancelled", "info") if progress.cancelled else (found, "error")
                 self.work.show_message(text, severity)

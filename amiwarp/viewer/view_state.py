@@ -213,12 +213,9 @@ def _with_value(state: ViewState, key: str, text: str, size: tuple[int, int], du
 
 def _with_knob(knobs: Knobs, name: str, text: str) -> Knobs:
     """Return parameters with one value of an address."""
-    if name == "model":
-        return replace(knobs, model=text if text in MODELS else _fail(text))
-    low, high = LIMITS[name]
-    value = float(text)
-    if not low <= value <= high:
-        raise ValueError(text)
+    if name == "model" and text in MODELS:
+        return replace(knobs, model=text)
+    value = _within(float(text), *LIMITS[name])
     return replace(knobs, **{name: math.radians(value) if name in ANGLES else value})  # type: ignore[arg-type]
 
 
@@ -230,9 +227,7 @@ def _region(text: str, size: tuple[int, int]) -> tuple[int, int, int, int] | Non
     if text == "all":
         return None
     left, top, right, bottom = (_whole(each, 0, max(size)) for each in text.split(","))
-    if not (left < right <= size[0] and top < bottom <= size[1]):
-        raise ValueError(text)
-    return left, top, right, bottom
+    return left, top, int(_within(right, left + 1, size[0])), int(_within(bottom, top + 1, size[1]))
 
 
 def _sources(text: str, known: tuple[tuple[str, Source], ...]) -> tuple[tuple[str, Source], ...]:
@@ -244,15 +239,17 @@ def _sources(text: str, known: tuple[tuple[str, Source], ...]) -> tuple[tuple[st
 
 def _time(text: str, low: int, high: int) -> int:
     """Return a time in us from a text in ms."""
-    time_us = round(float(text) * 1e3)
-    return time_us if low <= time_us <= high else _fail(text)
+    return int(_within(round(float(text) * 1e3), low, high))
 
 
 def _whole(text: str, low: int, high: int) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 12):
         raise ValueError(text)
-    return int(text) if low <= int(text) <= high else _fail(text)
+    return int(_within(int(text), low, high))
 
 
-def _fail(text: str) -> Any:
-    raise ValueError(text)
+def _within(value: float, low: float, high: float) -> float:
+    """Return a value in a range. Raises ValueError for any other, such as NaN."""
+    if not low <= value <= high:
+        raise ValueError(value)
+    return value
