@@ -15,8 +15,7 @@ import pytest
 
 from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
-from amiwarp.io.chunks import CHUNK, ChunkFile, EncodedChunk, encode, encode_parts
-from amiwarp.io.native_writer import make_dataset
+from amiwarp.io.chunks import CHUNK, ChunkFile, EncodedChunk, encode, encode_parts, make_dataset
 
 assert hdf5plugin.FILTERS  # its import registers the filter
 
@@ -170,7 +169,7 @@ FAILING = """
 import errno, os, sys
 import numpy as np
 from amiwarp.io.chunks import ChunkFile
-from amiwarp.io.native_writer import make_dataset
+from amiwarp.io.chunks import make_dataset
 written = os.pwritev
 calls = 0
 def failing(*arguments):
