@@ -92,11 +92,11 @@ from .progress import Progress as Progress
 from .reconstruction.picture import Picture as Picture
 from .reconstruction.picture import Reconstruction as Reconstruction
 from .reconstruction.picture import reconstruct as reconstruct
+from .simulation.description import Frames as Frames
+from .simulation.description import Scene as Scene
 from .simulation.motion import CameraMotion as CameraMotion
 from .simulation.motion import EncoderModel as EncoderModel
 from .simulation.motion import PrismMotion as PrismMotion
-from .simulation.scenery import Frames as Frames
-from .simulation.scenery import Scene as Scene
 from .simulation.sensor import SensorModel as SensorModel
 from .simulation.sequences import PictureFolder as PictureFolder
 from .simulation.sequences import Pictures as Pictures

@@ -30,6 +30,7 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
+from amiwarp import DatasetSummary, make_dataset
 from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.io.sealed_json import read_journal
 from amiwarp.kernels.launch import start_quietly
@@ -37,7 +38,7 @@ from amiwarp.simulation.engine import Engine
 from amiwarp.studies.cluster import ANY_GPU, machine, versions
 from amiwarp.studies.dataset import run
 from amiwarp.studies.dataset.items import Item, list_items, simulation_of
-from amiwarp.studies.dataset.run import DatasetSummary, make_dataset, threads_of_worker
+from amiwarp.studies.dataset.run import threads_of_worker
 from amiwarp.studies.dataset.specification import content_digest, load_specification
 
 RESULTS = Path(__file__).parent / "results"

@@ -31,14 +31,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.compensation.recordings import compensate
+from amiwarp import compensate, make_dataset, open_recording
 from amiwarp.cpu_threads import cpu_threads
-from amiwarp.io import open_recording
 from amiwarp.kernels.launch import start_quietly
 from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, machine, processor, run_jobs, start_workers, versions
 from amiwarp.studies.dataset import run
 from amiwarp.studies.dataset.items import Item, list_items, simulation_of, write_recording
-from amiwarp.studies.dataset.run import make_dataset
 from amiwarp.studies.dataset.specification import content_digest, load_specification
 from amiwarp.studies.stability import cells as run_cells
 from amiwarp.studies.stability.cells import METHODS, Cell, Stored, run_cell

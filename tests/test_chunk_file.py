@@ -13,8 +13,7 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from amiwarp.events.events import Events
-from amiwarp.io import RecordingWriter
+from amiwarp import Events, RecordingWriter
 from amiwarp.io.chunks import CHUNK, ChunkFile, EncodedChunk, encode, encode_parts, make_dataset
 
 assert hdf5plugin.FILTERS  # its import registers the filter

@@ -15,20 +15,29 @@ import pytest
 from faery.extension import aedat
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from io_samples import SIZE, make_events
 from io_samples_extra import CLIENTS, HOURS_28, Columns, by_dv_processing, by_eventcv
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, EventSource, MemoryEvents
-from amiwarp.events.recording import Recording, Truth
-from amiwarp.io import convert, open_recording, save_recording
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Codec,
+    Encoder,
+    Events,
+    EventSource,
+    MemoryEvents,
+    OutputFormat,
+    Prism,
+    Recording,
+    Rounding,
+    Truth,
+    convert,
+    open_recording,
+    save_recording,
+)
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.export import export
-from amiwarp.io.formats import Codec, OutputFormat, Rounding
 from amiwarp.io.prophesee import Evt3Encoder
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
+from reference.io_samples import SIZE, make_events
 
 
 def save(path: Path, events: Events, **options: object) -> Path:

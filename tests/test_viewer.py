@@ -7,30 +7,34 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from amiwarp.calib import Calibration
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    Encoder,
+    Events,
+    MemoryEvents,
+    Prism,
+    Recording,
+    compensate_events,
+    iwe,
+    open_recording,
+    save_recording,
+    simulate,
+)
 from amiwarp.calib.bad_pixels import MaskedEventSource
 from amiwarp.calib.parameters import build_model
 from amiwarp.choices import Axis, Colour, View
-from amiwarp.compensation.recordings import compensate_events
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.iwe import iwe
-from amiwarp.io import open_recording, save_recording
-from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import window
 from amiwarp.viewer.clouds import WIDEST_PX, Look, Scene, axis_range, colours_of, orbit_lines, residual, third_axis
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.timeline import read_span
 from amiwarp.viewer.window import Knobs, Selection
+from reference.calibration_sample import exact_calibration
 
 TRUE = Prism(math.radians(1.0))
 PICTURES = Path(__file__).parent / "pictures"

@@ -44,7 +44,8 @@ from amiwarp.kernels.equations import (
     sum_square_products,
     sum_squares,
 )
-from amiwarp.kernels.launch import BLOCK_DIM, Program, RepeatedLaunches, launch, slice_count, start_read
+from amiwarp.kernels.launch import BLOCK_DIM, Program, RepeatedLaunches, launch, slice_count
+from amiwarp.kernels.page_locked import start_read
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.displacement import model_camera
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -28,7 +28,7 @@ from amiwarp.progress import Progress
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.calib.calibration_events import CalibrationEvents
+    from amiwarp.calib.calibration_events import CalibrationEvents, EventsAhead
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.events.events import Events
     from amiwarp.imaging.votes import Image, UploadedEvents
@@ -359,7 +359,6 @@ class Quadratic:
 
 CANDIDATES = 3
 """Largest number of optima of the coarse image from which the local search starts."""
-"""Number of disjoint parts of the events, whose scatter measures the uncertainty of the parameters."""
 
 
 class Search:
@@ -381,7 +380,11 @@ class Search:
         self.space = space.without(DEGENERATE_WITH_APEX) if "photometric" in settings.stages else space
         """Parameter space of the sharpness search: without the parameters that are left to the photometric stage."""
         self.calibration_events, self.settings, self.device = calibration_events, settings, device
-        self.progress = progress
+        self._progress = progress
+        self.ahead: EventsAhead | None = None
+        """Events of the photometric stage that are already on the device."""
+        self.meanwhile: Iterator[None] = iter(())
+        """Other work, whose steps the photometric stage takes where the host would wait for a GPU."""
         self.stages: list[StageSummary] = []
         self.pad = padding(self.space)
         """Border of the fine image outside the sensor [px]."""
@@ -478,8 +481,7 @@ class Search:
         name = "global" if algorithm.startswith("G") else "local"
 
         def score(v: NDArray[np.float64]) -> float:
-            if self.progress is not None:
-                self.progress(*stage_share(self.settings, name, objective.evaluations / budget))
+            self.report(name, objective.evaluations / budget)
             values.append(space.to_values(v))
             return objective.values(values[-1])
 
@@ -490,6 +492,11 @@ class Search:
         )  # fmt: skip
         self.stages.append(StageSummary.of(name, stage, space.names, values))
         return stage
+
+    def report(self, stage: str, share: float) -> None:
+        """Tell the progress function which share of a stage is finished."""
+        if self._progress is not None:
+            self._progress(*stage_share(self.settings, stage, share))
 
     def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
         """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the sharpness."""

@@ -121,7 +121,7 @@ def run(
     seen = _camera(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
-    from amiwarp.simulation.scenery import Scene
+    from amiwarp.simulation.description import Scene
     from amiwarp.simulation.sensor import SensorModel
     from amiwarp.studies.demo import earth
     from amiwarp.studies.design import design

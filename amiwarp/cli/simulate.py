@@ -18,7 +18,7 @@ from amiwarp.io import open_recording
 from amiwarp.simulation.motion import CameraMotion
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.scenery import Scene
+    from amiwarp.simulation.description import Scene
     from amiwarp.simulation.simulator import Simulation
     from amiwarp.simulation.worlds.world import WorldScene
 
@@ -100,7 +100,7 @@ def _scene(
     picture: Path | None, world: WorldOptions, scene: SceneOptions, duration: float, seed: int
 ) -> Scene | WorldScene:
     """Return the scene of the simulation: a picture or a world."""
-    from amiwarp.simulation.scenery import Scene
+    from amiwarp.simulation.description import Scene
 
     if picture is not None:
         return Scene.from_picture(picture, fov=scene.fov, blur=scene.blur_px)

@@ -74,7 +74,7 @@ class ScreenshotOptions:
         from amiwarp.viewer.app import save_screenshot
         from amiwarp.viewer.clouds import Look
         from amiwarp.viewer.jobs import estimate_phase
-        from amiwarp.viewer.panel import notes
+        from amiwarp.viewer.layout import notes
 
         check_ending(path, "pictures are written", [".png"])
         third = self.axis or (Axis.ANGLE if inspector.has_encoder or inspector.knobs.rpm else Axis.TIME)

@@ -37,6 +37,7 @@ from amiwarp.io.native_writer import FlaggedEvents
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import join_columns
 from amiwarp.kernels.launch import RecordedLaunch, launch
+from amiwarp.kernels.page_locked import page_locked
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded
 
@@ -71,7 +72,7 @@ class PieceBuffers:
         self._columns, self._locked = Columns(), {}
         for name, dtype in (GIVEN | FOUND).items():
             setattr(self._columns, name, wp.empty(room, dtype=dtype, device=device))
-            self._locked[name] = wp.empty(room, dtype=dtype, device="cpu", pinned=True)
+            self._locked[name] = page_locked(self, (room,), dtype, device, written_by_host=name in GIVEN)
         self._host = {name: array.numpy() for name, array in self._locked.items()}
         self._launches: dict[bool, RecordedLaunch] = {}
 
@@ -86,7 +87,7 @@ class PieceBuffers:
             wp.copy(getattr(self._columns, name), self._locked[name], count=n)
         if outside not in self._launches:
             inputs = self._plan.inputs(self._encoder, self._columns, outside=outside)
-            self._launches[outside] = RecordedLaunch(self._plan.kernel, inputs, [], device=self._device)
+            self._launches[outside] = RecordedLaunch(self._plan.kernel, [*inputs, 0], [], device=self._device)
         self._launches[outside](0, n)
         for name in FOUND:
             wp.copy(self._locked[name], getattr(self._columns, name), count=n)

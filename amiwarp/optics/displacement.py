@@ -126,7 +126,7 @@ def compensate_by_each(models: Sequence[HasParams], xy: NDArray[Any], theta: NDA
         arguments = [model.params("cpu"), model_camera(model, "cpu")]
         compensate = launches.get(type(model))
         if compensate is None:
-            compensate = RecordedLaunch(kernels.compensate_points, [*arguments, *points], [out], device="cpu")
+            compensate = RecordedLaunch(kernels.compensate_points, [*arguments, *points, 0], [out], device="cpu")
             launches[type(model)] = compensate
         for index, value in enumerate(arguments):
             compensate.set(index, value)

@@ -46,6 +46,8 @@ WIDTH, TITLE = 15.0, 14.0
 GREYS, FAINT = 128, 8
 """Number of grey entries in a figure's palette of 256 colours, and largest difference of the channels of a grey
 [levels]."""
+MOST_NUMBERS = 9
+"""Largest number of numbers on a logarithmic axis."""
 FOUND, TRUTH, LOCAL = VERMILION, BLACK, ORANGE
 """Colours of the calibrated parameters, of the true parameters, and of the local search."""
 
@@ -339,15 +341,29 @@ def _figure(size: tuple[float, float], rows: int, columns: int, widths: tuple[fl
     return figure, figure.subplots(rows, columns, width_ratios=widths)
 
 
-def blank(size: tuple[float, float], layout: Literal["compressed"] | None = None) -> Any:
-    """Return an empty Matplotlib figure."""
+def blank(size: tuple[float, float], layout: Literal["compressed"] | None = None, dpi: int = 110) -> Any:
+    """Return an empty Matplotlib figure of a width and height [inch]."""
     # Without pyplot, which would change global state and look for a display.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, dpi=110, layout=layout)
+    figure = Figure(figsize=size, dpi=dpi, layout=layout)
     FigureCanvasAgg(figure)
     return figure
+
+
+def number_logarithmic(*axes: Any) -> None:
+    """Number logarithmic axes in plain digits: at decades and as many values between as fit, or evenly within one."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+    for axis in axes:
+        low, high = axis.get_view_interval()
+        decades = math.log10(high / low)
+        digits = next((d for d in ((1.0, 2.0, 5.0), (1.0, 3.0)) if decades * len(d) <= MOST_NUMBERS), (1.0,))
+        locator = MaxNLocator(7, steps=(1, 2, 5, 10)) if decades < 1.0 else LogLocator(subs=digits)
+        axis.set_ticks([value for value in locator.tick_values(low, high) if low <= value <= high])
+        axis.set_major_formatter(lambda value, _: f"{value:,.12f}".rstrip("0").rstrip("."))
+        axis.set_minor_formatter(NullFormatter())
 
 
 def save(figure: Any, path: Path, *, all_colours: bool = False, overwrite: bool = False) -> None:

@@ -44,8 +44,8 @@ from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.export import save_picture
 from amiwarp.reconstruction.picture import Picture, Reconstruction
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 

@@ -13,9 +13,9 @@ from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.io.formats import detect_format, open_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.progress import Progress
+from amiwarp.simulation.description import Still
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import read_picture
-from amiwarp.simulation.scenery import Still
 from amiwarp.simulation.sequences import (
     PICTURE_SUFFIXES,
     PictureFolder,
@@ -45,7 +45,7 @@ from amiwarp.translation.reconstructed_pictures import (
 )
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.scenery import Frames
+    from amiwarp.simulation.description import Frames
 
 DEFAULT_FOV = math.radians(60.0)
 """Default horizontal field of view of the camera [rad]."""

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.progress import Progress
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.sequences import Pictures
 from amiwarp.simulation.simulator import Simulation

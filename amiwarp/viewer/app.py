@@ -27,7 +27,8 @@ from amiwarp.io.atomic_output import check_output, interrupts_later
 from amiwarp.validation import guarded
 from amiwarp.viewer.clouds import Look, Scene
 from amiwarp.viewer.inspector import Inspector, Library
-from amiwarp.viewer.panel import RECORDED, SETTABLE, Panel
+from amiwarp.viewer.layout import SETTABLE
+from amiwarp.viewer.panel import RECORDED, Panel
 from amiwarp.viewer.serve import serve
 
 if TYPE_CHECKING:

@@ -16,7 +16,6 @@ import numpy as np
 import warp as wp
 
 from amiwarp.calib.parameters import DRIFTS, LENS, RATES
-from amiwarp.calib.photometric.answer_search import size_and_phase_directions
 from amiwarp.calib.photometric.cost import (
     CAUSES,
     CENTER,
@@ -25,6 +24,7 @@ from amiwarp.calib.photometric.cost import (
     Cause,
     other_side,
     place_arguments,
+    size_and_phase_directions,
     turned,
     with_cause,
 )

@@ -56,8 +56,6 @@ LETTERS, SMALL, TINY = 12.5, 10.5, 9.5
 """Font sizes of the chart [point], legible when the figure is shown at two thirds of its size."""
 QUANTISATION, PAPER = 0.29, (1.5, 2.0)
 """Rounding error of a pixel along one axis, and range of the error that the paper reports [px]."""
-REFERENCES = ((f"quantisation {QUANTISATION} px", QUANTISATION), (f"paper {PAPER[0]} to {PAPER[1]} px", PAPER[0]))
-"""Text and error [px] of each horizontal reference line."""
 COLOURS = {
     "circle": ORANGE, "radial": GREEN, "ellipse": BLUE, "exact": VERMILION, "other libraries": "#6b6b6b",
     "default": BLACK, "model": ORANGE, "algorithms": BLUE, "events": GREEN, "folding": PINK, "pairs": SKY_BLUE,
@@ -81,45 +79,20 @@ NAMED = "other libraries"
 DIRECTIONS = ((1, 1), (1, -1), (-1, 1), (-1, -1), (0, 1), (0, -1), (1, 0), (-1, 0), (0.5, 1), (0.5, -1), (-0.5, 1),
               (-0.5, -1), (2, 1), (2, -1), (-2, 1), (-2, -1))  # fmt: skip
 """Directions from a point in which its label may be placed, in order of preference."""
-DIGITS = ((1, 2, 3, 4, 5, 6, 7, 8, 9), (1, 2, 3, 5, 7), (1, 2, 5), (1, 3), (1,))
-"""Leading digits of the numbers on an axis, from the finest to the coarsest choice."""
+DISTANCES = (0.0, 4.0, 9.0, 15.0, 22.0, 30.0, 40.0, 55.0, 70.0, 90.0)
+"""Distances between a point and its label that are tried [point]."""
 
 
 class ChartPanel:
     """Axes of a chart with its points and labels, and the boxes that these occupy [screen px]."""
 
     def __init__(self, ax: Any, rows: Sequence[Row], limits: tuple[float, float], errors: tuple[float, float]) -> None:
+        from matplotlib.transforms import Bbox
+
         self.ax, self.timed = ax, rows[0].chart == "calibration"
         self.unit = ax.figure.dpi / 72.0
         ax.set(xscale="log", yscale="log", xlim=limits, ylim=errors)
-        self.rows = [row for row in rows if limits[0] < self.x(row) < limits[1]]
-        self._axes()
-        box, y = ax.get_window_extent(), ax.transData.transform((limits[0], QUANTISATION))[1]
-        self.taken: list[tuple[float, ...]] = [(box.x0, y - 1.0, box.x1, y + 1.0)]
-        self.points: list[tuple[float, ...]] = []
-        self.letters: list[tuple[float, ...]] = []
-        for row in sorted(self.rows, key=lambda r: r.default):
-            half = (8.5 if row.default else 5.0) * self.unit
-            self.points.append((*(self.at(row) - half), *(self.at(row) + half)))
-            self._point(row)
-        self.taken += self.points
-
-    def x(self, row: Row) -> float:
-        """Return the horizontal coordinate of a row: time [ms] or speed [million events/s]."""
-        return row.seconds * 1e3 if self.timed else row.mev_per_s
-
-    def at(self, row: Row) -> Any:
-        """Return the position of a row's point [screen px]."""
-        return self.ax.transData.transform((self.x(row), row.error_px))
-
-    def _axes(self) -> None:
-        """Set up ticks, grid and reference lines."""
-        ax = self.ax
-        for axis, limits, length in zip((ax.xaxis, ax.yaxis), (ax.get_xlim(), ax.get_ylim()),
-                                        ax.get_window_extent().size / self.unit, strict=True):  # fmt: skip
-            shown = numbers(limits, length, upright=axis is ax.yaxis)
-            axis.set_ticks([value for value, _ in shown], [text for _, text in shown])
-            axis.set_minor_formatter(lambda value, _: "")
+        figures.number_logarithmic(ax.xaxis, ax.yaxis)
         ax.tick_params(which="both", labelsize=SMALL)
         ax.tick_params(axis="x", which="both", pad=8.0)  # keeps clear of the lowest number of the other axis
         ax.grid(True, color="#e4e4e4", linewidth=0.8)
@@ -127,13 +100,25 @@ class ChartPanel:
         ax.axhspan(*PAPER, color="#bdbdbd", alpha=0.55, linewidth=0)
         ax.axhline(QUANTISATION, color="#555555", linestyle=":", linewidth=1.4)
         ax.set_xlabel("time of a calibration [ms]" if self.timed else "speed [million events/s]", fontsize=LETTERS)
+        self.rows = [row for row in rows if limits[0] < _across(row) < limits[1]]
+        self.points: list[Any] = []
+        self.lines: list[Any] = []
+        self.letters: list[Any] = []
+        for row in sorted(self.rows, key=lambda r: r.default):
+            half = (8.5 if row.default else 5.0) * self.unit
+            self.points.append(Bbox([self.at(row) - half, self.at(row) + half]))
+            self._point(row)
+
+    def at(self, row: Row) -> Any:
+        """Return the position of a row's point [screen px]."""
+        return self.ax.transData.transform((_across(row), row.error_px))
 
     def _point(self, row: Row) -> None:
         """Draw the point of a measured setting."""
         colour, mark = COLOURS[row.family], MARKS[row.mark]
         size = 5.0 if row.settings.get("angles", TURNS) < TURNS else 12.0 if mark == "*" else 8.5
         lines = row.mark in HOLLOW or mark in THIN
-        place = ([self.x(row)], [row.error_px])
+        place = ([_across(row)], [row.error_px])
         self.ax.plot(*place, mark, markersize=size, markerfacecolor="none" if row.mark in HOLLOW else colour,
                      markeredgecolor=colour if lines else "white", markeredgewidth=1.8 if lines else 0.5,
                      zorder=3)  # fmt: skip
@@ -143,100 +128,57 @@ class ChartPanel:
 
     def step(self, chosen: list[Row], style: Any) -> None:
         """Draw a Pareto front as steps: the smallest error that each time budget allows."""
-        low, high = self.ax.get_xlim()
-        top = self.ax.get_ylim()[1]
-        x, y = [self.x(row) for row in chosen], [row.error_px for row in chosen]
-        # fastest first, so errors fall along the list; no row is faster than the first or more accurate than the last
-        end = high if self.timed else low
-        x, y = [x[0], *x, end], [top, *y, y[-1]]
-        self.ax.step(x, y, where="post", color="black", linewidth=1.1, linestyle=style, zorder=2)
-        corners = self.ax.transData.transform(np.column_stack([np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]]))
-        for a, b in itertools.pairwise(corners):
-            self.taken.append((*(np.minimum(a, b) - 1.5), *(np.maximum(a, b) + 1.5)))
+        from matplotlib.transforms import Bbox
 
-    def write(self, text: str, row: Row, *, size: float = SMALL, **style: Any) -> None:
+        # fastest first, so errors fall along the list; no row is faster than the first or more accurate than the last
+        x, y = [_across(row) for row in chosen], [row.error_px for row in chosen]
+        x, y = [x[0], *x, self.ax.get_xlim()[self.timed]], [self.ax.get_ylim()[1], *y, y[-1]]
+        corners = np.column_stack([np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1]])
+        self.ax.plot(*corners.T, color="black", linewidth=1.1, linestyle=style, zorder=2)
+        ends = itertools.pairwise(self.ax.transData.transform(corners))
+        self.lines += [Bbox([np.minimum(a, b) - 1.5, np.maximum(a, b) + 1.5]) for a, b in ends]
+
+    def write(self, text: str, row: Row, **style: Any) -> None:
         """Write a label near a point, where it covers neither points nor other labels."""
         from matplotlib.patheffects import withStroke
+        from matplotlib.text import Text
+        from matplotlib.transforms import Bbox
 
-        if row not in self.rows:
-            return
-        here, box = self.at(row), self.ax.get_window_extent()
-        wide = 0.34 if "fontweight" in style else 0.29  # bold or regular
-        half = np.array([wide * size * len(text) + 1.0, 0.52 * size]) * self.unit
-        near = half + (9.0 if row.default else 5.0) * self.unit
-        away = np.array([0.0, 4.0, 9.0, 15.0, 22.0, 30.0, 40.0, 55.0, 70.0, 90.0]) * self.unit
-        spots = [here + np.array(d) * (near + more) for more in away for d in DIRECTIONS]
-        inside = [s for s in spots if (s - half > box.min + 3).all() and (s + half < box.max - 3).all()]
-        poor = [s for s in inside if self.free(s - half, s + half)]
-        good = [s for s in poor if self.open(here, s)]
-        last = [s for s in inside if self.free(s - half, s + half, letters=True)]
-        spot = (good or poor or last or inside or spots)[0]
-        self.letters.append((*(spot - half), *(spot + half)))
-        self.taken += [self.letters[-1], *((*p, *p) for p in along(here, spot))]
-        self.ax.annotate(
-            text, (self.x(row), row.error_px), (spot - here) / self.unit, zorder=5, textcoords="offset points",
-            fontsize=size, ha="center", va="center", path_effects=[withStroke(linewidth=2.5, foreground="white")],
+        here = self.at(row)
+        label = self.ax.annotate(
+            text, (_across(row), row.error_px), (0.0, 0.0), zorder=5, textcoords="offset points", ha="center",
+            va="center", path_effects=[withStroke(linewidth=2.5, foreground="white")],
             arrowprops={"arrowstyle": "-", "linewidth": 0.6, "color": "#707070", "shrinkA": 1.0, "shrinkB": 4.0,
                         "relpos": (0.5, 0.5)}, **style,
         )  # fmt: skip
+        half = Text.get_window_extent(label).size / 2.0
+        near = half + (9.0 if row.default else 5.0) * self.unit
+        inner = self.ax.get_window_extent().padded(-3.0)
 
-    def free(self, low: Any, high: Any, *, letters: bool = False) -> bool:
-        """Return whether a box [screen px] covers no point or label; with ``letters``, whether it covers no label."""
-        boxes = self.letters if letters else self.taken
-        return all(low[0] >= b[2] or high[0] <= b[0] or low[1] >= b[3] or high[1] <= b[1] for b in boxes)
+        def box(spot: Any) -> Any:
+            return Bbox([spot - half, spot + half])
 
-    def open(self, here: Any, there: Any) -> bool:
-        """Return whether the line between a point and its label [screen px] crosses neither labels nor other points."""
-        others = [b for b in self.points if not (b[0] < here[0] < b[2] and b[1] < here[1] < b[3])]
-        boxes = [*self.letters, *others]
-        return not any(b[0] < x < b[2] and b[1] < y < b[3] for x, y in along(here, there) for b in boxes)
+        def covered(spot: Any) -> tuple[int, ...]:
+            outside = inner.count_contains(box(spot).corners()) < 4
+            return outside, *(box(spot).count_overlaps(boxes) for boxes in (self.letters, self.points + self.lines))
 
-    def describe(self, text: str, error: float, *, anyhow: bool) -> bool:
-        """Write the text of a reference line if there is room, or if ``anyhow``; return whether it was written."""
-        ax, box = self.ax, self.ax.get_window_extent()
-        size = np.array([0.56 * TINY * len(text), 1.15 * TINY]) * self.unit
-        at = ax.transData.transform((ax.get_xlim()[0], error))[1]
-        spots = [(x, y) for y in (at - size[1] - 2.0, at + 2.0)
-                 for x in np.linspace(box.x0 + 6.0, box.x1 - 6.0 - size[0], 40)]  # fmt: skip
-        spot = next((s for s in spots if self.free(s, s + size)), spots[0] if anyhow else None)
-        if spot is None:
-            return False
-        self.taken.append((*spot, *(spot + size)))
-        self.letters.append(self.taken[-1])
-        place = ax.transAxes.inverted().transform((spot[0], spot[1] + 0.25 * size[1]))
-        ax.text(*place, text, transform=ax.transAxes, fontsize=TINY, color="#404040", va="baseline", zorder=2.5)
-        return True
+        def crosses(spot: Any) -> bool:
+            way = here + np.linspace(0.05, 0.95, 19)[:, None] * (spot - here)
+            others = [b for b in self.points if not b.contains(*here)]
+            return any(b.count_contains(way) for b in [*self.letters, *others])
+
+        spots = [here + np.array(d) * (near + more * self.unit) for more in DISTANCES for d in DIRECTIONS]
+        costs = [covered(spot) for spot in spots]
+        best = [spot for spot, cost in zip(spots, costs, strict=True) if cost == min(costs)]
+        spot = next((s for s in best if not crosses(s)), best[0])
+        label.xyann = (spot - here) / self.unit
+        self.letters.append(box(spot))
+        self.lines.append(Bbox([np.minimum(here, spot), np.maximum(here, spot)]))
 
 
-def along(here: Any, there: Any) -> list[Any]:
-    """Return points on the line between two points [screen px]."""
-    return [here + share * (there - here) for share in np.linspace(0.05, 0.95, 19)]
-
-
-def numbers(limits: tuple[float, float], length: float, *, upright: bool) -> list[tuple[float, str]]:
-    """Return values and texts of the ticks of a logarithmic axis of ``length`` [point]: as many as fit."""
-    low, high = limits
-    found: list[tuple[float, str]] = []
-    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    ways = [[digit * 10.0**k for k in decades for digit in digits] for digits in DIGITS]
-    ways += [[10.0**k for k in decades if k % every == 0] for every in (2, 3)]
-    if high / low < 4.0:
-        step = 10.0 ** math.floor(math.log10(high - low))
-        ways[:0] = [[k * step * part for k in range(math.ceil(high / step / part) + 1)] for part in (0.2, 0.5, 1.0)]
-    for values in ways:
-        found = [(v, word(v)) for v in values if low <= v <= high]
-        at = [length * math.log(v / low) / math.log(high / low) for v, _ in found]
-        half = [0.7 * SMALL if upright else 0.31 * SMALL * len(text) + 4.0 for _, text in found]
-        if len(found) <= 9 and all(at[k + 1] - at[k] > half[k] + half[k + 1] for k in range(len(found) - 1)):
-            break
-    return found
-
-
-def word(value: float) -> str:
-    """Return a number as plain text, such as 10,000 or 0.0001."""
-    if value >= 1.0:
-        return f"{value:,.10g}"
-    return np.format_float_positional(value, precision=3, fractional=False, trim="-")
+def _across(row: Row) -> float:
+    """Return the horizontal coordinate of a row: time [ms] or speed [million events/s]."""
+    return row.seconds * 1e3 if row.chart == "calibration" else row.mev_per_s
 
 
 def draw(path: Path, rows: Sequence[Row], title: str, note: str) -> None:
@@ -244,19 +186,15 @@ def draw(path: Path, rows: Sequence[Row], title: str, note: str) -> None:
 
     Raises :class:`ModuleNotFoundError` if Matplotlib or Pillow is missing.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     lines = [(job, chosen, LINES[k % len(LINES)]) for k, (job, chosen) in enumerate(fronts(rows)) if chosen]
     lists = _numbered(rows, lines)
     keys = _keys(rows, lines)
     listed = LINE * max(len(each) for each in lists)
     titles = TITLE * (1 if rows[0].chart == "calibration" else 1.75)
     height = titles + PANEL + AXIS + listed + KEY * -(-len(keys) // COLUMNS) + NOTE
-    figure = Figure(figsize=(WIDTH, height), dpi=150)
-    FigureCanvasAgg(figure)
-    top = height - titles
-    panels = _panels(figure, rows, height, top)
+    figure = figures.blank((WIDTH, height), dpi=150)
+    below = height - titles - PANEL
+    panels = _panels(figure, rows, below / height)
     for panel in panels:
         for _, chosen, style in lines:
             panel.step(chosen, style)
@@ -267,50 +205,41 @@ def draw(path: Path, rows: Sequence[Row], title: str, note: str) -> None:
 
     for number, row in (pair for each in lists for pair in each if isinstance(pair[1], Row)):
         if number.isdigit():
-            closest(row).write(number, row, fontweight="bold")
-    for text, error in REFERENCES:
-        for panel in reversed(panels):
-            if panel.describe(text, error, anyhow=panel is panels[0]):
-                break
+            closest(row).write(number, row, fontsize=SMALL, fontweight="bold")
     # from the right, because a name is placed to the right of its point if possible
     for row in sorted(rows, key=lambda r: r.cost):
         if row.family == NAMED:
             name = row.label.removesuffix(" (circle)").replace(" on the", ",")
-            closest(row).write(name, row, size=TINY, color=COLOURS[NAMED])
+            closest(row).write(name, row, fontsize=TINY, color=COLOURS[NAMED])
     for k, each in enumerate(lists):
-        _list(figure, each, k, panels[0].timed, top - PANEL - AXIS)
+        _list(figure, each, k, below - AXIS)
     figure.legend(handles=keys, loc="upper left", ncols=COLUMNS, frameon=False, fontsize=TINY, handletextpad=0.5,
-                  bbox_to_anchor=(LEFT / WIDTH, (top - PANEL - AXIS - listed - 0.1) / height),
+                  bbox_to_anchor=(LEFT / WIDTH, (below - AXIS - listed - 0.1) / height),
                   borderpad=0.0, borderaxespad=0.2, columnspacing=1.6, labelspacing=0.45)  # fmt: skip
     figure.text(LEFT / WIDTH, 0.08 / height, note, fontsize=TINY, color="#404040")
     figures.save(figure, path.with_suffix(".png"))
     figures.save_svg(figure, path.with_suffix(".svg"))
 
 
-def _panels(figure: Any, rows: Sequence[Row], height: float, top: float) -> list[ChartPanel]:
+def _panels(figure: Any, rows: Sequence[Row], bottom: float) -> list[ChartPanel]:
     """Return a panel of all rows, and for compensation an enlarged panel of the models."""
-    timed = rows[0].chart == "calibration"
-    x = [row.seconds * 1e3 if timed else row.mev_per_s for row in rows]
     errors = [row.error_px for row in rows]
-    limits = min(x) / 1.4, max(x) * 1.4
     heights = max(min(errors), 1e-5) / 1.8, max(2.6, max(errors) * 1.6)
-    close = [v for v, row in zip(x, rows, strict=True) if row.job == rows[0].job and row.comparable
-             and row.family != NAMED]  # fmt: skip
-    near = min(close) / 1.04, max(close) * 1.04
-    shown = [limits] if timed else [limits, near]
-    width = (WIDTH - LEFT - RIGHT - BETWEEN * (len(shown) - 1)) / len(shown)
-    panels = []
-    for k, span in enumerate(shown):
-        place = ((LEFT + k * (width + BETWEEN)) / WIDTH, (top - PANEL) / height, width / WIDTH,
-                 PANEL / height)  # fmt: skip
-        panels.append(ChartPanel(figure.add_axes(place), rows, span, heights))
-    first = panels[0].ax
-    first.set_ylabel("model error [px rms]" if timed else "displacement error [px rms]", fontsize=LETTERS)
-    for panel in panels[1:]:
-        first.axvspan(*near, color="#56b4e9", alpha=0.18, linewidth=0, zorder=0)
-        panel.ax.tick_params(axis="y", labelleft=False)
-        first.set_title("all", fontsize=LETTERS, loc="left")
-        panel.ax.set_title("shaded part, enlarged", fontsize=LETTERS, loc="left")
+    x = [_across(row) for row in rows]
+    shown = [(min(x) / 1.4, max(x) * 1.4)]
+    timed = rows[0].chart == "calibration"
+    if not timed:
+        close = [_across(r) for r in rows if r.job == rows[0].job and r.comparable and r.family != NAMED]
+        shown.append((min(close) / 1.04, max(close) * 1.04))
+    sides = {"left": LEFT / WIDTH, "right": 1.0 - RIGHT / WIDTH, "wspace": 0.05, "bottom": bottom,
+             "top": bottom + PANEL / figure.get_figheight()}  # fmt: skip
+    axes = figure.subplots(1, len(shown), sharey=True, squeeze=False, gridspec_kw=sides)[0]
+    panels = [ChartPanel(ax, rows, span, heights) for ax, span in zip(axes, shown, strict=True)]
+    axes[0].set_ylabel("model error [px rms]" if timed else "displacement error [px rms]", fontsize=LETTERS)
+    if not timed:
+        axes[0].axvspan(*shown[1], color="#56b4e9", alpha=0.18, linewidth=0, zorder=0)
+        for ax, name in zip(axes, ("all", "shaded part, enlarged"), strict=True):
+            ax.set_title(name, fontsize=LETTERS, loc="left")
     return panels
 
 
@@ -320,40 +249,36 @@ def _numbered(rows: Sequence[Row], lines: Sequence[tuple[str, list[Row], Any]]) 
     The default is listed separately if it is on no front.
     """
     lists: list[list[tuple[str, Any]]] = []
-    number = 0
+    numbers = itertools.count(1)
     for job, chosen, _ in lines:
-        listed: list[tuple[str, Any]] = []
-        for row in told_apart(chosen):
-            number += 1
-            listed.append((str(number), row))
-        for row in rows:
-            if row.default and row.job == job and row not in chosen:
-                listed.append(("–" if beaten_by(row, rows) else "≈", row))
-        lists.append([("", job), *listed])
-    if len(lists) == 1:
+        listed: list[tuple[str, Any]] = [("", job), *((str(next(numbers)), row) for row in told_apart(chosen))]
+        listed += [("–" if beaten_by(row, rows) else "≈", row)
+                   for row in rows if row.default and row.job == job and row not in chosen]  # fmt: skip
+        lists.append(listed)
+    if len(lists) == 1 and len(lists[0]) > 5:
         (only,) = lists
         half = -(-len(only) // 2) + 1
-        lists = [only[:half], [only[0], *only[half:]]] if len(only) > 5 else lists
+        lists = [only[:half], [only[0], *only[half:]]]
     return lists
 
 
-def _list(figure: Any, listed: list[tuple[str, Any]], column: int, timed: bool, top: float) -> None:
+def _list(figure: Any, listed: list[tuple[str, Any]], column: int, top: float) -> None:
     """Write one column of the list below the panels."""
     width = (WIDTH - LEFT - RIGHT - BETWEEN) / 2.0
     left = LEFT + column * (width + BETWEEN)
+    unit = "ms" if listed[-1][1].chart == "calibration" else "Mev/s"
     for k, (number, row) in enumerate(listed):
         if isinstance(row, Row):
             label = f"{row.label} (default)" if row.default and row.label != "default" else row.label
-            value = row.seconds * 1e3 if timed else row.mev_per_s
+            value = _across(row)
             words = (number, label, f"{value:,.0f}" if value >= 100.0 else f"{value:.3g}", _pixels(row.error_px))
             style: dict[str, Any] = {"fontweight": "bold"} if row.default else {}
         else:
-            words = ("", f"Pareto front, {row}", "ms" if timed else "Mev/s", "px rms")
+            words = ("", f"Pareto front, {row}", unit, "px rms")
             style = {"color": "#404040"}
         y = (top - LINE * (k + 0.75)) / figure.get_figheight()
-        right = left + width
-        for x, text in zip((left + 0.12, left + 0.22, right - 0.85, right), words, strict=True):
-            align = "left" if text is words[1] else "right"
+        places = (left + 0.12, left + 0.22, left + width - 0.85, left + width)
+        for x, align, text in zip(places, ("right", "left", "right", "right"), words, strict=True):
             figure.text(x / WIDTH, y, text, ha=align, va="baseline", fontsize=SMALL - 0.5, **style)
 
 
@@ -367,20 +292,20 @@ def _keys(rows: Sequence[Row], lines: Sequence[tuple[str, list[Row], Any]]) -> l
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    handles: list[Any] = [
-        Patch(color=COLOURS[f], label=WORDS.get(f, f)) for f in COLOURS if any(row.family == f for row in rows)
-    ]
-    for mark in (m for m in MARKS if any(row.mark == m and row.family != NAMED for row in rows)):
-        face = "none" if mark in HOLLOW else "#404040"
-        handles.append(Line2D([], [], marker=MARKS[mark], linestyle="none", markersize=7.5, markerfacecolor=face,
-                              markeredgecolor="#404040", label=mark))  # fmt: skip
-    handles.append(Line2D([], [], marker="o", linestyle="none", markersize=12, markerfacecolor="none",
-                          markeredgecolor="black", label="default of the command"))  # fmt: skip
-    handles += [
-        Line2D([], [], color="black", linewidth=1.1, linestyle=style,
-               label="Pareto front" if len(lines) == 1 else f"front, {job}") for job, _, style in lines
+    def mark(label: str, shape: str, size: float = 7.5, edge: str = "#404040", face: str = "none") -> Any:
+        return Line2D([], [], marker=shape, linestyle="none", markersize=size, markerfacecolor=face,
+                      markeredgecolor=edge, label=label)  # fmt: skip
+
+    marks = [name for name in MARKS if any(row.mark == name and row.family != NAMED for row in rows)]
+    return [
+        *(Patch(color=COLOURS[f], label=WORDS.get(f, f)) for f in COLOURS if any(row.family == f for row in rows)),
+        *(mark(name, MARKS[name], face="none" if name in HOLLOW else "#404040") for name in marks),
+        mark("default of the command", "o", 12, "black"),
+        *(Line2D([], [], color="black", linewidth=1.1, linestyle=style,
+                 label="Pareto front" if len(lines) == 1 else f"front, {job}") for job, _, style in lines),
+        Line2D([], [], color="#555555", linestyle=":", linewidth=1.4, label=f"quantisation {QUANTISATION} px"),
+        Patch(color="#bdbdbd", alpha=0.55, label=f"paper {PAPER[0]} to {PAPER[1]} px"),
     ]  # fmt: skip
-    return handles
 
 
 PACKAGES = ("warp-lang", "numpy", "nlopt", "numba", "torch", "cupy-cuda12x", "cupy-cuda13x")

@@ -23,8 +23,8 @@ from amiwarp.io import convert, open_recording
 from amiwarp.io.atomic_output import make_folder, put_in_place
 from amiwarp.io.json_files import LARGEST_INTEGER
 from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.world import WorldScene

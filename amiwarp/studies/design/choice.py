@@ -18,8 +18,9 @@ from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS, predicted_error
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, part, silent
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scenery import Scene, place_scene, seen_bearings
+from amiwarp.simulation.scenery import place_scene, seen_bearings
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 

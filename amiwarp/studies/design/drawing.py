@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 WIDTH, PANEL, LEFT, RIGHT, BETWEEN = 12.0, 3.9, 0.85, 1.15, 2.1
 """Figure width, panel height, left and right margins, and gap between panels, which contains the names of the lines
 [inch]."""
-TITLE, AXIS, HEAD, CELL, NOTE = 0.85, 0.7, 0.95, 0.55, 0.8
-"""Heights of the title above a panel, of the axis below it, of the table head, of a table row, and of the note [inch].
-"""
+TITLE, AXIS, HEAD, CELL, NOTE = 0.85, 0.7, 0.4, 0.55, 0.8
+"""Heights of the title above a panel, of the axis below it, of the table's title, of a table row, and of the note
+[inch]."""
 EDGE, TABLE, FIRST = 0.3, 11.4, 1.05
 """Margin of text and table, width of the table, and width of its first column [inch]."""
 LETTERS, SMALL, TINY = 12.0, 10.5, 9.5
@@ -48,13 +48,9 @@ def draw(path: Path, design: Design) -> None:
 
 def chart(design: Design) -> Any:
     """Return the chart as a Matplotlib figure."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    rows = len(design.rpms)
+    rows = len(design.rpms) + 1
     height = TITLE + PANEL + AXIS + HEAD + CELL * rows + NOTE
-    figure = Figure(figsize=(WIDTH, height), dpi=150)
-    FigureCanvasAgg(figure)
+    figure = figures.blank((WIDTH, height), dpi=150)
     width = (WIDTH - LEFT - RIGHT - BETWEEN) / 2.0
     bottom = height - TITLE - PANEL
     left, right = (
@@ -63,9 +59,7 @@ def chart(design: Design) -> Any:
     )
     _errors(left, design)
     _volume(right, design)
-    top = (bottom - AXIS) / height
-    deep = (HEAD + CELL * rows) / height
-    _table(figure.add_axes((EDGE / WIDTH, top - deep, TABLE / WIDTH, deep)), design)
+    _table(figure.add_axes((EDGE / WIDTH, NOTE / height, TABLE / WIDTH, CELL * rows / height)), design)
     _words(figure, design, height)
     return figure
 
@@ -155,11 +149,8 @@ def _axes(ax: Any, design: Design, values: tuple[float, float]) -> None:
     spare = 1.18 if len(apex) > 1 else 1.6
     ax.set(xscale="log", yscale="log", xlim=(apex[0] / spare, apex[-1] * spare), ylim=limits)
     ax.set_xticks(apex, [degrees(orbit.apex) for orbit in design.orbits])
-    shown = _numbers(limits)
-    ax.set_yticks(shown, [f"{value:g}" for value in shown])
-    for axis in (ax.xaxis, ax.yaxis):
-        axis.set_minor_formatter(lambda value, _: "")
-    ax.tick_params(axis="x", which="minor", length=0)
+    ax.set_xticks([], minor=True)
+    figures.number_logarithmic(ax.yaxis)
     ax.tick_params(which="both", labelsize=SMALL)
     ax.grid(True, color="#e6e6e6", linewidth=0.8)
     ax.set_axisbelow(True)
@@ -171,14 +162,6 @@ def _axes(ax: Any, design: Design, values: tuple[float, float]) -> None:
                 color="#404040", zorder=6, linespacing=1.25)  # fmt: skip
     if design.chosen is not None:
         ax.axvline(math.degrees(design.chosen.orbit.apex), color=CHOSEN, linewidth=5.0, alpha=0.25, zorder=1)
-
-
-def _numbers(limits: tuple[float, float]) -> list[float]:
-    """Return the tick values of a logarithmic axis: 1, 2 and 5 of each decade, or only 1 if there are many decades."""
-    low, high = limits
-    digits = (1.0, 2.0, 5.0) if high / low < 100.0 else (1.0,)
-    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    return [value for k in decades for digit in digits if low <= (value := float(f"{digit}e{k}")) <= high]
 
 
 def _name(ax: Any, names: Sequence[tuple[float, str, Any]]) -> None:
@@ -204,45 +187,40 @@ def _name(ax: Any, names: Sequence[tuple[float, str, Any]]) -> None:
 
 
 def _table(ax: Any, design: Design) -> None:
-    """Draw a cell for every choice; the axes are in inches, downwards from the top left corner."""
-    orbits, rpms = design.orbits, design.rpms
-    ax.set(xlim=(0.0, TABLE), ylim=(-HEAD - CELL * len(rpms), 0.0))
-    ax.axis("off")
-    wide = (TABLE - FIRST) / len(orbits)
-    heads = [f"apex {degrees(o.apex)}, orbit {o.radius:.1f} px\ndisplaces edges {o.swing:.2f} px" for o in orbits]
-    size = _fitting(TINY, wide, heads)
-    title = "Every choice: events, remaining error, and smallest sufficient model or violated limits"
-    ax.text(0.0, -0.2, title, fontsize=LETTERS, va="baseline")
-    ax.text(0.0, -HEAD + 0.1, "speed,\nquarter turn", va="bottom", fontsize=size, linespacing=1.3)
-    for k, text in enumerate(heads):
-        ax.text(FIRST + (k + 0.5) * wide, -HEAD + 0.1, text, ha="center", va="bottom", fontsize=size, linespacing=1.3)
-    for j, rpm in enumerate(rpms):
-        y = -HEAD - CELL * j
-        ax.text(0.0, y - CELL / 2.0, f"{rpm:g} rpm,\n{15e3 / rpm:.1f} ms", va="center", fontsize=size, linespacing=1.3)
-        for k, orbit in enumerate(orbits):
-            choice = design.at(orbit.apex, rpm)
-            _cell(ax, choice, (FIRST + k * wide, y, wide), size, chosen=choice is design.chosen)
-
-
-def _cell(ax: Any, choice: Choice, at: tuple[float, float, float], size: float, *, chosen: bool) -> None:
-    """Draw the table cell of one combination of apex angle and speed."""
+    """Draw a cell for every choice."""
     from matplotlib.patches import Rectangle
 
-    x, y, wide = at
-    good = not choice.misses
-    box = Rectangle((x + 0.03, y - CELL + 0.03), wide - 0.06, CELL - 0.06, facecolor=GOOD if good else BAD,
-                    edgecolor=CHOSEN if chosen else "none", linewidth=2.4)  # fmt: skip
-    ax.add_patch(box)
-    words = choice.model if good else f"violates {', '.join(choice.misses)}"
-    text = f"{choice.events_per_s / 1e6:.3g} Mev/s, {choice.error_px:.2f} px\n{words}"
-    size = _fitting(size, wide, [text])
-    ax.text(x + wide / 2.0, y - CELL / 2.0, text, ha="center", va="center", fontsize=size, linespacing=1.3,
-            color="black" if good else "#6a6a6a", fontweight="bold" if chosen else "normal")  # fmt: skip
+    ax.set(frame_on=False, xticks=(), yticks=())
+    ax.set_title("Every choice: events, remaining error, and smallest sufficient model or violated limits",
+                 fontsize=LETTERS, loc="left")  # fmt: skip
+    choices = [[design.at(orbit.apex, rpm) for orbit in design.orbits] for rpm in design.rpms]
+    texts = [[f"{rpm:g} rpm,\n{15e3 / rpm:.1f} ms", *map(_words_of, row)]
+             for rpm, row in zip(design.rpms, choices, strict=True)]  # fmt: skip
+    heads = [
+        f"apex {degrees(o.apex)}, orbit {o.radius:.1f} px\ndisplaces edges {o.swing:.2f} px" for o in design.orbits
+    ]
+    first, wide, high = FIRST / TABLE, (1.0 - FIRST / TABLE) / len(heads), 1.0 / (len(texts) + 1)
+    table = ax.table(texts, colLabels=["speed,\nquarter turn", *heads], cellLoc="center", bbox=(0.0, 0.0, 1.0, 1.0),
+                     colWidths=[first, *[wide] * len(heads)])  # fmt: skip
+    table.set_fontsize(TINY)
+    table.auto_set_font_size(True)
+    for (j, k), cell in table.get_celld().items():
+        cell.PAD = 0.03
+        cell.set(edgecolor="white", linewidth=4.0)
+        if j and k:
+            choice = choices[j - 1][k - 1]
+            cell.set_facecolor(BAD if choice.misses else GOOD)
+            cell.get_text().set(color="#6a6a6a" if choice.misses else "black")
+            if choice is design.chosen:
+                cell.get_text().set(fontweight="bold")
+                ax.add_patch(Rectangle((first + (k - 1) * wide, 1.0 - (j + 1) * high), wide, high, fill=False,
+                                       edgecolor=CHOSEN, linewidth=2.4, transform=ax.transAxes))  # fmt: skip
 
 
-def _fitting(size: float, wide: float, texts: Sequence[str]) -> float:
-    """Return the largest font size [point], at most ``size``, at which all lines fit into ``wide`` [inch]."""
-    return min(size, 72.0 * (wide - 0.2) / 0.56 / max(len(line) for text in texts for line in text.split("\n")))
+def _words_of(choice: Choice) -> str:
+    """Return the text of a cell of the table."""
+    words = f"violates {', '.join(choice.misses)}" if choice.misses else choice.model
+    return f"{choice.events_per_s / 1e6:.3g} Mev/s, {choice.error_px:.2f} px\n{words}"
 
 
 def _degrees(design: Design) -> list[float]:

@@ -19,7 +19,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from amiwarp.events.events import Events
+from amiwarp import Events
 
 SIZE = (320, 240)
 EVENT = "uint16 x\nuint16 y\ntime ts\nbool polarity\n"
