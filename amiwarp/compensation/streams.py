@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from amiwarp.compensation.launch_plan import LaunchPlan
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, check_sensor, encoder_pieces, limits, wait
-from amiwarp.events.events import TIME_LIMIT, Events
+from amiwarp.events.events import TIME_LIMIT, Events, held_bytes
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.votes import CanvasShape
 from amiwarp.kernels.compensation import Columns
@@ -418,10 +418,6 @@ LEAST_RETURNED = 2
 computes. The next call returns those."""
 AHEAD_US = 100_000
 """Span of encoder samples that is copied to the device at once, if the samples are available [us]."""
-EVENT_BYTES = 13
-"""Memory of an event from a sensor [bytes]."""
-OVERHEAD = 1024
-"""Memory of a packet's Python objects in addition to its arrays [bytes]."""
 QueuedPacket: TypeAlias = tuple[Events | DeviceEvents, int, int, int]
 """Queued packet, its last event time, the time when it was queued, and its time of arrival [us]."""
 
@@ -473,13 +469,6 @@ class DeviceCompensated:
     """Sum of :data:`OUTSIDE`, :data:`EXTRAPOLATED` and :data:`NO_ANGLE` for each event, uint8, shape ``(n,)``."""
     arrived_us: int = 0
     """Arrival time of the packet, by the caller's clock [us]."""
-
-
-def held_bytes(events: Events | DeviceEvents) -> int:
-    """Return the memory of a waiting packet of events [bytes], including its Python objects."""
-    if isinstance(events, DeviceEvents):
-        return OVERHEAD + EVENT_BYTES * len(events)
-    return OVERHEAD + events.x.nbytes + events.y.nbytes + events.t.nbytes + events.p.nbytes
 
 
 @guarded

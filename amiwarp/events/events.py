@@ -7,7 +7,7 @@ blocks, so that recordings of any length are processed in constant memory.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -501,3 +501,18 @@ def _by_duration(chunks: Iterable[Events], duration_us: int) -> Iterator[Events]
             held_window = int(window[start])
     if held:
         yield Events.concatenate(held)
+
+
+EVENT_BYTES = 13
+"""Memory of an event from a sensor [bytes]."""
+
+
+OVERHEAD = 1024
+"""Memory of a packet's Python objects in addition to its arrays [bytes]."""
+
+
+def held_bytes(events: Events | Sized) -> int:
+    """Return the memory of a waiting packet of events [bytes], including its Python objects."""
+    if not isinstance(events, Events):  # on a device
+        return OVERHEAD + EVENT_BYTES * len(events)
+    return OVERHEAD + events.x.nbytes + events.y.nbytes + events.t.nbytes + events.p.nbytes

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import warp as wp
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import camera as kernels
 from amiwarp.validation import INT64, array, guarded, real, shown, whole
+
+if TYPE_CHECKING:
+    from amiwarp.kernels import camera as kernels
 
 # Models of lens distortion.
 
@@ -275,6 +276,10 @@ def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) ->
 @lru_cache(maxsize=16)
 def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
     """Return the camera's parameters on ``device``, with a table of bearing vectors if the lens distorts."""
+    import warp as wp
+
+    from amiwarp.kernels import camera as kernels
+
     c = kernels.CameraParams()
     c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
     c.width, c.height = camera.width, camera.height
@@ -299,6 +304,8 @@ def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
 @lru_cache(maxsize=16)
 def pinhole_params(camera: Camera) -> kernels.PinholeParams | None:
     """Return the camera's parameters for kernels without a distortion branch, or None if the lens distorts."""
+    from amiwarp.kernels import camera as kernels
+
     if camera.distortion is not None:
         return None
     c = kernels.PinholeParams()
