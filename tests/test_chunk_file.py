@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from amiwarp import Events, RecordingWriter
-from amiwarp.io.chunks import CHUNK, ChunkFile, EncodedChunk, encode, encode_parts
-from amiwarp.io.native_writer import make_dataset
+from amiwarp.io.chunks import CHUNK, ChunkFile, EncodedChunk, encode, encode_parts, make_dataset
 
 assert hdf5plugin.FILTERS  # its import registers the filter
 
@@ -169,7 +168,7 @@ FAILING = """
 import errno, os, sys
 import numpy as np
 from amiwarp.io.chunks import ChunkFile
-from amiwarp.io.native_writer import make_dataset
+from amiwarp.io.chunks import make_dataset
 written = os.pwritev
 calls = 0
 def failing(*arguments):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.truth import Instants
+from amiwarp.events.truth import StoredInstants
 from amiwarp.validation import guarded
 
 
@@ -77,7 +77,7 @@ def mean_rate(t: NDArray[np.int64]) -> float | None:
     return (len(t) - 1) * 1e6 / span if span > 0 else None
 
 
-class ImageStore(Instants[NDArray[Any]], Protocol):
+class ImageStore(StoredInstants[NDArray[Any]], Protocol):
     """Protocol of the frames of a recording: grey levels, uint8 or uint16, shape ``(height, width)``.
 
     All frames have the same size and data type. Their times do not decrease.

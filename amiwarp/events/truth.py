@@ -43,14 +43,14 @@ class Cause(enum.StrEnum):
         return list(Cause).index(self)
 
 
-class Rows(Protocol[Item]):
+class StoredRows(Protocol[Item]):
     """Protocol of rows that are read by slicing, in memory or in a file that is read on demand."""
 
     def __getitem__(self, which: slice, /) -> Item:
         """Return the rows in a slice."""
 
 
-class Instants(Protocol[Item]):
+class StoredInstants(Protocol[Item]):
     """Protocol of records at several times, in memory or in a file that is read on demand."""
 
     @property
@@ -61,11 +61,11 @@ class Instants(Protocol[Item]):
         """Return the record at ``t[index]``."""
 
 
-class EventValues(Rows[NDArray[Any]], Protocol):
+class EventValues(StoredRows[NDArray[Any]], Protocol):
     """Protocol of arrays with one row per event, shape ``(n,)`` or ``(n, k)``."""
 
 
-class PointStore(Rows[NDArray[np.float32]], Protocol):
+class PointStore(StoredRows[NDArray[np.float32]], Protocol):
     """Protocol of one point per event [px], shape ``(n, 2)``, float32."""
 
 
@@ -199,7 +199,7 @@ def check_truth(name: str, values: NDArray[Any]) -> None:
         raise AmiwarpError(f"'{name}' holds {values[bad][0]}, which has no meaning there; give finite numbers")
 
 
-class FrameStore(Instants[FrameTruth], Protocol):
+class FrameStore(StoredInstants[FrameTruth], Protocol):
     """Protocol of the ground truth of all pixels at several instants, at increasing times."""
 
 
@@ -291,7 +291,7 @@ def rotation_of(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(Rotation.from_quat(pose[3:]).as_matrix())
 
 
-class KnownStore(Instants[NDArray[np.bool_]], Protocol):
+class KnownStore(StoredInstants[NDArray[np.bool_]], Protocol):
     """Protocol of masks of the pixels whose scene is known, shape ``(height, width)``.
 
     Each holds from its time until the next. The times increase.
@@ -312,7 +312,7 @@ class MemoryMasks:
         return np.unpackbits(self._bits[index], count=rows * columns).reshape(self._shape).astype(np.bool_)
 
 
-class PoseStore(Rows[Poses], Protocol):
+class PoseStore(StoredRows[Poses], Protocol):
     """Protocol of tables of poses: :class:`amiwarp.Poses`, or a file that is read on demand."""
 
     def __len__(self) -> int:

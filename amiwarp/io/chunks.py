@@ -249,11 +249,41 @@ class StoredColumn:
         return out if decode([self.encoded(at) for at in range(first, last + 1)], out) else None
 
 
+def make_dataset(
+    file: Any,
+    name: str,
+    dtype: Any,
+    row: tuple[int, ...] = (),
+    chunk_rows: int = CHUNK,
+    codec: Codec = Codec.BLOSC,
+) -> Any:
+    """Create an empty dataset of the native layout, whose rows have the shape ``row``."""
+    import hdf5plugin
+
+    blosc = {"compression": hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=blosc_shuffle(np.dtype(dtype)))}
+    gzip = {"compression": "gzip", "compression_opts": GZIP_LEVEL, "shuffle": True}
+    # The checksum covers the compressed bytes. Its cost is too small to measure. LZ4 alone misses most damage.
+    return file.create_dataset(
+        name,
+        shape=(0, *row),
+        maxshape=(None, *row),
+        chunks=(chunk_rows, *row),
+        dtype=dtype,
+        fletcher32=True,
+        **(blosc if codec is Codec.BLOSC else gzip),
+    )
+
+
 def append_chunk(dataset: Any, start: int, stored: bytes, count: int) -> None:
     """Append an encoded chunk of ``count`` elements to a dataset of ``start`` elements, a whole number of chunks."""
     row = dataset.shape[1:]
     dataset.id.set_extent((start + count, *row))
     dataset.id.write_direct_chunk((start, *(0 for _ in row)), stored)
+
+
+def append_values(dataset: Any, start: int, values: NDArray[Any], codec: Codec) -> None:
+    """Append the values of a chunk, as :func:`append_chunk`."""
+    append_chunk(dataset, start, encode(values, codec), len(values))
 
 
 # A new HDF5 file whose encoded chunks several threads write at the same time.
@@ -277,12 +307,10 @@ class EncodedChunk(NamedTuple):
     parts: Sequence[bytes]
     """Its encoded bytes, in one or several parts."""
 
-
-def chunks_of(name: str, start: int, column: NDArray[Any], parts: Iterable[Sequence[bytes]]) -> list[EncodedChunk]:
-    """Return the chunks of a column whose first element is element ``start``, and whose encoded bytes are ``parts``."""
-    return [
-        EncodedChunk(name, start + k * CHUNK, column[k * CHUNK : (k + 1) * CHUNK], part) for k, part in enumerate(parts)
-    ]
+    @classmethod
+    def of(cls, name: str, start: int, column: NDArray[Any], parts: Iterable[Sequence[bytes]]) -> list[EncodedChunk]:
+        """Return the chunks of a column from element ``start`` on, whose encoded bytes are ``parts``."""
+        return [cls(name, start + k * CHUNK, column[k * CHUNK : (k + 1) * CHUNK], part) for k, part in enumerate(parts)]
 
 
 class ChunkFile:

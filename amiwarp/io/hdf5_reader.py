@@ -31,16 +31,7 @@ from amiwarp.events.events import (
 )
 from amiwarp.events.recording import MetadataValue, Recording, Truth
 from amiwarp.events.sensors import ImuSamples
-from amiwarp.events.truth import (
-    EVENT_COLUMNS,
-    MAPS,
-    EventValues,
-    FrameTruth,
-    Poses,
-    WorldLabels,
-    check_truth,
-    rotation_of,
-)
+from amiwarp.events.truth import EVENT_COLUMNS, MAPS, FrameTruth, Poses, WorldLabels, check_truth, rotation_of
 from amiwarp.io.camera_files import attribute, read_camera, read_prism
 from amiwarp.io.chunks import CHUNK, StoredColumn, in_order
 from amiwarp.io.file_scan import FileEvents, Packet, head_limit, read_sensors, smallest_sensor
@@ -548,7 +539,7 @@ def _read_points(x: Column, y: Column, start: int, stop: int) -> NDArray[np.floa
     return np.stack([_read_as(column, np.float32, start, stop) for column in (x, y)], axis=1)
 
 
-def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> EventValues | None:
+def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> _StoredRows | None:
     """Return the values of the dataset ``truth/events/name``, or None if the dataset is missing."""
     column = file.columns.get(f"truth/events/{name}")
     if column is None:

@@ -26,19 +26,11 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, as_times, check_events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.atomic_output import NewFile, allocate, check_output, link_new, put_in_place
-from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
+from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order, make_dataset
 from amiwarp.io.formats import check_native
 from amiwarp.io.hdf5_reader import open_hdf5
 from amiwarp.io.input_files import errors_name
-from amiwarp.io.native_writer import (
-    Columns,
-    check_frame,
-    check_lengths,
-    make_dataset,
-    ms_entries,
-    save_recording,
-    write_header,
-)
+from amiwarp.io.native_writer import Columns, check_frame, check_lengths, ms_entries, save_recording, write_header
 from amiwarp.optics.camera import Camera
 
 if TYPE_CHECKING:

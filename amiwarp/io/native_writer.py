@@ -26,18 +26,7 @@ from amiwarp.events.sensors import ImuSamples, check_image
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS, EventTruth, FrameTruth, Poses, WorldLabels, as_poses, check_truth
 from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.camera_files import camera_attributes, prism_attributes
-from amiwarp.io.chunks import (
-    CHUNK,
-    GZIP_LEVEL,
-    ChunkFile,
-    EncodedChunk,
-    append_chunk,
-    blosc_shuffle,
-    chunks_of,
-    encode,
-    encode_parts,
-    in_order,
-)
+from amiwarp.io.chunks import CHUNK, ChunkFile, EncodedChunk, append_values, encode_parts, in_order, make_dataset
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
 from amiwarp.io.input_files import errors_name
 from amiwarp.optics.camera import Camera, check_size
@@ -93,31 +82,6 @@ def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) 
 def describe_columns(columns: Mapping[str, np.dtype[Any]]) -> str:
     """Return names and data types of columns as text for messages."""
     return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
-
-
-def make_dataset(
-    file: Any,
-    name: str,
-    dtype: Any,
-    row: tuple[int, ...] = (),
-    chunk_rows: int = CHUNK,
-    codec: Codec = Codec.BLOSC,
-) -> Any:
-    """Create an empty dataset of the native layout, whose rows have the shape ``row``."""
-    import hdf5plugin
-
-    blosc = {"compression": hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=blosc_shuffle(np.dtype(dtype)))}
-    gzip = {"compression": "gzip", "compression_opts": GZIP_LEVEL, "shuffle": True}
-    # The checksum covers the compressed bytes. Its cost is too small to measure. LZ4 alone misses most damage.
-    return file.create_dataset(
-        name,
-        shape=(0, *row),
-        maxshape=(None, *row),
-        chunks=(chunk_rows, *row),
-        dtype=dtype,
-        fletcher32=True,
-        **(blosc if codec is Codec.BLOSC else gzip),
-    )
 
 
 def write_header(
@@ -524,7 +488,7 @@ class RecordingWriter:
                     stored: Sequence[Sequence[bytes]] = [(part,) for part in known.get(name, ())]
                     if len(stored) * CHUNK < len(column):
                         stored = encode_parts(column, self._codec)
-                    chunks += chunks_of(name, start, column, stored)
+                    chunks += EncodedChunk.of(name, start, column, stored)
                 self._chunks.write(turn, chunks, self._dataset_of, lambda: self._follow(events, start))
         return events, inside
 
@@ -678,7 +642,7 @@ class RecordingWriter:
     def _write_chunk(self, name: str, start: int, values: NDArray[Any], turn: int) -> None:
         """Encode and write the values of a chunk that begins at element ``start``. Runs in a thread."""
         with self._chunks.stopping():
-            chunks = chunks_of(name, start, values, encode_parts(values, self._codec))
+            chunks = EncodedChunk.of(name, start, values, encode_parts(values, self._codec))
             self._chunks.write(turn, chunks, self._dataset_of)
 
     def _dataset_of(self, chunk: EncodedChunk) -> Any:
@@ -747,18 +711,13 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
                 ms += entries.size
             columns = {"x": events.x, "y": events.y, "t": events.t - about.t_first, "p": events.p}
             for name, dtype in COLUMNS.items():
-                _append(datasets[name], written, columns[name].astype(dtype), about.codec)
+                append_values(datasets[name], written, columns[name].astype(dtype), about.codec)
             written += len(events)
             chunks.check()
         stored = create("ms_to_idx", np.uint64)
         found = np.concatenate(index).astype(np.uint64)
         for start in range(0, ms, CHUNK):
-            _append(stored, start, found[start : start + CHUNK], about.codec)
-
-
-def _append(dataset: Any, start: int, values: NDArray[Any], codec: Codec) -> None:
-    """Append a chunk without HDF5's buffers."""
-    append_chunk(dataset, start, encode(values, codec), len(values))
+            append_values(stored, start, found[start : start + CHUNK], about.codec)
 
 
 # Copy of a recording into a native file.
