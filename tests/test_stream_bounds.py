@@ -183,7 +183,7 @@ def test_a_session_bounds_encoder_samples_without_events() -> None:
     for _ in range(50):  # it stays there
         time.sleep(0.002)
         assert session._queue.held_bytes <= MOST
-        assert session._consumers.raw[0].worker.held_bytes <= MOST
+        assert session._consumers.raw[0][1].held_bytes <= MOST
     assert source.given * samples(0).held_bytes < 2.1 * MOST
     taker.go.set()
     thread.join(LONG_S)

@@ -64,7 +64,10 @@ class ColumnCheck(NamedTuple):
 def join_packets(parts: list[Events], to: list[NDArray[Any]]) -> ColumnCheck:
     """Copy packets into the columns x, y, t and, if it is given, p. Times must not decrease between packets."""
     for name, column in zip("xytp", to, strict=False):
-        np.concatenate([getattr(part, name) for part in parts], out=column)
+        if len(parts) == 1:  # faster by 1 us for each column
+            column[:] = getattr(parts[0], name)
+        else:
+            np.concatenate([getattr(part, name) for part in parts], out=column)
     x, y, t, *_ = to
     return ColumnCheck(bool((t[1:] < t[:-1]).any()), int(x.max()), int(y.max()))
 

@@ -29,6 +29,10 @@ BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks
 SMALLEST_SLICE = 1 << 15  # fewest threads per slice: launching a smaller slice takes longer than running it
 
 
+# Background work has two kinds of worker: a job with a result runs in a pool, and a loop that runs until it is closed
+# has a daemon thread of its own. The helpers are a pool that hands over faster, for the jobs of one launch.
+
+
 @cache
 def pool() -> ThreadPoolExecutor:
     """Return the shared thread pool for CPU launches, with one thread per core."""

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -54,17 +54,6 @@ class RawConsumer(Protocol):
     def tick(self) -> None: ...
 
 
-Consumer = TypeVar("Consumer", bound="RawConsumer | LiveWriter", covariant=True)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Served(Generic[Consumer]):
-    """Consumer together with the background thread that calls it."""
-
-    consumer: Consumer
-    worker: BackgroundWorker
-
-
 class Consumers:
     """Consumers of a session's data. A consumer that fails is removed; the others continue.
 
@@ -73,19 +62,21 @@ class Consumers:
     """
 
     def __init__(self, raw: Iterable[RawConsumer], out: LiveWriter | None, fail: Callable[[Exception], None]) -> None:
-        self.raw = [Served(consumer, BackgroundWorker()) for consumer in raw]
-        self.out = None if out is None else Served(out, BackgroundWorker())
+        self.raw = [(consumer, BackgroundWorker()) for consumer in raw]
+        """Consumers of the sensor's events, each with the thread that calls it."""
+        self.out = None if out is None else (out, BackgroundWorker())
+        """The same for the consumer of compensated events."""
         self._fail = fail
 
     def append(self, events: Events) -> None:
         """Pass the sensor's events to the consumers of raw events."""
         for served in list(self.raw):
-            self._put(served, partial(served.consumer.append, events), held_bytes(events))
+            self._put(served, partial(served[0].append, events), held_bytes(events))
 
     def append_encoder(self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64]) -> None:
         """Pass encoder samples and index pulses to all consumers."""
         for served in self._all():
-            append = partial(served.consumer.append_encoder, t, angle, index_t)
+            append = partial(served[0].append_encoder, t, angle, index_t)
             self._put(served, append, t.nbytes + angle.nbytes + index_t.nbytes)
 
     def append_compensated(self, packet: Compensated) -> None:
@@ -94,42 +85,44 @@ class Consumers:
             return
         flags = packet.flags
         inside, extrapolated = (flags & OUTSIDE) == 0, (flags & (EXTRAPOLATED | NO_ANGLE)) != 0
-        append = partial(self.out.consumer.append, packet.events, inside=inside, extrapolated=extrapolated)
+        append = partial(self.out[0].append, packet.events, inside=inside, extrapolated=extrapolated)
         self._put(self.out, append, held_bytes(packet.events) + flags.nbytes)
 
     def tick(self) -> None:
         """Let all consumers continue pending work, even without new data."""
         for served in self._all():
-            self._put(served, served.consumer.tick)
+            self._put(served, served[0].tick)
 
     def finish(self) -> None:
         """Wait until the consumers have processed all data, and collect their errors."""
-        for served in self._all():
+        for _, worker in self._all():
             try:
-                served.worker.close()
+                worker.close()
             except Exception as error:
                 self._fail(error)
 
     def end(self) -> None:
         """Wait for the end of all background threads."""
-        for served in self._all():
-            served.worker.end()
+        for _, worker in self._all():
+            worker.end()
 
     def abandon(self) -> None:
         """Drop the waiting data, so that the caller can close the consumers at once."""
-        for served in self._all():
-            served.worker.abandon()
+        for _, worker in self._all():
+            worker.abandon()
 
-    def _all(self) -> list[Served[RawConsumer | LiveWriter]]:
+    def _all(self) -> list[tuple[RawConsumer | LiveWriter, BackgroundWorker]]:
         return [*self.raw, *([] if self.out is None else [self.out])]
 
-    def _put(self, served: Served[RawConsumer | LiveWriter], job: Callable[[], object], held: int = 0) -> None:
+    def _put(
+        self, served: tuple[RawConsumer | LiveWriter, BackgroundWorker], job: Callable[[], object], held: int = 0
+    ) -> None:
         """Pass a job to a consumer's thread; remove the consumer if it has failed."""
         try:
-            served.worker.put(job, held)
+            served[1].put(job, held)
         except Exception as error:
             self._fail(error)
-            served.worker.end()
+            served[1].end()
             if served is self.out:
                 self.out = None
             else:
