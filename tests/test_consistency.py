@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.photometric.consistency import Consistency, Finding, LinearFit
-from amiwarp.calib.photometric.cost import CAUSES
+from amiwarp.calib.photometric.consistency import CAUSES, Consistency, Finding, LinearFit
 from amiwarp.calib.photometric.stage import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.events.encoder import Encoder
