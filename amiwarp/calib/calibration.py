@@ -210,9 +210,10 @@ class Calibrator:
                         refined = stage.refine(recording, search)
                         for _ in search.meanwhile:
                             pass
-                        found = _refined(search, found, *refined)
                     except AmiwarpError as error:
                         found = _warning(found, f"the photometric stage failed: {error}")
+                    else:
+                        found = _refined(search, found, *refined)
         except AmiwarpError as error:
             return Attempt(None, error)
         return Attempt(replace(found, seconds=time.perf_counter() - began))
