@@ -22,8 +22,7 @@ from amiwarp import (
     simulate,
     truth_model,
 )
-from amiwarp.calib.photometric.consistency import Consistency, Finding, LinearFit
-from amiwarp.calib.photometric.cost import CAUSES
+from amiwarp.calib.photometric.consistency import CAUSES, Consistency, Finding, LinearFit
 from amiwarp.calib.photometric.stage import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
 
 CAMERA = Camera.from_fov(160, 120, math.radians(90.0))

@@ -202,7 +202,7 @@ class Calibrator:
                 for search in searches:
                     search.run()
                 search = max(searches, key=lambda s: s.score)
-                found = _sharpest(recording, search)
+                found = _sharpest(recording, search, *search.check_answer(recording.name))
                 if "photometric" in self.settings.stages:
                     search.ahead = ahead
                     search.meanwhile = iter(()) if self.meanwhile is None else self.meanwhile(found)
@@ -210,9 +210,10 @@ class Calibrator:
                         refined = stage.refine(recording, search)
                         for _ in search.meanwhile:
                             pass
-                        found = _refined(search, found, *refined)
                     except AmiwarpError as error:
                         found = _warning(found, f"the photometric stage failed: {error}")
+                    else:
+                        found = _refined(search, found, *refined)
         except AmiwarpError as error:
             return Attempt(None, error)
         return Attempt(replace(found, seconds=time.perf_counter() - began))
@@ -295,10 +296,11 @@ def _warning(found: Calibration, *said: str) -> Calibration:
     return replace(found, warnings=(*found.warnings, *said))
 
 
-def _sharpest(recording: Recording, search: Search) -> Calibration:
+def _sharpest(
+    recording: Recording, search: Search, warnings: tuple[str, ...], uncertainty: dict[str, float]
+) -> Calibration:
     """Return the calibration by the sharpness stage that ``search`` ran. Its time is not set."""
     settings, space, best = search.settings, search.space, search.best
-    warnings, uncertainty = search.check_answer(recording.name)
     still = {n: 0.0 for n in (space.size_name, *MOTION) if n in best}
     return Calibration(
         model_name=settings.model,

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,14 +16,13 @@ from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
 from amiwarp.brightness.multigrid import Tiles
 from amiwarp.calib.calibration_events import EventsAhead
 from amiwarp.calib.nlopt_solver import SearchStage, best_of
-from amiwarp.calib.parameters import RATES, widened
+from amiwarp.calib.parameters import RATES
 from amiwarp.calib.settings import GAUSS_NEWTON
 from amiwarp.calib.sharpness import reach
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import MemoryEvents
 from amiwarp.kernels.iwe import sum_segments
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -40,67 +39,6 @@ if TYPE_CHECKING:
 
     Vector = NDArray[np.float64]
 
-# Causes of an answer that does not hold everywhere in the image: what may be wrong in the given camera and prism.
-
-FLAT_SIDE = "flat_side"
-"""Name of the unknown that is 0 for the given flat side of the prism, and 1 for the other."""
-
-
-@dataclass(frozen=True)
-class Cause:
-    """One thing that may be wrong, and the parameters that correct it."""
-
-    words: str
-    """What is wrong, in words."""
-    names: tuple[str, ...]
-    """Names of the parameters that correct it."""
-
-    @property
-    def rank(self) -> int:
-        """Position in :data:`CAUSES`: of causes with equal evidence, the first one counts."""
-        return CAUSES.index(self)
-
-
-CENTER = Cause("the principal point", ("center_x", "center_y"))
-CAUSES = (
-    Cause("the focal length", ("focal_length",)),
-    CENTER,
-    Cause("the flat side of the prism", (FLAT_SIDE,)),
-    Cause("the lens distortion k1", ("k1",)),
-    Cause("the direction of the prism's axis", ("tilt_x", "tilt_y")),
-)
-"""All causes that the photometric stage can name and correct, the likeliest first."""
-SCREENED = CAUSES[:3]
-"""Causes that every answer is tested for. The effects of the others resemble those of the first two."""
-
-
-def turned(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, float]:
-    """Return values that deflect the axial ray as before if the prism's other side is flat."""
-    prism, index = space.prism, values.get("index", space.prism.index)
-    deflection = Prism(values["apex"], index, prism.flat_side).deflection
-    phase = math.remainder(values["phase"] + math.pi, math.tau)
-    return {**values, "apex": apex_from_deflection(deflection, index, _other(prism)), "phase": phase}
-
-
-def other_side(space: ParameterSpace) -> ParameterSpace:
-    """Return the parameter space with the prism's other side flat."""
-    prism = space.prism
-    apex = apex_from_deflection(prism.deflection, prism.index, _other(prism))
-    return replace(space, prism=Prism(apex, prism.index, _other(prism)), start=turned(space, space.start))
-
-
-def _other(prism: Prism) -> FlatSide:
-    return FlatSide.CAMERA if prism.flat_side is FlatSide.SCENE else FlatSide.SCENE
-
-
-def with_cause(space: ParameterSpace, cause: Cause, values: Mapping[str, float]) -> tuple[ParameterSpace, Vector]:
-    """Return the space in which a cause is corrected or free, and the vector of ``values`` there."""
-    if cause.names == (FLAT_SIDE,):
-        space, values = other_side(space), turned(space, values)
-    else:
-        space = widened(space, tuple(n for n in cause.names if n not in space.names))
-    return space, space.to_vector({**space.start, **values})
-
 
 def place_arguments(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, Any]:
     """Return the keyword arguments of :meth:`BrightnessMap.place` for parameter values."""
@@ -115,8 +53,6 @@ FIRST_SCALE = 1.0
 """Scale of the Cauchy weights before the first brightness map is solved [thresholds]."""
 SLOPE_PX = 0.005
 """Step of the finite differences that give the derivatives of the residuals [px]."""
-
-
 PREDICTED_PX = 0.5
 """Longest step for which the change of the brightness map is predicted [px]."""
 
@@ -492,12 +428,8 @@ def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
 
 MOST_STEPS = 15
 """Largest number of Gauss-Newton steps."""
-
-
 LONGEST_STEP_PX = 1.0
 """Largest change of any parameter in one Gauss-Newton step [px]."""
-
-
 HALVINGS = 4
 """Number of step lengths that are tried along a Gauss-Newton direction, each half of the previous one."""
 
@@ -540,6 +472,11 @@ def _inverse(hessian: Vector) -> Vector:
     """Return the inverse of the Hessian, with very small eigenvalues raised."""
     values, vectors = np.linalg.eigh(hessian)
     return np.asarray(vectors @ np.diag(1.0 / np.maximum(values, 1e-9 * max(float(values[-1]), 1e-12))) @ vectors.T)
+
+
+UNDETERMINED_PX, LEAST_CURVATURE = 0.3, 1e-3
+"""A parameter is undetermined if its standard deviation exceeds the first value [px], or if its curvature is below the
+second, a share of the largest curvature."""
 
 
 def determined(slopes: Slopes, space: ParameterSpace, left: float) -> tuple[str, ...]:
@@ -612,8 +549,3 @@ def iterate(
             ended = "tolerance" if moved < tolerance else "no better step"
             break
     return best_of(GAUSS_NEWTON, points, scores, seconds=time.perf_counter() - began, ended=ended)
-
-
-UNDETERMINED_PX, LEAST_CURVATURE = 0.3, 1e-3
-"""A parameter is undetermined if its standard deviation exceeds the first value [px], or if its curvature is below the
-second, a share of the largest curvature."""

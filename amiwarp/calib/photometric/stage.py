@@ -23,8 +23,6 @@ from amiwarp.calib.nlopt_solver import SearchStage, maximise
 from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, LENS, MOTION, ParameterSpace
 from amiwarp.calib.photometric import consistency
 from amiwarp.calib.photometric.cost import (
-    FLAT_SIDE,
-    Cause,
     Cost,
     check_pairs,
     collect_pairs,
@@ -32,8 +30,6 @@ from amiwarp.calib.photometric.cost import (
     fine_map_is_determined,
     iterate,
     size_and_phase_directions,
-    turned,
-    with_cause,
 )
 from amiwarp.calib.result import PhotometricSummary, StageSummary
 from amiwarp.calib.settings import GAUSS_NEWTON, LINEAR_UNKNOWNS, PhotometricSettings
@@ -104,16 +100,18 @@ class _Equations:
         whole_turn = abs(search.calibration_events.encoder.rpm) * duration_us >= 60e6
         self._off_excess = off_excess(self.pairs, with_leak="leak" in self._linear) if whole_turn else 0.0
         space = full.holding({n: x for n, x in best.items() if n not in full.names})
+        v = space.to_vector({**space.start, **best})
         cost = self.cost_on(tiles, space)
+        cost.warm_up(v)
         mean, coverage = cost.start_mean(), cost.brightness.coverage(cost.scale)
         few = not fine_map_is_determined(coverage, len(self.pairs))
         noisy = mean() > LARGEST_FINE_COST
         # a fine map converges too slowly for parameters that make nearly the same motion
         if tiles.density > 1.0 and (few or noisy or any(n in DEGENERATE_WITH_APEX for n in space.names)):
             cost = self.cost_on(tiles.at_density(1.0), space)
+            cost.warm_up(v)
             coverage = cost.brightness.coverage(cost.scale)
         left = check_pairs(recording.name, coverage, len(self.pairs))
-        v = space.to_vector({**space.start, **best})
         keep = determined(cost.slopes(v, with_parts=True), space, left)
         self.held = tuple(n for n in space.names if n not in keep)
         """Free parameters that the events do not determine."""
@@ -129,19 +127,24 @@ class _Equations:
         self._search.report("photometric", share)
 
     def cost_on(self, tiles: Tiles, space: ParameterSpace) -> Cost:
-        """Return a cost with a new map on tiles, solved at the sharpness stage's result."""
+        """Return a cost with a new map on tiles, which must be solved yet."""
         brightness = BrightnessMap(
             self.pairs, tiles, off_excess=None if "off_ratio" in self._linear else self._off_excess,
             with_leak="leak" in self._linear, middle_us=space.middle_us,
         )  # fmt: skip
-        cost = Cost(space, brightness, self._settings.steps, self._search.meanwhile)
+        return Cost(space, brightness, self._settings.steps, self._search.meanwhile)
+
+    def _solved_on(self, tiles: Tiles) -> Cost:
+        """Return a cost with a new map on tiles, solved at the sharpness stage's result."""
+        space = self.answers.cost.space
+        cost = self.cost_on(tiles, space)
         cost.warm_up(space.to_vector({**space.start, **self._search.best}))
         return cost
 
     def coarse(self) -> AnswerSearch:
         """Return the search on a new map with one node per pixel."""
-        cost = self.answers.cost
-        return replace(self.answers, cost=self.cost_on(cost.brightness.tiles.at_density(1.0), cost.space))
+        tiles = self.answers.cost.brightness.tiles
+        return replace(self.answers, cost=self._solved_on(tiles.at_density(1.0)))
 
     def with_slow_pixels(self, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:
         """Return the answer for pixels with slow photoreceptors, and the angle per time constant [rad]; 0 if it fails.
@@ -151,7 +154,7 @@ class _Equations:
         answers, v = self.answers, answer.stage.x
         self.pairs.clear_lags()
         turn = find_time_constant(self.coarse(), v, first, direction)
-        answers.cost = self.cost_on(answers.cost.brightness.tiles, answers.cost.space)
+        answers.cost = self._solved_on(answers.cost.brightness.tiles)
         again = answers.search(v)
         return replace(again, stage=join_runs(answer.stage, again.stage)), turn
 
@@ -463,27 +466,26 @@ def start_costs_around(
     points would cost more. Then a new map is solved for each point, ``best`` included.
     """
     few = cost.brightness.count < FEW_PAIRS
-
-    def start(point: Vector) -> Callable[[], float]:
+    points = [
+        best + side * along
+        for along in size_and_phase_directions(cost.space, best)
+        for side in (PERTURBATION_PX, -PERTURBATION_PX)
+    ]
+    costs = []
+    for point in [best, *points] if few else points:
         if few:
             cost.renew(point)
             cost.residuals(point, rounds=2)
         else:
             cost.predict(point)
             cost.residuals(point, rounds=2, steps=cost.steps // 2)
-        return cost.start_mean()
-
-    reference = start(best) if few else final
-    shifts = [
-        side * along
-        for along in size_and_phase_directions(cost.space, best)
-        for side in (PERTURBATION_PX, -PERTURBATION_PX)
-    ]
-    costs = [(best + shift, start(best + shift)) for shift in shifts]
+        costs.append(cost.start_mean())
+    reference = costs.pop(0) if few else final
 
     def result() -> list[tuple[Vector, float]]:
         here = reference()
-        return sorted(((point, there() - here) for point, there in costs), key=lambda found: found[1])
+        rises = [there() - here for there in costs]
+        return sorted(zip(points, rises, strict=True), key=lambda found: found[1])
 
     return result
 
@@ -674,7 +676,7 @@ LARGEST_LAST_STEP_PX = 0.01
 class _Corrected:
     """Answer after the correction of a cause."""
 
-    cause: Cause
+    cause: consistency.Cause
     answer: Answer
     cost: float
     """Cost with a new map, which compares with that of other answers."""
@@ -732,9 +734,9 @@ def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Co
 def _corrected(search: AnswerSearch, finding: consistency.Finding, v: Vector) -> _Corrected:
     """Return the answer with a cause corrected. The search's space stays."""
     cost, space, sharpest, cause = search.cost, search.cost.space, search.sharpest, finding.cause
-    cost.space, _ = with_cause(space, cause, space.to_values(v))
-    if cause.names == (FLAT_SIDE,):
-        search.sharpest = turned(space, sharpest)
+    cost.space, _ = consistency.with_cause(space, cause, space.to_values(v))
+    if cause.names == (consistency.FLAT_SIDE,):
+        search.sharpest = consistency.turned(space, sharpest)
     answer = search.search(finding.start)
     found = _Corrected(cause, answer, _comparable_cost(search, answer.stage.x), cost.space, search.sharpest)
     cost.space, search.sharpest = space, sharpest
@@ -744,7 +746,7 @@ def _corrected(search: AnswerSearch, finding: consistency.Finding, v: Vector) ->
 def _significant(found: _Corrected) -> bool:
     """Return whether a corrected parameter differs significantly from the given one. A turned prism always does."""
     result, start = found.answer.result, found.space.start
-    names = [n for n in found.cause.names if n != FLAT_SIDE]
+    names = [n for n in found.cause.names if n != consistency.FLAT_SIDE]
     return not names or any(
         abs(result.parameters[n] - start[n]) >= consistency.SIGNIFICANT * result.uncertainty[n] for n in names
     )
