@@ -32,16 +32,7 @@ from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker, t
 from amiwarp.studies.dataset import making as recordings
 from amiwarp.studies.dataset import specification
 from amiwarp.studies.dataset import specification as sources
-from amiwarp.studies.dataset.making import (
-    JOURNAL,
-    MANIFEST,
-    TABLE,
-    DatasetSummary,
-    duration_text,
-    list_items,
-    make_dataset,
-    simulation_of,
-)
+from amiwarp.studies.dataset.making import JOURNAL, MANIFEST, TABLE, duration_text, list_items, simulation_of
 from amiwarp.studies.dataset.specification import load_specification
 
 HEAD = 'format = "amiwarp-dataset-specification"\nversion = 1\n'
