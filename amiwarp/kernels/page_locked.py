@@ -4,6 +4,7 @@ A GPU copies to and from page-locked memory at full speed and without waiting, b
 milliseconds. So arrays are used again.
 """
 
+import heapq
 import weakref
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
@@ -15,6 +16,8 @@ from numpy.typing import NDArray
 
 _Kind = tuple[Any, ...]
 """What arrays that may take each other's place have in common: shape, type, and use."""
+_Numbered = tuple[int, wp.array]
+"""An array, and how many of its kind were made before it."""
 
 
 class PageLockedPool:
@@ -26,17 +29,21 @@ class PageLockedPool:
         ``locked=False`` gives ordinary memory, for machines without CUDA.
         """
         self._most, self._locked = most, locked
-        self._idle: defaultdict[_Kind, list[wp.array]] = defaultdict(list)
+        self._idle: defaultdict[_Kind, list[_Numbered]] = defaultdict(list)  # heaps
         self._made: Counter[_Kind] = Counter()
 
-    def _take(self, kind: _Kind) -> wp.array:
-        """Return the idle array of a kind that was used last, so that few are in use, or a new one."""
+    def _take(self, kind: _Kind) -> _Numbered:
+        """Return the idle array of a kind that was made first, so that few are in use, or a new one."""
         try:
-            return self._idle[kind].pop()
+            return heapq.heappop(self._idle[kind])
         except IndexError:
-            self._made[kind] += 1
             shape, dtype, *_ = kind
-            return wp.empty(shape, dtype=dtype, device="cpu", pinned=self._locked)
+            self._made[kind] += 1
+            return self._made[kind], wp.empty(shape, dtype=dtype, device="cpu", pinned=self._locked)
+
+    def _give_back(self, kind: _Kind, user: object, taken: _Numbered) -> None:
+        """Make an array idle once ``user`` is deleted."""
+        weakref.finalize(user, heapq.heappush, self._idle[kind], taken).atexit = False
 
     def array(self, owner: object, shape: tuple[int, ...], dtype: Any, *use: object) -> wp.array:
         """Return an array with undefined values, which another owner may get once ``owner`` is deleted.
@@ -44,14 +51,14 @@ class PageLockedPool:
         Keep no reference to it beyond ``owner``. ``use``: only an owner with the same use may get it.
         """
         kind = shape, dtype, *use
-        array = self._take(kind)
-        weakref.finalize(owner, self._idle[kind].append, array).atexit = False
-        return array
+        taken = self._take(kind)
+        self._give_back(kind, owner, taken)
+        return taken[1]
 
     def fill(self, size: int, dtypes: Iterable[Any]) -> None:
         """Lock memory for :meth:`results` of each of ``dtypes`` in advance."""
-        for kind, array in [(kind, self._take(kind)) for kind in [((size,), dtype) for dtype in dtypes]]:
-            self._idle[kind].append(array)
+        for kind, taken in [(kind, self._take(kind)) for kind in [((size,), dtype) for dtype in dtypes]]:
+            heapq.heappush(self._idle[kind], taken)
 
     def result(self, size: int, n: int, dtype: Any) -> tuple[wp.array, NDArray[Any]]:
         """Return an array of ``size`` values, and a NumPy view of its first ``n``, which a caller may keep.
@@ -63,11 +70,11 @@ class PageLockedPool:
         if self._most is not None and not self._idle[kind] and self._made[kind] >= self._most:
             view = np.empty(n, wp.dtype_to_numpy(dtype))
             return wp.array(view, dtype=dtype, device="cpu", copy=False), view
-        array = self._take(kind)
+        taken = self._take(kind)
         # Not a slice: NumPy makes a slice of a slice refer to the base, and the pool would miss that it is in use.
-        view = np.frombuffer(memoryview(array.numpy()), wp.dtype_to_numpy(dtype), n)
-        weakref.finalize(view, self._idle[kind].append, array).atexit = False
-        return array, view
+        view = np.frombuffer(memoryview(taken[1].numpy()), wp.dtype_to_numpy(dtype), n)
+        self._give_back(kind, view, taken)
+        return taken[1], view
 
 
 _shared = PageLockedPool()
