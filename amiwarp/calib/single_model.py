@@ -17,7 +17,7 @@ from amiwarp.calib import checks
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, thin
 from amiwarp.calib.first_guess import encoder_turns_per_period, estimate_rates, estimate_rpm
-from amiwarp.calib.parameters import LENS, MOTION, RATES, ParameterSpace, make_space, nominal, size_name, with_lens
+from amiwarp.calib.parameters import LENS, MOTION, RATES, ParameterSpace, make_space, nominal, with_lens
 from amiwarp.calib.photometric.answer_search import LARGEST_COST_RATIO, LARGEST_ROTATION_GAIN, LARGEST_STILL_COST
 from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.photometric.stage import refine
@@ -27,6 +27,7 @@ from amiwarp.calib.sharpness import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.optics.models import MODELS, size_names
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 
@@ -111,9 +112,10 @@ def _encoders(recording: Recording, settings: Settings) -> tuple[list[Encoder], 
 
     Without an encoder these are constant speeds: the given one, or the one found in the events with either sign.
     """
-    free = (size_name(settings.model), "phase") if settings.free is None else settings.free
+    kind = MODELS[settings.model]
+    free = kind.FREE[:2] if settings.free is None else settings.free
     free = tuple(n for n in free if n not in LINEAR_UNKNOWNS)
-    if not {"apex", "deflection", "phase"} & set(free) and settings.start.get(size_name(settings.model)) == 0.0:
+    if not {*size_names(), "phase"} & set(free) and settings.start.get(kind.SIZE) == 0.0:
         return [constant_speed(0.0, recording.events.t_first, recording.events.t_last, _middle(recording))], free
     if recording.encoder is not None:
         if "rpm" in free or "rpm" in settings.start:
@@ -215,7 +217,7 @@ def calibrate_model(
     if isinstance(found, AmiwarpError):
         raise found
     _check_confirmed(found, recording.name)
-    if isinstance(recording.prism, Prism) and not {"apex", "deflection"} & {*settings.bounds, *settings.start}:
+    if isinstance(recording.prism, Prism) and not size_names() & {*settings.bounds, *settings.start}:
         checks.check_nominal(found.model_name, found.parameters, recording.prism, recording.name)
     return replace(found, seconds=time.perf_counter() - began)
 
@@ -339,7 +341,7 @@ def _with_rotation(
     progress: Progress | None,
 ) -> Calibration | AmiwarpError:
     """Return the calibration with a free camera rotation if that lowers the photometric cost enough; else ``found``."""
-    free = (size_name(settings.model), "phase", "motion")
+    free = (MODELS[settings.model].SIZE, "phase", "motion")
     moving = _calibration_or_error(recording, replace(settings, free=free), device, progress)
     if isinstance(moving, AmiwarpError) or moving.photometric is None or not moving.photometric.accepted:
         return found

@@ -196,13 +196,14 @@ class ParameterOptions:
 
 
 def _named(text: str) -> tuple[str, str, str]:
-    from amiwarp.calib.parameters import UNITS
+    from amiwarp.calib.parameters import units
 
+    known = units()
     name, equals, value = text.partition("=")
     name = name.strip()
-    if not equals or name not in UNITS:
-        raise AmiwarpError(f"{text!r} does not name a parameter; write NAME=VALUE with NAME one of {', '.join(UNITS)}")
-    return name, UNITS[name], value
+    if not equals or name not in known:
+        raise AmiwarpError(f"{text!r} does not name a parameter; write NAME=VALUE with NAME one of {', '.join(known)}")
+    return name, known[name], value
 
 
 def run(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, MOTION
+from amiwarp.calib.parameters import MOTION, like_size
 from amiwarp.calib.photometric.cost import iterate
 from amiwarp.calib.result import PhotometricSummary
 from amiwarp.calib.settings import GAUSS_NEWTON
@@ -328,8 +328,9 @@ def _evaluate(
     cost.residuals(best, rounds=0)
     slopes, final, around = waiting_slopes(), waiting_final(), waiting_around()
     covariance = slopes.covariance() / left**2
-    of_sharpness = np.array([n not in DEGENERATE_WITH_APEX for n in space.names])
-    of_prism = np.array([n not in (*DEGENERATE_WITH_APEX, *MOTION) for n in space.names])
+    unsharp = like_size(space.names)
+    of_sharpness = np.array([n not in unsharp for n in space.names])
+    of_prism = np.array([n not in (*unsharp, *MOTION) for n in space.names])
     leak, excess = (float(x) for x in cost.brightness.extra)
     rise = around[0][1] if around else math.inf
     next_step = float(np.linalg.norm(slopes.step()[of_prism]))
@@ -355,8 +356,10 @@ def _evaluate(
 def search_box(space: ParameterSpace, v: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the corners of the box about the sharpness stage's result ``v`` in which this stage searches."""
 
+    unsharp = like_size(space.names)
+
     def largest_move(name: str) -> float:
-        if name in DEGENERATE_WITH_APEX:
+        if name in unsharp:
             return math.inf
         return LARGEST_ROTATION_MOVE_PX if name in MOTION else LARGEST_MOVE_PX
 

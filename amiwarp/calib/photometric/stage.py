@@ -15,7 +15,7 @@ import numpy as np
 
 from amiwarp.brightness.event_pairs import SensorTiming, off_excess
 from amiwarp.brightness.solver import BrightnessMap
-from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, LENS
+from amiwarp.calib.parameters import LENS, like_size
 from amiwarp.calib.photometric.answer_search import (
     LARGEST_COST_RATIO,
     LARGEST_EXAMINED_COST,
@@ -338,7 +338,7 @@ def _equations(
     few = not fine_map_is_determined(coverage, len(pairs))
     noisy = mean() > LARGEST_FINE_COST
     # a fine map converges too slowly for parameters that make nearly the same motion
-    if tiles.density > 1.0 and (few or noisy or any(n in DEGENERATE_WITH_APEX for n in space.names)):
+    if tiles.density > 1.0 and (few or noisy or like_size(space.names)):
         cost = cost_on(tiles.at_density(1.0))
         coverage = cost.brightness.coverage(cost.scale)
     left = check_pairs(recording.name, coverage, len(pairs))
