@@ -14,7 +14,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import refraction as kernels
 from amiwarp.kernels.launch import RecordedLaunch, launch
 from amiwarp.optics.camera import Camera, camera_params
-from amiwarp.validation import array
+from amiwarp.validation import array, guarded
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -28,9 +28,16 @@ Points = TypeVar("Points")
 """
 
 
+@guarded
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """Parameter of an optical model that a calibration can find."""
+    """Parameter of an optical model that a calibration can find.
+
+    Examples
+    --------
+    >>> amiwarp.ExactModel.PARAMETERS[-1].name
+    'index'
+    """
 
     name: str
     """Name in settings, files and results."""

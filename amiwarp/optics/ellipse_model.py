@@ -14,7 +14,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.refraction import EllipseParams, fit_harmonics
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.displacement import Model, model_camera, phase_values
+from amiwarp.optics.displacement import Model, model_camera, phase_values, struct_of
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import check_phase
 from amiwarp.validation import array, guarded, instance, whole
@@ -170,17 +170,18 @@ class EllipseModel(Model):
         tables = np.stack([pixels @ part for part in np.split(solution, 3)]).reshape(shape).astype(np.float32)
         return cls(camera, tables[0], tables[1], tables[2])
 
+    def kernel_values(self) -> tuple[Any, ...]:
+        return *phase_values(self.phase), np.concatenate([self.offset, self.cosine, self.sine], axis=2)
+
     @cached_property
     def _tables(self) -> dict[str, Any]:
         return {}
 
     def params(self, device: Any) -> Any:
         if str(device) not in self._tables:
-            p = EllipseParams()
-            table = np.concatenate([self.offset, self.cosine, self.sine], axis=2)
-            p.table = wp.array(table, dtype=float, device=device)
-            p.phase, p.phase_cos, p.phase_sin = phase_values(self.phase)
-            self._tables[str(device)] = p
+            *phase, table = self.kernel_values()
+            on_device = wp.array(table, dtype=float, device=device)
+            self._tables[str(device)] = struct_of(EllipseParams, [*phase, on_device])
         return self._tables[str(device)]
 
 
