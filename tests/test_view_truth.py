@@ -23,7 +23,7 @@ from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer import window
 from amiwarp.viewer.clouds import CAUSE_COLOURS, GREY, Look, Scene, colours_of, event_text, legend_of
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.panel import initial_state
+from amiwarp.viewer.layout import initial_state
 from amiwarp.viewer.window import Selection, colours_on_offer, truth_text
 
 COUNT, SIZE = 6000, (40, 30)

@@ -74,7 +74,7 @@ class ScreenshotOptions:
         from amiwarp.viewer.app import save_screenshot
         from amiwarp.viewer.clouds import Look
         from amiwarp.viewer.jobs import estimate_phase
-        from amiwarp.viewer.panel import notes
+        from amiwarp.viewer.layout import notes
 
         check_ending(path, "pictures are written", [".png"])
         third = self.axis or (Axis.ANGLE if inspector.has_encoder or inspector.knobs.rpm else Axis.TIME)
@@ -196,26 +196,20 @@ class StartOptions:
         ``latest``: function that returns the latest events of a live stream, or None.
         """
         from amiwarp.calib import Calibration
+        from amiwarp.optics.models import MODELS
         from amiwarp.viewer.inspector import Inspector
 
         found = None if self.calibration is None else Calibration.load(self.calibration)
         inspector = Inspector(recording, found, device=device, latest=latest)
         if self.model is not None:
-            inspector.set(replace(inspector.knobs, model=_checked_model(self.model)))
+            if self.model not in MODELS:
+                raise AmiwarpError(f"--model {self.model!r} is unknown; choose among {', '.join(MODELS)}")
+            inspector.set(replace(inspector.knobs, model=self.model))
         if self.window is not None:
             events = inspector.recording.events
             low, high = span(self.window, events.t_first, events.t_last)
             inspector.window = low, high - low
         return inspector
-
-
-def _checked_model(name: str) -> str:
-    """Return the name of a prism model; raise :class:`AmiwarpError` if the name is unknown."""
-    from amiwarp.optics.models import MODELS
-
-    if name not in MODELS:
-        raise AmiwarpError(f"--model {name!r} is unknown; choose among {', '.join(MODELS)}")
-    return name
 
 
 def run(

@@ -76,10 +76,11 @@ def apply_state(inspector: Inspector, state: ViewState) -> None:
 
 
 class History:
-    """States that can be undone and redone."""
+    """States that can be undone and redone, from the first one on."""
 
-    def __init__(self, state: ViewState) -> None:
-        self._states, self._at, self._change = [state], 0, ""
+    def __init__(self, first: ViewState) -> None:
+        self.first = first
+        self._states, self._at, self._change = [first], 0, ""
 
     @property
     def state(self) -> ViewState:
@@ -117,6 +118,11 @@ class History:
         """Go forward by one state if possible, and return the current one."""
         self._at, self._change = min(self._at + 1, len(self._states) - 1), ""
         return self.state
+
+    def reset(self) -> ViewState:
+        """Add the first state again, and return it."""
+        self.add(self.first)
+        return self.first
 
 
 # text in the address

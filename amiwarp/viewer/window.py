@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,21 +16,14 @@ from amiwarp.events.truth import Cause
 from amiwarp.imaging.corners import find_background_activity
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter, relative_variance
-from amiwarp.imaging.votes import CanvasShape, UploadedEvents, upload_events
-from amiwarp.optics.prism import apex_from_deflection
+from amiwarp.imaging.votes import CanvasShape, UploadedEvents
 from amiwarp.viewer.timeline import Span
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
     from numpy.typing import NDArray
 
-    from amiwarp.calib.result import Calibration
-    from amiwarp.events.encoder import Encoder
     from amiwarp.events.recording import Recording, Truth
-    from amiwarp.optics.camera import Camera
     from amiwarp.optics.models import Model
-    from amiwarp.optics.prism import Prism
     from amiwarp.reconstruction.picture import Picture
 
 
@@ -230,62 +223,6 @@ class Selection:
     """Time within which an earlier event at a neighbouring pixel must support an event [us]; None: no noise filter."""
 
 
-def first_sources(recording: Recording) -> dict[str, Source]:
-    """Return the sources of a recording's camera and of the parameters that the page shows, without a calibration."""
-    apex = getattr(recording.prism, "apex", None)
-    return {
-        "camera": Source.ASSUMED if recording.camera is None else Source.FILE,
-        "apex": Source.ASSUMED if apex is None else Source.FILE,
-        **dict.fromkeys(("model", "phase", "tilt_x", "tilt_y"), Source.ASSUMED),
-        **({"rpm": Source.ASSUMED} if recording.encoder is None else {"clock_offset": Source.FILE}),
-    }
-
-
-def true_knobs(recording: Recording, *, rpm: float) -> Knobs | None:
-    """Return the known parameters of a simulated recording; None without ground truth of its prism.
-
-    ``rpm``: the speed, which ground truth does not hold [1/min].
-    """
-    p = {} if recording.truth is None else recording.truth.parameters
-    if not {"apex", "phase"} <= set(p):
-        return None
-    recorded_us = 0.0 if recording.encoder is None else recording.encoder.clock_offset_us
-    tilts = p.get("tilt_x", 0.0), p.get("tilt_y", 0.0)
-    return Knobs("exact", p["apex"], p["phase"], p.get("clock_offset_us", recorded_us), *tilts, rpm, p.get("index"))
-
-
-def calibrated_knobs(calibration: Calibration, *, offset_us: float, zero_us: int) -> Knobs:
-    """Return the parameters of a calibration.
-
-    ``offset_us``: clock offset if the calibration has none [us]. ``zero_us``: time at which the angle of a
-    prism without encoder is 0 [us]; the phase is converted to it.
-    """
-    p, prism = calibration.parameters, calibration.prism
-    apex = p["apex"] if "apex" in p else apex_from_deflection(p["deflection"], prism.index, prism.flat_side)
-    offset, tilts = p.get("clock_offset", offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
-    rpm, phase = p.get("rpm", 0.0), p["phase"]
-    if calibration.zero_us is not None:
-        phase += rpm * math.tau / 60e6 * (zero_us - calibration.zero_us)
-    return Knobs(calibration.model_name, apex, phase, offset, *tilts, rpm, p.get("index"), p.get("focal_length"))
-
-
-def calibrated_sources(calibration: Calibration, known: Iterable[str]) -> dict[str, Source]:
-    """Return the sources of those ``known`` parameters that a calibration has."""
-
-    def named(names: Iterable[str]) -> set[str]:
-        return {"apex" if name == "deflection" else name for name in names} & set(known)
-
-    given = dict.fromkeys(named(calibration.parameters), Source.FILE)
-    return given | dict.fromkeys(("model", *named(calibration.free)), Source.CALIBRATED)
-
-
-def kept_values(knobs: Knobs, values: Mapping[str, float], *, has_encoder: bool) -> dict[str, float]:
-    """Return the parameters that a calibration file of a model keeps, of the ``values`` for all models."""
-    size = ("deflection",) if knobs.model in ("circle", "radial") else ("apex", "tilt_x", "tilt_y")
-    time = {"clock_offset": knobs.clock_offset} if has_encoder else {"rpm": knobs.rpm}
-    return {name: values[name] for name in (*size, "phase", *knobs.calibrated_only)} | time
-
-
 # Time windows of the inspector: their selected events, and what the page shows of them.
 
 
@@ -365,8 +302,6 @@ MOST_POINTS = 100_000
 """Largest number of points in each event cloud."""
 CURVE_EVENTS = 200_000
 """Largest number of events that a sharpness curve uses."""
-LARGEST_APEX = math.radians(3.0)
-"""Apex angle up to which events that move into the region are in its images, if the nominal apex is smaller [rad]."""
 
 
 def load_window(
@@ -395,20 +330,6 @@ def load_window(
     xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
     curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
     return LoadedWindow(span, region, n, drawn, truth, xy, events, curve_events)
-
-
-def upload(events: Events, encoder: Encoder, device: Any, *, drifting: bool) -> UploadedEvents:
-    """Upload events with their prism angles.
-
-    ``drifting``: whether the clock offset of the encoder can be changed afterwards.
-    """
-    return upload_events(events, encoder, device, slope=encoder.speed_at(events.t) * 1e-6 if drifting else None)
-
-
-def margin(camera: Camera, prism: Prism) -> int:
-    """Return how far a prism may move events [px]: the margin around a region."""
-    largest = replace(prism, apex=max(LARGEST_APEX, 2.0 * abs(prism.apex)))
-    return math.ceil(1.2 * math.tan(abs(largest.deflection)) * max(camera.fx, camera.fy))
 
 
 def kept(
