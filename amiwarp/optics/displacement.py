@@ -48,13 +48,15 @@ class Parameter:
     """
     like_size: bool = False
     """Whether its effect on the sharpness is nearly that of the size, so that sharpness alone hardly finds it."""
+    limits: tuple[float, float] = (-math.inf, math.inf)
+    """Smallest and largest value in an address of ``amiwarp view``, angles in degrees."""
     label: str = ""
     """Text of its slider in ``amiwarp view``; empty without a slider."""
     slider: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Minimum, maximum and step of its slider, angles in degrees."""
+    """Minimum, maximum and step of its slider, angles in degrees; the slider starts at 0."""
 
 
-PHASE = Parameter("phase", "rad", label="phase", slider=(-180.0, 180.0, 0.25))
+PHASE = Parameter("phase", "rad")
 """Phase θ_b, which is added to the encoder's angle."""
 
 

@@ -51,11 +51,15 @@ class ExactModel(Model):
 
     NAME, TEXT, NUMBERS, STRUCT = "exact", "exact (closed form)", "2, index given", ExactParams
     PARAMETERS = (
-        Parameter("apex", "rad", label="apex angle"),
+        Parameter("apex", "rad"),
         PHASE,
-        Parameter("tilt_x", "rad", math.radians(5.0), label="tilt in x", slider=(-5.0, 5.0, 0.05)),
-        Parameter("tilt_y", "rad", math.radians(5.0), label="tilt in y", slider=(-5.0, 5.0, 0.05)),
-        Parameter("index", "1", 0.2, like_size=True),
+        Parameter(
+            "tilt_x", "rad", math.radians(5.0), limits=(-45.0, 45.0), label="tilt in x", slider=(-5.0, 5.0, 0.05)
+        ),
+        Parameter(
+            "tilt_y", "rad", math.radians(5.0), limits=(-45.0, 45.0), label="tilt in y", slider=(-5.0, 5.0, 0.05)
+        ),
+        Parameter("index", "1", 0.2, like_size=True, limits=(1.0, 5.0)),
     )
 
     camera: Camera
