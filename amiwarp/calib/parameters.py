@@ -88,7 +88,7 @@ class ParameterSpace:
     """
 
     model: str
-    """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
+    """Name of the model, such as ``exact``."""
     camera: Camera
     """Nominal camera. If the focal length is free, its value replaces the camera's focal length."""
     prism: Prism

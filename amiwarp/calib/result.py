@@ -247,7 +247,7 @@ class Calibration:
     """
 
     model_name: str
-    """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
+    """Name of the model, such as ``exact``."""
     camera: Camera
     """Given camera, corrected where the events contradict it. If ``parameters`` contain a focal length, it replaces the
     camera's focal length."""

@@ -53,14 +53,15 @@ class ExactModel(Model):
     PARAMETERS = (
         Parameter("apex", "rad"),
         PHASE,
-        Parameter(
-            "tilt_x", "rad", math.radians(5.0), limits=(-45.0, 45.0), label="tilt in x", slider=(-5.0, 5.0, 0.05)
-        ),
-        Parameter(
-            "tilt_y", "rad", math.radians(5.0), limits=(-45.0, 45.0), label="tilt in y", slider=(-5.0, 5.0, 0.05)
+        *(
+            Parameter(
+                f"tilt_{axis}", "rad", math.radians(5.0), limits=(-45.0, 45.0), label=f"tilt in {axis}",
+                slider=(-5.0, 5.0, 0.05),
+            )
+            for axis in "xy"
         ),
         Parameter("index", "1", 0.2, like_size=True, limits=(1.0, 5.0)),
-    )
+    )  # fmt: skip
 
     camera: Camera
     """Camera intrinsics."""
