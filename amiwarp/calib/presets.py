@@ -119,8 +119,7 @@ def _check_type(name: str, value: Any, default: Any) -> None:
 def simplified(calibration: Calibration, model: str) -> Calibration:
     """Express a calibration by a simpler model of the same prism, with the size that fits best over image and turn.
 
-    Raises :class:`AmiwarpError` if ``model`` needs
-    parameters that the calibration does not have.
+    Raises :class:`AmiwarpError` if ``model`` needs parameters that the calibration does not have.
     """
     if one_of(model, MODELS, "model") == calibration.model_name:
         return calibration
