@@ -18,7 +18,7 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import RadialTangential
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.displacement import PHASE, Parameter, check_given, compensate_by_each, rms, wrap_angle
+from amiwarp.optics.displacement import PHASE, Parameter, check_given, compensate_by_each, model_of, rms, wrap_angle
 from amiwarp.optics.models import MODELS, size_names
 from amiwarp.optics.prism import Prism, UnsizedPrism
 from amiwarp.validation import guarded, instance, one_of, real, shown, vector
@@ -349,7 +349,7 @@ def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
 
 def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
     """Build the optical model of the parameter values; ``camera`` and ``prism`` give all other values."""
-    return MODELS[one_of(model, MODELS, "model")].from_values(with_lens(camera, values), prism, values)
+    return model_of(MODELS[one_of(model, MODELS, "model")], with_lens(camera, values), prism, values)
 
 
 def values_of(model: str, values: Mapping[str, float]) -> dict[str, float]:
