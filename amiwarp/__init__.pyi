@@ -77,9 +77,10 @@ from .optics.camera import RadialTangential as RadialTangential
 from .optics.camera_rotation import CameraRotation as CameraRotation
 from .optics.circle_models import CircleModel as CircleModel
 from .optics.circle_models import RadialCircleModel as RadialCircleModel
+from .optics.displacement import Model as Model
+from .optics.displacement import Parameter as Parameter
 from .optics.ellipse_model import EllipseModel as EllipseModel
 from .optics.exact_model import ExactModel as ExactModel
-from .optics.models import Model as Model
 from .optics.models import ModelError as ModelError
 from .optics.models import predicted_error as predicted_error
 from .optics.prism import FlatSide as FlatSide

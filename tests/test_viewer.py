@@ -223,7 +223,7 @@ def test_an_unknown_camera_is_assumed_and_said(recording: Recording) -> None:
 def test_a_calibration_sets_the_knobs_and_comes_back(recording: Recording) -> None:
     found = calibration_of(recording, clock_offset=120.0, tilt_x=0.01)
     inspector = Inspector(recording, found)
-    assert inspector.knobs == Knobs("exact", TRUE.apex, 0.2, 120.0, 0.01, 0.0, 0.0)
+    assert inspector.knobs == Knobs("exact", TRUE.apex, 0.2, 120.0, others=(("tilt_x", 0.01),))
     assert inspector.as_calibration() is found
     inspector.set(replace(inspector.knobs, apex=0.02, model="circle"))
     moved = inspector.as_calibration()

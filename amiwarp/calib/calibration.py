@@ -21,7 +21,7 @@ from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
 from amiwarp.calib.first_guess import encoder_turns_per_period, estimate_rates, estimate_rpm
 from amiwarp.calib.model_choice import ModelChooser
-from amiwarp.calib.parameters import LENS, MOTION, RATES, ParameterSpace, make_space, nominal, size_name, with_lens
+from amiwarp.calib.parameters import LENS, MOTION, RATES, ParameterSpace, make_space, nominal, with_lens
 from amiwarp.calib.photometric import stage
 from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
@@ -31,6 +31,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
+from amiwarp.optics.models import MODELS, size_names
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.validation import check_names, guarded
@@ -188,7 +189,7 @@ class Calibrator:
                 "several tenths of a pixel: accept it with --stages sharpness, or record a scene that stays still"
             )
         given = {*self.settings.bounds, *self.settings.start}
-        if isinstance(recording.prism, Prism) and not {"apex", "deflection"} & given:
+        if isinstance(recording.prism, Prism) and not size_names() & given:
             checks.check_nominal(found.model_name, found.parameters, recording.prism, recording.name)
         return replace(found, seconds=time.perf_counter() - began)
 
@@ -273,7 +274,7 @@ class Calibrator:
 
     def with_rotation(self, tried: Attempt) -> Attempt:
         """Return the attempt with a free camera rotation if that lowers the photometric cost enough; else ``tried``."""
-        free = (size_name(self.settings.model), "phase", "motion")
+        free = (MODELS[self.settings.model].SIZE, "phase", "motion")
         again = replace(self, settings=replace(self.settings, free=free)).attempt()
         if not again.accepted or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
             return tried
@@ -385,9 +386,10 @@ def _encoders(recording: Recording, settings: Settings) -> tuple[list[Encoder], 
 
     Without an encoder these are constant speeds: the given one, or the one found in the events with either sign.
     """
-    free = (size_name(settings.model), "phase") if settings.free is None else settings.free
+    kind = MODELS[settings.model]
+    free = kind.FREE[:2] if settings.free is None else settings.free
     free = tuple(n for n in free if n not in LINEAR_UNKNOWNS)
-    if not {"apex", "deflection", "phase"} & set(free) and settings.start.get(size_name(settings.model)) == 0.0:
+    if not {*size_names(), "phase"} & set(free) and settings.start.get(kind.SIZE) == 0.0:
         return [constant_speed(0.0, recording.events.t_first, recording.events.t_last, middle_time(recording))], free
     if recording.encoder is not None:
         if "rpm" in free or "rpm" in settings.start:

@@ -18,15 +18,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from amiwarp.calib.calibration_events import CalibrationEvents, rotation_window, thin, thin_events
-from amiwarp.calib.parameters import (
-    DEGENERATE_WITH_APEX,
-    DRIFTS,
-    EXACT_PARAMETERS,
-    MOTION,
-    ParameterSpace,
-    make_space,
-    size_name,
-)
+from amiwarp.calib.parameters import DRIFTS, MOTION, ParameterSpace, like_size, make_space, values_of
 from amiwarp.calib.photometric.cost import LEAST_CURVATURE, UNDETERMINED_PX
 from amiwarp.calib.result import Calibration, FreedParameter, ModelCandidate, ModelChoice
 from amiwarp.calib.settings import Settings
@@ -39,7 +31,8 @@ from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape
 from amiwarp.optics.displacement import compensate_by_each, rms, wrap_angle
-from amiwarp.optics.models import MODELS, predicted_error
+from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.models import MODELS, predicted_error, rungs
 from amiwarp.optics.prism import UnsizedPrism
 from amiwarp.validation import real
 
@@ -141,9 +134,6 @@ class ModelChooser:
 
 # Comparison of the models.
 
-NUMBERS = {"circle": "2", "radial": "2, index given", "ellipse": "6 a pixel", "exact": "2, index given"}
-"""Number of parameters of each model, as shown in the table of the candidates."""
-
 
 def compare_models(trial: Trial) -> tuple[ModelCandidate, ...]:
     """Compare all models, and choose the smallest that keeps the budget and is not clearly worse on held-out turns.
@@ -153,7 +143,7 @@ def compare_models(trial: Trial) -> tuple[ModelCandidate, ...]:
     """
     confirmed = accepted_photometric(trial.exact) is not None
     candidates: list[ModelCandidate] = []
-    for name in MODELS:
+    for name in rungs():
         predicted, held_out = trial.predicted[name], None
         found = any(c.chosen for c in candidates)
         if name in CIRCLES and not found and (predicted <= trial.budget_px or not confirmed):
@@ -186,7 +176,7 @@ def _candidate(trial: Trial, name: str, predicted: float, held_out: Vector | Non
     verdict = _verdict(trial, name, predicted, seen)
     if chosen or found:
         verdict = f"{'the smallest that keeps the budget' if chosen else 'larger than needed'}; {verdict}"
-    numbers = NUMBERS[name]
+    numbers = MODELS[name].NUMBERS
     if name == "exact" and any(trial.exact.parameters.get(n) for n in TILT):
         numbers = numbers.replace("2", "4")
     return ModelCandidate(
@@ -227,18 +217,17 @@ def _agree(trial: Trial, candidate: ModelCandidate) -> bool:
 def express(trial: Trial, name: str, settings: Settings) -> Calibration:
     """Express the exact model's calibration in the parameters of the model ``name``, with uncertainty.
 
-    A circle is fitted to the exact model at the sample. The deflection replaces the apex. The sharpness is measured
+    A circle is fitted to the exact model at the sample. Its size replaces the apex. The sharpness is measured
     like that of the exact model.
     """
     exact = trial.exact
-    if name in ("exact", "ellipse"):
+    if MODELS[name].closed_form() is ExactModel:
         return replace(exact, model_name=name)
+    size = MODELS[name].SIZE
     space, values = trial.fitted(name, exact)
-    gain = values["deflection"] / exact.parameters["apex"]
-    known = {
-        "deflection" if n == "apex" else n: x * (gain if n == "apex" else 1.0) for n, x in exact.uncertainty.items()
-    }
-    free = tuple("deflection" if n == "apex" else n for n in exact.free)
+    gain = values[size] / exact.parameters["apex"]
+    known = {size if n == "apex" else n: x * (gain if n == "apex" else 1.0) for n, x in exact.uncertainty.items()}
+    free = tuple(size if n == "apex" else n for n in exact.free)
     return replace(
         exact, model_name=name, prism=replace(exact.prism, index=exact.parameters.get("index", exact.prism.index)),
         parameters=values, uncertainty={n: x for n, x in known.items() if n in values},
@@ -393,7 +382,7 @@ def _confirmed(trial: Trial, p: FreedParameter, again: Calibration) -> FreedPara
 
 SEARCH_RANGE = {"clock_offset": 20_000.0, "tilt_x": math.radians(15.0), "tilt_y": math.radians(15.0), "index": 0.4}
 """Half width of the tested range of each parameter that might be freed, in its unit (us, rad, 1)."""
-CIRCLES = ("circle", "radial")
+CIRCLES = tuple(name for name, model in rungs().items() if model.closed_form() is model and name != ExactModel.NAME)
 """Models that are fitted to the exact one."""
 
 
@@ -516,7 +505,8 @@ def sharpness_answer(exact: Calibration) -> Calibration:
     if p is None:
         return exact
     # parameters that only the photometric stage found stay; a camera rotation that was discarded stays discarded
-    found = {n: x for n, x in p.sharpness_parameters.items() if n in exact.parameters and n not in DEGENERATE_WITH_APEX}
+    unsharp = like_size(p.sharpness_parameters)
+    found = {n: x for n, x in p.sharpness_parameters.items() if n in exact.parameters and n not in unsharp}
     return replace(exact, parameters={**exact.parameters, **found})
 
 
@@ -834,9 +824,8 @@ def candidate_space(
     """
     found = exact.parameters
     prism = replace(exact.prism, apex=found["apex"], index=found.get("index", exact.prism.index))
-    size = size_name(model)
-    start = {n: x for n, x in found.items() if size == "apex" or n not in EXACT_PARAMETERS}
-    start[size] = found["apex"] if size == "apex" else prism.deflection
+    size, start = MODELS[model].SIZE, values_of(model, found)
+    start[size] = MODELS[model].size_from_apex(found["apex"], prism)
     start["phase"] = math.remainder(found["phase"], math.tau)
     if pixels is not None:
         pixels = {**pixels, size: pixels["apex"] * prism.apex / start[size]}

@@ -14,7 +14,7 @@ import warp as wp
 
 from amiwarp.calib import checks
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, MOTION, UNITS, build_model
+from amiwarp.calib.parameters import MOTION, build_model, like_size
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.settings import Settings, stage_share
 from amiwarp.choices import Sharpness
@@ -23,6 +23,7 @@ from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape, TileVotes, upload_events
 from amiwarp.optics.camera_rotation import border
 from amiwarp.optics.displacement import points_on_host
+from amiwarp.optics.models import MODELS
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from amiwarp.optics.models import Model
 
     Vector = NDArray[np.float64]
-
 
 # Sharpness as a function of the free parameters, computed on the device. All buffers are allocated once.
 
@@ -104,12 +104,9 @@ class Objective:
             self._votes, self._events = Votes(canvas, self._meter.device), events
 
     def _model(self, values: Mapping[str, float]) -> Model:
-        """Return the model to evaluate: the exact model instead of the ellipse, which is its first harmonic.
-
-        Both have the same optimum, but the ellipse would need new tables at every point.
-        """
-        kind = "exact" if self.space.model == "ellipse" else self.space.model
-        return build_model(kind, self.space.camera, self.space.prism, values)
+        """Return the model to evaluate, without tables: they would have to be computed at every point."""
+        kind = MODELS[self.space.model].closed_form()
+        return build_model(kind.NAME, self.space.camera, self.space.prism, values)
 
     def measure(self, values: Mapping[str, float]) -> list[float]:
         """Return the sharpness of each part at parameter values, in their units."""
@@ -178,9 +175,9 @@ def padding(space: ParameterSpace) -> int:
 def reach(space: ParameterSpace, values: Mapping[str, float]) -> float:
     """Return the largest displacement of events at ``values`` [px], by the prism and the camera's rotation."""
     camera = space.camera
-    kind = "exact" if space.model == "ellipse" else space.model
+    kind = MODELS[space.model].closed_form()
     xy, *points = _border_points(camera)
-    moved = build_model(kind, camera, space.prism, values).compensate_points(*points).numpy() - xy
+    moved = build_model(kind.NAME, camera, space.prism, values).compensate_points(*points).numpy() - xy
     radius = np.linalg.norm(moved[np.isfinite(moved).all(axis=1)], axis=1)
     turned = space.camera_rotation(values).reach(camera, space.duration_us * 0.5e-6)
     return float(radius.max(initial=0.0)) + float(np.linalg.norm(turned))
@@ -362,7 +359,7 @@ class Search:
     ) -> None:
         self.full_space = space
         """Parameter space of the photometric stage: all free parameters."""
-        self.space = space.without(DEGENERATE_WITH_APEX) if "photometric" in settings.stages else space
+        self.space = space.without(like_size(space.names)) if "photometric" in settings.stages else space
         """Parameter space of the sharpness search: without the parameters that are left to the photometric stage."""
         self.calibration_events, self.settings, self.device = calibration_events, settings, device
         self._progress = progress
@@ -489,7 +486,8 @@ class Search:
             n for n in space.names
             if n != "phase" and min(best[n] - space.low[n], space.high[n] - best[n]) * space.pixels[n] < 0.05
         ]  # fmt: skip
-        bounds = (f"{n} = {best[n]:.6g} {UNITS[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)
+        unit = units()
+        bounds = (f"{n} = {best[n]:.6g} {unit[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)
         return (*bounds, *warnings), space.deviations(v, covariance)
 
     def sharpness_in(self, space: ParameterSpace, values: Mapping[str, float]) -> float:

@@ -153,7 +153,7 @@ FORMS = {
 def number(text: str, unit: str, name: str) -> float:
     """Convert a text such as ``1.2deg`` to a value in ``unit``. Angles other than 0 need a suffix.
 
-    ``unit`` is one of ``amiwarp.calib.parameters.UNITS``; ``name`` is the option for error messages. Raises
+    ``unit`` is one of ``amiwarp.calib.parameters.units()``; ``name`` is the option for error messages. Raises
     :class:`AmiwarpError` if the text is not such a value.
     """
     form, suffix = FORMS[unit][1], _suffix(text, unit)

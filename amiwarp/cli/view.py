@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.choices import Axis, Colour, View
+from amiwarp.choices import OPTICAL_MODELS, Axis, Colour, View
 from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.live import SourceOptions, check_angles
@@ -187,7 +187,10 @@ class StartOptions:
     ] = None
     model: Annotated[
         str | None,
-        typer.Option(help="Prism model: circle, exact, radial or ellipse. Default: the calibrated model, or exact."),
+        typer.Option(
+            help=f"Prism model: {', '.join(OPTICAL_MODELS[:-1])} or {OPTICAL_MODELS[-1]}. Default: the calibrated "
+            "model, or exact.",
+        ),
     ] = None
 
     def build(self, recording: Recording, device: str, latest: Callable[[], Recording] | None) -> Inspector:

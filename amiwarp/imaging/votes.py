@@ -18,7 +18,7 @@ from amiwarp.events.device_events import DeviceEvents, azimuths, check_sensor, e
 from amiwarp.kernels import tiles as kernels
 from amiwarp.kernels.camera import CameraRotationParams
 from amiwarp.kernels.iwe import CPU_WIDTH, Frame, add_sums, add_totals, empty_words, read_sums, read_votes
-from amiwarp.kernels.launch import Program, RecordedLaunch, launch, launch_slices, run_together
+from amiwarp.kernels.launch import Program, RecordedLaunch, launch, launch_slices, run_together, specialised
 from amiwarp.kernels.page_locked import page_locked
 from amiwarp.kernels.pixel_votes import (
     BLOCK,
@@ -27,7 +27,6 @@ from amiwarp.kernels.pixel_votes import (
     vote_point_blocks,
     vote_rotating_camera_blocks,
 )
-from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams
 from amiwarp.kernels.tiles import AT_ONCE, THREADS, read_tiles, vote_tiles
 from amiwarp.kernels.votes import (
     Canvas,
@@ -42,10 +41,7 @@ from amiwarp.kernels.votes import (
 from amiwarp.kernels.word_votes import TRASH, Cells, vote_events, vote_points, vote_quickly, vote_rotating_camera
 from amiwarp.optics.camera import LARGEST_SIZE, pinhole_params
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
 from amiwarp.optics.displacement import model_camera
-from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel
 from amiwarp.validation import choice, whole
 
 if TYPE_CHECKING:
@@ -644,8 +640,7 @@ class TileVotes:
         frame, self._layout = image.frame, kernels.Layout()
         self._layout.stride, self._layout.layer, self._layout.first = frame.stride, frame.layer, frame.first
         self._layout.shift = (canvas.pad + 0.5) * canvas.scale - 0.5
-        kind = {CircleModel: CircleParams, RadialCircleModel: RadialCircleParams, ExactModel: ExactParams}[type(like)]
-        dtypes = (kind,) if still else (kind, float, CameraRotationParams)
+        dtypes = (like.STRUCT,) if still else (like.STRUCT, float, CameraRotationParams)
         self._host = [page_locked(self, (candidates,), dtype, device, written_by_host=True) for dtype in dtypes]
         self._on_device = [wp.zeros(candidates, dtype=array.dtype, device=device) for array in self._host]
         self._rows = self._host[0].numpy()
@@ -654,6 +649,8 @@ class TileVotes:
         if not still:
             self._motion = kernels.Motion()
             self._motion.drift, self._motion.camera_rotation = self._on_device[1:]
+        self._inputs = [self._on_device[0], self._camera, self._arrays, self._motion, self._params, self._layout]
+        self._kernel = specialised(vote_tiles, self._inputs)
 
     def _sort(self, events: UploadedEvents) -> Any:
         """Sort the events by tile and pack each event into one word."""
@@ -700,7 +697,6 @@ class TileVotes:
 
         ``drift`` and ``camera_rotation`` move only events that have slopes or times.
         """
-        assert not isinstance(model, EllipseModel)
         self._rows[k] = model.kernel_values()
         if self._drifts is not None:
             self._drifts[k] = drift
@@ -712,8 +708,10 @@ class TileVotes:
             wp.copy(there, host)
         self.votes.zero_()
         blocks = len(self._arrays.chunks) * -(-self.candidates // int(AT_ONCE))
-        inputs = [self._on_device[0], self._camera, self._arrays, self._motion, self._params, self._layout]
-        wp.launch(vote_tiles, (blocks, int(THREADS)), inputs, [self.votes], device=self.device, block_dim=int(THREADS))
+        wp.launch(
+            self._kernel, (blocks, int(THREADS)), self._inputs, [self.votes], device=self.device,
+            block_dim=int(THREADS),
+        )  # fmt: skip
 
     def read(self, k: int, image: Image) -> None:
         """Write the image of candidate ``k`` [events] to ``image``."""

@@ -104,13 +104,17 @@ def specialised(kernel: Any, inputs: Sequence[Any]) -> Any:
     if not generic:
         return kernel
     with _specialising:
-        return _specialised(kernel, tuple(inputs[k]._cls for k in generic))
+        return _specialised(kernel, tuple(getattr(inputs[k], "_cls", None) or inputs[k].dtype for k in generic))
 
 
 @cache
-def _generic_arguments(kernel: Any) -> dict[int, str]:
-    """Return the names of a kernel's generic arguments by their positions."""
-    return {k: argument.label for k, argument in enumerate(kernel.adj.args) if argument.type is Any}
+def _generic_arguments(kernel: Any) -> dict[int, Any]:
+    """Return a kernel's generic arguments by their positions: structs, and arrays of structs.
+
+    A kernel that has overloads already is not generic.
+    """
+    arguments = enumerate(() if kernel.overloads else kernel.adj.args)
+    return {k: argument for k, argument in arguments if Any in (argument.type, getattr(argument.type, "dtype", None))}
 
 
 @cache
@@ -118,8 +122,12 @@ def _specialised(kernel: Any, structs: tuple[Any, ...]) -> Any:
     """Return a generic kernel for the structs in the order of its generic arguments."""
     module = wp.get_module(".".join([kernel.module.name, kernel.key, *(struct.key for struct in structs)]))
     module.options.update(kernel.module.options)
-    names = _generic_arguments(kernel).values()
-    return wp.overload(wp.kernel(kernel.func, module=module), dict(zip(names, structs, strict=True)))
+    types = {
+        argument.label: struct if argument.type is Any else wp.array(dtype=struct)
+        for argument, struct in zip(_generic_arguments(kernel).values(), structs, strict=True)
+    }
+    bounds = kernel.options.get("launch_bounds")
+    return wp.overload(wp.kernel(kernel.func, module=module, launch_bounds=bounds), types)
 
 
 def load(kernel: Any, device: Any) -> None:

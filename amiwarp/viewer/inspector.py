@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
@@ -23,7 +23,7 @@ from amiwarp.imaging.export import PERCENTILE
 from amiwarp.imaging.sharpness import random_variance
 from amiwarp.imaging.votes import upload_events
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import apex_from_deflection
+from amiwarp.optics.models import MODELS, size_names
 from amiwarp.reconstruction.picture import border_displacements
 from amiwarp.viewer import window
 from amiwarp.viewer.timeline import Span, read_span
@@ -180,7 +180,7 @@ class Inspector:
         self.sources = {
             "camera": Source.ASSUMED if recording.camera is None else Source.FILE,
             "apex": Source.ASSUMED if getattr(recording.prism, "apex", None) is None else Source.FILE,
-            **dict.fromkeys(("model", "phase", "tilt_x", "tilt_y"), Source.ASSUMED),
+            **dict.fromkeys(("model", "phase", *window.SLIDING), Source.ASSUMED),
             **({"rpm": Source.ASSUMED} if recording.encoder is None else {"clock_offset": Source.FILE}),
         }
         """Where the value of each parameter that the page shows, and the camera, come from."""
@@ -290,7 +290,7 @@ class Inspector:
         self.prism, self.recording = calibration.prism, replace(self.recording, camera=calibration.camera)
         self.set(self.knobs_of(calibration))
         found, free = (
-            {"apex" if name == "deflection" else name for name in names} & set(self.sources)
+            {"apex" if name in size_names() else name for name in names} & set(self.sources)
             for names in (calibration.parameters, calibration.free)
         )
         self.sources |= dict.fromkeys(found, Source.FILE) | dict.fromkeys(("model", *free), Source.CALIBRATED)
@@ -299,12 +299,14 @@ class Inspector:
     def knobs_of(self, calibration: Calibration) -> Knobs:
         """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
         p, prism = calibration.parameters, calibration.prism
-        apex = p["apex"] if "apex" in p else apex_from_deflection(p["deflection"], prism.index, prism.flat_side)
-        rpm, phase, tilts = p.get("rpm", 0.0), p["phase"], (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
+        kind, rpm, phase = MODELS[calibration.model_name], p.get("rpm", 0.0), p["phase"]
         if calibration.zero_us is not None:
             phase += rpm * math.tau / 60e6 * (self.zero_us - calibration.zero_us)
         offset = p.get("clock_offset", self._recorded_offset_us)
-        return Knobs(calibration.model_name, apex, phase, offset, *tilts, rpm, p.get("index"), p.get("focal_length"))
+        return Knobs.given(
+            p, model=kind.NAME, apex=kind.apex_from_size(p[kind.SIZE], prism), phase=phase, clock_offset=offset,
+            rpm=rpm, focal_length=p.get("focal_length"),
+        )  # fmt: skip
 
     @property
     def truth(self) -> Knobs | None:
@@ -315,8 +317,8 @@ class Inspector:
         p = {} if self.recording.truth is None else self.recording.truth.parameters
         if not {"apex", "phase"} <= set(p):
             return None
-        tilts, offset = (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0)), p.get("clock_offset_us", self._recorded_offset_us)
-        return Knobs("exact", p["apex"], p["phase"], offset, *tilts, self.knobs.rpm, p.get("index"))
+        offset = p.get("clock_offset_us", self._recorded_offset_us)
+        return Knobs.given(p, apex=p["apex"], phase=p["phase"], clock_offset=offset, rpm=self.knobs.rpm)
 
     def take_truth(self) -> None:
         """Set the parameters to the known truth. Raises :class:`AmiwarpError` if the recording has none."""
@@ -331,9 +333,10 @@ class Inspector:
         if self._found is not None and self._found[0] == self.knobs:
             return self._found[1]
         k, w, values = self.knobs, self.loaded, self._values(self.knobs)
-        size = ("deflection",) if k.model in ("circle", "radial") else ("apex", "tilt_x", "tilt_y")
+        kind = MODELS[k.model]
+        others = [name for name in kind.FREE if name in window.SLIDING]
         time = {"clock_offset": k.clock_offset} if self.has_encoder else {"rpm": k.rpm}
-        kept = {name: values[name] for name in (*size, "phase", *k.calibrated_only)} | time
+        kept = {name: values[name] for name in (kind.SIZE, *others, "phase", *k.calibrated_only)} | time
         before, after = self._unmoved(w), self._measured(w, k)
         return Calibration(
             model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
@@ -344,8 +347,9 @@ class Inspector:
 
     def set(self, knobs: Knobs) -> None:
         """Set the parameters of the prism. Parameters that change count as set by hand."""
-        changed = {f.name for f in fields(Knobs) if getattr(knobs, f.name) != getattr(self.knobs, f.name)}
-        self.sources |= dict.fromkeys(changed & set(self.sources), Source.HAND)
+        shown = self.sources.keys() - {"camera"}
+        changed = {name for name in shown if knobs.value(name) != self.knobs.value(name)}
+        self.sources |= dict.fromkeys(changed, Source.HAND)
         self.knobs = knobs
 
     def open(self, start_us: int, length_us: int, selection: Selection | None = None) -> None:
@@ -385,11 +389,11 @@ class Inspector:
         """Return values of a parameter around its current one, in its unit, and the sharpness at each of them."""
         current = self.knobs
         half = window.CURVE_HALF_WIDTH[name]
-        values = getattr(current, name) + np.linspace(-half, half, CURVE_POINTS)
+        values = (current.value(name) or 0.0) + np.linspace(-half, half, CURVE_POINTS)
         if name == "apex":
             values = values[values >= 0.0]
         sharpness = self.sharpness_meter(self._curve_imager)
-        changed = [replace(current, **{name: float(value)}) for value in values]  # type: ignore[arg-type]
+        changed = [current.with_values({name: float(value)}) for value in values]
         return values, np.array([sharpness(knobs) for knobs in changed])
 
     def sharpness_meter(self, imager: WindowImager | None = None) -> Callable[[Knobs | None], float]:
@@ -435,14 +439,15 @@ class Inspector:
         return self._window
 
     def _values(self, knobs: Knobs) -> dict[str, float]:
-        """Return the parameters of every optical model.
+        """Return the values of the optical model's parameters.
 
         A prism that does not rotate gets apex 0, so that nothing is compensated.
         """
         apex, more = knobs.apex if self.has_encoder or knobs.rpm else 0.0, knobs.calibrated_only
         prism = replace(self.prism, apex=apex, index=more.get("index", self.prism.index))
-        return {**more, "apex": apex, "deflection": prism.deflection, "phase": knobs.phase, "tilt_x": knobs.tilt_x,
-                "tilt_y": knobs.tilt_y}  # fmt: skip
+        kind = MODELS[knobs.model]
+        others = {name: knobs.value(name) or 0.0 for name in window.SLIDING}
+        return {**more, **others, kind.SIZE: kind.size_from_apex(apex, prism), "phase": knobs.phase}
 
     def model_of(self, knobs: Knobs, camera: Camera | None = None) -> Model:
         """Return the optical model with given parameters, of the recording's camera or another one."""

@@ -12,7 +12,7 @@ from amiwarp.viewer.exports import EXPORTS, FILMS
 from amiwarp.viewer.images import ImageKind
 from amiwarp.viewer.inspector import NO_ENCODER
 from amiwarp.viewer.serve import Check, flag, number, one_of, read_template
-from amiwarp.viewer.window import Source, colours_on_offer, truth_text
+from amiwarp.viewer.window import SLIDING, Source, colours_on_offer, truth_text
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
@@ -21,23 +21,25 @@ if TYPE_CHECKING:
     from amiwarp.viewer.window import DisplayedWindow
 
 UNITS = {
-    "apex": math.radians(1.0), "phase": math.radians(1.0), "clock_offset": 1.0, "tilt_x": math.radians(1.0),
-    "tilt_y": math.radians(1.0), "rpm": 1.0,
+    "apex": math.radians(1.0), "phase": math.radians(1.0), "clock_offset": 1.0,
+    **{name: math.radians(1.0) if p.unit == "rad" else 1.0 for name, p in SLIDING.items()}, "rpm": 1.0,
 }  # fmt: skip
 """Conversion from the page's units (angles in degrees) to the parameters' units (radians): factor per parameter."""
 NAMES = tuple(UNITS)
 """Names of the prism parameters that have a slider."""
 EDITABLE = ("start_ms", "length_ms", "turns", "noise_ms")
 """State variables with a number field, next to the prism's parameters."""
-_TILTED = "model === 'exact' || model === 'ellipse'"
 SLIDERS = {
     "apex": ("apex angle", "°", ("0", "apex_most", "0.005"), "true"),
     "phase": ("phase", "°", ("-180", "180", "0.25"), "true"),
     "clock_offset": ("clock offset", "µs", ("-20000", "20000", "10"), "has_encoder"),
     "rpm": ("speed of the prism", "rpm", ("-3000", "3000", "0.5"), "!has_encoder"),
-    "tilt_x": ("tilt in x", "°", ("-5", "5", "0.05"), _TILTED),
-    "tilt_y": ("tilt in y", "°", ("-5", "5", "0.05"), _TILTED),
-}
+    **{
+        name: (p.label, "°" if p.unit == "rad" else "", tuple(f"{x:g}" for x in p.slider),
+               " || ".join(f"model === '{each.NAME}'" for each in MODELS.values() if name in each.FREE))
+        for name, p in SLIDING.items()
+    },
+}  # fmt: skip
 """Sliders of the page by parameter: label, unit, (minimum, maximum, step), and the condition for showing the slider."""
 SPEEDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10)
 """Choices of the playback speed, relative to real time."""
@@ -163,7 +165,7 @@ def source_state(inspector: Inspector) -> dict[str, Any]:
 
 def knob_values(inspector: Inspector) -> dict[str, float]:
     """Return the prism's parameters in the page's units, rounded as the page shows them."""
-    return {name: round(getattr(inspector.knobs, name) / scale, 4) for name, scale in UNITS.items()}
+    return {name: round((inspector.knobs.value(name) or 0.0) / scale, 4) for name, scale in UNITS.items()}
 
 
 def knob_state(inspector: Inspector) -> dict[str, Any]:
@@ -182,7 +184,7 @@ def prism_state(inspector: Inspector) -> dict[str, Any]:
 def truths(inspector: Inspector) -> dict[str, float | None]:
     """Return the known true parameters in the page's units; None for an unknown one."""
     known = inspector.truth
-    return {n: None if known is None else round(getattr(known, n) / scale, 4) for n, scale in UNITS.items()}
+    return {n: None if known is None else round((known.value(n) or 0.0) / scale, 4) for n, scale in UNITS.items()}
 
 
 def notes(inspector: Inspector) -> list[str]:

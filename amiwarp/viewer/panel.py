@@ -399,7 +399,7 @@ class Panel:
         """Give the inspector the parameters that the page shows, where they differ from the inspector's."""
         known, shown = layout.knob_values(self.inspector), self.state
         values = {name: float(shown[name]) * UNITS[name] for name in NAMES if shown[name] != known[name]}
-        self.inspector.set(replace(self.inspector.knobs, model=shown.model, **values))
+        self.inspector.set(replace(self.inspector.knobs.with_values(values), model=shown.model))
 
     def show_knobs(self) -> None:
         """Show the inspector's parameters on the page."""

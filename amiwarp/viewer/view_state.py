@@ -11,7 +11,7 @@ from urllib.parse import parse_qsl, urlencode
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.images import ImageKind
-from amiwarp.viewer.window import Knobs, Selection, Source
+from amiwarp.viewer.window import OTHERS, SLIDING, Knobs, Selection, Source
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector
@@ -127,12 +127,12 @@ class History:
 
 # text in the address
 
-ANGLES = ("apex", "phase", "tilt_x", "tilt_y")
+ANGLES = ("apex", "phase", *(name for name, p in OTHERS.items() if p.unit == "rad"))
 """Parameters that the address gives in degrees."""
 LIMITS = {
     "apex": (0.0, 60.0), "phase": (-3600.0, 3600.0), "clock_offset": (-LARGEST_OFFSET_US, LARGEST_OFFSET_US),
-    "tilt_x": (-45.0, 45.0), "tilt_y": (-45.0, 45.0), "rpm": (-LARGEST_RPM, LARGEST_RPM), "index": (1.0, 5.0),
-    "focal_length": (0.1, 1e6),
+    **{name: p.limits for name, p in SLIDING.items()}, "rpm": (-LARGEST_RPM, LARGEST_RPM),
+    **{name: p.limits for name, p in OTHERS.items()}, "focal_length": (0.1, 1e6),
 }  # fmt: skip
 """Smallest and largest value of each parameter in an address: angles in degrees, others in their own units."""
 CHOICES: dict[str, Any] = {"image": ImageKind, "colour": Colour, "axis": Axis, "view": View}
@@ -185,7 +185,7 @@ def _knob_texts(knobs: Knobs, before: str) -> dict[str, str]:
     """Return the values of parameters as texts, with ``before`` in front of their names."""
     out = {f"{before}model": knobs.model}
     for name in LIMITS:
-        if (value := getattr(knobs, name)) is not None:
+        if (value := knobs.value(name)) is not None:
             out[before + name] = f"{math.degrees(value) if name in ANGLES else value:.10g}"
     return out
 
@@ -216,7 +216,7 @@ def _with_knob(knobs: Knobs, name: str, text: str) -> Knobs:
     if name == "model" and text in MODELS:
         return replace(knobs, model=text)
     value = _within(float(text), *LIMITS[name])
-    return replace(knobs, **{name: math.radians(value) if name in ANGLES else value})  # type: ignore[arg-type]
+    return knobs.with_values({name: math.radians(value) if name in ANGLES else value})
 
 
 def _selected(state: ViewState, **changes: Any) -> ViewState:

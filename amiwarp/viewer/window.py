@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import enum
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.calib.parameters import optical_parameters
 from amiwarp.choices import Colour, Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
@@ -17,9 +18,13 @@ from amiwarp.imaging.corners import find_background_activity
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter, relative_variance
 from amiwarp.imaging.votes import CanvasShape, UploadedEvents
+from amiwarp.optics.displacement import PHASE
+from amiwarp.optics.models import size_names
 from amiwarp.viewer.timeline import Span
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from amiwarp.events.recording import Recording, Truth
@@ -184,27 +189,45 @@ class Knobs:
     """Phase θ_b of the prism [rad]."""
     clock_offset: float = 0.0
     """Offset between the clocks of encoder and camera, as in :class:`Encoder` [us]."""
-    tilt_x: float = 0.0
-    """Tilt of the axis of rotation, x component [rad]."""
-    tilt_y: float = 0.0
-    """Tilt of the axis of rotation, y component [rad]."""
     rpm: float = 0.0
     """Speed of the prism if the recording has no encoder [1/min]."""
-    index: float | None = None
-    """Refractive index, if a calibration or the known truth gave it; None: that of the nominal prism."""
     focal_length: float | None = None
     """Calibrated focal length [px]; None: that of the camera."""
+    others: tuple[tuple[str, float], ...] = ()
+    """Names and values of other parameters of optical models that are not 0, sorted by name."""
+
+    @classmethod
+    def given(cls, values: Mapping[str, float], **known: Any) -> Knobs:
+        """Return parameters with ``known`` fields, and the other parameters of optical models among the ``values``."""
+        return cls(**known).with_values({name: values[name] for name in OTHERS if name in values})
+
+    def value(self, name: str) -> float | None:
+        """Return the value of a parameter; None if it is not known and has no slider."""
+        if name not in OTHERS:
+            known: float | None = getattr(self, name)
+            return known
+        return dict(self.others).get(name, 0.0 if name in SLIDING else None)
+
+    def with_values(self, values: Mapping[str, float]) -> Knobs:
+        """Return the parameters with other values of some of them."""
+        others = dict(self.others) | {name: value for name, value in values.items() if name in OTHERS}
+        fields: dict[str, Any] = {name: value for name, value in values.items() if name not in OTHERS}
+        return replace(self, **fields, others=tuple(sorted((n, v) for n, v in others.items() if v)))
 
     @property
     def calibrated_only(self) -> dict[str, float]:
         """Parameters by name that the page cannot change, and that a calibration or the known truth gave."""
-        found = {"index": self.index, "focal_length": self.focal_length}
+        found = {name: self.value(name) for name in (*(n for n in OTHERS if n not in SLIDING), "focal_length")}
         return {name: value for name, value in found.items() if value is not None}
 
 
+OTHERS = {name: p for name, p in optical_parameters().items() if name not in (*size_names(), PHASE.name)}
+"""Parameters of the optical models but for sizes and phase, by name."""
+SLIDING = {name: p for name, p in OTHERS.items() if p.label}
+"""Those among :data:`OTHERS` that have a slider."""
 CURVE_HALF_WIDTH = {
-    "apex": math.radians(0.4), "phase": math.radians(30.0), "clock_offset": 5000.0, "tilt_x": math.radians(5.0),
-    "tilt_y": math.radians(5.0), "rpm": 6.0,
+    "apex": math.radians(0.4), "phase": math.radians(30.0), "clock_offset": 5000.0, "rpm": 6.0,
+    **{name: p.half_range for name, p in SLIDING.items()},
 }  # fmt: skip
 """Half width of the range of each parameter over which its sharpness curve is drawn, in the parameter's unit."""
 

@@ -20,7 +20,7 @@ from amiwarp.brightness.event_pairs import SensorTiming, off_excess
 from amiwarp.brightness.multigrid import Tiles
 from amiwarp.brightness.solver import BrightnessMap, darkness, set_lags
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, LENS, MOTION, ParameterSpace
+from amiwarp.calib.parameters import LENS, MOTION, ParameterSpace, like_size
 from amiwarp.calib.photometric import consistency
 from amiwarp.calib.photometric.cost import (
     Cost,
@@ -107,7 +107,7 @@ class _Equations:
         few = not fine_map_is_determined(coverage, len(self.pairs))
         noisy = mean() > LARGEST_FINE_COST
         # a fine map converges too slowly for parameters that make nearly the same motion
-        if tiles.density > 1.0 and (few or noisy or any(n in DEGENERATE_WITH_APEX for n in space.names)):
+        if tiles.density > 1.0 and (few or noisy or like_size(space.names)):
             cost = self.cost_on(tiles.at_density(1.0), space)
             cost.warm_up(v)
             coverage = cost.brightness.coverage(cost.scale)
@@ -300,8 +300,9 @@ def _evaluate(
     cost.residuals(best, rounds=0)
     slopes, final, around = waiting_slopes(), waiting_final(), waiting_around()
     covariance = slopes.covariance() / left**2
-    of_sharpness = np.array([n not in DEGENERATE_WITH_APEX for n in space.names])
-    of_prism = np.array([n not in (*DEGENERATE_WITH_APEX, *MOTION) for n in space.names])
+    unsharp = like_size(space.names)
+    of_sharpness = np.array([n not in unsharp for n in space.names])
+    of_prism = np.array([n not in (*unsharp, *MOTION) for n in space.names])
     leak, excess = (float(x) for x in cost.brightness.extra)
     rise = around[0][1] if around else math.inf
     next_step = float(np.linalg.norm(slopes.step()[of_prism]))
@@ -327,8 +328,10 @@ def _evaluate(
 def search_box(space: ParameterSpace, v: Vector) -> tuple[Vector, Vector]:
     """Return the corners of the box about the sharpness stage's result ``v`` in which this stage searches."""
 
+    unsharp = like_size(space.names)
+
     def largest_move(name: str) -> float:
-        if name in DEGENERATE_WITH_APEX:
+        if name in unsharp:
             return math.inf
         return LARGEST_ROTATION_MOVE_PX if name in MOTION else LARGEST_MOVE_PX
 
