@@ -215,8 +215,9 @@ def _table(ax: Any, design: Design) -> None:
             cell.get_text().set(color="#6a6a6a" if choice.misses else "black")
             if choice is design.chosen:
                 cell.get_text().set(fontweight="bold")
-                ax.add_patch(Rectangle((first + (k - 1) * wide, 1.0 - (j + 1) * high), wide, high, fill=False,
-                                       edgecolor=CHOSEN, linewidth=2.4, transform=ax.transAxes))  # fmt: skip
+                corner = (first + (k - 1) * wide, 1.0 - (j + 1) * high)
+                ax.add_patch(Rectangle(corner, wide, high, fill=False, edgecolor=CHOSEN, linewidth=2.4,
+                                       transform=ax.transAxes, clip_on=False))  # fmt: skip
 
 
 def _words_of(choice: Choice) -> str:
