@@ -6,13 +6,11 @@ from typing import Any, Self
 
 import warp as wp
 
+from amiwarp import Camera, ExactModel, Model, Parameter, Prism
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.refraction import ExactParams, compensate_direction, deflect, refract_through_prism, trace
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.displacement import PHASE, Model, Parameter, phase_values, struct_of
-from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.displacement import PHASE, phase_values, struct_of
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import Prism
 from amiwarp.validation import guarded
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
