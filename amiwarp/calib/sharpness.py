@@ -14,7 +14,7 @@ import warp as wp
 
 from amiwarp.calib import checks
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import MOTION, build_model, like_size
+from amiwarp.calib.parameters import MOTION, build_model, like_size, units
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.settings import Settings, stage_share
 from amiwarp.choices import Sharpness
