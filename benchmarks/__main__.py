@@ -35,7 +35,7 @@ from benchmarks.job import Job
 from benchmarks.libraries import Missing
 
 ROOT = Path(__file__).parents[1]
-LIBRARIES = ("warp-lang", "numpy", "numba", "torch", "cupy", "dv_processing")
+LIBRARIES = ("warp-lang", "numpy", "numba", "torch", "cupy")
 REST_S = 0.02
 """Pause before each pass on a CPU [s], because other libraries' idle threads spin for a while before they sleep."""
 
@@ -227,7 +227,7 @@ def main(arguments: list[str] | None = None) -> int:
     if out is not None:
         write(out, results)
     if out in report.FILES.values():
-        report.PAGE.write_text(report.refreshed())
+        report.write_pages()
     bad = [f"{row['scene']}, {row['name']}: {'; '.join(row['wrong'])}" for row in results["rows"] if row.get("wrong")]
     print("wrong answers:\n" + "\n".join(bad) if bad else "all answers are correct")
     return 1 if bad else 0

@@ -26,20 +26,25 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from amiwarp.compensation.recordings import compensate_events
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
+from amiwarp import (
+    Camera,
+    CameraMotion,
+    Encoder,
+    Events,
+    ExactModel,
+    Prism,
+    PrismMotion,
+    Scene,
+    Simulation,
+    compensate_events,
+)
 from amiwarp.io.atomic_output import write_text
 from amiwarp.kernels import prism_view as sight
 from amiwarp.kernels.launch import launch
 from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_orbit, prism_path
-from amiwarp.optics.camera import Camera, camera_params
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.camera import camera_params
 from amiwarp.plotting.figures import save
-from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scenery import MapRing, Scene, place_scene, step_us
-from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.scenery import MapRing, place_scene, step_us
 from amiwarp.studies.cluster import machine, versions
 from amiwarp.studies.demo import earth
 

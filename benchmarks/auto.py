@@ -24,17 +24,23 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.calib import Calibration, Settings
-from amiwarp.calib.model_choice import Places, calibrate_auto, candidate_space, fit, linear_motions
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.ellipse_model import EllipseModel
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    EllipseModel,
+    EncoderModel,
+    FlatSide,
+    Prism,
+    PrismMotion,
+    Recording,
+    calibrate,
+    model_error,
+    simulate,
+    truth_model,
+)
+from amiwarp.calib.model_choice import Places, candidate_space, fit, linear_motions
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.motion import EncoderModel, PrismMotion
-from amiwarp.simulation.simulator import simulate
 from amiwarp.studies.cluster import machine
 
 FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
@@ -93,7 +99,7 @@ def row_of(recording: Recording, args: argparse.Namespace) -> dict[str, Any]:
     assert recording.camera is not None
     assert recording.truth is not None
     try:
-        c = calibrate_auto(recording, Settings(), device=args.device)
+        c = calibrate(recording, device=args.device)
     except AmiwarpError as error:
         return {"refused": str(error)}
     assert c.ladder is not None

@@ -35,24 +35,35 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.brightness.event_pairs import SensorTiming
-from amiwarp.calib import Calibration, Settings, calibrate
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    CameraMotion,
+    Events,
+    FlatSide,
+    MemoryEvents,
+    PhotometricSettings,
+    Prism,
+    PrismMotion,
+    Recording,
+    Scene,
+    SensorModel,
+    SensorTiming,
+    Settings,
+    Sharpness,
+    Simulation,
+    Truth,
+    calibrate,
+    compensate_events,
+    edge_blur,
+    model_error,
+    truth_model,
+)
+from amiwarp.calib.calibration import prepare
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
 from amiwarp.calib.parameters import RATES
-from amiwarp.calib.settings import GAUSS_NEWTON, STAGES, PhotometricSettings
-from amiwarp.calib.single_model import prepare
-from amiwarp.choices import Sharpness
-from amiwarp.compensation.recordings import compensate_events
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording, Truth
-from amiwarp.imaging.metrics import edge_blur, model_error, truth_model
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation
+from amiwarp.calib.settings import GAUSS_NEWTON, STAGES
 
 APEXES_DEG = (0.5, 1.0, 2.0)
 NOMINAL = 1.15

@@ -12,9 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from amiwarp import Vote
 from amiwarp.calib.settings import STAGES
-from amiwarp.choices import Vote
-from benchmarks import libraries, ours, unmoved
+from benchmarks import libraries, ours
 from benchmarks.job import Job
 from benchmarks.peers import image
 from benchmarks.scenes import RECORDED, event_scene, file_scene, recording_scene
@@ -43,7 +43,6 @@ SCENES = {
 }
 
 IMAGE = "image of warped events"
-UNMOVED = "image of events at their own pixels, without compensation"
 PREPARED = "votes of prepared events, 12 candidates a pass"
 SHARPNESS = "calibration without a guess, sharpness stage"
 BOTH = "calibration without a guess, both stages"
@@ -93,8 +92,6 @@ def _peer(name: str, way: Callable[..., libraries.Peer], *devices: str, most_rep
     return Case(IMAGE, name, partial(image, way), devices=devices, bars=bars, most_repeats=most_repeats)
 
 
-EXACT_COUNTS = {"max_events": 0.0}
-"""Accepted error of an image that counts events at integer pixels."""
 LADDER = tuple(
     Case(IMAGE, f"amiwarp {model} {vote.value}", ours.image, model, vote, bars=image_bars(model, vote))
     for model in ("circle", "radial", "ellipse", "exact")
@@ -118,15 +115,6 @@ PREPARED_VOTES = tuple(
          bars=image_bars("circle", vote), unit="votes")
     for vote in (Vote.BILINEAR, Vote.NEAREST)
 )  # fmt: skip
-UNMOVED_EVENTS = (
-    Case(UNMOVED, "amiwarp, at its pixel", unmoved.amiwarp, "none", Vote.NEAREST, devices=("cpu",), bars=EXACT_COUNTS),
-    Case(UNMOVED, "NumPy bincount", unmoved.numpy, "none", Vote.NEAREST, devices=("cpu",), bars=EXACT_COUNTS),
-    Case(UNMOVED, "dv-processing Accumulator", unmoved.dv_accumulator, "none", Vote.NEAREST, devices=("cpu",),
-         bars=EXACT_COUNTS, most_repeats=5),
-    Case(UNMOVED, "dv-processing EdgeMapAccumulator", unmoved.dv_edge_map, "none", Vote.NEAREST,
-         scenes=EVENT_SCENES[:2], devices=("cpu",), bars=EXACT_COUNTS),
-)  # fmt: skip
-"""Cases without motion compensation. The edge map cannot hold the events of the last scene."""
 WHOLE = (
     Case(SHARPNESS, "amiwarp sharpness stage", partial(ours.calibration, stages=STAGES[:1]), "exact",
          scenes=(RECORDING,), bars={"model_px": 0.3}, unit="", most_repeats=7),
@@ -141,7 +129,7 @@ WHOLE = (
     ),
 )  # fmt: skip
 """Cases of complete tasks, from end to end."""
-CASES = (*LADDER, *PEERS, *UNMOVED_EVENTS, *PREPARED_VOTES, *WHOLE)
+CASES = (*LADDER, *PEERS, *PREPARED_VOTES, *WHOLE)
 
 
 @dataclass(frozen=True, slots=True)

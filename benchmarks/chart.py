@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import AmiwarpError
 from amiwarp.io.atomic_output import own_folder
 from amiwarp.studies.chart import Charts, make, simulated
 from amiwarp.studies.chart.rows import beaten_by, fronts

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.choices import Vote
+from amiwarp import Vote
 from amiwarp.studies.chart.compensation import IMAGE, ErrorSample, LibraryTask, Uploads, circle
 from amiwarp.studies.chart.rows import Task
 from benchmarks import libraries

@@ -35,20 +35,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.calib import Calibration
-from amiwarp.compensation.recordings import PIECE, BlockCompensator, compensate
+from amiwarp import Calibration, Camera, Encoder, Events, Model, Prism, RecordingWriter, compensate, open_recording
+from amiwarp.compensation.recordings import PIECE, BlockCompensator
 from amiwarp.cpu_threads import cpu_threads
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, inside_image
-from amiwarp.io import RecordingWriter, open_recording
+from amiwarp.events.events import inside_image
 from amiwarp.io.chunks import in_order
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, Model
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.models import MODELS
 from benchmarks.simulate import FOV, HEIGHT, INDEX, WIDTH, blocks_picture
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-import reference
+from reference import optics as oracle
 
 APEX, PHASE, RPM, REPEATED_US = math.radians(2.0), 0.7, 720.0, 500_000
 CAMERA, PRISM = Camera.from_fov(WIDTH, HEIGHT, FOV), Prism(APEX, INDEX)
@@ -62,8 +56,8 @@ MOVED = {"x": np.float32, "y": np.float32, "t": np.int64, "p": np.uint8, "inside
 
 
 def half_a_second() -> Events:
+    from amiwarp.simulation.description import Scene
     from amiwarp.simulation.motion import EncoderModel
-    from amiwarp.simulation.scenery import Scene
     from amiwarp.simulation.simulator import Simulation
 
     scene = Scene.from_picture(blocks_picture())
@@ -149,7 +143,7 @@ def truth(name: str, model: Any, xy: Any, theta: Any, prism: Prism = PRISM, phas
         phi = (theta + PHASE)[:, None]
         at = xy[:, 1].astype(int), xy[:, 0].astype(int)
         return xy + model.offset[at] + model.cosine[at] * np.cos(phi) + model.sine[at] * np.sin(phi)
-    return reference.place(name, CAMERA, prism, xy, theta, phase=phase)
+    return oracle.place(name, CAMERA, prism, xy, theta, phase=phase)
 
 
 def error_of(

@@ -30,16 +30,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.choices import CornerMethod
+from amiwarp import CornerDetector, CornerMethod, DeviceEvents, Events, open_recording
 from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
-from amiwarp.events.device_events import DeviceEvents
-from amiwarp.events.events import Events
-from amiwarp.imaging.corners import CornerDetector
-from amiwarp.io import open_recording
 from amiwarp.studies.cluster import machine, versions
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-import corner_reference
+from reference import corners as oracle
 
 RESULTS = Path(__file__).parent / "results"
 WIDTH, HEIGHT = 640, 480
@@ -93,7 +87,7 @@ def ours(events: Events, size: tuple[int, int], method: CornerMethod, device: st
         return np.flatnonzero(found if isinstance(found, np.ndarray) else found.numpy())
 
     where = f"{threads} threads" if device == "cpu" else device
-    expected = np.flatnonzero(corner_reference.corners(events[:JUDGED], *size, method))
+    expected = np.flatnonzero(oracle.corners(events[:JUDGED], *size, method))
     return Program(f"amiwarp {method.value}, {where}", run, expected, len(events), threads if device == "cpu" else 0)
 
 
@@ -101,14 +95,14 @@ def by_dv_processing(events: Events, size: tuple[int, int]) -> Program:
     import dv_processing as dv
 
     store, mask = dv.EventStore(), np.full(size[::-1], 255, np.uint8)
-    for x, y, t, p in corner_reference.table(events).tolist():
+    for x, y, t, p in oracle.table(events).tolist():
         store.push_back(t, x, y, bool(p))
 
     def run() -> Any:
         return dv.features.ArcCornerDetector(size, RANGE_US, False).detect(store, (0, 0, *size), mask)
 
     few = events[:JUDGED]
-    expected = corner_reference.table(few)[corner_reference.corners_of_dv_processing(few, *size, RANGE_US)]
+    expected = oracle.table(few)[oracle.corners_of_dv_processing(few, *size, RANGE_US)]
     return Program("dv-processing ArcCornerDetector", run, expected[:, :3], len(events))
 
 
@@ -116,9 +110,9 @@ def by_eventcv(events: Events, size: tuple[int, int]) -> Program:
     import eventcv
 
     few = events[: max(len(events) // SMALLER, JUDGED)]
-    stream = eventcv.from_numpy(corner_reference.table(few), sensor_size=size, time_unit="us")
+    stream = eventcv.from_numpy(oracle.table(few), sensor_size=size, time_unit="us")
     first = few[:JUDGED]
-    expected = corner_reference.table(first)[corner_reference.corners(first, *size, CornerMethod.EFAST)]
+    expected = oracle.table(first)[oracle.corners(first, *size, CornerMethod.EFAST)]
     return Program("eventcv efast", stream.efast, expected, len(few))
 
 

@@ -30,13 +30,14 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
+from amiwarp import DatasetSummary, make_dataset
 from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.io.sealed_json import read_journal
 from amiwarp.kernels.launch import start_quietly
 from amiwarp.simulation.engine import Engine
 from amiwarp.studies.cluster import ANY_GPU, machine, threads_of_worker, versions
 from amiwarp.studies.dataset import making
-from amiwarp.studies.dataset.making import DatasetSummary, Item, list_items, make_dataset, simulation_of
+from amiwarp.studies.dataset.making import Item, list_items, simulation_of
 from amiwarp.studies.dataset.specification import content_digest, load_specification
 
 RESULTS = Path(__file__).parent / "results"

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import faulthandler
-import importlib
 import json
 import random
 import resource
@@ -29,10 +28,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from amiwarp import AmiwarpError
 from amiwarp.cpu_threads import cpu_threads
-from amiwarp.errors import AmiwarpError
-
-sys.path.append(str(Path(__file__).parents[1] / "tests"))
 
 LONGEST_S = 300.0
 """Time after which a decoder that still works on one input is considered hanging [s]."""
@@ -40,7 +37,9 @@ LONGEST_S = 300.0
 
 def files(count: int | None, until: float | None, seed: int, keep: Path) -> dict[str, Counter[str]]:
     """Check ``count`` mutated files, or files until the time limit, on all cores; return the outcomes by kind."""
-    kinds = list(importlib.import_module("mutation_files").KINDS)
+    from reference.mutation_files import KINDS
+
+    kinds = list(KINDS)
     outcomes: dict[str, Counter[str]] = {kind: Counter() for kind in kinds}
     workers = cpu_threads()
     with ThreadPoolExecutor(workers) as pool, tempfile.TemporaryDirectory() as folder:
@@ -57,7 +56,8 @@ def files(count: int | None, until: float | None, seed: int, keep: Path) -> dict
 
 def _files(numbers: range, until: float | None, seed: int, folder: Path, keep: Path) -> dict[str, Counter[str]]:
     """Check the mutated files with these numbers in one supervised process."""
-    mutation = importlib.import_module("mutation_files")
+    from reference import mutation_files as mutation
+
     kinds = list(mutation.KINDS)
     outcomes: dict[str, Counter[str]] = {kind: Counter() for kind in kinds}
     with contextlib.closing(mutation.Checker()) as checker:
@@ -80,7 +80,8 @@ def _files(numbers: range, until: float | None, seed: int, folder: Path, keep: P
 
 def frames(count: int | None, until: float | None, seed: int, keep: Path) -> dict[str, Counter[str]]:
     """Feed ``count`` mutated packets and messages to their decoders, or as many as fit into the time limit."""
-    mutation = importlib.import_module("mutation_frames")
+    from reference import mutation_frames as mutation
+
     wires: dict[str, tuple[Callable[[int], bytes], Callable[[bytes], int]]] = {
         "stream": (mutation.mutated_stream, mutation.read_stream),
         "serial": (mutation.mutated_serial, mutation.read_serial),
@@ -139,11 +140,14 @@ GUIDED = ("stream", "serial", "encoder_csv", "calibration_json", "camera_json", 
 
 
 def _targets() -> Iterator[tuple[str, Callable[[bytes], Any]]]:
-    frames_, files_ = importlib.import_module("mutation_frames"), importlib.import_module("mutation_files")
-    yield "stream", frames_.read_stream
-    yield "serial", frames_.read_serial
+    # Imported only now, so that Atheris sees the branches of what they import.
+    from reference.mutation_files import KINDS
+    from reference.mutation_frames import read_serial, read_stream
+
+    yield "stream", read_stream
+    yield "serial", read_serial
     for name in GUIDED[2:]:
-        yield name, partial(_from_file, files_.KINDS[name])
+        yield name, partial(_from_file, KINDS[name])
 
 
 def _from_file(kind: tuple[str, Any, Callable[[Path], object]], data: bytes) -> None:
@@ -154,11 +158,14 @@ def _from_file(kind: tuple[str, Any, Callable[[Path], object]], data: bytes) -> 
 
 
 def _samples(target: str) -> Iterator[bytes]:
+    from reference.mutation_files import sample
+    from reference.mutation_frames import mutated_serial, mutated_stream
+
     if target in ("stream", "serial"):
-        make = getattr(importlib.import_module("mutation_frames"), f"mutated_{target}")
+        make = mutated_stream if target == "stream" else mutated_serial
         yield from (make(seed) for seed in range(50))
     else:
-        yield importlib.import_module("mutation_files").sample(target)
+        yield sample(target)
 
 
 def summary(outcomes: dict[str, Counter[str]], seconds: float) -> dict[str, Any]:

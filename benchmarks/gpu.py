@@ -45,7 +45,6 @@ def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
         "dataset": [*module, "benchmarks.dataset", "--device", "cuda", "--limit-s", str(limit),
                     "--out", str(out / "dataset_cuda.json")],
         "two_gpus": [*module, "benchmarks.two_gpus", "--out", str(out / "two_gpus_cuda.json")],
-        "bounds": [*module, "benchmarks.bounds", *device, "--out", str(out / "bounds_cuda.json")],
         "corners": [*module, "benchmarks.corners", *device, "--out", str(out / "corners_cuda.json")],
         **{
             what: [*calibration, what, str(folder), "--out", str(out / f"calibration_{what}_cuda.json"), *device,

@@ -27,15 +27,18 @@ from typing import Any
 
 import numpy as np
 
+from amiwarp import (
+    Camera,
+    Encoder,
+    Events,
+    MemoryEvents,
+    Prism,
+    Recording,
+    RecordingWriter,
+    compensate_events,
+    simulate,
+)
 from amiwarp.choices import Axis, Colour
-from amiwarp.compensation.recordings import compensate_events
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.io import RecordingWriter
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import simulate
 from amiwarp.studies.cluster import machine
 from amiwarp.viewer.clouds import cloud_state, jpeg, scale_state
 from amiwarp.viewer.images import ImageKind, count_images, make_images, prepare

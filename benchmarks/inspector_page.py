@@ -22,7 +22,8 @@ import numpy as np
 
 from amiwarp.studies.cluster import machine
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.panel import SETTABLE, Panel
+from amiwarp.viewer.layout import SETTABLE
+from amiwarp.viewer.panel import Panel
 from amiwarp.viewer.serve import serve
 from benchmarks.inspector import made, recorded
 

@@ -23,13 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.calib.result import Calibration
+from amiwarp import Calibration, Events, ExactModel, Prism, model_error, open_recording
 from amiwarp.cpu_threads import cpu_threads
-from amiwarp.events.events import Events
-from amiwarp.imaging.metrics import model_error
-from amiwarp.io import open_recording
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
 from amiwarp.studies.cluster import processor
 from benchmarks.compensate import CAMERA, PRISM, SAMPLE, SAMPLES, error_of, make, pieces
 from benchmarks.simulate import blocks_picture
@@ -105,7 +100,7 @@ def decorrelation(folder: Path) -> float:
     """Return 1 minus the correlation of the picture with the scene's log brightness, without the image's border."""
     from PIL import Image
 
-    from amiwarp.simulation.scenery import Scene
+    from amiwarp.simulation.description import Scene
     from amiwarp.simulation.simulator import Simulation
 
     truth = Simulation(Scene.from_picture(blocks_picture()), CAMERA, PRISM, 1.0).log_view()

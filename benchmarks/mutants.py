@@ -235,11 +235,20 @@ def _imported(dotted: str) -> frozenset[str]:
 
 @functools.cache
 def _files_naming(dotted: str) -> set[str]:
-    """Return the test files that import a module by its name."""
-    package, _, name = dotted.rpartition(".")
-    statement = re.compile(rf"^\s*(from|import) {package}(\.{name}\b| import .*\b{name}\b)", re.MULTILINE)
-    files = ROOT.glob("tests/test_*.py")
-    return {str(path.relative_to(ROOT)) for path in files if statement.search(path.read_text())}
+    """Return the test files that import a module by its name, or one of its public names from ``amiwarp``."""
+    stub = (ROOT / "amiwarp" / "__init__.pyi").read_text()
+    public = re.findall(rf"^from {dotted.removeprefix('amiwarp')} import (\w+) as", stub, re.MULTILINE)
+    names = {dotted, *(f"amiwarp.{name}" for name in public)}
+    return {str(path.relative_to(ROOT)) for path in ROOT.glob("tests/test_*.py") if names & _imports(path)}
+
+
+@functools.cache
+def _imports(path: Path) -> set[str]:
+    """Return the modules, and the names from modules, that a file imports."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    modules = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    given = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
+    return modules.union(*({node.module, *(f"{node.module}.{a.name}" for a in node.names)} for node in given))
 
 
 def _function(tree: ast.AST, line: int, prefix: str = "") -> tuple[int, int, str]:

@@ -1,29 +1,34 @@
 """Print the tables of docs/explanation/optics.md: errors of the models, and rounding errors of the exact model.
 
-    python benchmarks/optics_table.py
+    python -m benchmarks.optics_table
 
-This needs a checkout, because the rounding errors are those against the float64 oracle in tests/reference.py.
+The rounding errors are those against the float64 oracle in ``reference/optics.py``.
 """
 
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from amiwarp.optics.camera import Camera, Distortion, Fisheye, RadialTangential
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
-from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import ModelError, predicted_error
-from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-import reference
+from amiwarp import (
+    Camera,
+    CircleModel,
+    Distortion,
+    EllipseModel,
+    ExactModel,
+    Fisheye,
+    FlatSide,
+    ModelError,
+    Prism,
+    RadialCircleModel,
+    RadialTangential,
+    apex_from_deflection,
+    predicted_error,
+)
+from reference import optics as oracle
 
 INDEX = 1.55
 GRID = 49  # number of rows of pixels; the number of angles is 36
@@ -66,9 +71,9 @@ def ladder_rows() -> Iterator[str]:
 
 def lens_camera(width: int, height: int, fov: float, lens: Distortion | None) -> Camera:
     """Return a camera whose horizontal field of view, including the lens distortion, is ``fov`` [rad]."""
-    bare = Camera(width, height, 1.0, 1.0, 0.0, 0.0, lens)
-    edge = reference.rays_to_pixels(bare, np.array([[math.sin(fov / 2), 0.0, math.cos(fov / 2)]]))[0, 0]
-    focal = width / (2.0 * float(edge))
+    bare = Camera(width, height, float(width), float(width), 0.0, 0.0, lens)
+    edge = oracle.rays_to_pixels(bare, np.array([[math.sin(fov / 2), 0.0, math.cos(fov / 2)]]))[0, 0]
+    focal = width**2 / (2.0 * float(edge))
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, lens)
 
 
@@ -88,7 +93,7 @@ def rounding(camera: Camera, *, count: int = 20_000) -> tuple[float, float]:
             model = ExactModel(camera, prism, tilt=tilt)
             seen = model.compensate_points(xy, theta)
             for to_scene, got in ((True, seen), (False, model.deflect_points(xy, theta))):
-                expected = reference.move(camera, prism, xy, theta, to_scene=to_scene, tilt=tilt)
+                expected = oracle.move(camera, prism, xy, theta, to_scene=to_scene, tilt=tilt)
                 deviation = max(deviation, float(np.linalg.norm(got - expected, axis=1).max()))
             back = max(back, float(np.linalg.norm(model.deflect_points(seen, theta) - xy, axis=1).max()))
     return deviation, back

@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.calib import Calibration, calibrate
-from amiwarp.choices import Vote
+from amiwarp import Calibration, Model, Picture, Reconstruction, Vote, calibrate, model_error
 from amiwarp.imaging.iwe import Votes
-from amiwarp.imaging.metrics import PictureQuality, model_error, picture_quality
+from amiwarp.imaging.metrics import PictureQuality, picture_quality
 from amiwarp.imaging.votes import TURNS, CanvasShape, Image, TileVotes, upload_events
-from amiwarp.optics.models import MODELS, Model
-from amiwarp.reconstruction.picture import Picture, Reconstruction
+from amiwarp.optics.models import MODELS
 from benchmarks import peers, truth
 from benchmarks.job import Job
 from benchmarks.libraries import Peer

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from amiwarp.choices import Vote
+from amiwarp import Vote
 from benchmarks import truth
 from benchmarks.job import Job
 from benchmarks.libraries import Peer, PeerEvents

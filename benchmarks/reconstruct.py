@@ -35,22 +35,27 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage.metrics import structural_similarity
 
-from amiwarp.compensation.recordings import compensate_events
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import Recording
+from amiwarp import (
+    Camera,
+    CameraMotion,
+    CameraRotation,
+    Encoder,
+    ExactModel,
+    Prism,
+    PrismMotion,
+    Reconstruction,
+    Recording,
+    Scene,
+    SensorModel,
+    Simulation,
+    compensate_events,
+    open_recording,
+    reconstruct,
+)
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.metrics import TRUTH_PERCENTILES, picture_quality
-from amiwarp.io import open_recording
 from amiwarp.io.text import read_calib
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
-from amiwarp.reconstruction.picture import Reconstruction, reconstruct
-from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scenery import Scene, place_scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.scenery import place_scene
 
 CAMERA = Camera.from_fov(346, 260, math.radians(60.0))
 PRISM, PHASE = Prism(math.radians(1.0)), 1.0

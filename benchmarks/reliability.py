@@ -30,8 +30,7 @@ from typing import Any
 import numpy as np
 import psutil
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.io import open_recording
+from amiwarp import AmiwarpError, open_recording
 from amiwarp.io.atomic_output import NewFile, remove_abandoned
 
 LIMIT_S = 180.0

@@ -17,15 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp import (
+    Camera,
+    Events,
+    ExactModel,
+    Prism,
+    Recording,
+    SensorModel,
+    Simulation,
+    apex_from_deflection,
+    truth_model,
+)
 from amiwarp.cpu_threads import cpu_threads
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.metrics import truth_model
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism, apex_from_deflection
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.demo import Demo, simulation
 from benchmarks import compensate
 from benchmarks.libraries import Missing

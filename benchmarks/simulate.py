@@ -1,6 +1,6 @@
 """Speed of the simulator, and the error of the timed events. Prints JSON, one row per line.
 
-    python benchmarks/simulate.py [--device cuda:0] [--picture FILE] [--apex 0.5 1 2] [--duration 1]
+    python -m benchmarks.simulate [--device cuda:0] [--picture FILE] [--apex 0.5 1 2] [--duration 1]
 
 The camera has 640x480 pixels and 60 degrees, the prism 720 turns/min, and the sensor its default settings. ``ratio`` is
 elapsed time over simulated time; below 1 is faster than real time. ``device`` leaves the events on the device; ``host``
@@ -21,13 +21,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
+from amiwarp import Camera, EncoderModel, ExactModel, Prism, Scene, Simulation
 from amiwarp.simulation.engine import Engine
-from amiwarp.simulation.motion import EncoderModel
-from amiwarp.simulation.scenery import Scene, step_us
-from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.scenery import step_us
 
 WIDTH, HEIGHT, FOV, INDEX = 640, 480, math.radians(60.0), 1.55
 

@@ -29,21 +29,24 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.calib.result import Calibration
-from amiwarp.compensation.recordings import compensate_events
-from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, Compensator
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events
+from amiwarp import (
+    Calibration,
+    Camera,
+    CircleModel,
+    Compensator,
+    Encoder,
+    EncoderStream,
+    Events,
+    ExactModel,
+    Model,
+    Prism,
+    compensate_events,
+    simulate,
+)
+from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.packets import Packet
 from amiwarp.live.stream.session import IMAGE_US, Session, SessionStatus
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.circle_models import CircleModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import Model
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import simulate
 from amiwarp.studies.cluster import machine
 
 PACKET, CAMERA, PRISM = 10_000, Camera.from_fov(640, 480, math.radians(60)), Prism(math.radians(1.0))

@@ -37,21 +37,23 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from amiwarp.calib.calibration import calibrate
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
-from amiwarp.events.truth import Cause
-from amiwarp.imaging.metrics import model_error
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
-from amiwarp.reconstruction.picture import reconstruct
-from amiwarp.simulation.motion import PrismMotion
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Cause,
+    ExactModel,
+    Prism,
+    PrismMotion,
+    Recording,
+    Simulation,
+    TruthRenderer,
+    WorldScene,
+    calibrate,
+    model_error,
+    named_world,
+    reconstruct,
+)
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.simulator import Simulation
-from amiwarp.simulation.worlds.named.catalogue import named_world
-from amiwarp.simulation.worlds.world import WorldScene
-from amiwarp.simulation.worlds.world_truth import TruthRenderer
 from amiwarp.translation.translator import translation
 
 CAMERA = Camera.from_fov(160, 120, math.radians(60.0))

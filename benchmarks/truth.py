@@ -1,23 +1,19 @@
 """True images of warped events: float64 NumPy, with angles from event times and positions by independent formulas.
 
-This needs a checkout, because the positions come from the oracle in tests/reference.py.
+The positions come from the oracle in ``reference/optics.py``.
 """
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from amiwarp.choices import Vote
+from amiwarp import Vote
 from benchmarks.scenes import MARGIN, PHASE, Array, EventScene, in_chunks
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-import reference
+from reference import optics as oracle
 
 Floats = NDArray[np.floating[Any]]
 
@@ -37,7 +33,7 @@ def places(scene: EventScene, model: str, xy: Array, theta: Array) -> Array:
             + table[:, 1] * np.cos(theta + PHASE)[:, None]
             + table[:, 2] * np.sin(theta + PHASE)[:, None]
         )
-    return reference.place(model, scene.camera, scene.prism, xy, theta, phase=PHASE)
+    return oracle.place(model, scene.camera, scene.prism, xy, theta, phase=PHASE)
 
 
 def _ellipses(scene: EventScene) -> Array:

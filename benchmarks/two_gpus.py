@@ -31,13 +31,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.compensation.recordings import compensate
+from amiwarp import compensate, make_dataset, open_recording
 from amiwarp.cpu_threads import cpu_threads
-from amiwarp.io import open_recording
 from amiwarp.kernels.launch import start_quietly
 from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, machine, processor, run_jobs, start_workers, versions
 from amiwarp.studies.dataset import making
-from amiwarp.studies.dataset.making import Item, list_items, make_dataset, simulation_of, write_recording
+from amiwarp.studies.dataset.making import Item, list_items, simulation_of, write_recording
 from amiwarp.studies.dataset.specification import content_digest, load_specification
 from amiwarp.studies.stability.cells import METHODS, Cell, Store, Stored, run_cell
 from amiwarp.studies.stability.cells import run as run_cells

@@ -19,16 +19,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.events.events import Events
-from amiwarp.events.truth import EventTruth
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
+from amiwarp import Camera, Events, EventTruth, Prism, Scene, Simulation, TruthRenderer, WorldScene, named_world
 from amiwarp.simulation.engine import Engine
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.simulator import Simulation
-from amiwarp.simulation.worlds.named import named_world
-from amiwarp.simulation.worlds.world import WorldScene
-from amiwarp.simulation.worlds.world_truth import TruthRenderer
 
 CAMERA, PRISM = Camera.from_fov(640, 480, math.radians(60.0)), Prism(math.radians(1.0))
 WIDE = math.radians(72.0)

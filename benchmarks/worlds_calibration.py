@@ -19,17 +19,21 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.calib.calibration import calibrate
-from amiwarp.calib.settings import Settings
-from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import Simulation
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Prism,
+    Settings,
+    Simulation,
+    WorldScene,
+    calibrate,
+    model_error,
+    named_world,
+    truth_model,
+)
 from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS, named_world
+from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS
 from amiwarp.simulation.worlds.renderer import movers_speed, parallax_speed
-from amiwarp.simulation.worlds.world import WorldScene
 
 SECONDS, APEX, RPM = 0.4, math.radians(1.0), 720.0
 """Length of a recording [s], true apex angle [rad], and speed of the prism [turns/min]."""

@@ -3,7 +3,6 @@
 import math
 import os
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,16 +11,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.settings import PhotometricSettings
-from amiwarp.events.recording import Recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.simulator import simulate
+from amiwarp import Calibration, Camera, PhotometricSettings, Prism, PrismMotion, Recording, calibrate, simulate
 
-# Makes benchmarks importable. At the end of the path, so that tests use the installed package, not the checkout.
-sys.path.append(str(Path(__file__).parents[1]))
 wp.init()
 
 LONGEST_FIRST = (

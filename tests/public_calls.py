@@ -15,8 +15,8 @@ import warp as wp
 import amiwarp as aw
 
 NAMES = re.findall(r"import (\w+) as \1", Path(aw.__file__).with_suffix(".pyi").read_text())
-NOT_CALLED = {"AmiwarpError", "NotebookPage"}
-"""Public classes that users catch or receive, and do not make."""
+NOT_CALLED = {"AmiwarpError", "Model", "NotebookPage"}
+"""Public classes that users catch, receive or derive from, and do not make."""
 
 _count = itertools.count()
 
@@ -274,12 +274,20 @@ OWN: dict[str, dict[str, Any]] = {
     "CameraRotation.about": {"middle_us": 5},
     "CameraRotation.reach": {"half_s": 0.1},
     "CameraRotation.rotation": {"tau": np.zeros(2)},
+    **{
+        f"{name}.{method}": given
+        for name in ("CircleModel", "EllipseModel", "ExactModel", "RadialCircleModel")
+        for method, given in (("apex_from_size", {"size": 0.02}), ("size_from_apex", {"apex": 0.02}))
+    },
     "CircleModel": {"deflection": 0.01},
+    "CircleModel.from_values": {"values": {"deflection": 0.01, "phase": 0.0}},
+    "RadialCircleModel.from_values": {"values": {"deflection": 0.01, "phase": 0.0}},
     "RadialCircleModel": {"deflection": 0.01},
     "EllipseModel": {"offset": TABLE, "cosine": TABLE, "sine": TABLE},
     "EllipseModel.fit": {"xy": XY, "theta": np.linspace(0, 6, 200), "compensated": XY, "degree": 1},
     "ModelError": {"rms": 0.1, "worst": 0.1, "lag": 0.0},
     "predicted_error": {"exact": MODEL},
+    "Parameter": {"name": "apex", "unit": "rad"},
     "Prism": {"apex": 0.02},
     "UnsizedPrism.with_apex": {"apex": 0.02},
     "apex_from_deflection": {"deflection": 0.01, "index": 1.5},

@@ -5,17 +5,20 @@ import math
 import numpy as np
 import pytest
 
-from amiwarp.compensation.recordings import compensate_events
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    CameraMotion,
+    Encoder,
+    Events,
+    ExactModel,
+    Prism,
+    PrismMotion,
+    Scene,
+    Simulation,
+    compensate_events,
+)
 from amiwarp.live.stream.adaptive import DIRECTIONS, Coverage, CoverageMeter, SpeedController, prism_path
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.stability.conditions import SceneKind, draw
 
 WINDOW_US = 33_000

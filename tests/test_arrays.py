@@ -16,20 +16,25 @@ import pytest
 import warp as wp
 
 import amiwarp
-from amiwarp import validation
-from amiwarp.compensation.streams import Compensator
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, DeviceMemoryEvents, converted, import_array
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.simulator import Simulation
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Compensator,
+    DeviceEvents,
+    DeviceMemoryEvents,
+    EllipseModel,
+    Encoder,
+    EncoderStream,
+    Events,
+    ExactModel,
+    MemoryEvents,
+    Prism,
+    Recording,
+    Scene,
+    Simulation,
+    validation,
+)
+from amiwarp.events.device_events import converted, import_array
 
 WIDTH, HEIGHT = 64, 48
 CAMERA, PRISM = Camera.from_fov(WIDTH, HEIGHT, math.radians(60)), Prism(math.radians(2.0))

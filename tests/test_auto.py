@@ -9,11 +9,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import COARSE
 from scipy.optimize import minimize
 
-from amiwarp.calib import Calibration, Settings, model_choice
-from amiwarp.calib import model_choice as auto
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    CircleModel,
+    Encoder,
+    EncoderModel,
+    Events,
+    ExactModel,
+    FlatSide,
+    Prism,
+    PrismMotion,
+    Recording,
+    Settings,
+    calibrate,
+    simulate,
+    truth_model,
+)
+from amiwarp.calib import model_choice
 from amiwarp.calib.calibration_events import CalibrationEvents
 from amiwarp.calib.model_choice import (
     CONVERSION_FACTOR,
@@ -21,7 +37,6 @@ from amiwarp.calib.model_choice import (
     TILT,
     Groundwork,
     Places,
-    calibrate_auto,
     candidate_space,
     compare_models,
     encoder_noise,
@@ -30,19 +45,9 @@ from amiwarp.calib.model_choice import (
     trial_for,
 )
 from amiwarp.calib.sharpness import split_turns
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.metrics import truth_model
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.circle_models import CircleModel
 from amiwarp.optics.displacement import rms
-from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.motion import EncoderModel, PrismMotion
-from amiwarp.simulation.simulator import simulate
+from tests.conftest import COARSE
 
 BOTH = Settings(events=120_000, photometric=COARSE)
 SHARPNESS = Settings(events=120_000, stages=("sharpness",))
@@ -72,13 +77,13 @@ def wide(texture: np.ndarray) -> Recording:
 
 @pytest.fixture(scope="module")
 def found(wide: Recording) -> Calibration:
-    return calibrate_auto(wide, BOTH)
+    return calibrate(wide, BOTH)
 
 
 @pytest.fixture(scope="module")
 def as_circle(wide: Recording) -> Calibration:
     """Calibrated with a budget that a circle keeps."""
-    return calibrate_auto(wide, BOTH, budget_px=5.0)
+    return calibrate(wide, BOTH, budget_px=5.0)
 
 
 def places_of(recording: Recording, most: int = SAMPLED) -> Places:
@@ -93,7 +98,7 @@ def true_exact(recording: Recording) -> ExactModel:
 
 
 def test_a_narrow_lens_gets_a_circle(texture: np.ndarray) -> None:
-    c = calibrate_auto(recorded(texture, fov_deg=20.0, apex_deg=0.5), SHARPNESS)
+    c = calibrate(recorded(texture, fov_deg=20.0, apex_deg=0.5), SHARPNESS)
     assert c.model_name == "circle"
     assert isinstance(c.model, CircleModel)
     assert c.ladder is not None
@@ -179,7 +184,7 @@ def test_held_out_turns_are_not_measured_if_they_cannot_change_the_choice(found:
 
 def test_a_judge_s_objection_is_heard(found: Calibration, wide: Recording) -> None:
     """Even if the predicted error of the circle is zero, the check on held-out turns rejects it."""
-    trial = trial_for(wide, found.exact, SHARPNESS, (), [], device="cpu", budget_px=None)
+    trial = trial_for(wide, found.exact, SHARPNESS, (), device="cpu")
     circle, exact = compare_models(replace(trial, predicted={**trial.predicted, "circle": 0.0}))[:2]
     assert not circle.chosen
     assert circle.seen_px is not None
@@ -199,13 +204,12 @@ def test_the_groundwork_of_the_sharpness_answer_serves_the_final_one(
         laid.append((yield from parts(*given)))
         return laid[-1]
 
-    for module in (auto, model_choice):
-        monkeypatch.setattr(module, "lay_in_parts", recorded)
-    again = calibrate_auto(wide, BOTH)
+    monkeypatch.setattr(model_choice, "lay_in_parts", recorded)
+    again = calibrate(wide, BOTH)
     assert len(laid) == 1
     assert laid[0].answer.photometric is None
     monkeypatch.setattr(Groundwork, "serves", lambda *_: False)
-    late = calibrate_auto(wide, BOTH)
+    late = calibrate(wide, BOTH)
     assert len(laid) == 3
     assert laid[2].answer.photometric is not None
     for c in (found, again):
@@ -218,13 +222,13 @@ def test_the_groundwork_of_the_sharpness_answer_serves_the_final_one(
 
 
 def test_the_budget_decides(wide: Recording) -> None:
-    assert calibrate_auto(wide, SHARPNESS, budget_px=5.0).model_name == "circle"
-    c = calibrate_auto(wide, SHARPNESS, budget_px=1e-5)
+    assert calibrate(wide, SHARPNESS, budget_px=5.0).model_name == "circle"
+    c = calibrate(wide, SHARPNESS, budget_px=1e-5)
     assert c.model_name == "exact"
     assert c.ladder is not None
     assert c.ladder.budget_px == 1e-5
     with pytest.raises(AmiwarpError, match="budget_px"):
-        calibrate_auto(wide, SHARPNESS, budget_px=0.0)
+        calibrate(wide, SHARPNESS, budget_px=0.0)
 
 
 def test_the_file_keeps_the_ladder(as_circle: Calibration, tmp_path: Path) -> None:
@@ -273,14 +277,14 @@ def test_a_tilt_that_the_photometric_stage_rules_out_is_not_measured(found: Cali
     assert tilt.verdict.startswith("held: the photometric stage finds that it moves events by at most 0.0")
     for center_px, names in (((0.0, 0.001), ()), ((0.1, 0.001), TILT), ((0.0, 0.1), TILT), (None, TILT)):
         exact = replace(found.exact, photometric=replace(found.photometric, center_px=center_px))
-        trial = trial_for(wide, exact, BOTH, TILT, [], device="cpu", budget_px=None)
+        trial = trial_for(wide, exact, BOTH, TILT, device="cpu")
         assert trial.space.names == ("apex", "phase", *names)
 
 
 def test_a_clock_offset_is_freed_where_the_speed_changes(texture: np.ndarray) -> None:
     late = EncoderModel(clock_offset_us=3000.0)
     recording = recorded(texture, fov_deg=60.0, apex_deg=2.0, rpm=DOUBLING, encoder=late)
-    c = calibrate_auto(recording, SHARPNESS)
+    c = calibrate(recording, SHARPNESS)
     assert c.ladder is not None
     assert [p.name for p in c.ladder.parameters if p.freed] == ["clock_offset"]
     assert c.parameters["clock_offset"] == pytest.approx(3000.0, abs=400.0)  # us; the sensor's latency adds to it
@@ -289,7 +293,7 @@ def test_a_clock_offset_is_freed_where_the_speed_changes(texture: np.ndarray) ->
 
 
 def test_a_tilt_is_freed_through_a_wide_lens(texture: np.ndarray) -> None:
-    c = calibrate_auto(recorded(texture, fov_deg=90.0, apex_deg=3.0, tilt_deg=4.0, width=240), SHARPNESS)
+    c = calibrate(recorded(texture, fov_deg=90.0, apex_deg=3.0, tilt_deg=4.0, width=240), SHARPNESS)
     assert c.ladder is not None
     assert [p.name for p in c.ladder.parameters if p.freed] == ["tilt"]
     assert math.degrees(c.exact.parameters["tilt_x"]) == pytest.approx(4.0, abs=0.5)
@@ -297,7 +301,7 @@ def test_a_tilt_is_freed_through_a_wide_lens(texture: np.ndarray) -> None:
 
 
 def test_what_is_given_is_left_alone(wide: Recording) -> None:
-    c = calibrate_auto(wide, replace(SHARPNESS, free=("apex", "phase")))
+    c = calibrate(wide, replace(SHARPNESS, free=("apex", "phase")))
     assert c.ladder is not None
     assert c.ladder.parameters == ()
 
@@ -330,7 +334,7 @@ def test_an_encoder_s_noise_is_told_from_its_speeding_up() -> None:
 
 
 def test_every_device_judges_alike(found: Calibration, wide: Recording, device: str) -> None:
-    trial = trial_for(wide, found.exact, SHARPNESS, (), [], device=device, budget_px=None)
+    trial = trial_for(wide, found.exact, SHARPNESS, (), device=device)
     values = trial.sharpest([0, 1])
     assert trial.test.each(trial.space, values).mean() > trial.test.each(trial.space, {**values, "apex": 0.0}).mean()
     assert np.abs(trial.start - trial.space.to_vector(values)).max() < 0.3  # px

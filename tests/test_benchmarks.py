@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from amiwarp.choices import Vote
+from amiwarp import Events, Vote
 from amiwarp.compensation.recordings import PIECE
-from amiwarp.events.events import Events
 from benchmarks import __main__ as runner
 from benchmarks import cases, compensate, dataset, ours, report, scenes, truth
 from benchmarks.job import Job

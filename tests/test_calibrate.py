@@ -7,29 +7,37 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import NOMINAL_PRISM, TRUE_PRISM
 
-from amiwarp import calib
-from amiwarp.calib import Calibration, Settings
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    Encoder,
+    EncoderModel,
+    Events,
+    FlatSide,
+    MemoryEvents,
+    Prism,
+    PrismMotion,
+    Recording,
+    SensorModel,
+    Settings,
+    Sharpness,
+    calib,
+    model_error,
+    open_recording,
+    predicted_error,
+    simulate,
+    truth_model,
+)
+from amiwarp.calib.calibration import prepare
 from amiwarp.calib.calibration_events import RUN, thin
 from amiwarp.calib.first_guess import estimate_rpm
 from amiwarp.calib.parameters import make_space
 from amiwarp.calib.sharpness import PARTS
-from amiwarp.calib.single_model import prepare
-from amiwarp.choices import Sharpness
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.io import open_recording
-from amiwarp.optics.camera import Camera
 from amiwarp.optics.displacement import wrap_angle
-from amiwarp.optics.models import MODELS, predicted_error
-from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.motion import EncoderModel, PrismMotion
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import simulate
+from amiwarp.optics.models import MODELS
+from tests.conftest import NOMINAL_PRISM, TRUE_PRISM
 
 calibrate = functools.partial(calib.calibrate, stages=("sharpness",))
 

@@ -8,10 +8,8 @@ from typing import Any
 
 import pytest
 
-from amiwarp.calib import Calibration
-from amiwarp.errors import AmiwarpError
+from amiwarp import AmiwarpError, Calibration, Camera, Fisheye, RadialTangential
 from amiwarp.io.camera_files import camera_from_json, camera_to_json
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
 
 
 def test_there_and_back(calibration: Calibration, tmp_path: Path) -> None:

@@ -11,25 +11,31 @@ from typing import Any
 
 import numpy as np
 import pytest
-import reference
 from matplotlib.text import Text
 from PIL import Image
 from typer.testing import CliRunner, Result
 
 import benchmarks.chart
-from amiwarp.calib import Calibration, Settings
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    ExactModel,
+    FlatSide,
+    MemoryEvents,
+    Prism,
+    RadialTangential,
+    Recording,
+    Settings,
+    Vote,
+    iwe,
+    open_recording,
+    predicted_error,
+    save_recording,
+)
 from amiwarp.calib.presets import Preset, check, settings_from, settings_to, simplified
-from amiwarp.choices import Vote
 from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.iwe import iwe
-from amiwarp.io import open_recording, save_recording
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import MODELS, predicted_error
-from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.optics.models import MODELS
 from amiwarp.plotting import figures
 from amiwarp.progress import silent
 from amiwarp.studies.chart import Charts, calibration, compensation
@@ -51,6 +57,7 @@ from amiwarp.studies.chart.rows import (
     told_apart,
 )
 from benchmarks import libraries as peers
+from reference import optics as oracle
 
 
 def run(*args: str | Path) -> Result:
@@ -92,7 +99,7 @@ def test_exact_places_are_those_of_the_trace(side: FlatSide, distortion: Any, ba
     rng = np.random.default_rng(0)
     xy = np.stack([rng.integers(0, 320, 2000), rng.integers(0, 240, 2000)], axis=1).astype(np.float64)
     theta = rng.uniform(-10.0, 10.0, 2000)
-    expected = reference.move(camera, model.prism, xy, theta, to_scene=True, phase=model.phase, tilt=model.tilt)
+    expected = oracle.move(camera, model.prism, xy, theta, to_scene=True, phase=model.phase, tilt=model.tilt)
     assert np.isfinite(expected).all()
     np.testing.assert_allclose(exact_places(model, xy, theta), expected, rtol=0.0, atol=bar)
 

@@ -14,27 +14,44 @@ import numpy as np
 import pytest
 
 import amiwarp
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    CircleModel,
+    Events,
+    ExactModel,
+    Fill,
+    FlatSide,
+    Format,
+    Layers,
+    MemoryEvents,
+    PhotometricSettings,
+    Picture,
+    Prism,
+    RadialCircleModel,
+    Reconstruction,
+    Recording,
+    Settings,
+    Sharpness,
+    UnsizedPrism,
+    Vote,
+    apex_from_deflection,
+    deflection_from_apex,
+    iwe,
+    open_recording,
+    sharpness,
+)
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
 from amiwarp.calib.parameters import build_model
 from amiwarp.calib.presets import simplified
-from amiwarp.calib.settings import STAGES, PhotometricSettings, Settings
-from amiwarp.choices import Axis, Colour, Fill, Layers, Sharpness, Tone, View, Vote
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
+from amiwarp.calib.settings import STAGES
+from amiwarp.choices import Axis, Colour, Tone, View
 from amiwarp.imaging.export import IweFiles, to_picture
-from amiwarp.imaging.iwe import iwe
-from amiwarp.imaging.sharpness import SharpnessMeter, sharpness
+from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape
-from amiwarp.io.formats import Format, open_recording
 from amiwarp.live.stream.queues import PacketQueue, Policy
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
-from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism, apex_from_deflection, deflection_from_apex
 from amiwarp.reconstruction.export import save_picture, tones
-from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.viewer.clouds import Look
 
 CAMERA = Camera.from_fov(8, 6, 1.0)

@@ -13,11 +13,8 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from amiwarp.events.events import Events
-from amiwarp.io import RecordingWriter
-from amiwarp.io.chunks import CHUNK, encode, encode_parts
-from amiwarp.io.native_layout import make_dataset
-from amiwarp.io.native_writer import ChunkFile, EncodedChunk
+from amiwarp import Events, RecordingWriter
+from amiwarp.io.chunks import CHUNK, ChunkFile, EncodedChunk, encode, encode_parts, make_dataset
 
 assert hdf5plugin.FILTERS  # its import registers the filter
 
@@ -42,7 +39,7 @@ def stored(path, columns):
 
 
 def in_two_pieces(output, data):
-    """Write data as :class:`amiwarp.io.native_writer._Output` does, but not at once."""
+    """Write data as :class:`amiwarp.io.chunks._Output` does, but not at once."""
     output.write_at([data[:7]], output.tell())
     output.write_at([data[7:]], output.tell() + 7)
     output.seek(output.tell() + len(data))
@@ -60,7 +57,7 @@ def make():
 def test_threads_write_chunks_in_any_order(tmp_path, monkeypatch, in_one_piece):
     """Also if HDF5 wrote the bytes of a chunk in an unknown way, so that their place is not found."""
     if not in_one_piece:
-        monkeypatch.setattr("amiwarp.io.native_writer._Output.write", in_two_pieces)
+        monkeypatch.setattr("amiwarp.io.chunks._Output.write", in_two_pieces)
     columns = make()
     stored(tmp_path / "a.h5", columns)
     with h5py.File(tmp_path / "a.h5") as file:
@@ -170,8 +167,8 @@ def test_a_full_disk_leaves_nothing(tmp_path, way, limit):
 FAILING = """
 import errno, os, sys
 import numpy as np
-from amiwarp.io.native_writer import ChunkFile
-from amiwarp.io.native_layout import make_dataset
+from amiwarp.io.chunks import ChunkFile
+from amiwarp.io.chunks import make_dataset
 written = os.pwritev
 calls = 0
 def failing(*arguments):

@@ -20,7 +20,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner, Result
 
-from amiwarp.calib import Calibration
+from amiwarp import AmiwarpError, Calibration, open_recording
 from amiwarp.cli import (
     calibrate,
     chart,
@@ -44,8 +44,6 @@ from amiwarp.cli import (
 )
 from amiwarp.cli.app import SUMMARIES, app
 from amiwarp.cli.options import number
-from amiwarp.errors import AmiwarpError
-from amiwarp.io import open_recording
 
 COMMANDS = {
     module.__name__.rpartition(".")[2]: module

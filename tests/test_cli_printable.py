@@ -13,12 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from amiwarp import AmiwarpError, Events, RecordingWriter, open_recording
 from amiwarp.cli.console import report, table
 from amiwarp.cli.options import Common
-from amiwarp.errors import AmiwarpError, printable
-from amiwarp.events.events import Events
-from amiwarp.io import RecordingWriter, open_recording
-from tests.io_samples_extra import arrays, write_ros2
+from amiwarp.errors import printable
+from reference.io_samples_extra import arrays, write_ros2
 
 NASTY = "a\x1b]0;owned\x07\x1b[31m\nb\u202egnp\u2028c.h5"
 """File name that sets the terminal's title and colour, breaks the line and reverses the direction of text."""

@@ -11,38 +11,48 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-import reference
 import warp as wp
-from calibration_sample import exact_calibration
-from conftest import TRUE_PRISM
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typer.testing import CliRunner
 
-from amiwarp.calib import Calibration
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    CircleModel,
+    Encoder,
+    Events,
+    ExactModel,
+    Fisheye,
+    FlatSide,
+    MemoryEvents,
+    Prism,
+    RadialTangential,
+    Recording,
+    compensate,
+    compensate_events,
+    convert,
+    edge_blur,
+    iwe,
+    open_recording,
+    save_recording,
+    sharpness,
+    truth_model,
+)
 from amiwarp.cli.app import app
-from amiwarp.compensation.recordings import compensate, compensate_events, compensated_blocks
-from amiwarp.errors import AmiwarpError
+from amiwarp.compensation.recordings import compensated_blocks
 from amiwarp.events.device_events import encoder_params
-from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.events import Events, MemoryEvents, inside_image
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.iwe import iwe
-from amiwarp.imaging.metrics import edge_blur, truth_model
-from amiwarp.imaging.sharpness import sharpness
-from amiwarp.io import convert, open_recording, read_encoder_csv, save_recording
+from amiwarp.events.encoder import TWO_PI
+from amiwarp.events.events import inside_image
+from amiwarp.io import read_encoder_csv
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.prophesee import Evt3Encoder
 from amiwarp.io.ros import PACKET_DEFINITION, opened_bag
 from amiwarp.kernels.events import EncoderParams, theta_u32_at
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
-from amiwarp.optics.circle_models import CircleModel
-from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import FlatSide, Prism
+from reference import optics as oracle
+from reference.calibration_sample import exact_calibration
+from tests.conftest import TRUE_PRISM
 
 
 @wp.kernel
@@ -135,7 +145,7 @@ def test_places_are_the_models(name: str, lens: RadialTangential | Fisheye | Non
     np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-3)
     if name == "exact":
         some = slice(0, 3000)
-        traced = reference.move(camera, TRUE_PRISM, xy[some], encoder.angle_at(t[some]), to_scene=True, phase=0.4)
+        traced = oracle.move(camera, TRUE_PRISM, xy[some], encoder.angle_at(t[some]), to_scene=True, phase=0.4)
         np.testing.assert_allclose(moved[some], traced, rtol=0, atol=1e-3)
 
 
@@ -369,14 +379,17 @@ HOST_NS = 1_700_000_000_123_456_789
 DELAY_NS = 4_000_000
 """Time from the first event of a message to its recording [ns]."""
 
-LATCHED = Qos(
-    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, QosTime(0, 0), QosTime(1, 2),
-    QosLiveliness.AUTOMATIC, QosTime(3, 4), False,
-)  # fmt: skip
-
 
 def write_bag(path: Path, events: Events) -> None:
     """Write a bag as a robot records it: events, and messages of other topics, among them an unknown type."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    latched = Qos(
+        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, QosTime(0, 0), QosTime(1, 2),
+        QosLiveliness.AUTOMATIC, QosTime(3, 4), False,
+    )  # fmt: skip
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(PACKET_DEFINITION, "event_camera_msgs/msg/EventPacket"))
     store.register(get_types_from_msg("float64[] values\nstring name", "rig_msgs/msg/State"))
@@ -399,7 +412,7 @@ def write_bag(path: Path, events: Events) -> None:
         topics = {
             topic: writer.add_connection(
                 topic, message.__msgtype__, typestore=store,
-                offered_qos_profiles=[LATCHED] if topic == "/note" else [],
+                offered_qos_profiles=[latched] if topic == "/note" else [],
             )
             for topic, message in {topic: message for _, topic, message in messages}.items()
         }  # fmt: skip
@@ -423,6 +436,8 @@ def bag_of_rosbags(path: Path) -> tuple[dict[str, Any], dict[str, list[tuple[int
 def test_a_bag_is_compensated_and_keeps_its_other_topics(
     recording: Recording, exact: Calibration, tmp_path: Path, source: str, target: str
 ) -> None:
+    from rosbags.highlevel import AnyReader
+
     events, encoder = recording.events.slice(0, 60_000), recording.encoder
     assert encoder is not None
     write_bag(tmp_path / source, events)

@@ -8,17 +8,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from amiwarp.compensation.recordings import compensate_events
-from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events
-from amiwarp.imaging.iwe import iwe
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.exact_model import ExactModel
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Compensated,
+    Compensator,
+    Encoder,
+    EncoderStream,
+    Events,
+    ExactModel,
+    Prism,
+    RadialTangential,
+    compensate_events,
+    iwe,
+)
+from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import Prism
 
 WIDTH, HEIGHT = 64, 48
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, math.radians(60))

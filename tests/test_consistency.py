@@ -7,18 +7,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib.photometric.answer_search import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
-from amiwarp.calib.photometric.consistency import Consistency, Finding, LinearFit
-from amiwarp.calib.photometric.cost import CAUSES
-from amiwarp.calib.settings import PhotometricSettings
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.motion import CameraMotion
-from amiwarp.simulation.simulator import simulate
+from amiwarp import (
+    Calibration,
+    Camera,
+    CameraMotion,
+    Encoder,
+    FlatSide,
+    PhotometricSettings,
+    Prism,
+    RadialTangential,
+    Recording,
+    calibrate,
+    model_error,
+    simulate,
+    truth_model,
+)
+from amiwarp.calib.photometric.consistency import CAUSES, Consistency, Finding, LinearFit
+from amiwarp.calib.photometric.stage import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
 
 CAMERA = Camera.from_fov(160, 120, math.radians(90.0))
 PRISM = Prism(math.radians(2.0))

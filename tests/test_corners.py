@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
-from corner_reference import corners as reference_corners
-from corner_reference import corners_of_dv_processing, table
 from numpy.typing import NDArray
 
 import amiwarp
-from amiwarp.choices import CornerMethod
-from amiwarp.events.events import Events
+from amiwarp import CornerMethod, Events
 from amiwarp.imaging import corners
+from reference.corners import corners as reference_corners
+from reference.corners import corners_of_dv_processing, table
 
 METHODS = list(CornerMethod)
 
@@ -203,7 +202,7 @@ def test_eventcv_finds_the_same_corners(data_dir: Path, name: str) -> None:
 def test_dv_processing_differs_only_by_its_own_rule(data_dir: Path, name: str) -> None:
     """Its circles have radii of 5 and 6 px, an arc ends where times jump, and no redundant event is left out.
 
-    Its rule, written once more in ``corner_reference``, gives exactly its corners.
+    Its rule, written once more in ``reference.corners``, gives exactly its corners.
     """
     dv_processing = pytest.importorskip("dv_processing")
     recording = amiwarp.open_recording(data_dir / name)

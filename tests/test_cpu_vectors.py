@@ -7,21 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from conftest import TRUE_PHASE, TRUE_PRISM
 
+from amiwarp import CameraRotation, ExactModel, RadialTangential, Recording
 from amiwarp.brightness.event_pairs import EventTable
 from amiwarp.brightness.multigrid import GridHierarchy, Tiles
 from amiwarp.brightness.pair_positions import PairEnds
 from amiwarp.brightness.solver import BrightnessMap, Smoothness
-from amiwarp.events.recording import Recording
 from amiwarp.kernels import conjugate_gradients as cg
 from amiwarp.kernels import equations_cuda, multilevel
 from amiwarp.kernels.conjugate_gradients import Prior
 from amiwarp.kernels.equations import slope_between
 from amiwarp.kernels.launch import Program
-from amiwarp.optics.camera import RadialTangential
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.exact_model import ExactModel
+from tests.conftest import TRUE_PHASE, TRUE_PRISM
 
 SCALE = 2.0**-32
 

@@ -16,17 +16,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import distributed
 import matplotlib.pyplot as plt
 import numpy as np
-import pyarrow.parquet
 import pytest
 from PIL import Image
 from typer.testing import CliRunner, Result
 
 import amiwarp
+from amiwarp import AmiwarpError, DatasetSummary, make_dataset
 from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
 from amiwarp.io.sealed_json import append_line, create_journal, read_journal
 from amiwarp.kernels import launch
 from amiwarp.studies import cluster
@@ -34,16 +32,7 @@ from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker, t
 from amiwarp.studies.dataset import making as recordings
 from amiwarp.studies.dataset import specification
 from amiwarp.studies.dataset import specification as sources
-from amiwarp.studies.dataset.making import (
-    JOURNAL,
-    MANIFEST,
-    TABLE,
-    DatasetSummary,
-    duration_text,
-    list_items,
-    make_dataset,
-    simulation_of,
-)
+from amiwarp.studies.dataset.making import JOURNAL, MANIFEST, TABLE, duration_text, list_items, simulation_of
 from amiwarp.studies.dataset.specification import load_specification
 
 HEAD = 'format = "amiwarp-dataset-specification"\nversion = 1\n'
@@ -149,6 +138,8 @@ def test_manifest_describes_every_file(place: Path) -> None:
 
 
 def test_parquet_equals_json(place: Path) -> None:
+    import pyarrow.parquet
+
     make(place)
     rows = pyarrow.parquet.read_table(place / "out" / TABLE).to_pylist()
     items = manifest(place)["items"]
@@ -288,6 +279,8 @@ def test_a_dry_run_makes_nothing(place: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
 def test_a_cluster_makes_the_same_files(place: Path) -> None:
+    import distributed
+
     make(place)
     alone = checksums(place)
     with distributed.LocalCluster(

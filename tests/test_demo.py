@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 from typer.testing import CliRunner
 
-from amiwarp.calib import Calibration
+from amiwarp import Calibration, open_recording
 from amiwarp.cli.app import app
-from amiwarp.io import open_recording
 from amiwarp.plotting import clouds
 
 FILES = {"recording.h5", "calibration.json", "compensated.h5", "picture.png", "demo.png"}

@@ -15,18 +15,23 @@ from matplotlib.text import Text
 from PIL import Image
 from typer.testing import CliRunner
 
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    ExactModel,
+    FlatSide,
+    Prism,
+    PrismMotion,
+    RadialTangential,
+    Scene,
+    SensorModel,
+    Simulation,
+    apex_from_deflection,
+)
 from amiwarp.calib.model_choice import QUANTISATION_PX
 from amiwarp.cli import design as command_line
 from amiwarp.cli.console import report
 from amiwarp.cli.options import Common, command
-from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
-from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.design import Design, Limits, Timing, design
 from amiwarp.studies.design.choice import (
     ACROSS,

@@ -1,9 +1,15 @@
 """The documentation's links have a target, headings included; its index names every page; files and names exist."""
 
+import pkgutil
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
+
+from amiwarp.cli.app import app
+from benchmarks import report
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -70,8 +76,8 @@ def test_what_the_site_makes_is_not_checked_as_a_source() -> None:
 
 
 CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
-PLACE = re.compile(r"(?:amiwarp|benchmarks|docs|examples|tests)/[\w./-]*|[\w./-]+\.pyi?")
-PLACEHOLDERS = ("NAME.py", "NAME_writer.py")
+PLACE = re.compile(r"(?:amiwarp|benchmarks|docs|examples|reference|tests)/[\w./-]*|[\w./-]+\.pyi?")
+PLACEHOLDERS = ("NAME.py",)
 
 
 def missing_files(text: str, *bases: str) -> list[str]:
@@ -85,16 +91,21 @@ def missing_files(text: str, *bases: str) -> list[str]:
 
 
 def unknown_names(text: str, source: str) -> list[str]:
-    """Return the identifiers in code spans that do not occur in ``source``; of dotted ones, the last part counts."""
+    """Return the identifiers in code spans of which a part does not occur in ``source``."""
     spans = [span.removesuffix("()") for span in CODE.findall(text)]
     names = [span for span in spans if re.fullmatch(r"[A-Za-z_][\w.]*", span) and not PLACE.fullmatch(span)]
     known = set(re.findall(r"\w+", source))
-    return [name for name in names if name.rpartition(".")[2] not in known]
+    return [name for name in names if not known.issuperset(name.split("."))]
 
 
 def source_text() -> str:
-    """Return the text of the package, its tests and its settings."""
-    files = [ROOT / "pyproject.toml", *(ROOT / "amiwarp").rglob("*.py*"), *(ROOT / "tests").rglob("*.py")]
+    """Return the text of the package, its tests, what they compare with, and its settings."""
+    files = [
+        ROOT / "pyproject.toml",
+        *(ROOT / "amiwarp").rglob("*.py*"),
+        *(ROOT / "tests").rglob("*.py"),
+        *(ROOT / "reference").rglob("*.py"),
+    ]
     own = [file for file in files if file.suffix in (".py", ".pyi", ".toml") and file != Path(__file__)]
     return "\n".join(file.read_text() for file in own)
 
@@ -105,11 +116,78 @@ def test_files_that_a_page_names_exist(page: Path) -> None:
     assert missing_files(page.read_text(), "amiwarp") == []
 
 
-def test_names_in_contributing_occur_in_the_source() -> None:
-    assert unknown_names((ROOT / "CONTRIBUTING.md").read_text(), source_text()) == []
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])
+def test_names_occur_in_the_source(page: str) -> None:
+    """The end of the changelog lists names that are gone."""
+    assert unknown_names((ROOT / page).read_text().partition("### Renamed")[0], source_text()) == []
 
 
 def test_files_and_names_that_do_not_exist_are_seen() -> None:
     text = "`calib/solve.py` only; `amiwarp/io/NAME.py`, `tests/none/`, `amiwarp/io/`; `pytest tests/test_docs.py`"
     assert missing_files(text, "amiwarp") == ["calib/solve.py", "tests/none/"]
-    assert unknown_names("`MODEL_STRUCTS`, `Sharp.score`, `known()`, `a b`", "score known") == ["MODEL_STRUCTS"]
+    names = "`MODEL_STRUCTS`, `Sharp.score`, `Sharp.gone`, `Gone.score`, `known()`, `a b`"
+    assert unknown_names(names, "Sharp score known") == ["MODEL_STRUCTS", "Sharp.gone", "Gone.score"]
+
+
+SHELL = re.compile(r"```sh\n(.*?)```|<!-- given: (.*?) -->", re.S)
+OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
+DOTTED = re.compile(r"(?<![\w./-])amiwarp(?:\.[A-Za-z_]\w*)+")
+COMMAND = re.compile(r"(?<![\w.-])amiwarp ([a-z]+)([^;|&#`]*)")
+BENCHMARK = re.compile(r"python -m (benchmarks[\w.]*)([^;|&#`]*)")
+
+
+def code_lines(text: str) -> list[str]:
+    """Return the code spans of a page, and the lines of its shell commands."""
+    commands = "\n".join(first or second for first, second in SHELL.findall(text))
+    return [*CODE.findall(SHELL.sub("", text)), *commands.splitlines()]
+
+
+def options_of(command: Any) -> set[str]:
+    """Return the options of a command and of the commands below it."""
+    below = getattr(command, "commands", {}).values()
+    own = {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
+    return own.union({"--help"}, *map(options_of, below))
+
+
+def resolves(dotted: str) -> bool:
+    try:
+        pkgutil.resolve_name(dotted)
+    except (ImportError, AttributeError):
+        return False
+    return True
+
+
+def unknown_commands(text: str) -> list[str]:
+    """Return what code on a page names and does not exist: dotted names, commands, programs and their options."""
+    commands = {name: options_of(one) for name, one in typer.main.get_command(app).commands.items()}
+    programs = {path.stem: path.read_text() for path in (ROOT / "benchmarks").glob("*.py")}
+    anywhere = set().union(*commands.values()) | {o for source in programs.values() for o in OPTION.findall(source)}
+    out = []
+    for line in code_lines(text):
+        out += [name for name in DOTTED.findall(line) if not resolves(name)]
+        for name, rest in COMMAND.findall(line):
+            out += [name] if name not in commands else set(OPTION.findall(rest)) - commands[name]
+        for name, rest in BENCHMARK.findall(line):
+            source = programs.get(name.rpartition(".")[2] if "." in name else "__main__")
+            out += [name] if source is None else [o for o in OPTION.findall(rest) if f'"{o}"' not in source]
+        out += [option for option in OPTION.findall(line) if line.startswith("--") and option not in anywhere]
+    return out
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_names_commands_and_options_on_a_page_exist(page: Path) -> None:
+    assert unknown_commands(page.read_text()) == []
+
+
+def test_commands_that_do_not_exist_are_seen() -> None:
+    text = "`amiwarp.calibrate(r)` `amiwarp.events.solve` `amiwarp info F --count --loud` `--deaf` `--help`\n```sh\n"
+    text += ".venv/bin/pip install x --pre\namiwarp dance\n"
+    text += "python -m benchmarks.report --check --bad\npython -m benchmarks.no\n```"
+    assert unknown_commands(text) == [
+        "amiwarp.events.solve", "--loud", "--deaf", "dance", "--bad", "benchmarks.no",
+    ]  # fmt: skip
+
+
+def test_tables_of_speed_are_those_of_the_measured_files() -> None:
+    for page, text in report.refreshed().items():
+        assert page.read_text() == text, page

@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
+from amiwarp import AmiwarpError, Encoder
 from amiwarp.live.link.clocks import WRAP
 from amiwarp.live.link.emulator import MOST_RPM, Controller, EmulatedFault, Motor, Played, PseudoTerminal
 from amiwarp.live.link.protocol import (

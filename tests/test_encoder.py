@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder, rpm_between
-from amiwarp.events.encoder_stream import EncoderStream
+from amiwarp import AmiwarpError, Encoder, EncoderStream
+from amiwarp.events.encoder import TWO_PI, rpm_between
 from amiwarp.io import read_encoder_csv
 
 SPEED = TWO_PI * 50e-6

@@ -12,7 +12,6 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from mutation_files import stored_edges, stored_fading
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching
 from scipy.spatial import KDTree
@@ -49,6 +48,7 @@ from amiwarp.studies.evaluate.study import (
     where_calibrated,
 )
 from amiwarp.studies.evaluate.texture import density_variance, event_counts
+from reference.mutation_files import stored_edges, stored_fading
 
 SMALL = replace(QUICK, width=64, height=48, duration_s=0.1, seeds=1)
 

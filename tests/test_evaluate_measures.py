@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import AmiwarpError
 from amiwarp.studies.evaluate import measures as naturalness
 from amiwarp.studies.evaluate.flow import flow_error
 from amiwarp.studies.evaluate.measures import displayed, fitted, library, similarity

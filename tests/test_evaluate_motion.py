@@ -11,15 +11,22 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from amiwarp.events.events import Events
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.simulator import Simulation
-from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
-from amiwarp.simulation.worlds.world import Body, Material, Mesh, World, WorldScene
+from amiwarp import (
+    Body,
+    Camera,
+    CameraRotation,
+    Events,
+    ExactModel,
+    Material,
+    Mesh,
+    Prism,
+    PrismMotion,
+    Simulation,
+    Trajectory,
+    World,
+    WorldScene,
+)
+from amiwarp.simulation.worlds.trajectory import looking_at
 from amiwarp.studies.evaluate import contrast_motion, flow, pictures, pose, segmentation
 from amiwarp.studies.evaluate.contrast_motion import estimate_rotation, rotated_back
 from amiwarp.studies.evaluate.flow import flow_by_contrast, flow_by_dis, flow_error, rotation_flow

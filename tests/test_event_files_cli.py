@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from io_samples import make_events, write_dat, write_evt, write_native, write_text
-from io_samples_extra import arrays, write_aedat2, write_evimo2, write_evt21, write_m3ed, write_ros1
 from typer.testing import CliRunner
 
+from amiwarp import Events, open_recording
 from amiwarp.cli.app import app
-from amiwarp.events.events import Events
-from amiwarp.io import open_recording
+from reference.io_samples import make_events, write_dat, write_evt, write_native, write_text
+from reference.io_samples_extra import arrays, write_aedat2, write_evimo2, write_evt21, write_m3ed, write_ros1
 
 EVENTS = make_events(5000)
 

@@ -8,10 +8,9 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, device_for
-from amiwarp.events.events import Events, EventSource, MemoryEvents, check_events, regroup
-from amiwarp.events.recording import Truth
+from amiwarp import AmiwarpError, DeviceEvents, Events, EventSource, MemoryEvents, Truth
+from amiwarp.events.device_events import device_for
+from amiwarp.events.events import check_events, regroup
 
 
 def make(t: list[int]) -> Events:

@@ -15,8 +15,14 @@ import h5py
 import numpy as np
 import pytest
 from faery.extension import aedat, evt
-from io_samples import make_events, refusal, to_faery, write_aedat4
-from io_samples_extra import (
+
+from amiwarp import AmiwarpError, Camera, Events, MemoryEvents, RadialTangential, convert, open_recording
+from amiwarp.io import file_scan as scan
+from amiwarp.io import read_encoder_triggers
+from amiwarp.io.prophesee import Evt2Decoder, Evt3Decoder, words_of
+from amiwarp.io.ros import read_packets
+from reference.io_samples import make_events, refusal, to_faery, write_aedat4
+from reference.io_samples_extra import (
     ENCODERS,
     LATE,
     MORE_WRITERS,
@@ -40,15 +46,7 @@ from io_samples_extra import (
     write_ros1,
     write_ros2,
 )
-from test_io_readers import assert_equal, assert_same_source
-
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.io import convert, open_recording, read_encoder_triggers
-from amiwarp.io import file_scan as scan
-from amiwarp.io.prophesee import Evt2Decoder, Evt3Decoder, words_of
-from amiwarp.io.ros import read_packets
-from amiwarp.optics.camera import Camera, RadialTangential
+from tests.test_io_readers import assert_equal, assert_same_source
 
 EVENTS = make_events()
 NOTHING = np.zeros(0, np.uint8)

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 import h5py
 import numpy as np
 import pytest
-from io_samples import WRITERS, make_events, refusal, write_sample
-from mutation_files import KINDS, Checker, check, mutated, sample
 
-from amiwarp.io import convert, open_recording
+from amiwarp import convert, open_recording
+from reference.io_samples import WRITERS, make_events, refusal, write_sample
+from reference.mutation_files import KINDS, Checker, check, mutated, sample
 
 MUTANTS = 60
-"""Mutants per kind of input. ``mutation_files.py`` runs any number."""
+"""Mutants per kind of input. ``reference.mutation_files`` runs any number."""
 
 
 @pytest.fixture(scope="module")

@@ -15,15 +15,25 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, EventSource, MemoryEvents
-from amiwarp.events.recording import Recording, Truth
-from amiwarp.io import RecordingWriter, open_recording, save_recording
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Encoder,
+    Events,
+    EventSource,
+    Fisheye,
+    FlatSide,
+    MemoryEvents,
+    Prism,
+    RadialTangential,
+    Recording,
+    RecordingWriter,
+    Truth,
+    open_recording,
+    save_recording,
+)
 from amiwarp.io.chunks import CHUNK, StoredColumn, checksum, decode, encode, in_order
 from amiwarp.kernels.checksum import Checksums
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
-from amiwarp.optics.prism import FlatSide, Prism
 
 SIZE = (320, 240)
 

@@ -6,17 +6,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from io_samples import SIZE, WRITERS, make_events, refusal, write_evt, write_sample
-from io_samples_extra import write_evimo, write_mvsec
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, EventSource, MemoryEvents
-from amiwarp.io import ConversionSummary, Format, convert, detect_format, open_recording
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    ConversionSummary,
+    Encoder,
+    Events,
+    EventSource,
+    Format,
+    MemoryEvents,
+    OutputFormat,
+    Prism,
+    RadialTangential,
+    convert,
+    open_recording,
+)
+from amiwarp.io import detect_format
 from amiwarp.io import file_scan as scan
-from amiwarp.io.output_formats import OutputFormat
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.prism import Prism
+from reference.io_samples import SIZE, WRITERS, make_events, refusal, write_evt, write_sample
+from reference.io_samples_extra import write_evimo, write_mvsec
 
 EVENTS = make_events()
 

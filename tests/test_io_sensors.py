@@ -7,16 +7,22 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from io_samples import SIZE, make_events, refusal
-from io_samples_extra import arrays, packets, typestore, write_aedat2, write_mvsec, write_ros1, write_ros2
 
+from amiwarp import (
+    AmiwarpError,
+    ImuSamples,
+    MemoryEvents,
+    MemoryImages,
+    Recording,
+    RecordingWriter,
+    convert,
+    open_recording,
+    save_recording,
+)
 from amiwarp.cli.info import _rows, describe
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.events.sensors import ImuSamples, MemoryImages
-from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
 from amiwarp.io.file_scan import head_only
+from reference.io_samples import SIZE, make_events, refusal
+from reference.io_samples_extra import arrays, packets, typestore, write_aedat2, write_mvsec, write_ros1, write_ros2
 
 EVENTS = make_events()
 G = 9.80665

@@ -6,17 +6,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp.choices import Vote
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
+from amiwarp import AmiwarpError, Camera, Encoder, Events, ExactModel, Prism, Vote, iwe
 from amiwarp.imaging import votes as pixel_votes
-from amiwarp.imaging.iwe import Votes, iwe
+from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.votes import FIRST_BATCH, CanvasShape, Image, upload_events
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import Prism
 
 
 def random_events(n: int, width: int, height: int, seed: int = 0) -> Events:

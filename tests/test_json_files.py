@@ -10,12 +10,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from amiwarp.calib import Calibration
+from amiwarp import AmiwarpError, Calibration, Camera
 from amiwarp.calib.presets import Preset
 from amiwarp.cli.options import read_camera
-from amiwarp.errors import AmiwarpError
 from amiwarp.io.json_files import MOST_BYTES, read_json
-from amiwarp.optics.camera import Camera
 from amiwarp.simulation.sequences import open_pictures
 
 READERS: dict[str, Callable[[Path], Any]] = {

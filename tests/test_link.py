@@ -13,11 +13,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rig_world import LONG_S, Wire, World
 from typer.testing import CliRunner
 
+from amiwarp import AmiwarpError
 from amiwarp.cli import motor as command
-from amiwarp.errors import AmiwarpError
 from amiwarp.live.link import follower as following
 from amiwarp.live.link import follower as updates
 from amiwarp.live.link import link as link_module
@@ -26,6 +25,7 @@ from amiwarp.live.link.emulator import LASTING_FAULTS, Controller, EmulatedFault
 from amiwarp.live.link.follower import Follower, LinkUpdate
 from amiwarp.live.link.link import Link, open_port, usb_id
 from amiwarp.live.link.protocol import Answer, ControllerStatus, FrameDecoder, Index, Message, Ping, Samples, encode
+from tests.rig_world import LONG_S, Wire, World
 
 S = 1_000_000
 RPM = 720.0

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import AmiwarpError
 from amiwarp.live.link.follower import AngleTracker, EncoderFault, FaultReport
 
 PER_TURN = 1000

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import AmiwarpError
 from amiwarp.live.link.clocks import WRAP, UnwrappedClock, fit_to_pulses, fit_to_round_trips
 
 DRIFT, OFFSET = 35e-6, 123_456_789_000

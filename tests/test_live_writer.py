@@ -14,16 +14,21 @@ import h5py
 import hdf5plugin  # noqa: F401
 import numpy as np
 import pytest
-from io_samples import refusal
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.io import RecordingWriter, open_recording
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Encoder,
+    Events,
+    FlatSide,
+    Prism,
+    RadialTangential,
+    RecordingWriter,
+    open_recording,
+)
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.live_writer import MAX_WASTE_BYTES, LiveWriter
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.prism import FlatSide, Prism
+from reference.io_samples import refusal
 
 SIZE = (320, 240)
 CAMERA = Camera(*SIZE, 200.0, 201.0, 159.5, 119.5, RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.01))

@@ -5,11 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.metrics import contrast, edge_blur, entropy, find_edges, model_error, picture_quality
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
+from amiwarp import AmiwarpError, Camera, ExactModel, Prism, edge_blur, model_error
+from amiwarp.imaging.metrics import contrast, entropy, find_edges, picture_quality
 
 
 def circle_events(sigma: float, noise: int = 0, seed: int = 0) -> np.ndarray:

@@ -8,31 +8,36 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import TRUE_PRISM
 from numpy.typing import NDArray
 
-from amiwarp.brightness.event_pairs import SensorTiming
-from amiwarp.calib import Calibration, calibrate
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    CameraMotion,
+    CameraRotation,
+    Encoder,
+    FlatSide,
+    PhotometricSettings,
+    Recording,
+    Scene,
+    SensorModel,
+    SensorTiming,
+    Simulation,
+    calibrate,
+    iwe,
+    model_error,
+    open_recording,
+    reconstruct,
+    simulate,
+    truth_model,
+)
 from amiwarp.calib.calibration_events import thin
 from amiwarp.calib.first_guess import estimate_rates
 from amiwarp.calib.parameters import RATES
-from amiwarp.calib.settings import PhotometricSettings
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.iwe import iwe
-from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.io import open_recording
 from amiwarp.io.text import read_calib
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.prism import FlatSide
-from amiwarp.reconstruction.picture import reconstruct
-from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import linear_luminance
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation, simulate
+from tests.conftest import TRUE_PRISM
 
 CAMERA = Camera.from_fov(140, 105, math.radians(50.0))
 SMALL = Camera.from_fov(100, 75, math.radians(50.0))

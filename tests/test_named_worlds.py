@@ -11,16 +11,13 @@ import warp as wp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import AmiwarpError, Camera, Mesh, Trajectory, World, named_world
 from amiwarp.kernels import world as world_maps
-from amiwarp.optics.camera import Camera
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS, ball, bodies, named_world, room
+from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS, ball, bodies, room
 from amiwarp.simulation.worlds.named import person as gait
 from amiwarp.simulation.worlds.renderer import MapRenderer, device_pose, pixel_rays, surfaces_at
-from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.simulation.worlds.world import Mesh, World
 
 FOV = math.radians(60.0)
 ALL_ROUND = [Rotation.from_rotvec(v).as_matrix() for v in np.pi / 2 * np.array(

@@ -6,20 +6,31 @@ from typing import Any
 
 import numpy as np
 import pytest
-import reference
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    CameraRotation,
+    CircleModel,
+    EllipseModel,
+    ExactModel,
+    Fisheye,
+    FlatSide,
+    Model,
+    Prism,
+    RadialCircleModel,
+    RadialTangential,
+    apex_from_deflection,
+    deflection_from_apex,
+    predicted_error,
+)
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential, camera_params, pinhole_params
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
+from amiwarp.optics.camera import camera_params, pinhole_params
 from amiwarp.optics.displacement import compensate_by_each, wrap_angle
-from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import MODELS, Model, predicted_error
-from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection, deflection_from_apex
+from amiwarp.optics.models import MODELS
+from reference import optics as oracle
 
 ATOL = 1e-3  # px, the documented limit; docs/explanation/optics.md has the measured values
 SIDES = list(FlatSide)
@@ -67,7 +78,7 @@ def on(device: str, xy: np.ndarray, theta: np.ndarray) -> tuple[wp.array, wp.arr
 @pytest.mark.parametrize("apex_deg", [0.0, 0.1, 1.817, 4.0, 15.0])
 def test_conversions_meet_the_traced_axial_ray(side: FlatSide, index: float, apex_deg: float) -> None:
     wedge = Prism(math.radians(apex_deg), index, side)
-    out = reference.through_prism(wedge, np.array([[0.0, 0.0, 1.0]]), np.zeros(1), to_scene=True)[0]
+    out = oracle.through_prism(wedge, np.array([[0.0, 0.0, 1.0]]), np.zeros(1), to_scene=True)[0]
     turned = math.atan2(out[0], out[2]) * (1.0 if side is FlatSide.SCENE else -1.0)
     assert wedge.deflection == pytest.approx(turned, abs=1e-12)
     assert apex_from_deflection(wedge.deflection, index, side) == pytest.approx(wedge.apex, abs=1e-12)
@@ -98,10 +109,10 @@ def test_exact_model_meets_the_two_interface_trace(device: str, side: FlatSide, 
     xy, theta = samples(cam)
     points, angles = on(device, xy, theta)
     seen = model.compensate_points(points, angles)
-    expected = reference.move(cam, wedge, xy, theta, to_scene=True, phase=0.7, tilt=(0.02, -0.03))
+    expected = oracle.move(cam, wedge, xy, theta, to_scene=True, phase=0.7, tilt=(0.02, -0.03))
     assert distance(seen.numpy(), expected).max() < ATOL
     assert distance(model.deflect_points(seen, angles).numpy(), xy).max() < ATOL
-    expected = reference.move(cam, wedge, xy, theta, to_scene=False, phase=0.7, tilt=(0.02, -0.03))
+    expected = oracle.move(cam, wedge, xy, theta, to_scene=False, phase=0.7, tilt=(0.02, -0.03))
     assert distance(model.deflect_points(points, angles).numpy(), expected).max() < ATOL
 
 
@@ -152,16 +163,16 @@ def test_paper_formula_in_the_plane_of_the_wedge(side: FlatSide, apex_deg: float
     angle = np.radians(np.linspace(-60.0, 60.0, 121))
     rays = np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], axis=1)
     for to_scene in (True, False):
-        out = reference.through_prism(wedge, rays, 0.0 * angle, to_scene=to_scene)
+        out = oracle.through_prism(wedge, rays, 0.0 * angle, to_scene=to_scene)
         tilted_first = (side is FlatSide.SCENE) == to_scene
-        delta = reference.cross_section(angle, wedge.apex, 1.55, tilted_first=tilted_first)
+        delta = oracle.cross_section(angle, wedge.apex, 1.55, tilted_first=tilted_first)
         np.testing.assert_allclose(np.arctan2(out[:, 0], out[:, 2]) - angle, delta, rtol=0, atol=1e-13)
 
 
 def test_paper_formula_needs_signed_angles() -> None:
     """Ray from the scene at α = 1°, φ = 45°: −0.93°. With both refractions counted towards the normal it is −34.8°."""
     apex, phi_i = math.radians(1.0), np.array(math.radians(45.0))
-    signed = reference.cross_section(phi_i, apex, 1.55, tilted_first=False)
+    signed = oracle.cross_section(phi_i, apex, 1.55, tilted_first=False)
     assert math.degrees(signed) == pytest.approx(-0.93, abs=5e-3)
     phi_p = np.arcsin(np.sin(phi_i) / 1.55)
     phi_o = phi_p - apex
@@ -174,20 +185,20 @@ def test_paper_formula_needs_signed_angles() -> None:
 def test_skew_rays_follow_the_cross_section_with_the_bravais_index(side: FlatSide) -> None:
     """Outside that plane s = bearing · axis is constant, and the projection refracts with √(n² − s²)/√(1 − s²)."""
     rng = np.random.default_rng(2)
-    rays = reference.pixels_to_rays(camera(80.0), samples(camera(80.0), 500)[0])
+    rays = oracle.pixels_to_rays(camera(80.0), samples(camera(80.0), 500)[0])
     phi = rng.uniform(-np.pi, np.pi, len(rays))
     wedge = Prism(math.radians(4.0), 1.55, side)
     along = np.stack([np.cos(phi), np.sin(phi)], axis=1)
     axis = np.stack([-np.sin(phi), np.cos(phi), 0.0 * phi], axis=1)
-    out = reference.through_prism(wedge, rays, phi, to_scene=True)
+    out = oracle.through_prism(wedge, rays, phi, to_scene=True)
     s = np.sum(rays * axis, axis=1)
     np.testing.assert_allclose(np.sum(out * axis, axis=1), s, rtol=0, atol=1e-14)
     before = np.arctan2(np.sum(rays[:, :2] * along, axis=1), rays[:, 2])
     after = np.arctan2(np.sum(out[:, :2] * along, axis=1), out[:, 2])
     index = np.sqrt(1.55**2 - s**2) / np.sqrt(1.0 - s**2)
-    delta = reference.cross_section(before, wedge.apex, index, tilted_first=side is FlatSide.SCENE)
+    delta = oracle.cross_section(before, wedge.apex, index, tilted_first=side is FlatSide.SCENE)
     np.testing.assert_allclose(after - before, delta, rtol=0, atol=1e-13)
-    plain = reference.cross_section(before, wedge.apex, 1.55, tilted_first=side is FlatSide.SCENE)
+    plain = oracle.cross_section(before, wedge.apex, 1.55, tilted_first=side is FlatSide.SCENE)
     assert np.abs(after - before - plain).max() > 1e-3
 
 
@@ -200,10 +211,10 @@ def test_circle_is_a_rotation_of_the_bearing(device: str, side: FlatSide) -> Non
     xy, theta = samples(cam, 1000)
     model = CircleModel.from_prism(cam, prism(1.0, side), phase=0.3)
     sign = 1.0 if side is FlatSide.SCENE else -1.0
-    rays = reference.turn(reference.pixels_to_rays(cam, xy), theta + 0.3, sign * math.radians(1.0))
+    rays = oracle.turn(oracle.pixels_to_rays(cam, xy), theta + 0.3, sign * math.radians(1.0))
     points, angles = on(device, xy, theta)
     seen = model.compensate_points(points, angles)
-    assert distance(seen.numpy(), reference.rays_to_pixels(cam, rays)).max() < ATOL
+    assert distance(seen.numpy(), oracle.rays_to_pixels(cam, rays)).max() < ATOL
     assert distance(model.deflect_points(seen, angles).numpy(), xy).max() < ATOL
 
 
@@ -227,11 +238,11 @@ def test_published_circle_table(
     """Mean and worst error [px] of a single δ and of δ(φ) of the observed ray; the flat face points to the camera."""
     cam, wedge = camera(fov), prism(deflection, FlatSide.CAMERA)
     xy, theta = lattice(cam)
-    exact = reference.move(cam, wedge, xy, theta, to_scene=True)
-    rays = reference.pixels_to_rays(cam, xy)
+    exact = oracle.move(cam, wedge, xy, theta, to_scene=True)
+    rays = oracle.pixels_to_rays(cam, xy)
     for factor, (mean, worst) in ((1.0, one), (growth(rays, 1.55), per_pixel)):
-        turned = reference.turn(rays, theta, -factor * math.radians(deflection))
-        error = distance(reference.rays_to_pixels(cam, turned), exact)
+        turned = oracle.turn(rays, theta, -factor * math.radians(deflection))
+        error = distance(oracle.rays_to_pixels(cam, turned), exact)
         assert error.mean() == pytest.approx(mean, abs=0.006 + 0.015 * mean)
         assert error.max() == pytest.approx(worst, abs=0.006 + 0.015 * worst)
 
@@ -242,13 +253,13 @@ def test_radial_circle_takes_its_angle_on_the_tilted_side(device: str, side: Fla
     xy, theta = samples(cam, 1000)
     points, angles = on(device, xy, theta)
     model = RadialCircleModel.from_prism(cam, prism(1.0, side))
-    rays = reference.pixels_to_rays(cam, xy)
-    turned = reference.turn(rays, theta, math.radians(1.0) * growth(rays, 1.55))
+    rays = oracle.pixels_to_rays(cam, xy)
+    turned = oracle.turn(rays, theta, math.radians(1.0) * growth(rays, 1.55))
     direct, back = model.compensate_points, model.deflect_points
     if side is FlatSide.CAMERA:
         direct, back = back, direct
     moved = direct(points, angles)
-    assert distance(moved.numpy(), reference.rays_to_pixels(cam, turned)).max() < ATOL
+    assert distance(moved.numpy(), oracle.rays_to_pixels(cam, turned)).max() < ATOL
     assert distance(back(moved, angles).numpy(), xy).max() < ATOL
 
 
@@ -284,7 +295,7 @@ def test_published_ellipse_table(device: str, fov: float, apex_deg: float, mean:
     xy = np.round(xy).astype(np.float64)
     model = EllipseModel.from_model(ExactModel(cam, wedge), device)
     points, angles = on(device, xy, theta)
-    exact = reference.move(cam, wedge, xy, theta, to_scene=True)
+    exact = oracle.move(cam, wedge, xy, theta, to_scene=True)
     error = distance(model.compensate_points(points, angles).numpy(), exact)
     assert error.mean() == pytest.approx(mean, abs=0.001 + 0.2 * mean)
     assert error.max() == pytest.approx(worst, abs=0.002 + 0.1 * worst)
@@ -296,7 +307,7 @@ def test_ellipse_tables_are_the_mean_and_first_harmonic() -> None:
     xy = np.array([[10.0, 20.0], [63.0, 47.0]])
     turn = np.arange(64) * (2.0 * np.pi / 64)
     for pixel in xy:
-        moved = reference.move(cam, wedge, np.tile(pixel, (64, 1)), turn, to_scene=True) - pixel
+        moved = oracle.move(cam, wedge, np.tile(pixel, (64, 1)), turn, to_scene=True) - pixel
         at = int(pixel[1]), int(pixel[0])
         np.testing.assert_allclose(model.offset[at], moved.mean(axis=0), rtol=0, atol=1e-4)
         np.testing.assert_allclose(model.cosine[at], 2.0 * (moved.T @ np.cos(turn)) / 64, rtol=0, atol=1e-4)
@@ -313,7 +324,7 @@ def test_ellipse_round_trip_and_between_pixels(device: str, side: FlatSide, lens
     points, angles = on(device, xy, theta)
     seen = model.compensate_points(points, angles)
     assert distance(model.deflect_points(seen, angles).numpy(), xy).max() < ATOL
-    exact = reference.move(cam, prism(2.0, side), xy, theta, to_scene=True, phase=0.2)
+    exact = oracle.move(cam, prism(2.0, side), xy, theta, to_scene=True, phase=0.2)
     assert distance(seen.numpy(), exact).max() < 1.0
 
 
@@ -380,7 +391,7 @@ def test_fit_recovers_a_known_field() -> None:
 def test_fit_of_a_real_prism_needs_no_optics() -> None:
     cam, wedge = camera(60.0, BARREL, (160, 120)), prism(1.0)
     xy, theta = samples(cam, 5000)
-    model = EllipseModel.fit(cam, xy, theta, reference.move(cam, wedge, xy, theta, to_scene=True, phase=0.4))
+    model = EllipseModel.fit(cam, xy, theta, oracle.move(cam, wedge, xy, theta, to_scene=True, phase=0.4))
     assert predicted_error(model, ExactModel(cam, wedge, 0.4)).rms < 0.03
 
 
@@ -405,7 +416,7 @@ def test_grazing_rays_end_where_the_trace_ends(device: str, side: FlatSide) -> N
     points, angles = on(device, xy, theta)
     model = ExactModel(cam, wedge)
     for to_scene, move in ((True, model.compensate_points), (False, model.deflect_points)):
-        got, expected = move(points, angles).numpy(), reference.move(cam, wedge, xy, theta, to_scene=to_scene)
+        got, expected = move(points, angles).numpy(), oracle.move(cam, wedge, xy, theta, to_scene=to_scene)
         lost = np.isnan(expected).all(axis=1)
         assert 500 < lost.sum() < 15_000
         assert (np.isnan(got).all(axis=1) != lost).sum() <= 5  # float32 differs from float64 at the very limit
@@ -451,10 +462,10 @@ def test_radial_circle_never_returns_an_unsolved_point(device: str, side: FlatSi
 def test_predicted_error_is_that_of_a_dense_independent_evaluation(side: FlatSide, lens: Any) -> None:
     cam, wedge = camera(60.0, lens, (320, 240)), prism(1.0, side)
     xy, theta = lattice(cam, 46, 35)
-    rays = reference.pixels_to_rays(cam, xy)
+    rays = oracle.pixels_to_rays(cam, xy)
     sign = 1.0 if side is FlatSide.SCENE else -1.0
-    circle = reference.rays_to_pixels(cam, reference.turn(rays, theta, sign * math.radians(1.0)))
-    error = distance(circle, reference.move(cam, wedge, xy, theta, to_scene=True))
+    circle = oracle.rays_to_pixels(cam, oracle.turn(rays, theta, sign * math.radians(1.0)))
+    error = distance(circle, oracle.move(cam, wedge, xy, theta, to_scene=True))
     got = predicted_error(CircleModel.from_prism(cam, wedge), ExactModel(cam, wedge))
     assert got.rms == pytest.approx(math.sqrt(np.mean(error**2)), abs=0.1 * got.rms)
     assert got.worst == pytest.approx(error.max(), abs=0.05 * got.worst)

@@ -23,29 +23,37 @@ from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
 from PIL import Image
 from typer.models import ArgumentInfo
 from typer.testing import CliRunner, Result
 
 import amiwarp
-from amiwarp.calib import Calibration
-from amiwarp.choices import Layers
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    Encoder,
+    Events,
+    FrameTruth,
+    Layers,
+    MemoryEvents,
+    Poses,
+    Prism,
+    Recording,
+    RecordingWriter,
+    convert,
+    open_recording,
+    save_recording,
+)
 from amiwarp.cli.app import SUMMARIES, app
 from amiwarp.cli.options import NO_FILE, OUTPUT, OUTPUT_FOLDER
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.events.truth import MAPS, FrameTruth, MemoryFrames, Poses
+from amiwarp.events.truth import MAPS, MemoryFrames
 from amiwarp.imaging.export import IweFiles
-from amiwarp.io import RecordingWriter, convert, open_recording, save_recording
 from amiwarp.io import atomic_output as output
 from amiwarp.io.atomic_output import NewFile, check_output, own_folder, remove_abandoned, write_text
 from amiwarp.io.json_files import read_json
 from amiwarp.io.live_writer import LiveWriter
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
+from reference.calibration_sample import exact_calibration
 
 SPECIFICATION = """
 format = "amiwarp-dataset-specification"

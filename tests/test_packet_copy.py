@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+import warp as wp
 
-from amiwarp.compensation import packet_copy
-from amiwarp.compensation.packet_copy import (
-    PIECE,
-    POOL_SIZE,
-    FindPointers,
-    PacketCopier,
-    PinnedPool,
-    address,
-    fastest,
-    listed_pointers,
-    pointers_in_place,
-)
-from amiwarp.events.events import Events
+from amiwarp import Events
+from amiwarp.compensation.streams import MOST_HELD, PIECE, ColumnCheck, PacketCopier, join_packets
+from amiwarp.kernels.page_locked import PageLockedPool
 
-WAYS = pytest.mark.parametrize("find_pointers", [pointers_in_place, listed_pointers])
+Copy = Callable[[list[Events], list[np.ndarray]], ColumnCheck]
+
+
+def by_threads(parts: list[Events], to: list[np.ndarray]) -> ColumnCheck:
+    return PacketCopier()(parts, to)()
+
+
+WAYS = pytest.mark.parametrize("copy", [join_packets, by_threads])
 
 
 def packets(sizes: list[int]) -> list[Events]:
@@ -34,19 +33,19 @@ def packets(sizes: list[int]) -> list[Events]:
     return parts
 
 
-def copied(copier: PacketCopier, parts: list[Events]) -> tuple[Events, tuple[bool, int, int]]:
+def copied(copy: Copy, parts: list[Events]) -> tuple[Events, tuple[bool, int, int]]:
     n = sum(map(len, parts))
     to = [np.zeros(n, dtype) for dtype in (np.uint16, np.uint16, np.int64, np.uint8)]
-    check = copier(parts, n, [address(column) for column in to], with_p=True).wait()
+    check = copy(parts, to)
     return Events(*to), check
 
 
 @WAYS
 @pytest.mark.parametrize("sizes", [[1], [1, 700, 3], [10] * 300, [PIECE + 5, 100, 2 * PIECE]])
-def test_packets_are_copied_one_after_the_other(find_pointers: FindPointers, sizes: list[int]) -> None:
+def test_packets_are_copied_one_after_the_other(copy: Copy, sizes: list[int]) -> None:
     parts = packets(sizes)
     whole = Events.concatenate(parts)
-    found, check = copied(PacketCopier(find_pointers), parts)
+    found, check = copied(copy, parts)
     for name in ("x", "y", "t", "p"):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
     assert check == (False, whole.x.max(), whole.y.max())
@@ -54,54 +53,47 @@ def test_packets_are_copied_one_after_the_other(find_pointers: FindPointers, siz
 
 @WAYS
 @pytest.mark.parametrize("at", [5, PIECE])
-def test_a_step_back_in_a_packet_is_found(find_pointers: FindPointers, at: int) -> None:
-    """Also at the border between two pieces of a long packet."""
+def test_a_step_back_in_a_packet_is_found(copy: Copy, at: int) -> None:
     (part,) = packets([PIECE + 100])
     part.t[at] = part.t[at - 1] - 1
-    assert copied(PacketCopier(find_pointers), [part])[1].unsorted
-
-
-def test_an_unknown_layout_of_numpy_is_served_by_its_public_interface(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert fastest() is pointers_in_place
-    monkeypatch.setattr(packet_copy, "layout_is_known", lambda: False)
-    assert fastest() is listed_pointers
+    assert copied(copy, [part])[1].unsorted
 
 
 def test_a_pooled_array_is_reused_once_it_is_released() -> None:
-    pool = PinnedPool(100, pinned=False)
-    _, first = pool(100, np.float32)
-    _, second = pool(50, np.float32)
+    pool = PageLockedPool(MOST_HELD, locked=False)
+    _, first = pool.result(100, 100, wp.float32)
+    _, second = pool.result(100, 50, wp.float32)
     assert not np.shares_memory(first, second)
-    start = address(first)
+    start = first.ctypes.data
     del first
-    _, again = pool(10, np.float32)
-    assert address(again) == start
+    _, again = pool.result(100, 10, wp.float32)
+    assert again.ctypes.data == start
 
 
 def test_a_pooled_array_is_not_reused_while_a_view_of_it_is_held() -> None:
-    pool = PinnedPool(100, pinned=False)
-    _, array = pool(100, np.int64)
+    pool = PageLockedPool(MOST_HELD, locked=False)
+    _, array = pool.result(100, 100, wp.int64)
     array[:] = np.arange(100)
     part, buffer = array[20:30][::2], memoryview(array[40:])
     del array
     gc.collect()
-    other = pool(100, np.int64)[1]
+    other = pool.result(100, 100, wp.int64)[1]
     other[:] = -1
     np.testing.assert_array_equal(part, np.arange(20, 30, 2))
     del part
-    pool(100, np.int64)[1][:] = -1
+    pool.result(100, 100, wp.int64)[1][:] = -1
     assert buffer[0] == 40
 
 
 def test_when_the_pool_is_empty_ordinary_memory_is_handed_out() -> None:
-    pool = PinnedPool(100, pinned=False)
-    pool.fill({np.uint8: POOL_SIZE})
-    held = [pool(100, np.uint8) for _ in range(2 * POOL_SIZE)]
-    assert len({address(view) for _, view in held}) == len(held)
+    pool = PageLockedPool(MOST_HELD, locked=False)
+    pool.fill(100, [wp.uint8] * MOST_HELD)
+    held = [pool.result(100, 100, wp.uint8) for _ in range(2 * MOST_HELD)]
+    assert len({view.ctypes.data for _, view in held}) == len(held)
     for array, view in held:
         view[:] = 7
         assert (array.numpy()[:100] == 7).all()
     del array, view
-    pooled = {address(view) for _, view in held[:POOL_SIZE]}
+    pooled = {view.ctypes.data for _, view in held[:MOST_HELD]}
     held.clear()
-    assert {address(view) for _, view in [pool(100, np.uint8) for _ in range(POOL_SIZE)]} == pooled
+    assert {view.ctypes.data for _, view in [pool.result(100, 100, wp.uint8) for _ in range(MOST_HELD)]} == pooled

@@ -9,30 +9,39 @@ from pathlib import Path
 import numpy as np
 import pytest
 import warp as wp
-from conftest import COARSE, TRUE_PHASE, TRUE_PRISM
 from scipy import ndimage
 from scipy.sparse import csr_array, eye_array
 from scipy.sparse.linalg import spsolve
 
-from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    CameraMotion,
+    Encoder,
+    EncoderModel,
+    Events,
+    ExactModel,
+    FlatSide,
+    MemoryEvents,
+    PhotometricSettings,
+    Prism,
+    PrismMotion,
+    Recording,
+    SensorModel,
+    SensorTiming,
+    calibrate,
+    model_error,
+    simulate,
+    truth_model,
+)
+from amiwarp.brightness.event_pairs import EventTable, PairSet
 from amiwarp.brightness.multigrid import Tiles
 from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap, Residuals
-from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.calibration_events import EventsAhead
 from amiwarp.calib.photometric.cost import TILE, Slopes, choose_tiles, iterate, near_tiles, one_tile, van_der_corput
-from amiwarp.calib.settings import PhotometricSettings
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.imaging.votes import CanvasShape, Image
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import simulate
+from tests.conftest import COARSE, TRUE_PHASE, TRUE_PRISM
 
 KNOWN = PhotometricSettings(sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
 KNOWN_COARSE = replace(COARSE, sensor=KNOWN.sensor)

@@ -9,7 +9,22 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from amiwarp.calib import calibrate
+from amiwarp import (
+    Camera,
+    CameraMotion,
+    Encoder,
+    Events,
+    FlatSide,
+    MemoryEvents,
+    Prism,
+    Recording,
+    Scene,
+    SensorModel,
+    calibrate,
+    model_error,
+    simulate,
+    truth_model,
+)
 from amiwarp.calib.bad_pixels import (
     BadPixelSummary,
     bin_times,
@@ -19,17 +34,7 @@ from amiwarp.calib.bad_pixels import (
     unrepeated_counts,
     without_pixels,
 )
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import linear_luminance
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import simulate
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 SIZE = (200, 150)

@@ -13,18 +13,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-from public_calls import CAMERA, RECORDING, REFUSED, PublicCall, public_calls, write_files
 
 import amiwarp
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import LARGEST_ANGLE, Encoder
-from amiwarp.events.events import TIME_LIMIT, Events, MemoryEvents, check_events
-from amiwarp.io import RecordingWriter, open_recording
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Encoder,
+    Events,
+    ExactModel,
+    FlatSide,
+    MemoryEvents,
+    Prism,
+    RecordingWriter,
+    UnsizedPrism,
+    open_recording,
+)
+from amiwarp.events.encoder import LARGEST_ANGLE
+from amiwarp.events.events import TIME_LIMIT, check_events
 from amiwarp.io.live_writer import LiveWriter
-from amiwarp.optics.camera import LARGEST_FOCAL, Camera
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
+from amiwarp.optics.camera import LARGEST_FOCAL
 from amiwarp.validation import shown
+from tests.public_calls import CAMERA, RECORDING, REFUSED, PublicCall, public_calls, write_files
 
 
 class Odd:

@@ -5,43 +5,44 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 import warp as wp
-from calibration_sample import exact_calibration
 from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 from typer.testing import CliRunner
 
-from amiwarp.brightness.event_pairs import EventTable
-from amiwarp.calib.result import Calibration
-from amiwarp.choices import Fill, Tone
-from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.io import open_recording, save_recording
-from amiwarp.io.text import read_calib
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
-from amiwarp.reconstruction.export import save_film, save_picture, save_video, tones
-from amiwarp.reconstruction.picture import (
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    CameraMotion,
+    CameraRotation,
+    Encoder,
+    Events,
+    ExactModel,
+    Fill,
+    MemoryEvents,
     Picture,
+    Prism,
+    PrismMotion,
     Reconstruction,
-    nodes_near,
+    Recording,
+    Scene,
+    SensorModel,
+    Simulation,
+    open_recording,
     reconstruct,
-    without_small_holes,
-    without_small_regions,
+    save_recording,
 )
-from amiwarp.simulation.motion import CameraMotion, PrismMotion
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation
+from amiwarp.brightness.event_pairs import EventTable
+from amiwarp.choices import Tone
+from amiwarp.cli.app import app
+from amiwarp.io.text import read_calib
+from amiwarp.reconstruction.export import save_film, save_picture, save_video, tones
+from amiwarp.reconstruction.picture import nodes_near, without_small_holes, without_small_regions
+from reference.calibration_sample import exact_calibration
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 PRISM, PHASE = Prism(math.radians(1.2)), 2.0
@@ -334,6 +335,8 @@ def test_files_of_each_ending(picture: Picture, tmp_path: Path) -> None:
 
 
 def test_video(recording: Recording, truth: NDArray[np.float32], tmp_path: Path) -> None:
+    import av
+
     work = Reconstruction(recording, model=MODEL)
     pictures = list(work.windows(START, TURN_US, step_us=20_000.0))
     assert len(pictures) == work.count(START, TURN_US, step_us=20_000.0) == 5
@@ -350,6 +353,8 @@ def test_video(recording: Recording, truth: NDArray[np.float32], tmp_path: Path)
 
 def test_a_film_in_colour_keeps_its_place_if_its_size_is_odd(tmp_path: Path) -> None:
     """The codec needs even sizes: the last row and column are repeated."""
+    import av
+
     grey = np.full((31, 45), 200, np.uint8)
     colour = np.stack([grey, grey // 4, np.zeros_like(grey)], axis=2)
     colour[:16] = 0

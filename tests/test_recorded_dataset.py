@@ -10,11 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.io.native_writer import save_recording
-from amiwarp.io.recorded_dataset import RecordedDataset
+from amiwarp import AmiwarpError, Events, MemoryEvents, RecordedDataset, Recording, save_recording
 
 COUNTS = (3, 1, 4, 0, 5)
 

@@ -6,23 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import COARSE, TRUE_PRISM
 
-from amiwarp.calib import calibrate
+from amiwarp import AmiwarpError, Camera, Encoder, Events, MemoryEvents, Prism, Recording, Settings, calibrate, simulate
+from amiwarp.calib.calibration import prepare
 from amiwarp.calib.checks import check_pulses, check_texture
 from amiwarp.calib.first_guess import encoder_turns_per_period
 from amiwarp.calib.model_choice import LARGEST_MOTION_PX, in_pixels
-from amiwarp.calib.photometric.answer_search import judge_optimum
-from amiwarp.calib.settings import Settings
-from amiwarp.calib.single_model import prepare
+from amiwarp.calib.photometric.stage import judge_optimum
 from amiwarp.cli.options import interval, number
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import simulate
+from amiwarp.events.encoder import TWO_PI
+from tests.conftest import COARSE, TRUE_PRISM
 
 WIDTH, HEIGHT, LENGTH_US = 96, 72, 500_000
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, math.radians(50.0))

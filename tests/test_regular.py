@@ -11,18 +11,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from io_samples import SIZE, make_events, write_text
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.io import Format, open_recording, read_encoder_csv
+from amiwarp import AmiwarpError, Format, Trajectory, open_recording
+from amiwarp.io import read_encoder_csv
 from amiwarp.io.input_files import check_regular
 from amiwarp.io.json_files import read_toml
 from amiwarp.io.sealed_json import read_journal
 from amiwarp.io.text import read_calib
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.sequences import open_pictures
-from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.studies.chart.charts import Charts
+from reference.io_samples import SIZE, make_events, write_text
 
 
 def fifo(path: Path) -> Path:

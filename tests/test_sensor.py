@@ -11,17 +11,21 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    CameraMotion,
+    Events,
+    Prism,
+    PrismMotion,
+    Scene,
+    SensorModel,
+    Simulation,
+    simulate,
+)
 from amiwarp.cli.options import SensorOptions
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
 from amiwarp.kernels import pixels
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.motion import CameraMotion, PrismMotion
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation, simulate
 
 CAMERA = Camera.from_fov(64, 48, math.radians(50.0))
 PRISM = Prism(math.radians(3.0), 1.55)

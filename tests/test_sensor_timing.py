@@ -7,13 +7,10 @@ import numpy as np
 import pytest
 import warp as wp
 
+from amiwarp import Calibration, ExactModel, PhotometricSettings, Settings, calibrate, model_error
 from amiwarp.brightness.event_pairs import EventTable
 from amiwarp.brightness.multigrid import Tiles
 from amiwarp.brightness.solver import THRESHOLD, BrightnessMap, darkness, set_lags
-from amiwarp.calib import Calibration, Settings, calibrate
-from amiwarp.calib.settings import PhotometricSettings
-from amiwarp.imaging.metrics import model_error
-from amiwarp.optics.exact_model import ExactModel
 from amiwarp.studies.stability import Condition, make
 
 SMALL = Condition(width=160, height=120, turns=3.0, latency_us=0.0)

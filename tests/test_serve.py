@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import AmiwarpError
 from amiwarp.viewer.serve import Check, Session, number, serve
 
 pytest.importorskip("trame_client")

@@ -22,17 +22,14 @@ import aiohttp
 import msgpack
 import numpy as np
 import pytest
-from test_serve import COUNT, TOKEN, WAIT_S, Counters, get, origin_of, served, until
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import simulate
+from amiwarp import AmiwarpError, Camera, Prism, Recording, simulate
 from amiwarp.viewer import serve as server_module
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.panel import MOST_IN_FLIGHT, SETTABLE
+from amiwarp.viewer.layout import SETTABLE
 from amiwarp.viewer.serve import MOST_BYTES, HostNames, MessageFilter, address, is_local, reachable, serve, warning
+from amiwarp.viewer.work import MOST_IN_FLIGHT
+from tests.test_serve import COUNT, TOKEN, WAIT_S, Counters, get, origin_of, served, until
 
 pytest.importorskip("trame_client")
 
@@ -55,7 +52,7 @@ class Panels:
         from amiwarp.viewer.panel import Panel
 
         panel = Panel(server, Inspector(self.recording))
-        parts = (server, panel, panel.inspector, panel.updates)
+        parts = (server, panel, panel.inspector, panel.work)
         self.parts += map(weakref.ref, parts)
         if self.keep:
             self.panels.append(panel)
@@ -170,7 +167,7 @@ def test_junk_changes_nothing_and_the_page_goes_on(
                 for junk in JUNK:
                     if name not in SETTABLE or not SETTABLE[name](junk):
                         await page.send("trame.state.update", [{"key": name, "value": junk}])
-            for name in (*build.panels[0].calls.offered, "close", "trigger__1"):
+            for name in (*build.panels[0].offered, "close", "trigger__1"):
                 for junk in JUNK:
                     if not isinstance(junk, str | int | float):
                         await page.send("trame.trigger", name, [junk], {})
@@ -221,14 +218,14 @@ def test_all_that_the_page_may_set_leaves_it_alive(recording: Recording, caplog:
             for name in ("apex", "start_ms", "length_ms", "turns", "rpm", "message", "trame__title", "__class__"):
                 for text in ("", "nan", "inf", "-inf", "1e308", "-1e308", "1e-308", "x", "0x10", "1_0", "٣"):
                     await page.call("trame.trigger", "typed", [name, text], {})
-            for name in build.panels[0].calls.offered:
+            for name in build.panels[0].offered:
                 for plain in ("", "c", "?", "__class__", "apex", 0, -1, 1e12, True):
                     for args in ([], [plain], [plain] * 2, [plain] * 4):
                         await page.send("trame.trigger", name, args, {})
             for _ in range(7):  # plays and stops at once
                 await page.call("trame.trigger", "key", [" "], {})
             await page.call("trame.trigger", "key", [" "], {})
-            await until_async(lambda: not build.panels[0].playback.runs)
+            await until_async(lambda: not build.panels[0].plays)
             for name, value in first.items():
                 if name in SETTABLE and SETTABLE[name](value):
                     await page.call("trame.state.update", [{"key": name, "value": value}])
@@ -477,7 +474,7 @@ def test_for_a_page_that_takes_nothing_nothing_more_is_computed(
             assert MessageFilter(server, SETTABLE).passes(message)
             await connection.send(True, aiohttp.WSMessage(aiohttp.WSMsgType.BINARY, message, None))
             panel.state.update({"playing": False, "loop": True, "speed": 10})
-            panel.calls.play()
+            panel.play()
             await until_async(lambda: monitor.pending > MOST_IN_FLIGHT)
             computed.clear()
             for number in range(200):

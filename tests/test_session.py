@@ -15,16 +15,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
-from rig_world import LONG_S, Counted, Wire, World, has_taken_in
 
-from amiwarp.compensation.recordings import compensate, compensate_events
-from amiwarp.compensation.streams import OUTSIDE, Compensated
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.io import open_recording, save_recording
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Compensated,
+    Encoder,
+    Events,
+    ExactModel,
+    MemoryEvents,
+    Prism,
+    Recording,
+    compensate,
+    compensate_events,
+    open_recording,
+    save_recording,
+)
+from amiwarp.compensation.streams import OUTSIDE
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream import session as session_module
@@ -34,9 +41,8 @@ from amiwarp.live.stream.packets import Packet, make_packet
 from amiwarp.live.stream.queues import BackgroundWorker, Policy
 from amiwarp.live.stream.session import Session, SessionStatus
 from amiwarp.live.stream.sources import open_source
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
+from reference.calibration_sample import exact_calibration
+from tests.rig_world import LONG_S, Counted, Wire, World, has_taken_in
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 MODEL = ExactModel.from_prism(CAMERA, PRISM, 0.4)

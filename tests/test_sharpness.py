@@ -5,9 +5,8 @@ import pytest
 import warp as wp
 from scipy import ndimage
 
-from amiwarp.choices import Sharpness
-from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.sharpness import PAPER_ETA, SharpnessMeter, gaussian, sharpness
+from amiwarp import AmiwarpError, Sharpness, sharpness
+from amiwarp.imaging.sharpness import PAPER_ETA, SharpnessMeter, gaussian
 from amiwarp.imaging.votes import CanvasShape
 
 

@@ -12,19 +12,27 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    CameraMotion,
+    EncoderModel,
+    Events,
+    ExactModel,
+    FlatSide,
+    Prism,
+    PrismMotion,
+    RadialTangential,
+    Recording,
+    Scene,
+    SensorModel,
+    Simulation,
+    simulate,
+)
 from amiwarp.kernels import launch as launching
 from amiwarp.kernels import pixels as kernels
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import DARK, Placement, linear_luminance, log_map, place_picture, read_picture
-from amiwarp.simulation.scenery import Scene, step_us
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation, simulate
+from amiwarp.simulation.scenery import step_us
 
 CAMERA = Camera.from_fov(64, 48, math.radians(50.0))
 PRISM = Prism(math.radians(3.0), 1.55)

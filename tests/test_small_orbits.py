@@ -5,15 +5,19 @@ import math
 import numpy as np
 import pytest
 
+from amiwarp import (
+    Camera,
+    FlatSide,
+    PhotometricSettings,
+    Prism,
+    Recording,
+    SensorModel,
+    calibrate,
+    model_error,
+    simulate,
+    truth_model,
+)
 from amiwarp.brightness.multigrid import Tiles
-from amiwarp.calib import calibrate
-from amiwarp.calib.settings import PhotometricSettings
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import simulate
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 

@@ -6,8 +6,8 @@ import weakref
 import numpy as np
 import pytest
 
+from amiwarp import AmiwarpError
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, maximise
-from amiwarp.errors import AmiwarpError
 
 LOW, HIGH = np.array([-10.0, -10.0]), np.array([10.0, 10.0])
 PEAK = np.array([3.1, -2.3])

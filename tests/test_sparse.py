@@ -7,17 +7,21 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from amiwarp.calib import calibrate
-from amiwarp.calib.settings import PhotometricSettings
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    FlatSide,
+    PhotometricSettings,
+    Prism,
+    PrismMotion,
+    Recording,
+    Scene,
+    SensorModel,
+    Simulation,
+    calibrate,
+    model_error,
+    truth_model,
+)
 
 CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
 COARSE = PhotometricSettings(density=1.0)

@@ -6,17 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import COARSE
 
-from amiwarp.calib import calibrate
+from amiwarp import AmiwarpError, ExactModel, calibrate, model_error
 from amiwarp.calib.paper_method import calibrate_as_paper
-from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.metrics import model_error
-from amiwarp.optics.exact_model import ExactModel
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.stability import AXES, Condition, Outcome, chosen, identity, make, quick_axes, run, sensible
 from amiwarp.studies.stability.cells import Store, best_fit, conditions
 from amiwarp.studies.stability.conditions import SceneKind, draw
+from tests.conftest import COARSE
 
 SMALL = Condition(width=160, height=120, turns=3.0)
 

@@ -19,8 +19,8 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 import amiwarp.studies.stability
+from amiwarp import AmiwarpError
 from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
 from amiwarp.io.sealed_json import sealed
 from amiwarp.studies.stability import (
     METHODS,

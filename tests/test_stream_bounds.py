@@ -15,14 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rig_world import World
-from test_session import KNOWN, MODEL, Made, points, world
 
-from amiwarp.compensation.streams import Compensated, Compensator, held_bytes
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events, EventSource
+from amiwarp import AmiwarpError, Compensated, Compensator, Encoder, EncoderStream, Events, EventSource
+from amiwarp.events.events import held_bytes
 from amiwarp.live.link.emulator import (
     MOST_OUT_BYTES,
     MOST_SEGMENTS,
@@ -45,6 +40,8 @@ from amiwarp.live.stream.queues import BackgroundWorker, PacketQueue, Policy
 from amiwarp.live.stream.recent_events import RecentEvents
 from amiwarp.live.stream.session import Session
 from amiwarp.live.stream.sockets import MOST_CLIENTS, PACKET_OVERHEAD, REST_S, PipeSink, SocketSink
+from tests.rig_world import World
+from tests.test_session import KNOWN, MODEL, Made, points, world
 
 MOST = 1 << 20
 """Bound of the queues here [bytes]."""
@@ -186,7 +183,7 @@ def test_a_session_bounds_encoder_samples_without_events() -> None:
     for _ in range(50):  # it stays there
         time.sleep(0.002)
         assert session._queue.held_bytes <= MOST
-        assert session._consumers.raw[0].worker.held_bytes <= MOST
+        assert session._consumers.raw[0][1].held_bytes <= MOST
     assert source.given * samples(0).held_bytes < 2.1 * MOST
     taker.go.set()
     thread.join(LONG_S)

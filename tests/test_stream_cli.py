@@ -21,24 +21,28 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
-from rig_world import LONG_S
 from typer.testing import CliRunner
 
-from amiwarp.calib.result import Calibration
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    Encoder,
+    Events,
+    MemoryEvents,
+    Prism,
+    Recording,
+    compensate,
+    open_recording,
+    save_recording,
+)
 from amiwarp.cli.app import app
 from amiwarp.cli.live import describe
-from amiwarp.compensation.recordings import compensate
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.io import open_recording, save_recording
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
 from amiwarp.live.stream.session import SessionStatus
 from amiwarp.live.stream.sockets import close_listener, listen
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
+from reference.calibration_sample import exact_calibration
+from tests.rig_world import LONG_S
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 SCRIPT = (

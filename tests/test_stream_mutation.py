@@ -6,12 +6,12 @@ import json
 import tracemalloc
 
 import pytest
-from mutation_frames import CAMERA, mutated_serial, mutated_stream, packed, read_serial, read_stream
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import AmiwarpError
 from amiwarp.live.link.follower import MOST_UPDATES, Follower
 from amiwarp.live.link.protocol import LONGEST, ControllerStatus, FrameDecoder, Samples, Sync, encode
 from amiwarp.live.stream.packets import HEADER, HELLO, LONGEST_HELLO, MAGIC, Hello, PacketDecoder
+from reference.mutation_frames import CAMERA, mutated_serial, mutated_stream, packed, read_serial, read_stream
 
 SEEDS = 300
 

@@ -11,9 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amiwarp.compensation.streams import Compensated
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
+from amiwarp import AmiwarpError, Camera, Compensated, Events, Fisheye, FlatSide, Prism, RadialTangential
 from amiwarp.live.stream.packets import (
     ENCODER,
     HEADER,
@@ -33,8 +31,6 @@ from amiwarp.live.stream.packets import (
     encode_triggers,
 )
 from amiwarp.live.stream.queues import EventSorter
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
-from amiwarp.optics.prism import FlatSide, Prism
 
 CAMERAS = (
     None,

@@ -7,8 +7,7 @@ import threading
 import numpy as np
 import pytest
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
+from amiwarp import AmiwarpError, Events
 from amiwarp.live.stream.packets import Packet
 from amiwarp.live.stream.queues import PacketQueue, Policy
 

@@ -15,21 +15,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
-from test_stream_cli import start
 from typer.testing import CliRunner
 
+from amiwarp import AmiwarpError, Camera, Encoder, Events, Prism, open_recording
 from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.io import open_recording
 from amiwarp.live.stream.packets import Packet, encode_encoder, encode_end, encode_events, encode_hello, encode_triggers
 from amiwarp.live.stream.recent_events import RecentEvents, followed
 from amiwarp.live.stream.sockets import close_listener, listen
 from amiwarp.live.stream.sources import open_source
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
+from reference.calibration_sample import exact_calibration
+from tests.test_stream_cli import start
 
 CAMERA, PRISM = Camera.from_fov(64, 48, math.radians(60)), Prism(math.radians(2.0))
 HELLO = encode_hello(64, 48, CAMERA, PRISM)

@@ -13,10 +13,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.io import RecordingWriter
+from amiwarp import AmiwarpError, Camera, Encoder, Events, Prism, RecordingWriter
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream import cameras, sockets, sources
 from amiwarp.live.stream import sockets as connections
@@ -35,8 +32,6 @@ from amiwarp.live.stream.packets import (
 )
 from amiwarp.live.stream.sockets import PipeSink, SocketSink, open_sink
 from amiwarp.live.stream.sources import FileSource, StreamSource, open_source
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
 
 SIZE = (320, 240)
 CAMERA = Camera(*SIZE, 200.0, 201.0, 159.5, 119.5)

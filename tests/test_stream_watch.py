@@ -14,15 +14,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
 
-from amiwarp.calib.result import Calibration
-from amiwarp.compensation.streams import Compensated, Compensator
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
-from amiwarp.io import save_recording
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    Compensated,
+    Compensator,
+    EncoderStream,
+    Events,
+    Prism,
+    Recording,
+    SensorModel,
+    save_recording,
+    simulate,
+)
 from amiwarp.live.stream import recent_events as ring_module
 from amiwarp.live.stream.adaptive import WINDOW_US, SpeedController, SpeedKeeper, prism_orbit
 from amiwarp.live.stream.packets import EncoderSamples, Packet, PacketDecoder
@@ -30,12 +36,9 @@ from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.recent_events import SECONDS, RecentEvents, followed
 from amiwarp.live.stream.sockets import Forward
 from amiwarp.live.stream.sources import FileSource, open_source
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.jobs import LiveSource
+from reference.calibration_sample import exact_calibration
 
 CAMERA, PRISM = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(2.0))
 BIAS_DEG = 3.5

@@ -1,4 +1,4 @@
-"""Rules for the code that a program can check: size of device code, lazy imports, public names, no import cycles.
+"""Rules for the code that a program can check: lazy imports, public names, no import cycles, one way to open files.
 
 Which room may import which is a contract of import-linter in ``pyproject.toml``.
 """
@@ -21,9 +21,7 @@ import amiwarp
 
 PACKAGE = Path(__file__).parents[1] / "amiwarp"
 MODULES = sorted(PACKAGE.rglob("*.py"))
-KERNEL_LINES, KERNEL_PARAMETERS, FILE_LINES = 25, 10, 1_000
-FUNC_LINES = 18
-"""Largest number of lines; aim at 12. A bilinear vote and the steps of the pixel model are one idea each."""
+KERNEL_PARAMETERS = 10
 HEAVY = (
     "warp",
     "nlopt",
@@ -46,19 +44,13 @@ def name_of(path: Path) -> str:
 
 
 def imports_of(path: Path) -> Iterator[str]:
-    """Yield modules that a file imports at run time, in functions too; ``if TYPE_CHECKING`` does not count."""
-    stack: list[ast.AST] = [ast.parse(path.read_text())]
-    while stack:
-        node = stack.pop()
-        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            stack.extend(node.orelse)
-            continue
+    """Yield the modules that a file imports: in functions, and for types only, too."""
+    for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
-        stack.extend(ast.iter_child_nodes(node))
 
 
 @functools.cache
@@ -75,25 +67,10 @@ def device_code() -> list[tuple[str, str, ast.FunctionDef]]:
     return found
 
 
-def length(node: ast.FunctionDef) -> int:
-    """Return the number of lines of the body without the docstring."""
-    body = node.body[1:] if ast.get_docstring(node) is not None else node.body
-    return (body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
-
-
 def test_there_is_something_to_check() -> None:
     kinds = [kind for _, kind, _ in device_code()]
     assert kinds.count("wp.kernel") >= 5
     assert kinds.count("wp.func") >= 20
-
-
-def test_kernels_and_device_functions_stay_small() -> None:
-    long = [
-        f"{where}: {length(node)} lines"
-        for where, kind, node in device_code()
-        if length(node) > (KERNEL_LINES if kind == "wp.kernel" else FUNC_LINES)
-    ]
-    assert long == []
 
 
 def test_kernels_take_few_parameters() -> None:
@@ -103,11 +80,6 @@ def test_kernels_take_few_parameters() -> None:
         if kind == "wp.kernel" and len(node.args.args) > KERNEL_PARAMETERS
     ]
     assert wide == []
-
-
-def test_files_stay_readable() -> None:
-    lengths = {name_of(path): len(path.read_text().splitlines()) for path in MODULES}
-    assert {name: lines for name, lines in lengths.items() if lines > FILE_LINES} == {}
 
 
 def test_kernel_modules_keep_their_annotations() -> None:
@@ -182,13 +154,13 @@ def _names(annotations: list[ast.expr | None]) -> Iterator[str]:
 
 
 def imported_modules(path: Path) -> set[str]:
-    """Return the modules of the package that a file imports at run time, in functions too."""
+    """Return the modules of the package that a file imports."""
     known = {name_of(other) for other in MODULES}
     return {module for module in imports_of(path) if module in known} - {name_of(path), "amiwarp"}
 
 
 def test_no_modules_import_each_other() -> None:
-    """No cycles at run time, imports inside functions included. Packages that only re-export names do not count."""
+    """Not even for types or inside functions. Packages that only re-export names do not count."""
     graph = {name_of(path): imported_modules(path) for path in MODULES if path.name != "__init__.py"}
     order = graphlib.TopologicalSorter({name: used & set(graph) for name, used in graph.items()})
     order.prepare()
@@ -228,8 +200,8 @@ OPENED_OTHERWISE = {
     "amiwarp.io.ros: bag.open()": "reading process",
     # Files of the system and of the package.
     "amiwarp.io.atomic_output: Path('/proc/sys/kernel/random/boot_id').read_text()": "system",
-    "amiwarp.io.reading_server: open('/proc/self/statm')": "system",
-    "amiwarp.io.reading_server: open(f'/proc/self/fdinfo/{number}')": "system",
+    "amiwarp.io.reading_process: open('/proc/self/statm')": "system",
+    "amiwarp.io.reading_process: open(f'/proc/self/fdinfo/{number}')": "system",
     "amiwarp.studies.cluster: info.read_text()": "system",
     "amiwarp.live.stream.sources: open(0, 'rb', buffering=0, closefd=False)": "standard input",
     "amiwarp.viewer.serve: path.read_text(encoding='utf-8')": "file of the package",

@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp.choices import Vote
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
+from amiwarp import (
+    Camera,
+    CameraRotation,
+    CircleModel,
+    Encoder,
+    Events,
+    ExactModel,
+    Model,
+    Prism,
+    RadialTangential,
+    Vote,
+)
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.votes import CanvasShape, Image, TileVotes, upload_events
-from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.circle_models import CircleModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import Model
-from amiwarp.optics.prism import Prism
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
 

@@ -8,16 +8,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
+from amiwarp import AmiwarpError, Camera, Events, ExactModel, Prism, Recording, SensorModel, translate
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.sequences import open_pictures
-from amiwarp.translation.translator import translate, translation
+from amiwarp.translation.translator import translation
 
 CLEAR = Prism(0.0, 1.5)  # no deflection
 WEDGE = Prism(math.radians(2.0), 1.55)

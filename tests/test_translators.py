@@ -15,25 +15,33 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, map_coordinates, shift
 from typer.testing import CliRunner
 
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    CameraMotion,
+    DataSet,
+    Events,
+    Interpolation,
+    MemoryEvents,
+    PictureStack,
+    Prism,
+    Recording,
+    Scene,
+    SensorModel,
+    Simulation,
+    Truth,
+    open_recording,
+    save_recording,
+    translate,
+)
 from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording, Truth
 from amiwarp.events.truth import MemoryMasks
-from amiwarp.io.formats import open_recording
-from amiwarp.io.native_writer import save_recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.sequences import PictureStack, open_pictures
-from amiwarp.simulation.simulator import Simulation
-from amiwarp.translation.datasets import SACCADE_US, SACCADES_PX, DataSet, open_mvsec, saccades
-from amiwarp.translation.pictures_between import READ_US, EventPictures, Interpolation, MotionPictures, PicturePair
+from amiwarp.simulation.sequences import open_pictures
+from amiwarp.translation.datasets import SACCADE_US, SACCADES_PX, open_mvsec, saccades
+from amiwarp.translation.pictures_between import READ_US, EventPictures, MotionPictures, PicturePair
 from amiwarp.translation.reconstructed_pictures import find_motion
-from amiwarp.translation.translator import translate, translation, translator_input
+from amiwarp.translation.translator import translation, translator_input
 
 WEDGE = Prism(math.radians(1.0))
 SIZE = (48, 64)

@@ -11,16 +11,22 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from amiwarp.calib import Calibration, calibrate
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    FlatSide,
+    Prism,
+    Recording,
+    UnsizedPrism,
+    calibrate,
+    open_recording,
+    save_recording,
+    simulate,
+)
 from amiwarp.cli.app import app
 from amiwarp.cli.options import NominalPrismOptions
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
-from amiwarp.io import open_recording, save_recording
 from amiwarp.io.camera_files import prism_attributes, read_prism
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
-from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer.inspector import Inspector
 
 APEX, INDEX = math.radians(1.0), 1.55

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import assume, event, example, given, settings
 from hypothesis import strategies as st
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder, UnwrapError
+from amiwarp import AmiwarpError, Encoder
+from amiwarp.events.encoder import TWO_PI, UnwrapError
 from amiwarp.io import read_encoder_csv
 
 

@@ -5,15 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from amiwarp import AmiwarpError, Camera, Encoder, Events, ExactModel, Prism
 from amiwarp.calib.calibration_events import CalibrationEvents
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.votes import LARGEST_WEIGHT, TURNS, CanvasShape, upload_events
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.prism import Prism
 
 
 def still_scene(n: int, points: int = 200, seed: int = 0) -> Events:

@@ -14,22 +14,25 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from test_serve import WAIT_S, served, until
 
-from amiwarp.calib import Calibration, calibrate
-from amiwarp.events.events import MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.io import open_recording, save_recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.simulator import simulate
+from amiwarp import (
+    Calibration,
+    Camera,
+    MemoryEvents,
+    Prism,
+    PrismMotion,
+    Recording,
+    calibrate,
+    open_recording,
+    save_recording,
+    simulate,
+)
 from amiwarp.viewer import exports, jobs
-from amiwarp.viewer import jobs as selected_calibration
 from amiwarp.viewer.inspector import Inspector, Library
 from amiwarp.viewer.jobs import LiveFigures, LiveSource, estimate_phase
-from amiwarp.viewer.layout import KEYS
-from amiwarp.viewer.panel import SETTABLE
+from amiwarp.viewer.layout import KEYS, SETTABLE
+from amiwarp.viewer.work import JobCancelled
+from tests.test_serve import WAIT_S, served, until
 
 pytest.importorskip("trame_client")
 APEX_DEG, NOMINAL_DEG, RPM, PHASE = 1.0, 1.2, 720.0, 2.0
@@ -149,18 +152,18 @@ def page(kept: tuple[Any, Any, dict[str, Any]], tabs: Tabs, nothing_fails: None)
     page, panel, first = kept
 
     async def anew() -> None:
-        panel.calibration_job.cancel()
+        panel.cancel()
         with panel.state:
             panel.state.playing = False
-        while panel.state.busy or panel.playback.runs:
+        while panel.state.busy or panel.plays:
             await asyncio.sleep(0.01)
         with panel.state:
-            panel.calls.discard()
-            panel.comparison.show_b(None)
+            panel.discard()
+            panel.show_b(None)
             panel.state.update({**first, "message": "", "region_kind": "suggested"})
-            panel.calls.pick(-1)
-            panel.calls.look_from("free")
-            panel.calls.reset()
+            panel.pick(-1)
+            panel.look_from("free")
+            panel.reset()
         while panel.state.updating:
             await asyncio.sleep(0.01)
 
@@ -410,11 +413,11 @@ def endless(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
         try:
             while True:
                 calibrate(*args, **kwargs)
-        except jobs.JobCancelled:
+        except JobCancelled:
             ended.set()
             raise
 
-    monkeypatch.setattr(selected_calibration, "calibrate", again)
+    monkeypatch.setattr(jobs, "calibrate", again)
     return ended
 
 
@@ -725,7 +728,7 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     page.locator("#stream-note").wait_for()
     latest.problem = ""
     page.locator("#stream-note").wait_for(state="detached")
-    until(lambda: not tabs.panels[-1].playback.runs)
+    until(lambda: not tabs.panels[-1].plays)
     times, start = len(asked), field(page, "start_ms")
     before = sharpness(page)
     enter(page, "apex", APEX_DEG)

@@ -15,20 +15,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
 from PIL import Image
 from typer.testing import CliRunner
 
 import amiwarp
+from amiwarp import Camera, MemoryEvents, Prism, open_recording, save_recording, simulate
 from amiwarp.cli.app import app
-from amiwarp.events.events import MemoryEvents
-from amiwarp.io import open_recording, save_recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import app as viewer_app
 from amiwarp.viewer.app import BROWSERS, has_display, open_window
 from amiwarp.viewer.inspector import Inspector, Library
+from reference.calibration_sample import exact_calibration
 
 
 @pytest.fixture(scope="module")

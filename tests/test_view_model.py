@@ -14,22 +14,27 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from amiwarp.calib import Settings
-from amiwarp.choices import Axis, Colour, Sharpness, View
-from amiwarp.compensation.recordings import compensate_events
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.corners import find_background_activity
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Encoder,
+    Events,
+    MemoryEvents,
+    Prism,
+    Recording,
+    Settings,
+    Sharpness,
+    compensate_events,
+    find_background_activity,
+    open_recording,
+    reconstruct,
+    sharpness,
+    simulate,
+)
+from amiwarp.choices import Axis, Colour, View
 from amiwarp.imaging.iwe import Votes
-from amiwarp.imaging.sharpness import random_variance, relative_variance, sharpness
+from amiwarp.imaging.sharpness import random_variance, relative_variance
 from amiwarp.imaging.votes import CanvasShape
-from amiwarp.io import open_recording
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.reconstruction.picture import reconstruct
-from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import exports, timeline
 from amiwarp.viewer import images as log_intensity
 from amiwarp.viewer import images as selected_part
@@ -37,8 +42,9 @@ from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.exports import as_bytes, write_events, write_image
 from amiwarp.viewer.images import ImageKind, Scale, make_images
 from amiwarp.viewer.inspector import Inspector, suggest_region
-from amiwarp.viewer.jobs import calibrate_selected, cost_surface, estimate_phase, scope_text
-from amiwarp.viewer.panel import Updates, events_text
+from amiwarp.viewer.jobs import cost_surface, estimate_phase, find_calibration, scope_text
+from amiwarp.viewer.layout import events_text
+from amiwarp.viewer.panel import Panel
 from amiwarp.viewer.timeline import EventRates
 from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
 from amiwarp.viewer.window import Knobs, Selection, Source
@@ -620,7 +626,7 @@ def test_a_calibration_uses_what_is_selected(
     inspector.set(replace(truth, apex=0.5 * truth.apex))
     said: list[str] = []
     settings = Settings(model="exact", stages=("sharpness",))
-    found = calibrate_selected(inspector, settings, progress=lambda what, share: said.append(what))
+    found = find_calibration(inspector, settings, progress=lambda what, share: said.append(what))
     assert said
     assert found.calibration.camera == recording.camera
     assert found.calibration.parameters["apex"] == pytest.approx(truth.apex, abs=math.radians(0.12))
@@ -643,7 +649,7 @@ def test_a_selection_that_determines_nothing_is_refused(inspector: Inspector) ->
     assert "ON events" in scope_text(inspector)
     assert "without background activity (3 ms)" in scope_text(inspector)
     with pytest.raises(AmiwarpError, match=r"quarter turn|too few"):
-        calibrate_selected(inspector)
+        find_calibration(inspector)
 
 
 def test_the_cost_surface_has_its_top_at_the_truth(inspector: Inspector) -> None:
@@ -772,7 +778,7 @@ class PageState(dict[str, Any]):
     __setattr__ = dict.__setitem__
 
 
-def test_a_number_that_is_typed_during_an_update_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_number_that_is_typed_during_an_update_stays() -> None:
     """The page sets the variable while an update is computed in a thread; the end of the update once reset it."""
     state = PageState(apex=1.0, knob="apex", playing=True)
 
@@ -780,12 +786,11 @@ def test_a_number_that_is_typed_during_an_update_stays(monkeypatch: pytest.Monke
         state.apex = 2.5
         return None, {}
 
+    work = SimpleNamespace(errors_shown=lambda what: contextlib.nullcontext(), in_thread=compute_while_the_user_types)
     panel = SimpleNamespace(
-        state=state, errors_shown=lambda what: contextlib.nullcontext(), set_knobs=lambda: None,
-        show_knobs=lambda: state.update(apex=1.0), history=SimpleNamespace(remember=lambda change: None),
-        in_thread=compute_while_the_user_types,
+        state=state, work=work, inspector=SimpleNamespace(turn_us=math.inf), shown=None, set_knobs=lambda: None,
+        show_knobs=lambda: state.update(apex=1.0), remember=lambda change: None, _compute=None,
     )  # fmt: skip
-    monkeypatch.setattr(Updates, "_show_prism", lambda self: None)
-    asyncio.run(Updates(panel).make({"knobs"}))  # type: ignore[arg-type]
+    asyncio.run(Panel.make(panel, {"knobs"}))  # type: ignore[arg-type]
     assert state.apex == 2.5
     assert state.curve_mark == 2.5

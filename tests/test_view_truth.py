@@ -12,18 +12,24 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 from typer.testing import CliRunner
 
+from amiwarp import (
+    AmiwarpError,
+    Cause,
+    Events,
+    MemoryEvents,
+    Recording,
+    Truth,
+    WorldLabels,
+    open_recording,
+    save_recording,
+)
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording, Truth
-from amiwarp.events.truth import Cause, WorldLabels
-from amiwarp.io import open_recording, save_recording
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer import window
 from amiwarp.viewer.clouds import CAUSE_COLOURS, GREY, Look, Scene, colours_of, event_text, legend_of
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.panel import initial_state
+from amiwarp.viewer.layout import initial_state
 from amiwarp.viewer.window import Selection, colours_on_offer, truth_text
 
 COUNT, SIZE = 6000, (40, 30)

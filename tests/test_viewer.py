@@ -7,30 +7,34 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calibration_sample import exact_calibration
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from amiwarp.calib import Calibration
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    Encoder,
+    Events,
+    MemoryEvents,
+    Prism,
+    Recording,
+    compensate_events,
+    iwe,
+    open_recording,
+    save_recording,
+    simulate,
+)
 from amiwarp.calib.bad_pixels import MaskedEventSource
 from amiwarp.calib.parameters import build_model
 from amiwarp.choices import Axis, Colour, View
-from amiwarp.compensation.recordings import compensate_events
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.iwe import iwe
-from amiwarp.io import open_recording, save_recording
-from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.simulator import simulate
 from amiwarp.viewer import window
 from amiwarp.viewer.clouds import WIDEST_PX, Look, Scene, axis_range, colours_of, orbit_lines, residual, third_axis
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.timeline import read_span
 from amiwarp.viewer.window import Knobs, Selection
+from reference.calibration_sample import exact_calibration
 
 TRUE = Prism(math.radians(1.0))
 PICTURES = Path(__file__).parent / "pictures"
@@ -219,7 +223,7 @@ def test_an_unknown_camera_is_assumed_and_said(recording: Recording) -> None:
 def test_a_calibration_sets_the_knobs_and_comes_back(recording: Recording) -> None:
     found = calibration_of(recording, clock_offset=120.0, tilt_x=0.01)
     inspector = Inspector(recording, found)
-    assert inspector.knobs == Knobs("exact", TRUE.apex, 0.2, 120.0, 0.01, 0.0, 0.0)
+    assert inspector.knobs == Knobs("exact", TRUE.apex, 0.2, 120.0, others=(("tilt_x", 0.01),))
     assert inspector.as_calibration() is found
     inspector.set(replace(inspector.knobs, apex=0.02, model="circle"))
     moved = inspector.as_calibration()

@@ -16,12 +16,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from amiwarp.errors import AmiwarpError
+from amiwarp import AmiwarpError, Sun, Trajectory, load_world
 from amiwarp.io.input_files import inputs_in_use, inputs_noted
 from amiwarp.simulation.pictures import LUMINANCE, linear_luminance
-from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.simulation.worlds.world import Sun
-from amiwarp.simulation.worlds.world_files import load_mesh, load_world
+from amiwarp.simulation.worlds.world_files import load_mesh
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "world-files.md"
 EXAMPLE = re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.S)[0]

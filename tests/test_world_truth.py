@@ -20,8 +20,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import amiwarp
+from amiwarp import AmiwarpError
 from amiwarp.cli.app import app
-from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import MAPS
 from amiwarp.io.chunks import CHUNK
 from amiwarp.simulation.worlds import world_files
@@ -601,8 +601,7 @@ def test_the_truth_command_exports(named: Path, stored: Path) -> None:
 INTERRUPTED = """
 import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
-sys.path.insert(0, {tests!r})
-import test_world_truth as made
+from tests import test_world_truth as made
 from amiwarp.simulation.simulator import Simulation
 long = made.simulation()
 kept = made.amiwarp.TruthRenderer.at
@@ -619,7 +618,7 @@ except KeyboardInterrupt:
 
 
 def test_ctrl_c_while_an_instant_is_rendered_leaves_nothing(tmp_path: Path) -> None:
-    script = INTERRUPTED.format(tests=str(Path(__file__).parent), path=str(tmp_path / "cut.h5"))
+    script = INTERRUPTED.format(path=str(tmp_path / "cut.h5"))
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.stdout.splitlines()[-1:] == ["interrupted"], done.stderr
     assert done.returncode in (0, 128 + signal.SIGINT)

@@ -10,19 +10,29 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
+from amiwarp import (
+    AmiwarpError,
+    Body,
+    Camera,
+    Lamp,
+    Material,
+    Mesh,
+    Prism,
+    Scene,
+    SensorModel,
+    Simulation,
+    Sky,
+    Sun,
+    Trajectory,
+    TruthRenderer,
+    World,
+    WorldScene,
+)
 from amiwarp.simulation.engine import Engine
-from amiwarp.simulation.scenery import Scene
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.renderer import WorldMapRing, pixel_rays, surfaces_at
-from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
-from amiwarp.simulation.worlds.world import Body, Lamp, Material, Mesh, Sky, Sun, World, WorldScene
-from amiwarp.simulation.worlds.world_truth import TruthRenderer
-from tests import reference
+from amiwarp.simulation.worlds.trajectory import looking_at
+from reference import optics as oracle
 
 CAMERA = Camera.from_fov(64, 48, math.radians(60.0))
 CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -183,7 +193,7 @@ def test_flow_through_the_prism_is_what_finite_differences_say() -> None:
     pixels = np.stack(np.meshgrid(np.arange(64), np.arange(48)), axis=-1).reshape(-1, 2).astype(np.float64)
 
     def moved(xy: NDArray[np.float64], angle: float, *, to_scene: bool) -> NDArray[np.float64]:
-        return reference.move(CAMERA, simulation.prism, xy, np.full(len(xy), angle), to_scene=to_scene)
+        return oracle.move(CAMERA, simulation.prism, xy, np.full(len(xy), angle), to_scene=to_scene)
 
     (turn,), (place,) = path.poses([t])
     rays = CAMERA.pixels_to_rays(moved(pixels, theta[1], to_scene=True))

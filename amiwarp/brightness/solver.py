@@ -19,32 +19,10 @@ from amiwarp.brightness.multigrid import GridHierarchy
 from amiwarp.brightness.pair_positions import FEW_BLOCKS, PairPositions
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import conjugate_gradients as cg
+from amiwarp.kernels import equations as eqs
 from amiwarp.kernels import slow_pixels as slow_kernels
-from amiwarp.kernels.conjugate_gradients import (
-    CPU_WIDTH,
-    EXTRA,
-    Prior,
-    add_multiple,
-    dot,
-    gather,
-    gather_diagonal,
-    link,
-    sum_seen,
-)
-from amiwarp.kernels.equations import (
-    HELD,
-    MOST_ROWS,
-    Atlas,
-    add_clusters,
-    find_squares,
-    find_starts,
-    magnitudes,
-    sum_costs,
-    sum_products,
-    sum_square_products,
-    sum_squares,
-)
-from amiwarp.kernels.launch import BLOCK_DIM, Program, RepeatedLaunches, launch, slice_count, start_read
+from amiwarp.kernels.launch import BLOCK_DIM, Program, RepeatedLaunches, launch, slice_count
+from amiwarp.kernels.page_locked import start_read
 from amiwarp.optics.camera_rotation import CameraRotation
 from amiwarp.optics.displacement import model_camera
 
@@ -76,7 +54,7 @@ class Residuals:
         self.pairs, self.tiles, self.device, self.count = pairs, tiles, wp.get_device(pairs.device), len(pairs)
         n = pairs.arrays.stride
         self.values, self.weight = (wp.zeros(n, dtype=float, device=self.device) for _ in "vw")
-        self._width = int(CPU_WIDTH) if self.device.is_cpu else 1
+        self._width = int(cg.CPU_WIDTH) if self.device.is_cpu else 1
         self._launch = RepeatedLaunches(self.device)
 
     def start_mean_cost(self, scale: float, *, missing: float = math.nan, held: bool = False) -> Callable[[], float]:
@@ -87,8 +65,8 @@ class Residuals:
         """
         threads, parts = self._sum_shape
         partial = self._doubles(2, parts)
-        inputs = [self.values, self.pairs.arrays.on, int(HELD) * held, self.count, scale, missing, self._width]
-        self._launch(sum_costs, threads, inputs, [partial], smallest=CHUNKS)
+        inputs = [self.values, self.pairs.arrays.on, int(eqs.HELD) * held, self.count, scale, missing, self._width]
+        self._launch(eqs.sum_costs, threads, inputs, [partial], smallest=CHUNKS)
         sums = start_read(partial)
 
         def result() -> float:
@@ -106,7 +84,7 @@ class Residuals:
         partial = self._doubles(len(factors), parts)
         for k, (a, b) in enumerate(factors):
             inputs = [a, b, self.weight, self.count, self._width]
-            self._launch(sum_products, threads, inputs, [partial[k]], smallest=CHUNKS)
+            self._launch(eqs.sum_products, threads, inputs, [partial[k]], smallest=CHUNKS)
         sums = start_read(partial)
         return lambda: np.asarray(sums().sum(axis=1))
 
@@ -123,7 +101,7 @@ class Residuals:
             sums = wp.zeros((2, size * copies), dtype=wp.int64, device=self.device)
             inputs = [self.pairs.arrays, self.tiles, copies, slope, self.weight, self.values, 0, sums]
             # one CPU thread only: several would add to the same sums
-            wp.launch(add_clusters, self.count, inputs=inputs, device=self.device)
+            wp.launch(eqs.add_clusters, self.count, inputs=inputs, device=self.device)
             # the sums of one tile are too large for page-locked memory
             rows.append(start_read(sums) if self.tiles > 1 else sums.numpy)
 
@@ -147,21 +125,20 @@ class Residuals:
         for k, factor in enumerate(factors):
             wp.copy(values[k], factor, count=n)
         square, order = (wp.empty(2 * n, dtype=int, device=self.device) for _ in "so")
-        launch(
-            find_squares, n, [self.pairs.arrays, values, side, columns, squares], [square, order], device=self.device
-        )
+        inputs = [self.pairs.arrays, values, side, columns, squares]
+        launch(eqs.find_squares, n, inputs, [square, order], device=self.device)
         wp.utils.radix_sort_pairs(square, order, n, end_bit=squares.bit_length())
         starts = wp.empty(squares + 1, dtype=int, device=self.device)
-        launch(find_starts, squares + 1, [square, n], [starts], device=self.device)
+        launch(eqs.find_starts, squares + 1, [square, n], [starts], device=self.device)
         upper = np.triu_indices(len(factors))
         sums = self._doubles(squares, len(upper[0]))
         inputs = [values, self.weight, order, starts]
-        if self.device.is_cpu and len(factors) <= MOST_ROWS:
-            launch(sum_squares, squares, inputs, [sums], device="cpu", smallest=CHUNKS)
+        if self.device.is_cpu and len(factors) <= eqs.MOST_ROWS:
+            launch(eqs.sum_squares, squares, inputs, [sums], device="cpu", smallest=CHUNKS)
         else:
             lanes = 1 if self.device.is_cpu else 32
             inputs += [*(wp.array(k, dtype=int, device=self.device) for k in upper), lanes]
-            launch(sum_square_products, lanes * sums.size, inputs, [sums], device=self.device, smallest=CHUNKS)
+            launch(eqs.sum_square_products, lanes * sums.size, inputs, [sums], device=self.device, smallest=CHUNKS)
         used = np.flatnonzero(np.diff(starts.numpy()))
         found = np.empty((len(used), len(factors), len(factors)))
         found[:, upper[0], upper[1]] = found[:, upper[1], upper[0]] = sums.numpy()[used]
@@ -183,7 +160,7 @@ class Residuals:
             return lambda: found
         keys, order = (wp.empty(2 * n, dtype=t, device=self.device) for t in (float, int))
         number = wp.zeros(1, dtype=int, device=self.device)
-        wp.launch(magnitudes, n, inputs=[self.values, 0, keys, number], device=self.device)
+        wp.launch(eqs.magnitudes, n, inputs=[self.values, 0, keys, number], device=self.device)
         wp.utils.radix_sort_pairs(keys, order, n)
 
         def result() -> float:
@@ -257,11 +234,11 @@ class BrightnessMap:
             raise AmiwarpError("no pixel fired twice in time, so no brightness can be found; give a longer recording")
         self.device, self.tiles, self.count = wp.get_device(pairs.device), tiles, len(pairs)
         self.pairs, self.middle_us, self.smoothness = pairs, middle_us, smoothness
-        self._atlas = Atlas()
+        self._atlas = eqs.Atlas()
         self._atlas.origin = wp.array(tiles.origin.ravel(), dtype=float, device=self.device)
         self._atlas.rows, self._atlas.columns, self._atlas.density = tiles.rows, tiles.columns, tiles.density
         self._atlas.with_leak, self._atlas.with_off = float(with_leak), int(off_excess is None)
-        unknowns = tiles.nodes + int(EXTRA)
+        unknowns = tiles.nodes + int(cg.EXTRA)
         self._image = self._zeros(unknowns)
         self._sums = wp.zeros((slice_count(self.device), unknowns), dtype=wp.int64, device=self.device)
         self._slices = [self._sums[k] for k in range(len(self._sums))]
@@ -292,7 +269,7 @@ class BrightnessMap:
     def _make_prior(self, damping: float, unknowns: int) -> None:
         """Set up damping, smoothness, and the multigrid preconditioner of a single tile."""
         linked = self.smoothness is not None
-        self._prior = Prior()
+        self._prior = cg.Prior()
         self._prior.columns = self.tiles.columns
         self._prior.damping = wp.full(1, damping, dtype=float, device=self.device)
         self._prior.linked, self._prior.held = int(linked), unknowns
@@ -364,7 +341,8 @@ class BrightnessMap:
         parts = len(self._dots.pq)
         partial = wp.empty((2, parts), dtype=wp.float64, device=self.device)
         threads = parts if self.device.is_cpu else parts * BLOCK_DIM  # block sums need whole blocks
-        self._launch(sum_seen, threads, [self._image[: self.tiles.nodes], self._width], [partial], smallest=FEW_CHUNKS)
+        inputs = [self._image[: self.tiles.nodes], self._width]
+        self._launch(cg.sum_seen, threads, inputs, [partial], smallest=FEW_CHUNKS)
         squares, number = partial.numpy().sum(axis=1).tolist()
         if squares <= CONTRAST * number:
             return False
@@ -377,7 +355,7 @@ class BrightnessMap:
 
     def add(self, change: Any, factor: float) -> None:
         """Add a change of the map times a factor to the map."""
-        self._launch(add_multiple, len(change), [change, factor], [self._image])
+        self._launch(cg.add_multiple, len(change), [change, factor], [self._image])
 
     def unexplained(self, target: Any, change: Any = None, *, steps: int) -> Any:
         """Return the part of ``target`` (pairs, on the device) that no change of the map explains.
@@ -423,9 +401,9 @@ class BrightnessMap:
         program = Program(self.device)
         if self.smoothness is not None:
             inputs = [self._image, self.tiles.rows, self.smoothness.edge, self._prior]
-            program.add(link, self.tiles.nodes, inputs, [self._prior.right, self._prior.down])
+            program.add(cg.link, self.tiles.nodes, inputs, [self._prior.right, self._prior.down])
         self._equations.add_diagonal(program, self.residuals.weight, self._slices)
-        program.add(gather_diagonal, len(self._image), [self._sums, self._prior], [self._u.diagonal])
+        program.add(cg.gather_diagonal, len(self._image), [self._sums, self._prior], [self._u.diagonal])
         return program
 
     @cached_property
@@ -483,7 +461,7 @@ class BrightnessMap:
         self._add_weigh(program)
         self._equations.add_diagonal(program, self.residuals.weight, self._slices)
         out = self._zeros(len(self._image))
-        program.add(gather, len(out), [self._sums], [out])
+        program.add(cg.gather, len(out), [self._sums], [out])
         program.launch()
         self.pairs.arrays.weak = weak
         return out
@@ -534,7 +512,7 @@ class _ConjugateGradients:
         of = self._map
         if of._grids is not None:
             of._grids.correct(program, of._u.diagonal, of._prior, of._u.residual, of._z)
-            self._add(program, dot, [of._u.residual, of._z], [of._dots.rz])
+            self._add(program, cg.dot, [of._u.residual, of._z], [of._dots.rz])
 
     def _add(self, program: Any, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
         program.add(kernel, self._map._threads, [*inputs, self._map._width], outputs, smallest=FEW_CHUNKS)

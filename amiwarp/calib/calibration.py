@@ -1,17 +1,43 @@
-"""Calibration of the prism from a recording."""
+"""Calibration of the prism from a recording, to be read from top to bottom.
+
+:func:`calibrate` runs a :class:`Calibrator`, and for the model ``auto`` lets a :class:`ModelChooser` choose among the
+models. A calibrator makes attempts by the stages of the settings. If no brightness map explains the events, it tries
+three causes in turn: hot or flickering pixels, a rotating camera, and a wrong scale of the encoder. :func:`prepare`
+sets up an attempt: the encoder, the events and the parameter space.
+"""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-from typing import Any
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
-from amiwarp.calib.model_choice import calibrate_auto
-from amiwarp.calib.result import Calibration
-from amiwarp.calib.settings import AUTO, Settings
-from amiwarp.calib.single_model import calibrate_model
+import numpy as np
+
+from amiwarp.calib import checks
+from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
+from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
+from amiwarp.calib.first_guess import encoder_turns_per_period, estimate_rates, estimate_rpm
+from amiwarp.calib.model_choice import ModelChooser
+from amiwarp.calib.parameters import LENS, MOTION, RATES, ParameterSpace, make_space, nominal, with_lens
+from amiwarp.calib.photometric import stage
+from amiwarp.calib.photometric.cost import upload_ahead
+from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
+from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, Settings
+from amiwarp.calib.sharpness import Search
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
+from amiwarp.optics.models import MODELS, size_names
+from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.validation import check_names, guarded
+
+if TYPE_CHECKING:
+    from amiwarp.optics.camera import Camera
 
 
 @guarded
@@ -70,6 +96,356 @@ def calibrate(
     check_names(changes, [entry.name for entry in fields(Settings)], "calibrate: setting ")
     settings = replace(settings or Settings(), **changes)
     settings.check()
+    if settings.model != AUTO:
+        return Calibrator(recording, settings, device, progress).run()
+    chooser = ModelChooser(recording, settings, device)
+    exact = Calibrator(recording, chooser.settings, device, progress, chooser.prepare).run()
+    return chooser.choose(exact, lambda again, free: Calibrator(again, free, device, progress).run())
+
+
+LEAST_BAD_SHARE = 0.01
+"""Share of the events on hot or flickering pixels above which these pixels are masked."""
+LEAST_SCALE_ERROR = 0.003
+"""Smallest relative error of an encoder's scale that is reported. Three turns measure the scale to about 0.001."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """Outcome of one attempt: a calibration, or the error that ended it."""
+
+    calibration: Calibration | None
+    error: AmiwarpError | None = None
+
+    @property
+    def photometric(self) -> PhotometricSummary | None:
+        """Result of the photometric stage; None if it did not run."""
+        return None if self.calibration is None else self.calibration.photometric
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the photometric stage accepted its result."""
+        return self.photometric is not None and self.photometric.accepted
+
+    @property
+    def cost(self) -> float:
+        """Cost of the photometric stage, relative to that without a map; 1 if the stage did not run."""
+        return 1.0 if self.photometric is None else self.photometric.cost
+
+    @property
+    def unexplained(self) -> bool:
+        """Whether the photometric cost is so high that the camera may have rotated."""
+        if self.photometric is None:
+            return isinstance(self.error, checks.NoSharpOptimumError)
+        return self.cost > stage.LARGEST_STILL_COST
+
+    @property
+    def camera_turned(self) -> bool:
+        """Whether a rotation of the camera explains much of the photometric residual."""
+        return self.photometric is not None and self.photometric.rotation_gain > stage.LARGEST_ROTATION_GAIN
+
+    def found(self) -> Calibration:
+        """Return the calibration, or raise the error."""
+        if self.calibration is None:
+            assert self.error is not None
+            raise self.error
+        return self.calibration
+
+
+@dataclass(frozen=True)
+class Calibrator:
+    """Calibration of one model from one recording, by sharpness and then photometrically."""
+
+    recording: Recording
+    settings: Settings
+    device: Any
+    progress: Progress | None
+    meanwhile: Callable[[Calibration], Iterator[None]] | None = None
+    """Function that gets the answer of the first attempt's sharpness stage and returns other work. Some of its steps
+    are taken while a GPU works on the photometric stage, those that are left after the stage."""
+
+    def run(self) -> Calibration:
+        """Return the calibration of ``settings.model``; raise :class:`AmiwarpError` as :func:`calibrate` does.
+
+        If no brightness map explains the events, or a slow rotation of the camera explains much of what is left, the
+        camera's rotation is freed too.
+        """
+        began = time.perf_counter()
+        tried = self.attempt()
+        if "photometric" not in self.settings.stages:
+            return tried.found()
+        recording, calibrator = self.recording, replace(self, meanwhile=None)
+        if recording.encoder is not None:
+            if tried.unexplained:
+                calibrator, tried = calibrator.without_bad_pixels(tried)
+            if tried.unexplained:
+                tried = calibrator.explained(tried)
+            elif self.settings.free is None and tried.camera_turned:
+                tried = calibrator.with_rotation(tried)
+        found = tried.found()
+        if not tried.accepted:  # the answer of sharpness alone may be off by tenths of a pixel
+            reasons = [w for w in found.warnings if "photometric" in w]
+            raise AmiwarpError(
+                f"{recording.name}: {'; '.join(reasons)}; the result of the sharpness stage alone may be off by "
+                "several tenths of a pixel: accept it with --stages sharpness, or record a scene that stays still"
+            )
+        given = {*self.settings.bounds, *self.settings.start}
+        if isinstance(recording.prism, Prism) and not size_names() & given:
+            checks.check_nominal(found.model_name, found.parameters, recording.prism, recording.name)
+        return replace(found, seconds=time.perf_counter() - began)
+
+    def attempt(self) -> Attempt:
+        """Calibrate once by the stages of the settings, with the free parameters that they name."""
+        began = time.perf_counter()
+        try:
+            recording = rotation_window(self.recording, self.settings)
+            searches = prepare(recording, self.settings, device=self.device, progress=self.progress)
+            with upload_ahead(recording, searches[0]) as ahead:
+                for search in searches:
+                    search.run()
+                search = max(searches, key=lambda s: s.score)
+                found = _sharpest(recording, search, *search.check_answer(recording.name))
+                if "photometric" in self.settings.stages:
+                    search.ahead = ahead
+                    search.meanwhile = iter(()) if self.meanwhile is None else self.meanwhile(found)
+                    try:
+                        refined = stage.refine(recording, search)
+                        for _ in search.meanwhile:
+                            pass
+                    except AmiwarpError as error:
+                        found = _warning(found, f"the photometric stage failed: {error}")
+                    else:
+                        found = _refined(search, found, *refined)
+        except AmiwarpError as error:
+            return Attempt(None, error)
+        return Attempt(replace(found, seconds=time.perf_counter() - began))
+
+    def without_bad_pixels(self, tried: Attempt) -> tuple[Calibrator, Attempt]:
+        """Mask hot and flickering pixels if they have a notable share of the events, and calibrate without them.
+
+        Return the calibrator of the masked recording and the better of both attempts. Raises :class:`AmiwarpError` if
+        most pixels flicker.
+        """
+        source, encoder = self.recording.events, self.recording.encoder
+        assert encoder is not None
+        mask, summary = strange_pixels(stretch(source, encoder), encoder, source.size)
+        if summary.share < LEAST_BAD_SHARE:
+            return self, tried
+        checks.check_light(mask, summary, self.recording.name)
+        cleaned = replace(self, recording=replace(self.recording, events=MaskedEventSource(source, mask)))
+        again = cleaned.attempt()
+        if tried.accepted and not again.accepted:
+            return cleaned, tried
+        if again.calibration is None:
+            return cleaned, again
+        return cleaned, Attempt(_warning(again.calibration, str(summary)))
+
+    def explained(self, tried: Attempt) -> Attempt:
+        """Return the attempt with a free camera rotation, the error of a wrong encoder scale, or ``tried`` unchanged.
+
+        A slow camera rotation and a wrong encoder scale have similar effects on the events. If the rotation leaves a
+        high cost, the cause with the lower cost is taken.
+        """
+        moving = tried if self.settings.free is not None else self.with_rotation(tried)
+        if moving is not tried and moving.cost <= stage.LARGEST_STILL_COST:
+            return moving
+        scaled = self.with_other_scale(tried)
+        if scaled is None or (moving is not tried and moving.cost <= scaled[1]):
+            return moving
+        turns, cost = scaled
+        return Attempt(None, checks.wrong_scale(self.recording.name, turns, "the events repeat", tried.cost, cost))
+
+    def with_other_scale(self, tried: Attempt) -> tuple[float, float] | None:
+        """Return after how many encoder turns events repeat, and the photometric cost with the scale corrected by it.
+
+        The events of a still scene repeat every turn of the prism. If they repeat at another encoder angle, the
+        encoder's scale may be wrong. None if the corrected scale does not lower the cost enough.
+        """
+        encoder = self.recording.encoder
+        assert encoder is not None
+        try:
+            turns = encoder_turns_per_period(self.recording, encoder)
+        except AmiwarpError:
+            return None  # the events do not repeat: the scene or the camera moves
+        if abs(turns - 1.0) < LEAST_SCALE_ERROR:
+            return None
+        corrected = replace(encoder, angle=encoder.angle / turns, index_t=None)
+        again = replace(self, recording=replace(self.recording, encoder=corrected)).attempt()
+        return (turns, again.cost) if again.accepted and again.cost <= stage.LARGEST_COST_RATIO * tried.cost else None
+
+    def with_rotation(self, tried: Attempt) -> Attempt:
+        """Return the attempt with a free camera rotation if that lowers the photometric cost enough; else ``tried``."""
+        free = (MODELS[self.settings.model].SIZE, "phase", "motion")
+        again = replace(self, settings=replace(self.settings, free=free)).attempt()
+        if not again.accepted or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
+            return tried
+        moving = again.found()
+        speed = math.degrees(math.hypot(*(moving.parameters[n] for n in RATES)))
+        # only the prism's parameters are kept: the rotation holds for two turns in the middle of the recording
+        still = replace(
+            moving,
+            parameters={n: x for n, x in moving.parameters.items() if n not in MOTION},
+            uncertainty={n: x for n, x in moving.uncertainty.items() if n not in MOTION},
+            free=tuple(n for n in moving.free if n not in MOTION),
+            middle_us=None,
+        )
+        said = f"the camera turned at {speed:.1f} deg/s; its rotation was calibrated together with the prism"
+        return Attempt(_warning(still, said))
+
+
+def _warning(found: Calibration, *said: str) -> Calibration:
+    """Return the calibration with more warnings."""
+    return replace(found, warnings=(*found.warnings, *said))
+
+
+def _sharpest(
+    recording: Recording, search: Search, warnings: tuple[str, ...], uncertainty: dict[str, float]
+) -> Calibration:
+    """Return the calibration by the sharpness stage that ``search`` ran. Its time is not set."""
+    settings, space, best = search.settings, search.space, search.best
+    still = {n: 0.0 for n in (space.size_name, *MOTION) if n in best}
+    return Calibration(
+        model_name=settings.model,
+        camera=space.camera,
+        prism=space.prism,
+        parameters=best,
+        uncertainty=uncertainty,
+        free=space.names,
+        sharpness_name=settings.sharpness.value,
+        sharpness_before=search.fine.values({**best, **still}),
+        sharpness_after=search.score,
+        stages=tuple(search.stages),
+        # without an encoder, the prism angle is 0 at this time
+        zero_us=middle_time(recording) if recording.encoder is None and space.sized else None,
+        middle_us=space.middle_us if space.moving else None,
+        events=len(search.calibration_events.events),
+        seconds=0.0,
+        warnings=warnings,
+    )
+
+
+def _refined(
+    search: Search, sharp: Calibration, found: PhotometricSummary, summary: StageSummary, space: ParameterSpace
+) -> Calibration:
+    """Return the photometric stage's result, or ``sharp``, the sharpness stage's, with a warning that says why."""
+    held = [f"the events do not determine {', '.join(found.held)}: the photometric stage left it unchanged"]
+    result = _warning(sharp, *(held if found.held else ()), *found.warnings)
+    result = replace(result, stages=(*result.stages, summary), photometric=found)
+    if not found.accepted:
+        return _warning(result, f"photometric stage: {found.verdict}")
+    lens = {n: x for n, x in found.parameters.items() if n in LENS and n not in search.full_space.names}
+    return replace(
+        result,
+        camera=with_lens(result.camera, lens),
+        prism=space.prism,
+        parameters={n: x for n, x in found.parameters.items() if n not in lens},
+        uncertainty={n: x for n, x in found.uncertainty.items() if n not in lens},
+        free=tuple(n for n in space.names if n not in lens),
+        sharpness_after=search.sharpness_in(space, found.parameters),
+    )
+
+
+# Preparation of an attempt: the encoder, the events and the parameter space for a recording.
+
+
+def prepare(
+    recording: Recording, settings: Settings, *, device: Any = "cpu", progress: Progress | None = None
+) -> list[Search]:
+    """Return the searches for a recording: one, or one for each sense of rotation if the prism's speed is unknown.
+
+    For the model ``auto`` the search is that of the exact model, to which the smaller models are fitted later.
+    Raises :class:`AmiwarpError` if the recording does not suit a calibration.
+    """
     if settings.model == AUTO:
-        return calibrate_auto(recording, settings, device=device, progress=progress, budget_px=settings.budget_px)
-    return calibrate_model(recording, settings, device=device, progress=progress)
+        settings = replace(settings, model="exact")
+    name, camera = recording.name, _camera(recording)
+    checks.check_events(len(recording.events), name)
+    encoders, free = _encoders(recording, settings)
+    events = thin(recording, settings.events)
+    if isinstance(recording.events, MaskedEventSource) and len(events) < settings.events:
+        checks.check_unmasked_events(len(events), recording.events.mask, name)
+    searches = []
+    for encoder in encoders:
+        checks.check_coverage(encoder, int(events.t[0]), int(events.t[-1]), name)
+        checks.check_pulses(encoder, name)
+        space = _space(recording, camera, encoder, events, settings, free)
+        calibration_events = _calibration_events(events, encoder, space, middle_time(recording), settings.fold)
+        if space.sized:
+            checks.check_turned(encoder.angle_at(events.t[:: max(1, len(events) // 10_000)]), name)
+        searches.append(Search(space, calibration_events, settings, device, progress))
+    return searches
+
+
+def _camera(recording: Recording) -> Camera:
+    if recording.camera is None:
+        raise AmiwarpError(f"{recording.name}: the camera is unknown; give its intrinsics or its field of view")
+    return recording.camera
+
+
+def _encoders(recording: Recording, settings: Settings) -> tuple[list[Encoder], tuple[str, ...]]:
+    """Return the encoders to try and the free parameters.
+
+    Without an encoder these are constant speeds: the given one, or the one found in the events with either sign.
+    """
+    kind = MODELS[settings.model]
+    free = kind.FREE[:2] if settings.free is None else settings.free
+    free = tuple(n for n in free if n not in LINEAR_UNKNOWNS)
+    if not {*size_names(), "phase"} & set(free) and settings.start.get(kind.SIZE) == 0.0:
+        return [constant_speed(0.0, recording.events.t_first, recording.events.t_last, middle_time(recording))], free
+    if recording.encoder is not None:
+        if "rpm" in free or "rpm" in settings.start:
+            raise AmiwarpError(
+                f"{recording.name}: the encoder gives the rpm; remove rpm from the settings, or free clock_offset"
+            )
+        return [recording.encoder], free
+    if "clock_offset" in free or "clock_offset" in settings.start:
+        raise AmiwarpError(
+            f"{recording.name}: the recording has no encoder, so clock_offset is part of the phase; remove "
+            "clock_offset from the settings"
+        )
+    rpm = settings.start.get("rpm")
+    speeds = [rpm] if rpm is not None else [s * estimate_rpm(recording) for s in (1.0, -1.0)]
+    first, last = recording.events.t_first, recording.events.t_last
+    encoders = [constant_speed(s, first, last, middle_time(recording)) for s in speeds]
+    return encoders, free if "rpm" in free else (*free, "rpm")
+
+
+def _space(
+    recording: Recording,
+    camera: Camera,
+    encoder: Encoder,
+    events: Events,
+    settings: Settings,
+    free: tuple[str, ...],
+) -> ParameterSpace:
+    """Return the space of the free parameters, started at estimates from the encoder and the events."""
+    duration = int(events.t[-1]) - int(events.t[0])
+    turned = float(np.ptp(encoder.angle_at(events.t[[0, -1]])))
+    start = dict(settings.start)
+    if "rpm" in free:
+        start["rpm"] = encoder.rpm
+    if "clock_offset" in free:
+        start.setdefault("clock_offset", encoder.clock_offset_us)
+    if ("motion" in free or set(RATES) & set(free)) and turned > 0.0 and not set(RATES) & set(start):
+        found = dict(zip(RATES, estimate_rates(events, encoder, camera), strict=True))
+        start |= {n: rate for n, rate in found.items() if "motion" in free or n in free}
+    return make_space(
+        settings.model, camera, nominal(recording.prism), free=free, start=start, bounds=settings.bounds,
+        rad_per_us=turned / max(duration, 1), duration_us=float(duration), middle_us=middle_time(recording),
+    )  # fmt: skip
+
+
+def _calibration_events(
+    events: Events, encoder: Encoder, space: ParameterSpace, middle: int, fold: int
+) -> CalibrationEvents:
+    """Return the calibration events with their encoder and the angles' derivative by a free clock offset or rpm."""
+    if fold and (space.moving or {"clock_offset", "rpm"} & set(space.names)):
+        raise AmiwarpError(
+            f"fold = {fold} with {', '.join(space.names)} free: folding discards the events' times; set fold to 0"
+        )
+    if "clock_offset" in space.start:
+        encoder = encoder.with_clock_offset(space.start["clock_offset"])
+    if "clock_offset" in space.names:
+        return CalibrationEvents(events, encoder, lambda t: encoder.speed_at(t) * 1e-6)
+    if "rpm" in space.names:
+        return CalibrationEvents(events, encoder, lambda t: (t - middle).astype(np.float64) * (2.0 * math.pi / 60e6))
+    return CalibrationEvents(events, encoder, None, fold)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from amiwarp.calib.parameters import MOTION
 from amiwarp.events.device_events import NAMES, DeviceEvents
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.imaging.votes import upload_events
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from amiwarp.calib.settings import Settings
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.recording import Recording
     from amiwarp.imaging.votes import UploadedEvents
@@ -80,10 +82,33 @@ class CalibrationEvents:
         return CalibrationEvents(self.events[cut], self.encoder, self.slope_of, self.fold)
 
 
-# Even thinning of a recording's events.
+# Choice of the events of a recording: a window about its middle, and even thinning.
 
+ROTATION_WINDOW_TURNS, ROTATION_WINDOW_US = 2.1, 100_000.0
+"""Length of the part of a recording that is used if the camera's rotation is free: in turns, or without a prism in
+microseconds."""
 RUN = 8
 """Number of consecutive events that thinning keeps together: their times fill one cache line."""
+
+
+def middle_time(recording: Recording) -> int:
+    """Return the middle time of the recording [us], about which a change of speed changes the phase least."""
+    return (recording.events.t_first + recording.events.t_last) // 2
+
+
+def rotation_window(recording: Recording, settings: Settings) -> Recording:
+    """Return two turns from the recording's middle if the camera's rotation is free, else the recording itself.
+
+    The rotation model holds for a short time only.
+    """
+    if not settings.free or not {"motion", *MOTION} & set(settings.free):
+        return recording
+    encoder, events = recording.encoder, recording.events
+    rpm = settings.start.get("rpm", 0.0) if encoder is None else encoder.rpm
+    length = ROTATION_WINDOW_TURNS * 60e6 / abs(rpm) if abs(rpm) > 1e-3 else ROTATION_WINDOW_US
+    middle = middle_time(recording)
+    cut = events.between(round(middle - length / 2), round(middle + length / 2))
+    return replace(recording, events=MemoryEvents(cut, *events.size))
 
 
 def thin(recording: Recording, most: int) -> Events:

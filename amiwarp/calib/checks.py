@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.calib.parameters import size_name
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.sharpness import edge_coherence
+from amiwarp.optics.models import MODELS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -144,10 +144,11 @@ def check_nominal(model: str, parameters: Mapping[str, float], nominal: Prism, n
 
     Prisms are made to within a few percent. A larger difference means another prism, or motion that is not the prism's.
     """
-    size = size_name(model)
+    kind = MODELS[model]
+    size = kind.SIZE
     if size not in parameters:
         return
-    share = parameters[size] / (nominal.apex if size == "apex" else nominal.deflection)
+    share = parameters[size] / kind.size_from_apex(nominal.apex, nominal)
     if not abs(share - 1.0) <= LARGEST_FROM_NOMINAL:
         raise AmiwarpError(
             f"{name}: the calibrated size of the prism is {100 * share:.0f} % of its nominal {size} (nominal apex "

@@ -6,17 +6,13 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.validation import guarded, one_of
-
-if TYPE_CHECKING:
-    pass
-
 
 GLOBAL_ALGORITHMS = (
     "GN_DIRECT",
@@ -87,11 +83,6 @@ def best_of(
     )  # fmt: skip
 
 
-def check_algorithm(name: str, known: tuple[str, ...]) -> None:
-    """Raise :class:`AmiwarpError` unless ``name`` is one of ``known``."""
-    one_of(name, known, "algorithm")
-
-
 def maximise(
     score: Callable[[NDArray[np.float64]], float],
     algorithm: str,
@@ -147,7 +138,7 @@ def maximise(
     import nlopt
 
     names = LOCAL_ALGORITHMS if algorithm.startswith("LN_") else GLOBAL_ALGORITHMS
-    check_algorithm(algorithm, names)
+    one_of(algorithm, names, "algorithm")
     began = time.perf_counter()
     nlopt.srand(seed + 1)  # 0 would seed NLopt from the clock
     optimiser = _optimiser(
@@ -250,13 +241,10 @@ def _optimiser(
         optimiser.set_xtol_abs(np.full(n, tolerance))
         optimiser.set_initial_step(np.minimum(step, 0.45 * (high - low)))
     if "MLSL" in algorithm:
-        check_algorithm(inner, LOCAL_ALGORITHMS)
+        one_of(inner, LOCAL_ALGORITHMS, "algorithm")
         local = _optimiser(
             inner, low=low, high=high, evaluations=max(20, evaluations // 8), tolerance=max(tolerance, 0.05),
             step=step, inner=inner,
         )  # fmt: skip
         optimiser.set_local_optimizer(local)
     return optimiser
-
-
-# Share of a calibration that is finished, for progress messages.

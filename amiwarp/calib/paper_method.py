@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.calib.calibration import prepare
 from amiwarp.calib.nlopt_solver import best_of
 from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.settings import STAGES, Settings
-from amiwarp.calib.single_model import prepare
 from amiwarp.choices import Sharpness
 from amiwarp.events.events import MemoryEvents
 

@@ -8,7 +8,7 @@ and one first step then fit every parameter. If the phase is free over the full 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
@@ -18,12 +18,9 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import RadialTangential
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
-from amiwarp.optics.displacement import compensate_by_each, rms, wrap_angle
-from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import MODELS
-from amiwarp.optics.prism import Prism, UnsizedPrism, deflection_from_apex
+from amiwarp.optics.displacement import PHASE, Parameter, check_given, compensate_by_each, model_of, rms, wrap_angle
+from amiwarp.optics.models import MODELS, size_names
+from amiwarp.optics.prism import Prism, UnsizedPrism
 from amiwarp.validation import guarded, instance, one_of, real, shown, vector
 
 if TYPE_CHECKING:
@@ -36,29 +33,6 @@ if TYPE_CHECKING:
 
 NOMINAL_APEX = math.radians(2.0)
 """Apex angle assumed if a recording does not give it [rad]. The search goes up to twice this value."""
-UNITS = {
-    "apex": "rad",
-    "deflection": "rad",
-    "phase": "rad",
-    "clock_offset": "us",
-    "rpm": "1/min",
-    "tilt_x": "rad",
-    "tilt_y": "rad",
-    "index": "1",
-    "focal_length": "px",
-    "rate_x": "rad/s",
-    "rate_y": "rad/s",
-    "rate_z": "rad/s",
-    "change_x": "rad/s2",
-    "change_y": "rad/s2",
-    "change_z": "rad/s2",
-}
-"""Unit of every parameter that can be free.
-
-``clock_offset`` is the encoder's clock offset (see :class:`amiwarp.Encoder`). ``focal_length`` is the camera's fx; fy
-keeps its ratio to fx. ``rate_*`` and ``change_*`` describe the camera's rotation (:class:`amiwarp.CameraRotation`).
-"""
-
 DRIFTS = ("clock_offset", "rpm")
 """Parameters that shift the prism angle of each event by an amount that depends on the event's time."""
 RATES = ("rate_x", "rate_y", "rate_z")
@@ -67,14 +41,41 @@ CHANGES = ("change_x", "change_y", "change_z")
 """Angular acceleration of the camera about its x, y and z axes: names of the parameters."""
 MOTION = (*RATES, *CHANGES)
 """Names of all parameters of the camera's rotation."""
-EXACT_PARAMETERS = ("apex", "index", "tilt_x", "tilt_y")
-"""Parameters of the exact model that the circle models do not have."""
 LENS = ("focal_length", "center_x", "center_y", "k1")
 """Parameters of the camera's lens. The principal point (px) and the first radial coefficient of distortion are freed by
 the photometric stage only, if the events contradict the given camera."""
-DEGENERATE_WITH_APEX = ("index", *LENS)
-"""Parameters that the sharpness stage does not search if the photometric stage follows: in sharpness they are nearly
-degenerate with the apex."""
+_UNITS = {
+    "clock_offset": "us",
+    "rpm": "1/min",
+    "focal_length": "px",
+    **dict.fromkeys(RATES, "rad/s"),
+    **dict.fromkeys(CHANGES, "rad/s2"),
+}
+"""Unit of every parameter that can be free and is not one of an optical model.
+
+``clock_offset`` is the encoder's clock offset (see :class:`amiwarp.Encoder`). ``focal_length`` is the camera's fx; fy
+keeps its ratio to fx. ``rate_*`` and ``change_*`` describe the camera's rotation (:class:`amiwarp.CameraRotation`).
+"""
+
+
+def optical_parameters() -> dict[str, Parameter]:
+    """Return the parameters of all optical models by name: sizes, phase, then others."""
+    found = {parameter.name: parameter for model in MODELS.values() for parameter in model.PARAMETERS}
+    return {name: found[name] for name in (*sorted(size_names()), PHASE.name, *found)}
+
+
+def units() -> dict[str, str]:
+    """Return the unit of every parameter that can be free, by name."""
+    return {name: parameter.unit for name, parameter in optical_parameters().items()} | _UNITS
+
+
+def like_size(names: Iterable[str]) -> tuple[str, ...]:
+    """Return those parameters that in sharpness are nearly degenerate with the size: of the lens, and some of a model.
+
+    The sharpness stage does not search them if the photometric stage follows.
+    """
+    known = optical_parameters()
+    return tuple(n for n in names if n in LENS or (n in known and known[n].like_size))
 
 
 @guarded
@@ -87,7 +88,7 @@ class ParameterSpace:
     """
 
     model: str
-    """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
+    """Name of the model, such as ``exact``."""
     camera: Camera
     """Nominal camera. If the focal length is free, its value replaces the camera's focal length."""
     prism: Prism
@@ -113,7 +114,7 @@ class ParameterSpace:
     @property
     def size_name(self) -> str:
         """Name of the parameter that sets the size of the orbit: ``apex`` or ``deflection``."""
-        return size_name(self.model)
+        return MODELS[one_of(self.model, MODELS, "model")].SIZE
 
     @cached_property
     def cartesian(self) -> bool:
@@ -191,7 +192,7 @@ class ParameterSpace:
         ndarray
             The vector [px], shape ``(n,)`` for n free parameters.
         """
-        _check_values(values, self.names)
+        check_given(values, self.names)
         v = np.array([values[n] * self.pixels[n] for n in self.names])
         if self.cartesian:
             v[:2] = v[0] * math.cos(values["phase"]), v[0] * math.sin(values["phase"])
@@ -325,18 +326,6 @@ def _difference(name: str, a: float, b: float) -> float:
     return math.remainder(a - b, 2.0 * math.pi) if name == "phase" else a - b
 
 
-def _check_values(values: Mapping[str, float], names: tuple[str, ...]) -> None:
-    """Raise :class:`AmiwarpError` if a parameter has no value."""
-    missing = [name for name in names if name not in values]
-    if missing:
-        raise AmiwarpError(f"values have no {', '.join(missing)}; give the value of each parameter")
-
-
-def size_name(model: str) -> str:
-    """Return the name of the parameter that sets the size of the orbit in ``model``: ``apex`` or ``deflection``."""
-    return "apex" if model in ("exact", "ellipse") else "deflection"
-
-
 def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraRotation:
     """Return the camera rotation that the parameter values describe; a missing rate is taken as 0."""
     if values.keys().isdisjoint(MOTION):
@@ -360,27 +349,19 @@ def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
 
 def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
     """Build the optical model of the parameter values; ``camera`` and ``prism`` give all other values."""
-    one_of(model, MODELS, "model")
-    _check_values(values, (size_name(model), "phase"))
-    camera = with_lens(camera, values)
-    if model == "circle":
-        return CircleModel(camera, values["deflection"], values["phase"], prism.flat_side)
-    if model == "radial":
-        return RadialCircleModel(camera, values["deflection"], values["phase"], prism.index, prism.flat_side)
-    wedge = Prism(values["apex"], values.get("index", prism.index), prism.flat_side)
-    exact = ExactModel(camera, wedge, values["phase"], (values.get("tilt_x", 0.0), values.get("tilt_y", 0.0)))
-    return EllipseModel.from_model(exact) if model == "ellipse" else exact
+    return model_of(MODELS[one_of(model, MODELS, "model")], with_lens(camera, values), prism, values)
+
+
+def values_of(model: str, values: Mapping[str, float]) -> dict[str, float]:
+    """Return the values without those of optical parameters that ``model`` does not have."""
+    foreign = optical_parameters().keys() - MODELS[model].FREE
+    return {name: value for name, value in values.items() if name not in foreign}
 
 
 # Set-up of a parameter space: checks of names and bounds, and the scale of each parameter in pixels.
 
-_EXACT_ONLY = ("tilt_x", "tilt_y", "index")
-_DEFAULT_RANGE = {
-    "tilt_x": math.radians(5.0), "tilt_y": math.radians(5.0), "clock_offset": 5000.0, "index": 0.2,
-    **dict.fromkeys(RATES, 5.0), **dict.fromkeys(CHANGES, 50.0),
-}  # fmt: skip
+_HALF_RANGE = {"clock_offset": 5000.0, **dict.fromkeys(RATES, 5.0), **dict.fromkeys(CHANGES, 50.0)}
 """Half width of the default bounds of each parameter about its start value, in the parameter's unit."""
-_FULL_PHASE_RANGE = (-math.pi, math.pi)
 
 
 def make_space(
@@ -432,17 +413,14 @@ def make_space(
         If a name is unknown, not part of the model or in conflict with another one, if the bounds are in the wrong
         order, or if a free parameter moves no event.
     """
-    size = size_name(model)
-    names = _ordered_names(model, (size, "phase") if free is None else free)
-    _check_given(model, names, start, bounds)
-    nominal = {
-        "apex": prism.apex, "deflection": prism.deflection, "phase": 0.0, "index": prism.index,
-        "focal_length": camera.fx,
-    }  # fmt: skip
-    values = {n: start.get(n, nominal.get(n, 0.0)) for n in (size, "phase", *names, *start)}
+    kind = MODELS[model]
+    names = _ordered_names(kind, kind.FREE[:2] if free is None else free)
+    _check_given(kind, names, start, bounds)
+    nominal = {**kind.start_values(prism), "focal_length": camera.fx}
+    values = {n: start.get(n, nominal.get(n, 0.0)) for n in (*kind.FREE[:2], *names, *start)}
     low, high = {}, {}
     for name in names:
-        low[name], high[name] = bounds.get(name) or _default_bounds(name, values[name], prism)
+        low[name], high[name] = bounds.get(name) or _default_bounds(kind, name, values[name], prism)
         if not low[name] < high[name]:
             raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower bound first")
         values[name] = min(max(values[name], low[name]), high[name])
@@ -469,7 +447,7 @@ def widened(space: ParameterSpace, names: tuple[str, ...]) -> ParameterSpace:
     values = {**{n: given.get(n, 0.0) for n in names}, **space.start}
     half = {"focal_length": 0.6 * values.get("focal_length", 0.0), "k1": 0.5}
     half |= dict.fromkeys(("center_x", "center_y"), 0.2 * camera.width)
-    half |= {n: _DEFAULT_RANGE[n] for n in ("tilt_x", "tilt_y")}
+    half |= {name: parameter.half_range for name, parameter in optical_parameters().items()}
     shifts = _pixels_per_unit(
         space.model, camera, space.prism, names=names, values=values, rad_per_us=0.0, duration_us=space.duration_us
     )
@@ -481,51 +459,55 @@ def widened(space: ParameterSpace, names: tuple[str, ...]) -> ParameterSpace:
     )  # fmt: skip
 
 
-def _ordered_names(model: str, free: tuple[str, ...]) -> tuple[str, ...]:
+def _ordered_names(kind: type[Model], free: tuple[str, ...]) -> tuple[str, ...]:
     """Return the free parameters' names in the search vector's order; raise for unknown or conflicting names."""
-    size = size_name(model)
-    wanted = {size if n in ("apex", "deflection") else n for n in free if n != "motion"}
+    wanted = {kind.SIZE if n in size_names() else n for n in free if n != "motion"}
     wanted |= set(RATES if "motion" in free else ())
-    unknown = wanted - set(UNITS)
+    unknown = wanted - set(units())
     if unknown:
-        raise AmiwarpError(f"free parameter {sorted(unknown)[0]!r} is unknown; choose among {', '.join(UNITS)}")
+        raise AmiwarpError(f"free parameter {sorted(unknown)[0]!r} is unknown; choose among {', '.join(units())}")
     if not wanted:
         raise AmiwarpError("no parameter is free; name at least one free parameter")
-    if model in ("circle", "radial") and wanted & set(_EXACT_ONLY):
-        raise AmiwarpError(f"the {model} model has no {sorted(wanted & set(_EXACT_ONLY))[0]}; use model 'exact'")
+    foreign = sorted(wanted - set(_names_of(kind)))
+    if foreign:
+        other = next(each.NAME for each in MODELS.values() if foreign[0] in each.FREE)
+        raise AmiwarpError(f"the {kind.NAME} model has no {foreign[0]}; use model {other!r}")
     if set(DRIFTS) <= wanted:
         raise AmiwarpError(
             "clock_offset and rpm cannot both be free; free rpm only for recordings without an encoder, else free "
             "clock_offset"
         )
-    return tuple(n for n in (size, "phase", *DRIFTS, *_EXACT_ONLY, "focal_length", *MOTION) if n in wanted)
+    return tuple(n for n in _names_of(kind) if n in wanted)
+
+
+def _names_of(kind: type[Model]) -> tuple[str, ...]:
+    """Return the names of all parameters that can be free for a model, in the search vector's order."""
+    return (*kind.FREE[:2], *DRIFTS, *kind.FREE[2:], "focal_length", *MOTION)
 
 
 def _check_given(
-    model: str, names: tuple[str, ...], start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
+    kind: type[Model], names: tuple[str, ...], start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
 ) -> None:
     """Raise :class:`AmiwarpError` for start values that the model lacks and bounds of parameters that are not free."""
-    exact = () if model in ("circle", "radial") else _EXACT_ONLY
-    known = (size_name(model), "phase", *DRIFTS, *exact, "focal_length", *MOTION)
+    known = _names_of(kind)
     for name in start:
         if name not in known:
             raise AmiwarpError(
-                f"start names {name}, which is no parameter of the {model} model; choose among {', '.join(known)}"
+                f"start names {name}, which is no parameter of the {kind.NAME} model; choose among {', '.join(known)}"
             )
     for name in bounds:
         if name not in names:
             raise AmiwarpError(f"bounds are given for {name}, which is not free; add {name} to the free parameters")
 
 
-def _default_bounds(name: str, value: float, prism: Prism) -> tuple[float, float]:
-    if name == "apex":
-        return 0.0, 2.0 * prism.apex
-    if name == "deflection":
-        return 0.0, deflection_from_apex(2.0 * prism.apex, prism.index, prism.flat_side)
-    if name == "phase":
-        return _FULL_PHASE_RANGE
+def _default_bounds(kind: type[Model], name: str, value: float, prism: Prism) -> tuple[float, float]:
+    if name == kind.SIZE:
+        return 0.0, kind.size_from_apex(2.0 * prism.apex, prism)
+    if name == PHASE.name:
+        return -PHASE.half_range, PHASE.half_range
     share = {"rpm": 0.02, "focal_length": 0.2}
-    half = share[name] * abs(value) if name in share else _DEFAULT_RANGE[name]
+    ranges = _HALF_RANGE | {parameter.name: parameter.half_range for parameter in kind.PARAMETERS}
+    half = share[name] * abs(value) if name in share else ranges[name]
     return value - half, value + half
 
 
@@ -544,16 +526,16 @@ def _pixels_per_unit(
     The displacement is differentiated by finite differences over a grid of pixels and prism angles, at the nominal
     size.
     """
-    nominal = {**values, "apex": prism.apex, "deflection": prism.deflection}
-    kind = "exact" if model == "ellipse" else model  # the ellipse's tables are computed from the exact model
-    size = size_name(model)
+    kind = MODELS[model].closed_form()
+    nominal = {**values, kind.SIZE: kind.size_from_apex(prism.apex, prism)}
     lens = {"center_x": 1.0, "center_y": 1.0, "k1": 0.01}
-    steps = {size: 0.25 * nominal[size], "phase": 0.05, **dict.fromkeys(_EXACT_ONLY, 0.02), **lens}
+    steps = {**dict.fromkeys((kind.SIZE, *optical_parameters()), 0.02), **lens}
+    steps |= {kind.SIZE: 0.25 * nominal[kind.SIZE], "phase": 0.05}
     steps = {n: h for n, h in steps.items() if n in names or (n == "phase" and set(DRIFTS) & set(names))}
     if "focal_length" in names:
         steps["focal_length"] = 0.01 * camera.fx
     built = [
-        build_model(kind, camera, prism, {**nominal, n: nominal[n] + h}) for n, x in steps.items() for h in (x, -x)
+        build_model(kind.NAME, camera, prism, {**nominal, n: nominal[n] + h}) for n, x in steps.items() for h in (x, -x)
     ]
     moved = compensate_by_each(built, *_grid_points(camera.width, camera.height))
     moved = (moved[0::2] - moved[1::2]) / (2.0 * np.array([*steps.values()])[:, None, None])

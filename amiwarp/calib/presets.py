@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.calib import Settings
-from amiwarp.calib.parameters import EXACT_PARAMETERS, size_name
+from amiwarp.calib.parameters import values_of
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.atomic_output import write_text
+from amiwarp.io.formats import check_ending
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import fields_of, read_json
-from amiwarp.io.output_formats import check_ending
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, rungs
 from amiwarp.validation import check_names, one_of, shown
 
 if TYPE_CHECKING:
@@ -117,30 +117,27 @@ def _check_type(name: str, value: Any, default: Any) -> None:
 
 
 def simplified(calibration: Calibration, model: str) -> Calibration:
-    """Express a calibration by a simpler model of the same prism: an ellipse, a radial circle or a circle.
+    """Express a calibration by a simpler model of the same prism, with the size that fits best over image and turn.
 
-    A circle gets the size that fits best over image and turn. Raises :class:`AmiwarpError` if ``model`` needs
-    parameters that the calibration does not have.
+    Raises :class:`AmiwarpError` if ``model`` needs parameters that the calibration does not have.
     """
     if one_of(model, MODELS, "model") == calibration.model_name:
         return calibration
     calibration = calibration.exact
-    found, known = calibration.parameters, size_name(calibration.model_name)
-    if size_name(model) == "apex" == known:
+    found, known, wanted = calibration.parameters, MODELS[calibration.model_name].closed_form(), MODELS[model]
+    if wanted.closed_form() is known:
         return replace(calibration, model_name=model)
-    if size_name(model) == "apex" or (model, calibration.model_name) == ("radial", "circle"):
+    if model not in rungs(known.NAME):
         raise AmiwarpError(
             f"the model {model} needs parameters that a calibration of the model {calibration.model_name} does not "
             "have; calibrate with exact"
         )
     prism = replace(calibration.prism, apex=found.get("apex", calibration.prism.apex),
                     index=found.get("index", calibration.prism.index))  # fmt: skip
-    values = {n: v for n, v in found.items() if n not in EXACT_PARAMETERS}
-    exact = replace(calibration, model_name="exact") if known == "apex" else calibration
-    start = found.get("deflection", prism.deflection)
-    simple = replace(calibration, model_name=model, prism=prism, parameters={**values, "deflection": start})
-    size = start * _gain(simple.model, exact.model)
-    return replace(simple, parameters={**values, "deflection": size}, uncertainty={})
+    values, start = values_of(model, found), found.get(wanted.SIZE, wanted.size_from_apex(prism.apex, prism))
+    simple = replace(calibration, model_name=model, prism=prism, parameters={**values, wanted.SIZE: start})
+    size = start * _gain(simple.model, replace(calibration, model_name=known.NAME).model)
+    return replace(simple, parameters={**values, wanted.SIZE: size}, uncertainty={})
 
 
 def _gain(model: Model, other: Model) -> float:

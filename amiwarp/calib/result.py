@@ -12,17 +12,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.calib.parameters import MOTION, UNITS, build_model, rotation_from_values, size_name
+from amiwarp.calib.parameters import MOTION, build_model, rotation_from_values, units
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.io.atomic_output import write_text
 from amiwarp.io.camera_files import camera_from_json, camera_to_json
+from amiwarp.io.formats import check_ending
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import build, fields_of, read_json
-from amiwarp.io.output_formats import check_ending
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 from amiwarp.validation import guarded, one_of, real, shown
@@ -246,7 +247,7 @@ class Calibration:
     """
 
     model_name: str
-    """Name of the model: ``circle``, ``radial``, ``ellipse`` or ``exact``."""
+    """Name of the model, such as ``exact``."""
     camera: Camera
     """Given camera, corrected where the events contradict it. If ``parameters`` contain a focal length, it replaces the
     camera's focal length."""
@@ -293,9 +294,10 @@ class Calibration:
         """Calibration of the exact model to which a smaller model was fitted; itself if the settings named a model."""
         if self.ladder is None:
             return self
-        free = tuple("apex" if n == "deflection" else n for n in self.free)
+        size, exact = MODELS[self.model_name].SIZE, ExactModel
+        free = tuple(exact.SIZE if n == size else n for n in self.free)
         found, std = self.ladder.exact, self.ladder.exact_uncertainty
-        return replace(self, model_name="exact", parameters=found, uncertainty=std, free=free, ladder=None)
+        return replace(self, model_name=exact.NAME, parameters=found, uncertainty=std, free=free, ladder=None)
 
     @property
     def camera_rotation(self) -> CameraRotation | None:
@@ -327,7 +329,7 @@ class Calibration:
         AmiwarpError
             If the recording has no encoder and the calibration no rpm.
         """
-        if self.parameters.get("apex", self.parameters.get("deflection")) == 0.0:
+        if self.parameters.get(MODELS[self.model_name].SIZE) == 0.0:
             return constant_speed(0.0, t_first, t_last, t_first)
         if encoder is not None:
             return encoder.with_clock_offset(self.parameters.get("clock_offset", encoder.clock_offset_us))
@@ -369,10 +371,11 @@ class Calibration:
 
     def _parameter(self, name: str) -> dict[str, Any]:
         value = self.parameters[name]
-        out: dict[str, Any] = {"value": value, "unit": UNITS[name], "free": name in self.free}
+        unit = units()[name]
+        out: dict[str, Any] = {"value": value, "unit": unit, "free": name in self.free}
         if name in self.uncertainty:
             out["std"] = self.uncertainty[name]
-        if UNITS[name] == "rad":
+        if unit == "rad":
             out["degrees"] = math.degrees(value)
         return out
 
@@ -426,7 +429,7 @@ class Calibration:
     def _from_json(cls, data: dict[str, Any]) -> Calibration:
         fields_of(data, "", *NEEDED, optional=OPTIONAL)
         model = one_of(data["model"], MODELS, "field model")
-        given = fields_of(data["parameters"], "parameters", size_name(model), "phase", optional=tuple(UNITS))
+        given = fields_of(data["parameters"], "parameters", *MODELS[model].FREE[:2], optional=tuple(units()))
         entries = {name: _entry(name, entry) for name, entry in given.items()}
         prism = fields_of(data["prism"], "prism", "apex_rad", "index", "flat_side")
         sharpness = build(_Sharpness, data["sharpness"], "sharpness")
@@ -444,7 +447,7 @@ class Calibration:
             sharpness_after=sharpness.after,
             **{name: getattr(rest, name) for name in names},
         )
-        _ = replace(result, model_name="exact" if result.model_name == "ellipse" else result.model_name).model
+        _ = replace(result, model_name=MODELS[model].closed_form().NAME).model
         return result
 
 
@@ -485,7 +488,7 @@ class _PlainFields:
 
 def _entry(name: str, data: Any) -> _Entry:
     """Return the entry of one parameter in the file; raise :class:`AmiwarpError` for any unit but the expected one."""
-    unit, entry = UNITS[name], build(_Entry, data, f"parameters.{name}")
+    unit, entry = units()[name], build(_Entry, data, f"parameters.{name}")
     if entry.unit != unit:
         raise AmiwarpError(f"field parameters.{name}.unit is {shown(entry.unit)}; expected {unit}")
     if entry.std is not None:

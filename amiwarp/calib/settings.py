@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from amiwarp.brightness.event_pairs import SensorTiming
-from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS, check_algorithm
+from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
 from amiwarp.calib.parameters import check_names
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
@@ -21,6 +21,8 @@ AUTO = "auto"
 """Name in the settings for the automatic choice of the model."""
 STAGES = ("sharpness", "photometric")
 """Names of the stages of a calibration, in order."""
+LINEAR_UNKNOWNS = ("off_ratio", "leak")
+"""Free parameters that only the photometric stage has: unknowns of its linear equations."""
 GAUSS_NEWTON = "gauss-newton"
 """Name of the Gauss-Newton method in the settings."""
 
@@ -64,7 +66,7 @@ class PhotometricSettings:
         AmiwarpError
             If the algorithm is unknown or a number out of range.
         """
-        check_algorithm(self.algorithm, (GAUSS_NEWTON, *LOCAL_ALGORITHMS))
+        one_of(self.algorithm, (GAUSS_NEWTON, *LOCAL_ALGORITHMS), "algorithm")
         for name in ("pairs", "evaluations", "steps"):
             whole(getattr(self, name), f"photometric {name}", 1, 10**12)
         real(self.tolerance_px, "photometric tolerance_px", 0.0, 1e3, " px")
@@ -85,7 +87,7 @@ class Settings:
     """
 
     model: str = AUTO
-    """Model: ``circle``, ``radial``, ``ellipse``, ``exact``, or ``auto`` for the smallest with a tolerable error."""
+    """Name of the model, such as ``exact``, or ``auto`` for the smallest with a tolerable error."""
     budget_px: float | None = None
     """Largest tolerated error of a smaller model for ``auto``, relative to the exact model [px rms]; None: a tenth of
     the blur by quantisation and timing."""
@@ -136,8 +138,8 @@ class Settings:
         """
         one_of(self.model, (AUTO, *MODELS), "model")
         if self.global_algorithm is not None:
-            check_algorithm(self.global_algorithm, GLOBAL_ALGORITHMS)
-        check_algorithm(self.local_algorithm, LOCAL_ALGORITHMS)
+            one_of(self.global_algorithm, GLOBAL_ALGORITHMS, "algorithm")
+        one_of(self.local_algorithm, LOCAL_ALGORITHMS, "algorithm")
         if not isinstance(self.stages, tuple) or [*map(str, self.stages)] not in ([*STAGES], [*STAGES[:1]]):
             raise AmiwarpError(f"stages is {shown(self.stages)}; expected 'sharpness' or 'sharpness, photometric'")
         for name in ("global_evaluations", "local_evaluations", "events"):

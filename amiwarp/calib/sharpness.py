@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,7 @@ import warp as wp
 
 from amiwarp.calib import checks
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, MOTION, UNITS, build_model
+from amiwarp.calib.parameters import MOTION, build_model, like_size, units
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.settings import Settings, stage_share
 from amiwarp.choices import Sharpness
@@ -23,21 +23,20 @@ from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape, TileVotes, upload_events
 from amiwarp.optics.camera_rotation import border
 from amiwarp.optics.displacement import points_on_host
+from amiwarp.optics.models import MODELS
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from amiwarp.calib.calibration_events import CalibrationEvents
+    from amiwarp.calib.calibration_events import CalibrationEvents, EventsAhead
     from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.events.events import Events
     from amiwarp.imaging.votes import Image, UploadedEvents
     from amiwarp.optics.camera import Camera
-    from amiwarp.optics.camera_rotation import CameraRotation
     from amiwarp.optics.models import Model
 
     Vector = NDArray[np.float64]
-
 
 # Sharpness as a function of the free parameters, computed on the device. All buffers are allocated once.
 
@@ -96,29 +95,53 @@ class Objective:
         if parts > 1:
             events = events.in_parts(parts, per_polarity=per_polarity)
         self._meter = SharpnessMeter(canvas, kind, smoothing=smoothing * scale, device=device)
+        self._graph: Any = None
+        self._votes: Votes | TileVotes
         # tiles are prepared for one camera, so a free focal length excludes them
         if self._meter.device.is_cuda and "focal_length" not in space.names:
-            self._image: _DirectImage | _TiledImage = _TiledImage(canvas, events, self._meter, self._model(space.start))
+            self._votes = TileVotes(self._meter.image, canvas, events, self._model(space.start))
         else:
-            self._image = _DirectImage(canvas, events, self._meter)
+            self._votes, self._events = Votes(canvas, self._meter.device), events
 
     def _model(self, values: Mapping[str, float]) -> Model:
-        """Return the model to evaluate: the exact model instead of the ellipse, which is its first harmonic.
+        """Return the model to evaluate, without tables: they would have to be computed at every point."""
+        kind = MODELS[self.space.model].closed_form()
+        return build_model(kind.NAME, self.space.camera, self.space.prism, values)
 
-        Both have the same optimum, but the ellipse would need new tables at every point.
-        """
-        kind = "exact" if self.space.model == "ellipse" else self.space.model
-        return build_model(kind, self.space.camera, self.space.prism, values)
-
-    def _measure(self, values: Mapping[str, float]) -> list[float]:
+    def measure(self, values: Mapping[str, float]) -> list[float]:
+        """Return the sharpness of each part at parameter values, in their units."""
         self.evaluations += 1
+        votes, model, drift = self._votes, self._model(values), self.space.drift(values)
         rotation = self.space.camera_rotation(values) if self._moving else None
-        self._image.measure(self._model(values), self.space.drift(values), rotation)
+        if isinstance(votes, TileVotes):
+            votes.set(0, model, drift=drift, camera_rotation=rotation)
+            if self._graph is None:
+                with wp.ScopedCapture(self._meter.device) as capture:
+                    votes.launch()
+                    if self._meter.takes_votes:
+                        self._meter.launch(votes.votes[0])
+                    else:
+                        self._read()
+                        self._meter.launch()
+                self._graph = capture.graph
+            wp.capture_launch(self._graph)
+        else:
+            votes.clear()
+            votes.add_events(model, self._events, drift=drift, camera_rotation=rotation)
+            self._read()
+            self._meter.launch()
         return self._meter.results()
+
+    def _read(self) -> None:
+        """Write the votes to the meter's image."""
+        if isinstance(self._votes, TileVotes):
+            self._votes.read(0, self._meter.image)
+        else:
+            self._votes.read(self._meter.image)
 
     def values(self, values: Mapping[str, float]) -> float:
         """Return the sharpness of the image of warped events at parameter values, in their units."""
-        return self._measure(values)[0]
+        return self.measure(values)[0]
 
     def __call__(self, v: NDArray[np.float64]) -> float:
         """Return the sharpness at a search vector [px]."""
@@ -126,59 +149,14 @@ class Objective:
 
     def each(self, values: Mapping[str, float]) -> NDArray[np.float64]:
         """Return the sharpness of each part at parameter values, shape (parts,)."""
-        return np.array(self._measure(values))
+        return np.array(self.measure(values))
 
     def image(self, values: Mapping[str, float]) -> Image:
         """Return the IWE at parameter values, with the border outside the sensor, until the next evaluation."""
-        self._measure(values)
+        self.measure(values)
         if self._meter.takes_votes:
-            self._image.read()
+            self._read()
         return self._meter.image
-
-
-class _DirectImage:
-    """Image of warped events that is voted in one pass over the events in the order of time."""
-
-    def __init__(self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter) -> None:
-        self._votes, self._events, self._meter = Votes(canvas, meter.device), events, meter
-
-    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation | None) -> None:
-        self._votes.clear()
-        self._votes.add_events(model, self._events, drift=drift, camera_rotation=camera_rotation)
-        self.read()
-        self._meter.launch()
-
-    def read(self) -> None:
-        """Write the votes to the meter's image."""
-        self._votes.read(self._meter.image)
-
-
-class _TiledImage:
-    """Image of warped events that is voted tile by tile, launched as one CUDA graph."""
-
-    def __init__(self, canvas: CanvasShape, events: UploadedEvents, meter: SharpnessMeter, like: Model) -> None:
-        self._tiles, self._meter = TileVotes(meter.image, canvas, events, like), meter
-        self._graph: Any = None
-
-    def measure(self, model: Model, drift: float, camera_rotation: CameraRotation | None) -> None:
-        self._tiles.set(0, model, drift=drift, camera_rotation=camera_rotation)
-        if self._graph is None:
-            with wp.ScopedCapture(self._meter.device) as capture:
-                self._launch()
-            self._graph = capture.graph
-        wp.capture_launch(self._graph)
-
-    def _launch(self) -> None:
-        self._tiles.launch()
-        if self._meter.takes_votes:
-            self._meter.launch(self._tiles.votes[0])
-        else:
-            self.read()
-            self._meter.launch()
-
-    def read(self) -> None:
-        """Write the votes to the meter's image."""
-        self._tiles.read(0, self._meter.image)
 
 
 def padding(space: ParameterSpace) -> int:
@@ -197,9 +175,9 @@ def padding(space: ParameterSpace) -> int:
 def reach(space: ParameterSpace, values: Mapping[str, float]) -> float:
     """Return the largest displacement of events at ``values`` [px], by the prism and the camera's rotation."""
     camera = space.camera
-    kind = "exact" if space.model == "ellipse" else space.model
+    kind = MODELS[space.model].closed_form()
     xy, *points = _border_points(camera)
-    moved = build_model(kind, camera, space.prism, values).compensate_points(*points).numpy() - xy
+    moved = build_model(kind.NAME, camera, space.prism, values).compensate_points(*points).numpy() - xy
     radius = np.linalg.norm(moved[np.isfinite(moved).all(axis=1)], axis=1)
     turned = space.camera_rotation(values).reach(camera, space.duration_us * 0.5e-6)
     return float(radius.max(initial=0.0)) + float(np.linalg.norm(turned))
@@ -219,23 +197,27 @@ STEP_PX = 0.25
 """Step of the finite differences, as displacement of events [px]."""
 
 
-def finite_differences(at: Callable[[Vector], Vector], directions: Vector) -> tuple[Vector, Vector]:
+def finite_differences(
+    each: Callable[[dict[str, float]], Vector], space: ParameterSpace, v: Vector, directions: Vector
+) -> tuple[Vector, Vector]:
     """Return the parts' gradients of sharpness [1/px], shape (n, parts), and the mean Hessian [1/px²], shape (n, n).
 
-    ``at`` returns the sharpness of each part, shape (parts,), at a shift from the point. Each row of ``directions`` is
-    a shift that moves events by one pixel, shape (n, entries of the shift).
+    ``each`` returns the sharpness of each part at parameter values, shape (parts,). ``v`` is the search vector about
+    which they hold. Each row of ``directions`` is a shift of it that moves events by one pixel, shape (n, entries).
     """
-    n = len(directions)
-    steps = STEP_PX * directions
-    centre, up, down = at(np.zeros(directions.shape[1])), [at(h) for h in steps], [at(-h) for h in steps]
+    n, steps = len(directions), STEP_PX * directions
+    both = [steps[i] + steps[j] for i in range(n) for j in range(i)]
+    shifts = [np.zeros(directions.shape[1]), *steps, *-steps, *both, *(-h for h in both)]
+    found = np.array([*map(each, [space.to_values(v + h) for h in shifts])])
+    centre, up, down = found[0], found[1 : 1 + n], found[1 + n : 1 + 2 * n]
+    mixed = iter(np.sum(np.split(found[1 + 2 * n :], 2), axis=0))
     hessian = np.zeros((n, n))
     for i in range(n):
         hessian[i, i] = np.mean(up[i] - 2.0 * centre + down[i]) / STEP_PX**2
         for j in range(i):
-            both = at(steps[i] + steps[j]) + at(-steps[i] - steps[j])
-            mixed = both - up[i] - up[j] - down[i] - down[j] + 2.0 * centre
-            hessian[i, j] = hessian[j, i] = np.mean(mixed) / (2.0 * STEP_PX**2)
-    return (np.array(up) - np.array(down)) / (2.0 * STEP_PX), hessian
+            bend = next(mixed) - up[i] - up[j] - down[i] - down[j] + 2.0 * centre
+            hessian[i, j] = hessian[j, i] = np.mean(bend) / (2.0 * STEP_PX**2)
+    return (up - down) / (2.0 * STEP_PX), hessian
 
 
 # Sharpness on held-out turns: models are fitted to half of the turns and measured on the other half.
@@ -324,7 +306,7 @@ class Quadratic:
 
         Each row of ``directions`` is a vector that moves events by one pixel, shape (n, entries of the vector).
         """
-        return cls(*finite_differences(lambda shift: half.each(space, space.to_values(v + shift)), directions))
+        return cls(*finite_differences(partial(half.each, space), space, v, directions))
 
     def restricted_to(self, which: list[int]) -> Quadratic:
         """Return the approximation along the directions whose numbers are in ``which``."""
@@ -359,7 +341,6 @@ class Quadratic:
 
 CANDIDATES = 3
 """Largest number of optima of the coarse image from which the local search starts."""
-"""Number of disjoint parts of the events, whose scatter measures the uncertainty of the parameters."""
 
 
 class Search:
@@ -378,10 +359,14 @@ class Search:
     ) -> None:
         self.full_space = space
         """Parameter space of the photometric stage: all free parameters."""
-        self.space = space.without(DEGENERATE_WITH_APEX) if "photometric" in settings.stages else space
+        self.space = space.without(like_size(space.names)) if "photometric" in settings.stages else space
         """Parameter space of the sharpness search: without the parameters that are left to the photometric stage."""
         self.calibration_events, self.settings, self.device = calibration_events, settings, device
-        self.progress = progress
+        self._progress = progress
+        self.ahead: EventsAhead | None = None
+        """Events of the photometric stage that are already on the device."""
+        self.meanwhile: Iterator[None] = iter(())
+        """Other work, whose steps the photometric stage takes where the host would wait for a GPU."""
         self.stages: list[StageSummary] = []
         self.pad = padding(self.space)
         """Border of the fine image outside the sensor [px]."""
@@ -415,33 +400,25 @@ class Search:
 
     def run(self) -> None:
         """Run the global and the local search; set ``best``, ``score`` and ``stages``."""
-        starts = [self.space.to_vector(self.space.start)]
-        if self.settings.global_algorithm is not None:
-            starts = self._run_global(self.settings.global_algorithm)
-        if self.space.moving:
+        s, space = self.settings, self.space
+        starts = [space.to_vector(space.start)]
+        still = space.without(MOTION) if space.moving else space  # the global search keeps a rotation's start values
+        if s.global_algorithm is not None and still.names:
+            objective, start = self._coarse_objective(self.calibration_events, still), still.to_vector(still.start)
+            stage = self._maximise(objective, s.global_algorithm, start, s.global_evaluations, step=1.0)
+            starts = [space.to_vector(still.to_values(v)) for v in distinct_optima(stage, CANDIDATES)]
+        if space.moving:
             starts = [self._track_rotation(start) for start in starts]
         runs: list[SearchStage] = []
         for start in starts:
-            runs.append(self._run_local(start, [run.x for run in runs]))
+            known = [run.x for run in runs]  # near an optimum that is known a search ends early
+            runs.append(self._maximise(self.fine, s.local_algorithm, start, s.local_evaluations, step=0.7, known=known))
         best = max(runs, key=lambda run: run.score)
-        self.best, self.score = self.space.to_values(best.x), best.score
+        self.best, self.score = space.to_values(best.x), best.score
 
     def _coarse_objective(self, events: CalibrationEvents, space: ParameterSpace) -> Objective:
         step = max(1, len(events.events) // (self.settings.events // 3 + 1))
         return self._objective(events.every(step), scale=0.5, smoothing=4.0, space=space)
-
-    def _run_global(self, algorithm: str) -> list[NDArray[np.float64]]:
-        """Run the global search and return the starts of the local search.
-
-        The camera's rotation stays at its start values.
-        """
-        space = self.space.without(MOTION) if self.space.moving else self.space
-        if not space.names:
-            return [self.space.to_vector(self.space.start)]
-        start = space.to_vector(space.start)
-        objective = self._coarse_objective(self.calibration_events, space)
-        stage = self._maximise(objective, algorithm, start, self.settings.global_evaluations, step=1.0)
-        return [self.space.to_vector(space.to_values(v)) for v in distinct_optima(stage, CANDIDATES)]
 
     def _track_rotation(self, start: NDArray[np.float64]) -> NDArray[np.float64]:
         """Improve the start values of a rotating camera by a local search on the coarse image.
@@ -456,12 +433,6 @@ class Search:
             )
             start = stage.x
         return start
-
-    def _run_local(self, start: NDArray[np.float64], known: Sequence[NDArray[np.float64]]) -> SearchStage:
-        """Run a local search on the fine image from ``start``. It ends early near an optimum in ``known``."""
-        return self._maximise(
-            self.fine, self.settings.local_algorithm, start, self.settings.local_evaluations, step=0.7, known=known
-        )
 
     def _maximise(
         self,
@@ -478,10 +449,9 @@ class Search:
         name = "global" if algorithm.startswith("G") else "local"
 
         def score(v: NDArray[np.float64]) -> float:
-            if self.progress is not None:
-                self.progress(*stage_share(self.settings, name, objective.evaluations / budget))
+            self.report(name, objective.evaluations / budget)
             values.append(space.to_values(v))
-            return objective.values(values[-1])
+            return objective.measure(values[-1])[0]
 
         s = self.settings
         stage = maximise(
@@ -491,34 +461,34 @@ class Search:
         self.stages.append(StageSummary.of(name, stage, space.names, values))
         return stage
 
+    def report(self, stage: str, share: float) -> None:
+        """Tell the progress function which share of a stage is finished."""
+        if self._progress is not None:
+            self._progress(*stage_share(self.settings, stage, share))
+
     def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
         """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the sharpness."""
-        best = self.best
+        best, space, camera = self.best, self.space, self.space.camera
         parts = self._objective_by_parts(self.settings.sharpness)
-        if self.space.sized:
-            self._check_sharper_than_chance(best, parts, name)
-            checks.check_directions(self.fine.image(best), self._edge_inset, name)
-        v = self.space.to_vector(best)
+        if space.sized:
+            # variance, whatever the measure of the search: the paper's J may prefer an image without compensation
+            plain = self.settings.sharpness is Sharpness.VARIANCE
+            variance = parts if plain else self._objective_by_parts(Sharpness.VARIANCE)
+            points = (best, {**best, "phase": best["phase"] + math.pi}, {**best, space.size_name: 0.0})
+            sharp, opposite, still = (variance.each(values) for values in points)
+            checks.check_texture(sharp, opposite, still, name)
+            # not the border outside the sensor, and as much inside, where the view ends: at most a quarter of it
+            inset = self.pad + min(self.pad, min(camera.width, camera.height) // 4)
+            checks.check_directions(self.fine.image(best), inset, name)
+        v = space.to_vector(best)
         covariance, warnings = estimate_covariance(parts, v)
-        return self._bound_warnings(best) + warnings, self.space.deviations(v, covariance)
-
-    def _check_sharper_than_chance(self, best: dict[str, float], parts: Objective, name: str) -> None:
-        # variance, whatever the measure of the search: the paper's J may prefer an image without compensation
-        variance = (
-            parts if self.settings.sharpness is Sharpness.VARIANCE else self._objective_by_parts(Sharpness.VARIANCE)
-        )
-        points = (best, {**best, "phase": best["phase"] + math.pi}, {**best, self.space.size_name: 0.0})
-        sharp, opposite, still = (variance.each(values) for values in points)
-        checks.check_texture(sharp, opposite, still, name)
-
-    @property
-    def _edge_inset(self) -> int:
-        """Border of the fine image that the check of edge directions leaves out [px].
-
-        It is the part outside the sensor and as much inside, where the view ends, but at most a quarter of the sensor.
-        """
-        camera = self.space.camera
-        return self.pad + min(self.pad, min(camera.width, camera.height) // 4)
+        at_bound = [
+            n for n in space.names
+            if n != "phase" and min(best[n] - space.low[n], space.high[n] - best[n]) * space.pixels[n] < 0.05
+        ]  # fmt: skip
+        unit = units()
+        bounds = (f"{n} = {best[n]:.6g} {unit[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)
+        return (*bounds, *warnings), space.deviations(v, covariance)
 
     def sharpness_in(self, space: ParameterSpace, values: Mapping[str, float]) -> float:
         """Return the sharpness at ``values`` with the camera and the prism of ``space``."""
@@ -530,14 +500,6 @@ class Search:
             smoothing = self.settings.smoothing_px
             fine = self._objective(self.calibration_events, scale=1.0, smoothing=smoothing, space=space)
         return fine.values(values)
-
-    def _bound_warnings(self, best: dict[str, float]) -> tuple[str, ...]:
-        """Return a warning for each parameter that ended on a bound."""
-        s = self.space
-        at_bound = [
-            n for n in s.names if n != "phase" and min(best[n] - s.low[n], s.high[n] - best[n]) * s.pixels[n] < 0.05
-        ]
-        return tuple(f"{n} = {best[n]:.6g} {UNITS[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)
 
 
 def distinct_optima(stage: SearchStage, most: int, apart: float = 6.0) -> list[NDArray[np.float64]]:
@@ -558,7 +520,7 @@ def estimate_covariance(parts: Objective, v: NDArray[np.float64]) -> tuple[NDArr
     The sandwich estimate H⁻¹ cov(g) H⁻¹ / n from n disjoint parts of the events: g is a part's gradient at the optimum
     of all events, and H the mean Hessian of the parts.
     """
-    slopes, hessian = finite_differences(lambda shift: parts.each(parts.space.to_values(v + shift)), np.eye(len(v)))
+    slopes, hessian = finite_differences(parts.each, parts.space, v, np.eye(len(v)))
     gradients = slopes.T
     values, vectors = np.linalg.eigh(-hessian)
     largest = max(float(values.max()), 1e-12)

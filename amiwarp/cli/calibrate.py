@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.choices import Sharpness
+from amiwarp.choices import OPTICAL_MODELS, Sharpness
 from amiwarp.cli.console import choose_device, progress, report, table
 from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, interval, number, span
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import MemoryEvents
 from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import check_output
-from amiwarp.io.output_formats import check_ending
+from amiwarp.io.formats import check_ending
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
@@ -44,7 +44,7 @@ class SearchOptions:
     model: Annotated[
         str | None,
         typer.Option(
-            help="Prism model: circle, exact, radial, ellipse, or auto: the smallest model within --budget-px. "
+            help=f"Prism model: {', '.join(OPTICAL_MODELS)}, or auto: the smallest model within --budget-px. "
             "Default: auto.",
             rich_help_panel=_SEARCH,
         ),
@@ -196,13 +196,14 @@ class ParameterOptions:
 
 
 def _named(text: str) -> tuple[str, str, str]:
-    from amiwarp.calib.parameters import UNITS
+    from amiwarp.calib.parameters import units
 
+    known = units()
     name, equals, value = text.partition("=")
     name = name.strip()
-    if not equals or name not in UNITS:
-        raise AmiwarpError(f"{text!r} does not name a parameter; write NAME=VALUE with NAME one of {', '.join(UNITS)}")
-    return name, UNITS[name], value
+    if not equals or name not in known:
+        raise AmiwarpError(f"{text!r} does not name a parameter; write NAME=VALUE with NAME one of {', '.join(known)}")
+    return name, known[name], value
 
 
 def run(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +16,7 @@ from amiwarp.cli.convert import EncoderOptions, Format, HdfCodec, Round, format_
 from amiwarp.cli.options import OUTPUT, Common, Topic
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.io.chunks import Codec
+from amiwarp.io.formats import COMPENSATED_HELP, Codec
 
 if TYPE_CHECKING:
     from amiwarp.events.recording import Recording
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = "amiwarp compensate recording.h5 compensated.h5 --calibration calibration.json --iwe iwe.png"
 
-_IWE = "Image of warped events"
+_in_iwe = partial(typer.Option, rich_help_panel="Image of warped events")
 
 
 @dataclass(frozen=True)
@@ -32,25 +33,23 @@ class IweOptions:
 
     iwe: Annotated[
         list[Path] | None,
-        typer.Option(
+        _in_iwe(
             help="Image of warped events (IWE) to write: .png for viewing, .npy with the counts. Can be given twice.",
             metavar="<path>",
-            rich_help_panel=_IWE,
         ),
         OUTPUT,
     ] = None
     iwe_window_ms: Annotated[
         float | None,
-        typer.Option(
-            min=0.001, rich_help_panel=_IWE,
+        _in_iwe(
+            min=0.001,
             help="Write one image per time window of this length (ms): NAME_00000.png ..., or one stack in .npy.",
         ),
-    ] = None  # fmt: skip
+    ] = None
     iwe_layers: Annotated[
         Layers,
-        typer.Option(
-            help="Use of polarity. merged: ignored; signed: ON minus OFF; polarity: ON and OFF in separate layers.",
-            rich_help_panel=_IWE,
+        _in_iwe(
+            help="Use of polarity. merged: ignored; signed: ON minus OFF; polarity: ON and OFF in separate layers."
         ),
     ] = Layers.MERGED
 
@@ -70,10 +69,7 @@ def run(
     recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     out: Annotated[
         Path,
-        typer.Argument(
-            help="Compensated recording to write. Its extension gives the format: .h5 (native), .npz or .txt with "
-            "sub-pixels; with --round .raw (Prophesee EVT 3.0), .aedat4, .mcap or .db3 (ROS 2 bag)."
-        ),
+        typer.Argument(help=f"Compensated recording to write. Its extension gives the format: {COMPENSATED_HELP}."),
         OUTPUT,
     ],
     *,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,8 +15,7 @@ from amiwarp.cli.console import progress, report
 from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, Topic
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import convert, open_recording, read_encoder_csv, read_encoder_triggers
-from amiwarp.io.chunks import Codec
-from amiwarp.io.output_formats import LIMITS, OutputFormat, Rounding
+from amiwarp.io.formats import EXTENSION_HELP, LIMITS, Codec, OutputFormat, Rounding
 
 if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
@@ -38,7 +38,7 @@ Round = Annotated[
 ]
 """Option for the rounding of compensated events."""
 
-_PANEL = "Encoder"
+_in_panel = partial(typer.Option, rich_help_panel="Encoder")
 
 
 @dataclass(frozen=True)
@@ -47,36 +47,27 @@ class EncoderOptions:
 
     encoder: Annotated[
         Path | None,
-        typer.Option(
-            help="Encoder log: CSV with the header t_us,angle_deg or t_us,count, and optionally index (0 or 1).",
-            rich_help_panel=_PANEL,
-        ),
+        _in_panel(help="Encoder log: CSV with the header t_us,angle_deg or t_us,count, and optionally index (0 or 1)."),
     ] = None
     encoder_from: Annotated[
         str | None,
-        typer.Option(
+        _in_panel(
             help="Take the encoder from the trigger edges in the recording: triggers:CHANNEL. Each rising edge is one "
             "count; by default it is the index pulse, one per turn.",
             metavar="triggers:CHANNEL",
-            rich_help_panel=_PANEL,
         ),
     ] = None
-    counts_per_turn: Annotated[
-        int | None, typer.Option(min=1, help="Encoder counts per turn.", rich_help_panel=_PANEL)
-    ] = None
+    counts_per_turn: Annotated[int | None, _in_panel(min=1, help="Encoder counts per turn.")] = None
     counter_bits: Annotated[
         int | None,
-        typer.Option(
+        _in_panel(
             min=0,
             max=64,
             help="Width of the encoder's counter (bits); 0: the counter restarts at every turn. "
             "Default: inferred from the counts.",
-            rich_help_panel=_PANEL,
         ),
     ] = None
-    direction: Annotated[
-        Literal["1", "-1"], typer.Option(help="Counting direction; -1: backwards.", rich_help_panel=_PANEL)
-    ] = "1"
+    direction: Annotated[Literal["1", "-1"], _in_panel(help="Counting direction; -1: backwards.")] = "1"
 
     def build(self, source: Path, topic: str | None) -> Encoder | None:
         """Return the encoder of the log or of the recording's triggers, or None if neither is given."""
@@ -109,12 +100,7 @@ class EncoderOptions:
 def run(
     source: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     out: Annotated[
-        Path,
-        typer.Argument(
-            help="File to write. Its extension gives the format: .h5 (native), .raw (Prophesee EVT 3.0), .aedat4, "
-            ".npz, .txt, .mcap or .db3 (ROS 2 bag)."
-        ),
-        OUTPUT,
+        Path, typer.Argument(help=f"File to write. Its extension gives the format: {EXTENSION_HELP}."), OUTPUT
     ],
     *,
     format: Format = None,

@@ -36,10 +36,7 @@ def run(
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            help="Number of local processes. Default: one for each GPU, or for each core without GPU.",
-        ),
+        typer.Option(min=1, help="Number of local processes. Default: one for each GPU, or for each core without GPU."),
     ] = None,
     common: Common,
 ) -> None:

@@ -7,6 +7,7 @@ import io
 import json
 import math
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,23 +25,20 @@ if TYPE_CHECKING:
 EXAMPLE = "amiwarp design --size 640x480 --fov-deg 60 --tolerance-px 0.5 --out amiwarp-design"
 FOV_DEG = 60.0
 """Horizontal field of view that is assumed if no option describes the camera [deg]."""
-_LIMITS, _FAULTS, _PRISM = "Limits", "Faults", "Prism"
+_in_camera = partial(typer.Option, rich_help_panel="Camera")
+_in_limits = partial(typer.Option, rich_help_panel="Limits")
+_in_faults = partial(typer.Option, rich_help_panel="Faults")
+_in_prism = partial(typer.Option, rich_help_panel="Prism")
 
 
 @dataclass(frozen=True)
 class GridOptions:
     """Options for the prisms and speeds to compare."""
 
-    apex_deg: Annotated[
-        str, typer.Option(help="Apex angles to compare (deg).", metavar="A,B,...", rich_help_panel=_PRISM)
-    ] = "0.25,0.5,1,2,4"
-    rpm: Annotated[
-        str, typer.Option(help="Speeds to compare (turns/min).", metavar="A,B,...", rich_help_panel=_PRISM)
-    ] = "180,360,720,1440,2880"
-    index: Annotated[float, typer.Option(help="Refractive index of the prism.", rich_help_panel=_PRISM)] = 1.5168
-    flat_side: Annotated[
-        FlatSide, typer.Option(help="Direction that the prism's flat face points to.", rich_help_panel=_PRISM)
-    ] = FlatSide.SCENE
+    apex_deg: Annotated[str, _in_prism(help="Apex angles to compare (deg).", metavar="A,B,...")] = "0.25,0.5,1,2,4"
+    rpm: Annotated[str, _in_prism(help="Speeds to compare (turns/min).", metavar="A,B,...")] = "180,360,720,1440,2880"
+    index: Annotated[float, _in_prism(help="Refractive index of the prism.")] = 1.5168
+    flat_side: Annotated[FlatSide, _in_prism(help="Direction that the prism's flat face points to.")] = FlatSide.SCENE
 
     @property
     def apexes(self) -> list[float]:
@@ -58,27 +56,17 @@ class LimitOptions:
     """Options for the limits that prism and speed must meet."""
 
     tolerance_px: Annotated[
-        float,
-        typer.Option(
-            help="Largest standard deviation across an edge after compensation (px).", rich_help_panel=_LIMITS
-        ),
+        float, _in_limits(help="Largest standard deviation across an edge after compensation (px).")
     ] = 0.5
-    window_ms: Annotated[
-        float,
-        typer.Option(help="Time within which edges of every direction must be seen (ms).", rich_help_panel=_LIMITS),
-    ] = 33.4
+    window_ms: Annotated[float, _in_limits(help="Time within which edges of every direction must be seen (ms).")] = 33.4
     bandwidth_mev_s: Annotated[
-        float | None,
-        typer.Option(
-            help="Largest event rate of sensor and cable (million events/s). Default: any.", rich_help_panel=_LIMITS
-        ),
+        float | None, _in_limits(help="Largest event rate of sensor and cable (million events/s). Default: any.")
     ] = None
     budget_px: Annotated[
         float | None,
-        typer.Option(
+        _in_limits(
             help="Largest error of the prism model (px rms). Default: a tenth of the blur from pixels, clock and "
-            "encoder.",
-            rich_help_panel=_LIMITS,
+            "encoder."
         ),
     ] = None
 
@@ -95,15 +83,10 @@ class FaultOptions:
     """Options for the errors of event times and encoder angles."""
 
     clock_us: Annotated[
-        float,
-        typer.Option(
-            help="Standard deviation of the event times, from readout and jitter (us).", rich_help_panel=_FAULTS
-        ),
+        float, _in_faults(help="Standard deviation of the event times, from readout and jitter (us).")
     ] = 60.0
-    encoder_deg: Annotated[
-        float, typer.Option(help="Standard deviation of the encoder's angle (deg).", rich_help_panel=_FAULTS)
-    ] = 0.1
-    contrast: Annotated[float, typer.Option(help="Contrast threshold (log intensity).", rich_help_panel=_FAULTS)] = 0.25
+    encoder_deg: Annotated[float, _in_faults(help="Standard deviation of the encoder's angle (deg).")] = 0.1
+    contrast: Annotated[float, _in_faults(help="Contrast threshold (log intensity).")] = 0.25
 
     def timing(self) -> Timing:
         """Return the errors of event times and encoder angles."""
@@ -119,16 +102,15 @@ def run(
     ),
     size: Annotated[
         str | None,
-        typer.Option(help="Size of the camera's image (px). Default: 640x480, or the size in --camera.",
-                     metavar="WIDTHxHEIGHT", rich_help_panel="Camera"),
+        _in_camera(
+            help="Size of the camera's image (px). Default: 640x480, or the size in --camera.", metavar="WIDTHxHEIGHT"
+        ),
     ] = None,
     camera: CameraOptions,
     grid: GridOptions,
     limits: LimitOptions,
     faults: FaultOptions,
-    picture: Annotated[
-        Path | None, typer.Option(help="Picture of the scene. Default: a map of the earth.")
-    ] = None,
+    picture: Annotated[Path | None, typer.Option(help="Picture of the scene. Default: a map of the earth.")] = None,
     common: Common,
 ) -> None:  # fmt: skip
     """Compare prisms and speeds for a camera, and recommend one with the reasons.
@@ -139,7 +121,7 @@ def run(
     seen = _camera(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
-    from amiwarp.simulation.scenery import Scene
+    from amiwarp.simulation.description import Scene
     from amiwarp.simulation.sensor import SensorModel
     from amiwarp.studies.demo import earth
     from amiwarp.studies.design import design

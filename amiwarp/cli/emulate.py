@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,41 +38,28 @@ AFTER_S = 1.0
 LATE_US = 100_000
 """Delay of the camera's events above which a message is printed [us]."""
 
-_CONTROLLER, _PLAYBACK = "Controller", "Playback"
+_in_controller = partial(typer.Option, rich_help_panel="Controller")
+_in_playback = partial(typer.Option, rich_help_panel="Playback")
 
 
 @dataclass(frozen=True)
 class ControllerOptions:
     """Options for the emulated controller."""
 
-    counts_per_turn: Annotated[
-        int, typer.Option(min=1, max=1 << 24, help="Encoder counts per turn.", rich_help_panel=_CONTROLLER)
-    ] = 4096
+    counts_per_turn: Annotated[int, _in_controller(min=1, max=1 << 24, help="Encoder counts per turn.")] = 4096
     rpm: Annotated[
-        float,
-        typer.Option(
-            min=-6000.0,
-            max=6000.0,
-            help="Speed at the start (turns/min); negative: backwards.",
-            rich_help_panel=_CONTROLLER,
-        ),
+        float, _in_controller(min=-6000.0, max=6000.0, help="Speed at the start (turns/min); negative: backwards.")
     ] = 0.0
     drift_ppm: Annotated[
         float,
-        typer.Option(
-            min=-1e5,
-            max=1e5,
-            help="Frequency error of the controller's clock (ppm); positive: fast.",
-            rich_help_panel=_CONTROLLER,
-        ),
+        _in_controller(min=-1e5, max=1e5, help="Frequency error of the controller's clock (ppm); positive: fast."),
     ] = 0.0
     fault: Annotated[
         list[str] | None,
-        typer.Option(
+        _in_controller(
             help="Fault with its start and duration (s): garbage, truncate, crc, drop (bytes), missed-index, stall, "
             "slip, reverse, reset, clock-jump or unplug. Can be repeated.",
             metavar="NAME@SECONDS[+DURATION]",
-            rich_help_panel=_CONTROLLER,
         ),
     ] = None
 
@@ -92,18 +80,16 @@ class PlaybackOptions:
 
     recording: Annotated[
         Path | None,
-        typer.Option(
-            help="Recording to play: its prism rotation replaces the motor, its events are served at --camera.",
-            rich_help_panel=_PLAYBACK,
+        _in_playback(
+            help="Recording to play: its prism rotation replaces the motor, its events are served at --camera."
         ),
     ] = None
     camera: Annotated[
         str | None,
-        typer.Option(
+        _in_playback(
             help="Address of an emulated camera that serves the recording's events: tcp:HOST:PORT or unix:PATH. "
             "Playing starts when the first client connects.",
             metavar="ADDRESS",
-            rich_help_panel=_PLAYBACK,
         ),
     ] = None
 

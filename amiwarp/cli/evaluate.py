@@ -46,7 +46,7 @@ def run(
         list[Path] | None,
         typer.Option(
             help="Recording of your own, for the evaluations that need no ground truth: texture and event rate. Can be "
-            "repeated. Simulated worlds are then left out, unless --only is given.",
+            "repeated. Simulated worlds are then left out, unless --only is given."
         ),
     ] = None,
     scheduler: Annotated[

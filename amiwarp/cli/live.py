@@ -8,6 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 # Functions that ``record`` and ``live`` share: event source, link to the controller, status line, end of session.
 
-_SOURCE = "Source"
+_in_source = partial(typer.Option, rich_help_panel="Source")
 
 
 @dataclass(frozen=True)
@@ -47,22 +48,15 @@ class SourceOptions:
 
     port: Annotated[
         str | None,
-        typer.Option(
+        _in_source(
             help="Serial port of the prism's controller: name, USB id VID:PID, or 'find'. Default: none; the encoder "
-            "samples of the source are used.",
-            rich_help_panel=_SOURCE,
+            "samples of the source are used."
         ),
     ] = None
     counts_per_turn: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="Encoder counts per turn, if the controller sends lines of text.", rich_help_panel=_SOURCE
-        ),
+        int | None, _in_source(min=1, help="Encoder counts per turn, if the controller sends lines of text.")
     ] = None
-    fast: Annotated[
-        bool,
-        typer.Option("--fast", help="Replay a file as fast as possible, not in real time.", rich_help_panel=_SOURCE),
-    ] = False
+    fast: Annotated[bool, _in_source("--fast", help="Replay a file as fast as possible, not in real time.")] = False
     seconds: Annotated[
         float | None,
         typer.Option(min=0.001, help="Stop after this time (s). Default: at the end of the source or at Ctrl-C."),
@@ -70,10 +64,9 @@ class SourceOptions:
 
     wait_for_source: Annotated[
         float,
-        typer.Option(
+        _in_source(
             min=0.0,
             help="Longest wait for the sender to return after a socket's stream breaks off (s); 0: do not wait.",
-            rich_help_panel=_SOURCE,
         ),
     ] = 0.0
 
@@ -196,7 +189,8 @@ def summary(s: SessionStatus, source: Source) -> dict[str, Any]:
 
 EXAMPLE = "amiwarp live dv --port find --calibration calibration.json --out compensated.h5"
 
-_ADAPTIVE, _OUTPUTS = "Adaptive speed", "Outputs"
+_in_adaptive = partial(typer.Option, rich_help_panel="Adaptive speed")
+_in_outputs = partial(typer.Option, rich_help_panel="Outputs")
 START_RPM = 720.0
 """Speed at which adaptive control begins [turns/min], limited to the speeds that the options allow."""
 
@@ -206,24 +200,12 @@ class AdaptiveOptions:
     """Options for setting the prism's speed from the stream."""
 
     adaptive: Annotated[
-        bool,
-        typer.Option(
-            "--adaptive",
-            help="Set the prism's speed automatically: just fast enough to see the edges.",
-            rich_help_panel=_ADAPTIVE,
-        ),
+        bool, _in_adaptive("--adaptive", help="Set the prism's speed automatically: just fast enough to see the edges.")
     ] = False
-    least_rpm: Annotated[
-        float, typer.Option(min=1.0, help="Lowest speed allowed (turns/min).", rich_help_panel=_ADAPTIVE)
-    ] = 120.0
-    limit_rpm: Annotated[
-        float, typer.Option(min=1.0, help="Highest speed allowed (turns/min).", rich_help_panel=_ADAPTIVE)
-    ] = 1440.0
+    least_rpm: Annotated[float, _in_adaptive(min=1.0, help="Lowest speed allowed (turns/min).")] = 120.0
+    limit_rpm: Annotated[float, _in_adaptive(min=1.0, help="Highest speed allowed (turns/min).")] = 1440.0
     most_mev_s: Annotated[
-        float | None,
-        typer.Option(
-            min=0.001, help="Highest event rate allowed (million events/s). Default: any.", rich_help_panel=_ADAPTIVE
-        ),
+        float | None, _in_adaptive(min=0.001, help="Highest event rate allowed (million events/s). Default: any.")
     ] = None
 
     def build(self, model: Model, link: Link | None, say: Callable[[str], None]) -> SpeedKeeper | None:
@@ -246,28 +228,22 @@ class AdaptiveOptions:
 class OutputOptions:
     """Options for the files and addresses that receive events."""
 
-    out: Annotated[
-        Path | None, typer.Option(help="Compensated recording to write (.h5).", rich_help_panel=_OUTPUTS), OUTPUT
-    ] = None
+    out: Annotated[Path | None, _in_outputs(help="Compensated recording to write (.h5)."), OUTPUT] = None
     record: Annotated[
-        Path | None,
-        typer.Option(help="Recording of the uncompensated events to write (.h5).", rich_help_panel=_OUTPUTS),
-        OUTPUT,
+        Path | None, _in_outputs(help="Recording of the uncompensated events to write (.h5)."), OUTPUT
     ] = None
     to: Annotated[
         str | None,
-        typer.Option(
+        _in_outputs(
             help="Address to serve compensated packets at: tcp:HOST:PORT, unix:PATH, or - for standard output.",
             metavar="ADDRESS",
-            rich_help_panel=_OUTPUTS,
         ),
     ] = None
     raw_to: Annotated[
         str | None,
-        typer.Option(
+        _in_outputs(
             help="Address to serve the uncompensated packets at, for example for 'amiwarp view --live'.",
             metavar="ADDRESS",
-            rich_help_panel=_OUTPUTS,
         ),
     ] = None
 
@@ -287,8 +263,7 @@ class ProcessingOptions:
     """Options for the compensation of the stream."""
 
     wait_ms: Annotated[
-        float,
-        typer.Option(min=0.0, help="Longest wait for encoder samples (ms); after it the angle is extrapolated."),
+        float, typer.Option(min=0.0, help="Longest wait for encoder samples (ms); after it the angle is extrapolated.")
     ] = 10.0
     policy: Annotated[
         Policy,

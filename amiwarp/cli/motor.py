@@ -50,10 +50,7 @@ def run(
     ] = 500.0,
     limit_rpm: Annotated[
         float,
-        typer.Option(
-            min=0.0,
-            help="Largest accepted speed (turns/min): what prism, mount and bearing withstand.",
-        ),
+        typer.Option(min=0.0, help="Largest accepted speed (turns/min): what prism, mount and bearing withstand."),
     ] = LIMIT_RPM,
     common: Common,
 ) -> None:

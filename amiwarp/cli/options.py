@@ -7,6 +7,7 @@ import inspect
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -16,9 +17,9 @@ from amiwarp.choices import Seeing
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import atomic_output as output
 from amiwarp.io.camera_files import camera_from_json
+from amiwarp.io.formats import check_ending
 from amiwarp.io.input_files import check_regular, errors_name, text_lines
 from amiwarp.io.json_files import read_json
-from amiwarp.io.output_formats import check_ending
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
@@ -38,26 +39,25 @@ Topic = Annotated[
 ]
 """Option that chooses among several streams of events."""
 
-_CAMERA = "Camera"
-_PRISM = "Prism"
-_SENSOR = "Sensor"
-_ENCODER = "Encoder"
+_in_common = partial(typer.Option, rich_help_panel="Common")
+_in_camera = partial(typer.Option, rich_help_panel="Camera")
+_in_prism = partial(typer.Option, rich_help_panel="Prism")
+_in_sensor = partial(typer.Option, rich_help_panel="Sensor")
+_in_encoder = partial(typer.Option, rich_help_panel="Encoder")
 
 
 @dataclass(frozen=True)
 class CameraOptions:
     """Options for the camera. They override the camera in the recording."""
 
-    fov_deg: Annotated[
-        float | None,
-        typer.Option(help="Horizontal field of view of an ideal pinhole camera (deg).", rich_help_panel=_CAMERA),
-    ] = None
+    fov_deg: Annotated[float | None, _in_camera(help="Horizontal field of view of an ideal pinhole camera (deg).")] = (
+        None
+    )
     camera: Annotated[
         Path | None,
-        typer.Option(
+        _in_camera(
             help="Camera intrinsics: JSON (width, height, fx, fy, cx, cy, distortion), a calibration file, or "
-            "calib.txt (fx fy cx cy k1 k2 p1 p2 k3).",
-            rich_help_panel=_CAMERA,
+            "calib.txt (fx fy cx cy k1 k2 p1 p2 k3)."
         ),
     ] = None
 
@@ -97,13 +97,9 @@ def read_camera(path: Path, width: int, height: int) -> Camera:
 class NominalPrismOptions:
     """Options for the prism as its data sheet describes it."""
 
-    nominal_apex_deg: Annotated[
-        float | None, typer.Option(help="Apex angle from the prism's data sheet (deg).", rich_help_panel=_PRISM)
-    ] = None
-    index: Annotated[float | None, typer.Option(help="Refractive index of the prism.", rich_help_panel=_PRISM)] = None
-    flat_side: Annotated[
-        FlatSide | None, typer.Option(help="Direction that the prism's flat face points to.", rich_help_panel=_PRISM)
-    ] = None
+    nominal_apex_deg: Annotated[float | None, _in_prism(help="Apex angle from the prism's data sheet (deg).")] = None
+    index: Annotated[float | None, _in_prism(help="Refractive index of the prism.")] = None
+    flat_side: Annotated[FlatSide | None, _in_prism(help="Direction that the prism's flat face points to.")] = None
 
     def build(self, known: NominalPrism | None) -> NominalPrism | None:
         """Return the nominal prism ``known`` with the values that options give; None if neither exists.
@@ -157,7 +153,7 @@ FORMS = {
 def number(text: str, unit: str, name: str) -> float:
     """Convert a text such as ``1.2deg`` to a value in ``unit``. Angles other than 0 need a suffix.
 
-    ``unit`` is one of ``amiwarp.calib.parameters.UNITS``; ``name`` is the option for error messages. Raises
+    ``unit`` is one of ``amiwarp.calib.parameters.units()``; ``name`` is the option for error messages. Raises
     :class:`AmiwarpError` if the text is not such a value.
     """
     form, suffix = FORMS[unit][1], _suffix(text, unit)
@@ -224,31 +220,19 @@ OUTPUT_FOLDER = "output folder"
 NO_FILE = "no file"
 """Mark in ``Annotated`` of an option with a path that is neither read nor written as a file."""
 
-_FORCE = Annotated[
-    bool,
-    typer.Option(
-        "--force", help="Replace existing output files. Input files are never replaced.", rich_help_panel="Common"
-    ),
-]
+_FORCE = Annotated[bool, _in_common("--force", help="Replace existing output files. Input files are never replaced.")]
 
 
 @dataclass(frozen=True)
 class Common:
     """Options that every command has."""
 
-    json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.", rich_help_panel="Common")
-    ] = False
+    json: Annotated[bool, _in_common("--json", help="Print one JSON object on stdout and nothing else.")] = False
     device: Annotated[
         str | None,
-        typer.Option(
-            help="Device that runs the kernels: cpu, cuda:0 ... Default: cuda:0 if present, otherwise cpu.",
-            rich_help_panel="Common",
-        ),
+        _in_common(help="Device that runs the kernels: cpu, cuda:0 ... Default: cuda:0 if present, otherwise cpu."),
     ] = None
-    seed: Annotated[
-        int, typer.Option(min=0, max=2**31 - 1, help="Seed of the random number generators.", rich_help_panel="Common")
-    ] = 0
+    seed: Annotated[int, _in_common(min=0, max=2**31 - 1, help="Seed of the random number generators.")] = 0
 
 
 def command(app: typer.Typer, function: Callable[..., None], *, name: str, example: str) -> None:
@@ -322,53 +306,28 @@ class RigOptions:
 
     size: Annotated[
         str | None,
-        typer.Option(
+        _in_camera(
             help="Size of the camera's image (px). Default: 640x480; for 'amiwarp translate', its pictures' size.",
             metavar="WIDTHxHEIGHT",
-            rich_help_panel=_CAMERA,
         ),
     ] = None
     fov_deg: Annotated[
-        float | None,
-        typer.Option(
-            help="Horizontal field of view (deg). Default: 60 if --camera is not given.", rich_help_panel=_CAMERA
-        ),
+        float | None, _in_camera(help="Horizontal field of view (deg). Default: 60 if --camera is not given.")
     ] = None
-    camera: Annotated[
-        Path | None,
-        typer.Option(help="Camera intrinsics: JSON (including the size) or calib.txt.", rich_help_panel=_CAMERA),
-    ] = None
-    apex_deg: Annotated[float, typer.Option(help="True apex angle of the prism (deg).", rich_help_panel=_PRISM)] = 1.0
+    camera: Annotated[Path | None, _in_camera(help="Camera intrinsics: JSON (including the size) or calib.txt.")] = None
+    apex_deg: Annotated[float, _in_prism(help="True apex angle of the prism (deg).")] = 1.0
     nominal_apex_deg: Annotated[
-        float | None,
-        typer.Option(
-            help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.",
-            rich_help_panel=_PRISM,
-        ),
+        float | None, _in_prism(help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.")
     ] = None
-    index: Annotated[float, typer.Option(help="Refractive index of the prism.", rich_help_panel=_PRISM)] = 1.5168
-    flat_side: Annotated[
-        FlatSide, typer.Option(help="Side that the prism's flat face is on.", rich_help_panel=_PRISM)
-    ] = FlatSide.SCENE
-    rpm: Annotated[
-        float, typer.Option(help="Speed of the prism (turns/min); negative: backwards.", rich_help_panel=_PRISM)
-    ] = 720.0
+    index: Annotated[float, _in_prism(help="Refractive index of the prism.")] = 1.5168
+    flat_side: Annotated[FlatSide, _in_prism(help="Side that the prism's flat face is on.")] = FlatSide.SCENE
+    rpm: Annotated[float, _in_prism(help="Speed of the prism (turns/min); negative: backwards.")] = 720.0
     speed: Annotated[
-        Path | None,
-        typer.Option(
-            help="Speed over time, instead of --rpm: CSV with 'seconds,rpm' on each line.", rich_help_panel=_PRISM
-        ),
+        Path | None, _in_prism(help="Speed over time, instead of --rpm: CSV with 'seconds,rpm' on each line.")
     ] = None
-    phase_deg: Annotated[
-        float, typer.Option(help="Azimuth of the prism at encoder angle 0 (deg).", rich_help_panel=_PRISM)
-    ] = 0.0
+    phase_deg: Annotated[float, _in_prism(help="Azimuth of the prism at encoder angle 0 (deg).")] = 0.0
     tilt_deg: Annotated[
-        str,
-        typer.Option(
-            help="Tilt of the prism's rotation axis about the camera's x and y axes (deg).",
-            metavar="X,Y",
-            rich_help_panel=_PRISM,
-        ),
+        str, _in_prism(help="Tilt of the prism's rotation axis about the camera's x and y axes (deg).", metavar="X,Y")
     ] = "0,0"
 
     def build_camera(self, default: tuple[int, int] = (640, 480)) -> Camera:
@@ -414,54 +373,53 @@ def _read_speed(path: Path) -> list[tuple[float, ...]]:
     return rows
 
 
-def _sensor(text: str) -> Any:
-    return typer.Option(help=text, rich_help_panel=_SENSOR)
-
-
 @dataclass(frozen=True)
 class SensorOptions:
     """Options for the sensor's imperfections. Defaults are those of ``amiwarp.SensorModel``."""
 
-    ideal: Annotated[
-        bool,
-        typer.Option("--ideal", help="Simulate a sensor without noise, mismatch and latency.", rich_help_panel=_SENSOR),
-    ] = False
+    ideal: Annotated[bool, _in_sensor("--ideal", help="Simulate a sensor without noise, mismatch and latency.")] = False
     sensor: Annotated[
         str | None,
-        _sensor("Known camera whose sensor is simulated: dvxplorer, davis346 or gen4. Other options change it."),
+        _in_sensor(
+            help="Known camera whose sensor is simulated: dvxplorer, davis346 or gen4. Other options change it."
+        ),
     ] = None
-    contrast_on: Annotated[float | None, _sensor("ON threshold: rise of log intensity.")] = None
-    contrast_off: Annotated[float | None, _sensor("OFF threshold: fall of log intensity.")] = None
-    mismatch: Annotated[float | None, _sensor("Relative standard deviation of the thresholds between pixels.")] = None
-    refractory_us: Annotated[float | None, _sensor("Refractory period (us).")] = None
-    latency_us: Annotated[float | None, _sensor("Mean latency of the time stamps (us).")] = None
-    latency_jitter_us: Annotated[float | None, _sensor("Standard deviation of the latency (us).")] = None
-    leak_hz: Annotated[float | None, _sensor("Rate of leak events per pixel (1/s).")] = None
-    shot_noise_hz: Annotated[float | None, _sensor("Rate of random events per pixel (1/s).")] = None
-    hot_fraction: Annotated[float | None, _sensor("Fraction of hot pixels (0 to 1).")] = None
-    hot_hz: Annotated[float | None, _sensor("Additional event rate of a hot pixel (1/s).")] = None
+    contrast_on: Annotated[float | None, _in_sensor(help="ON threshold: rise of log intensity.")] = None
+    contrast_off: Annotated[float | None, _in_sensor(help="OFF threshold: fall of log intensity.")] = None
+    mismatch: Annotated[
+        float | None, _in_sensor(help="Relative standard deviation of the thresholds between pixels.")
+    ] = None
+    refractory_us: Annotated[float | None, _in_sensor(help="Refractory period (us).")] = None
+    latency_us: Annotated[float | None, _in_sensor(help="Mean latency of the time stamps (us).")] = None
+    latency_jitter_us: Annotated[float | None, _in_sensor(help="Standard deviation of the latency (us).")] = None
+    leak_hz: Annotated[float | None, _in_sensor(help="Rate of leak events per pixel (1/s).")] = None
+    shot_noise_hz: Annotated[float | None, _in_sensor(help="Rate of random events per pixel (1/s).")] = None
+    hot_fraction: Annotated[float | None, _in_sensor(help="Fraction of hot pixels (0 to 1).")] = None
+    hot_hz: Annotated[float | None, _in_sensor(help="Additional event rate of a hot pixel (1/s).")] = None
     cutoff_hz: Annotated[
         float | None,
-        _sensor("Bandwidth of the photoreceptor at white (Hz), proportional to the light; 0: unlimited."),
+        _in_sensor(help="Bandwidth of the photoreceptor at white (Hz), proportional to the light; 0: unlimited."),
     ] = None
     shot_noise_dark: Annotated[
-        float | None, _sensor("Rate of random events in the dark, relative to that at white (1 or more).")
+        float | None, _in_sensor(help="Rate of random events in the dark, relative to that at white (1 or more).")
     ] = None
     leak_jitter_fraction: Annotated[
-        float | None, _sensor("Relative standard deviation of the time between leak events.")
+        float | None, _in_sensor(help="Relative standard deviation of the time between leak events.")
     ] = None
     noise_rate_cov_decades: Annotated[
-        float | None, _sensor("Spread of leak and random-event rates between pixels (standard deviation of log10).")
+        float | None,
+        _in_sensor(help="Spread of leak and random-event rates between pixels (standard deviation of log10)."),
     ] = None
     row_us: Annotated[
-        float | None, _sensor("Time to read out a row (us), one row after the other; 0: events are read out at once.")
+        float | None,
+        _in_sensor(help="Time to read out a row (us), one row after the other; 0: events are read out at once."),
     ] = None
     bus_rate_mev_s: Annotated[
-        float | None, _sensor("Largest rate that the bus transmits (million events/s); 0: unlimited.")
+        float | None, _in_sensor(help="Largest rate that the bus transmits (million events/s); 0: unlimited.")
     ] = None
-    bus_queue: Annotated[float | None, _sensor("Number of events that wait for the bus; further events are lost.")] = (
-        None
-    )
+    bus_queue: Annotated[
+        float | None, _in_sensor(help="Number of events that wait for the bus; further events are lost.")
+    ] = None
 
     def build(self) -> SensorModel:
         """Return the sensor model that the options describe."""
@@ -475,24 +433,20 @@ class SensorOptions:
         return replace(SensorModel.ideal() if ideal else sensor, **given)
 
 
-def _encoder(text: str) -> Any:
-    return typer.Option(help=text, rich_help_panel=_ENCODER)
-
-
 @dataclass(frozen=True)
 class EncoderModelOptions:
     """Options for the encoder's imperfections. Defaults are those of ``amiwarp.EncoderModel``."""
 
-    counts_per_turn: Annotated[int | None, _encoder("Counts per turn; 0: no rounding to counts.")] = None
-    rate_hz: Annotated[float | None, _encoder("Sample rate (Hz).")] = None
-    jitter_us: Annotated[float | None, _encoder("Standard deviation of the sample times (us).")] = None
+    counts_per_turn: Annotated[int | None, _in_encoder(help="Counts per turn; 0: no rounding to counts.")] = None
+    rate_hz: Annotated[float | None, _in_encoder(help="Sample rate (Hz).")] = None
+    jitter_us: Annotated[float | None, _in_encoder(help="Standard deviation of the sample times (us).")] = None
     clock_offset_us: Annotated[
-        float | None, _encoder("Encoder clock minus camera clock (us); stored in the ground truth only.")
+        float | None, _in_encoder(help="Encoder clock minus camera clock (us); stored in the ground truth only.")
     ] = None
-    dropouts_hz: Annotated[float | None, _encoder("Rate of drop-outs (1/s).")] = None
-    dropout_us: Annotated[float | None, _encoder("Length of a drop-out, during which all samples are lost (us).")] = (
-        None
-    )
+    dropouts_hz: Annotated[float | None, _in_encoder(help="Rate of drop-outs (1/s).")] = None
+    dropout_us: Annotated[
+        float | None, _in_encoder(help="Length of a drop-out, during which all samples are lost (us).")
+    ] = None
 
     def build(self) -> EncoderModel:
         """Return the encoder model that the options describe."""
@@ -504,7 +458,7 @@ class EncoderModelOptions:
 
 # Command-line options for simulated worlds: world, camera trajectory, and ground truth to record and draw.
 
-_WORLD = "World"
+_in_world = partial(typer.Option, rich_help_panel="World")
 
 
 @dataclass(frozen=True)
@@ -513,62 +467,55 @@ class WorldOptions:
 
     world: Annotated[
         str | None,
-        typer.Option(
+        _in_world(
             help="Simulate a 3-D world instead of a picture: room, desk, corridor, street, ball, person, or a world "
             "file (.toml, .json).",
             metavar="NAME|FILE",
-            rich_help_panel=_WORLD,
         ),
     ] = None
     trajectory: Annotated[
         str | None,
-        typer.Option(
+        _in_world(
             help="Camera motion in the world: still, handheld, fast, or a file of poses (.txt in TUM format, .csv). "
             "Default: the trajectory in the world file, or handheld for a named world.",
             metavar="NAME|FILE",
-            rich_help_panel=_WORLD,
         ),
     ] = None
     no_prism: Annotated[
         bool,
-        typer.Option(
+        _in_world(
             "--no-prism",
             help="Simulate the same scene, sensor and seed with a plain event camera without a prism. The recording "
             "then has no encoder.",
-            rich_help_panel=_WORLD,
         ),
     ] = False
     seeing: Annotated[
         Seeing | None,
-        typer.Option(
+        _in_world(
             help="How the light of each pixel is computed: maps (look-up in pre-rendered pictures of the world) or "
-            "rays (ray casting through the prism: exact, but slow on a CPU). Default: maps.",
-            rich_help_panel=_WORLD,
+            "rays (ray casting through the prism: exact, but slow on a CPU). Default: maps."
         ),
     ] = None
     motion_px: Annotated[
         float | None,
-        typer.Option(
+        _in_world(
             help="Largest motion of the image between two renderings of the world, 0.01 to 2 (px). A smaller value is "
-            "more accurate and slower. Default: 0.5.",
-            rich_help_panel=_WORLD,
+            "more accurate and slower. Default: 0.5."
         ),
     ] = None
     truth_hz: Annotated[
         float | None,
-        typer.Option(
+        _in_world(
             help="Rate at which depth, normals, instances, optical flow and intensity of all pixels are recorded "
-            "(1/s). Default: not recorded.",
-            rich_help_panel=_WORLD,
+            "(1/s). Default: not recorded."
         ),
     ] = None
     preview: Annotated[
         Path | None,
-        typer.Option(
+        _in_world(
             help="Figure to write (.png): the view of the camera in the middle of the recording, with and without the "
             "prism, with depth and optical flow.",
             metavar="<path>",
-            rich_help_panel=_WORLD,
         ),
         OUTPUT,
     ] = None

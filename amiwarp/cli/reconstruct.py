@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
 
 EXAMPLE = "amiwarp reconstruct recording.h5 picture.png --calibration calibration.json --turns 1"
 
-_WINDOW, _PICTURE = "Window", "Picture"
+_in_window = partial(typer.Option, rich_help_panel="Window")
+_in_picture = partial(typer.Option, rich_help_panel="Picture")
 
 
 @dataclass(frozen=True)
@@ -32,36 +34,24 @@ class WindowOptions:
 
     start: Annotated[
         float | None,
-        typer.Option(
+        _in_window(
             help="Start of the window (s from the first event). Default: one turn, less in short recordings; 0 for a "
-            "video.",
-            rich_help_panel=_WINDOW,
+            "video."
         ),
     ] = None
-    length: Annotated[
-        float | None, typer.Option(min=1e-6, help="Length of the window (s).", rich_help_panel=_WINDOW)
-    ] = None
+    length: Annotated[float | None, _in_window(min=1e-6, help="Length of the window (s).")] = None
     turns: Annotated[
-        float | None,
-        typer.Option(
-            min=0.01,
-            help="Length of the window (turns of the prism), at least 0.25. Default: 1.",
-            rich_help_panel=_WINDOW,
-        ),
+        float | None, _in_window(min=0.01, help="Length of the window (turns of the prism), at least 0.25. Default: 1.")
     ] = None
     fps: Annotated[
-        float | None,
-        typer.Option(
-            min=0.01, max=100_000.0, help="Frames per second of a video. Default: 25.", rich_help_panel=_WINDOW
-        ),
+        float | None, _in_window(min=0.01, max=100_000.0, help="Frames per second of a video. Default: 25.")
     ] = None
     omega: Annotated[
         str | None,
-        typer.Option(
+        _in_window(
             help="Angular velocity of the camera about its x, y and z axes (rad/s), such as 0,0.6,0. "
             "Default: from the calibration.",
             metavar="X,Y,Z",
-            rich_help_panel=_WINDOW,
         ),
     ] = None
 
@@ -85,36 +75,24 @@ class PictureOptions:
 
     fill: Annotated[
         Fill,
-        typer.Option(
+        _in_picture(
             help="Filling of pixels that no event determines. none: black; smooth: smooth surface; edge: flat areas "
-            "with sharp edges.",
-            rich_help_panel=_PICTURE,
+            "with sharp edges."
         ),
     ] = Fill.SMOOTH
     tone: Annotated[
-        Tone,
-        typer.Option(
-            help="Grey values. mapped: contrast stretched, gamma 2.2; linear: proportional to intensity.",
-            rich_help_panel=_PICTURE,
-        ),
+        Tone, _in_picture(help="Grey values. mapped: contrast stretched, gamma 2.2; linear: proportional to intensity.")
     ] = Tone.MAPPED
-    bits: Annotated[
-        int, typer.Option(help="Bits per pixel of a .png: 8 or 16. A .tif has 16.", rich_help_panel=_PICTURE)
-    ] = 8
+    bits: Annotated[int, _in_picture(help="Bits per pixel of a .png: 8 or 16. A .tif has 16.")] = 8
     contrast: Annotated[
         float,
-        typer.Option(
-            min=0.01, max=10.0, rich_help_panel=_PICTURE,
-            help="ON threshold of the sensor (log intensity), which scales the brightness.",
+        _in_picture(
+            min=0.01, max=10.0, help="ON threshold of the sensor (log intensity), which scales the brightness."
         ),
-    ] = CONTRAST  # fmt: skip
+    ] = CONTRAST
     mask: Annotated[
         Path | None,
-        typer.Option(
-            help="Mask of the pixels that events determine, to write (.png).",
-            metavar="<path>",
-            rich_help_panel=_PICTURE,
-        ),
+        _in_picture(help="Mask of the pixels that events determine, to write (.png).", metavar="<path>"),
         OUTPUT,
     ] = None
 

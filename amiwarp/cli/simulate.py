@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,7 +18,7 @@ from amiwarp.io import open_recording
 from amiwarp.simulation.motion import CameraMotion
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.scenery import Scene
+    from amiwarp.simulation.description import Scene
     from amiwarp.simulation.simulator import Simulation
     from amiwarp.simulation.worlds.world import WorldScene
 
@@ -28,28 +29,21 @@ AVERAGE_S = 600.0
 minutes."""
 
 
+_in_scene = partial(typer.Option, rich_help_panel="Scene")
+
+
 @dataclass(frozen=True)
 class SceneOptions:
     """Options for the picture and the camera's rotation in front of it."""
 
     scene_fov_deg: Annotated[
         float | None,
-        typer.Option(
-            help="Horizontal extent of the picture (deg). Default: it fills the field of view at all times.",
-            rich_help_panel="Scene",
-        ),
+        _in_scene(help="Horizontal extent of the picture (deg). Default: it fills the field of view at all times."),
     ] = None
-    blur_px: Annotated[
-        float, typer.Option(help="Standard deviation of the optical blur (px).", rich_help_panel="Scene")
-    ] = 0.5
+    blur_px: Annotated[float, _in_scene(help="Standard deviation of the optical blur (px).")] = 0.5
 
     rotate_deg_s: Annotated[
-        str,
-        typer.Option(
-            help="Angular velocity of the camera about its x, y and z axes (deg/s).",
-            metavar="X,Y,Z",
-            rich_help_panel="Scene",
-        ),
+        str, _in_scene(help="Angular velocity of the camera about its x, y and z axes (deg/s).", metavar="X,Y,Z")
     ] = "0,0,0"
 
     @property
@@ -106,7 +100,7 @@ def _scene(
     picture: Path | None, world: WorldOptions, scene: SceneOptions, duration: float, seed: int
 ) -> Scene | WorldScene:
     """Return the scene of the simulation: a picture or a world."""
-    from amiwarp.simulation.scenery import Scene
+    from amiwarp.simulation.description import Scene
 
     if picture is not None:
         return Scene.from_picture(picture, fov=scene.fov, blur=scene.blur_px)

@@ -34,8 +34,7 @@ def run(
         Path, typer.Option(help="Folder for the results of single runs (cells), figures and tables."), OUTPUT_FOLDER
     ] = Path("amiwarp-atlas"),
     quick: Annotated[
-        bool,
-        typer.Option("--quick", help="Use three values per axis, three methods and one seed: within ten minutes."),
+        bool, typer.Option("--quick", help="Use three values per axis, three methods and one seed: within ten minutes.")
     ] = False,
     axes: Annotated[
         list[str] | None, typer.Option(help="Axis to vary. Can be repeated. Default: all axes.", metavar="NAME")

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.choices import Axis, Colour, View
+from amiwarp.choices import OPTICAL_MODELS, Axis, Colour, View
 from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.live import SourceOptions, check_angles
 from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, parse_size, span
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.io.output_formats import check_ending
+from amiwarp.io.formats import check_ending
 from amiwarp.viewer.serve import warning
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class ScreenshotOptions:
         from amiwarp.viewer.app import save_screenshot
         from amiwarp.viewer.clouds import Look
         from amiwarp.viewer.jobs import estimate_phase
-        from amiwarp.viewer.panel import notes
+        from amiwarp.viewer.layout import notes
 
         check_ending(path, "pictures are written", [".png"])
         third = self.axis or (Axis.ANGLE if inspector.has_encoder or inspector.knobs.rpm else Axis.TIME)
@@ -187,7 +187,10 @@ class StartOptions:
     ] = None
     model: Annotated[
         str | None,
-        typer.Option(help="Prism model: circle, exact, radial or ellipse. Default: the calibrated model, or exact."),
+        typer.Option(
+            help=f"Prism model: {', '.join(OPTICAL_MODELS[:-1])} or {OPTICAL_MODELS[-1]}. Default: the calibrated "
+            "model, or exact.",
+        ),
     ] = None
 
     def build(self, recording: Recording, device: str, latest: Callable[[], Recording] | None) -> Inspector:
@@ -196,26 +199,20 @@ class StartOptions:
         ``latest``: function that returns the latest events of a live stream, or None.
         """
         from amiwarp.calib import Calibration
+        from amiwarp.optics.models import MODELS
         from amiwarp.viewer.inspector import Inspector
 
         found = None if self.calibration is None else Calibration.load(self.calibration)
         inspector = Inspector(recording, found, device=device, latest=latest)
         if self.model is not None:
-            inspector.set(replace(inspector.knobs, model=_checked_model(self.model)))
+            if self.model not in MODELS:
+                raise AmiwarpError(f"--model {self.model!r} is unknown; choose among {', '.join(MODELS)}")
+            inspector.set(replace(inspector.knobs, model=self.model))
         if self.window is not None:
             events = inspector.recording.events
             low, high = span(self.window, events.t_first, events.t_last)
             inspector.window = low, high - low
         return inspector
-
-
-def _checked_model(name: str) -> str:
-    """Return the name of a prism model; raise :class:`AmiwarpError` if the name is unknown."""
-    from amiwarp.optics.models import MODELS
-
-    if name not in MODELS:
-        raise AmiwarpError(f"--model {name!r} is unknown; choose among {', '.join(MODELS)}")
-    return name
 
 
 def run(

@@ -60,10 +60,7 @@ class LaunchPlan:
         c.inside = wp.empty(padded, dtype=wp.uint8, device=device)
         inputs = self.inputs(encoder, c, outside=self.any_outside(max_x, max_y))
         blocks = padded // self.block
-        if all_cores:
-            launch(self.kernel, blocks, inputs, [], device=device, smallest=512)
-        else:
-            wp.launch(specialised(self.kernel, inputs), dim=blocks, inputs=[*inputs, 0], device=device)
+        launch(self.kernel, blocks, inputs, [], device=device, smallest=512 if all_cores else blocks)
         return c
 
     def inputs(self, encoder: Any, columns: Any, *, outside: bool) -> list[Any]:

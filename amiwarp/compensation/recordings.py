@@ -17,18 +17,27 @@ import warp as wp
 
 from amiwarp.compensation.launch_plan import LaunchPlan
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, check_order, device_for, encoder_params, limits, wait
-from amiwarp.events.events import Events, check_sensor
+from amiwarp.events.device_events import (
+    DeviceEvents,
+    check_order,
+    check_sensor,
+    device_for,
+    encoder_params,
+    limits,
+    wait,
+)
+from amiwarp.events.events import Events
 from amiwarp.io import RecordingWriter
 from amiwarp.io.atomic_output import check_output
-from amiwarp.io.chunks import CHUNK, Codec, compile_checksums, in_order
+from amiwarp.io.chunks import CHUNK, compile_checksums, in_order
 from amiwarp.io.export import bag_of, export, left_out
-from amiwarp.io.native_reader import NativeEvents
+from amiwarp.io.formats import Codec, OutputFormat, Rounding, check_codec, check_rounding, output_format
+from amiwarp.io.hdf5_reader import NativeEvents
 from amiwarp.io.native_writer import FlaggedEvents
-from amiwarp.io.output_formats import OutputFormat, Rounding, check_codec, check_rounding, output_format
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import join_columns
 from amiwarp.kernels.launch import RecordedLaunch, launch
+from amiwarp.kernels.page_locked import page_locked
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded
 
@@ -63,7 +72,7 @@ class PieceBuffers:
         self._columns, self._locked = Columns(), {}
         for name, dtype in (GIVEN | FOUND).items():
             setattr(self._columns, name, wp.empty(room, dtype=dtype, device=device))
-            self._locked[name] = wp.empty(room, dtype=dtype, device="cpu", pinned=True)
+            self._locked[name] = page_locked(self, (room,), dtype, device, written_by_host=name in GIVEN)
         self._host = {name: array.numpy() for name, array in self._locked.items()}
         self._launches: dict[bool, RecordedLaunch] = {}
 
@@ -78,7 +87,7 @@ class PieceBuffers:
             wp.copy(getattr(self._columns, name), self._locked[name], count=n)
         if outside not in self._launches:
             inputs = self._plan.inputs(self._encoder, self._columns, outside=outside)
-            self._launches[outside] = RecordedLaunch(self._plan.kernel, inputs, [], device=self._device)
+            self._launches[outside] = RecordedLaunch(self._plan.kernel, [*inputs, 0], [], device=self._device)
         self._launches[outside](0, n)
         for name in FOUND:
             wp.copy(self._locked[name], getattr(self._columns, name), count=n)

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.compensation.launch_plan import LaunchPlan
-from amiwarp.compensation.packet_copy import PIECE, ColumnCheck, PacketCopier, PinnedPool, PooledArray, address
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, encoder_pieces, limits, wait
-from amiwarp.events.events import TIME_LIMIT, Events, check_sensor
+from amiwarp.events.device_events import DeviceEvents, check_sensor, encoder_pieces, limits, wait
+from amiwarp.events.events import TIME_LIMIT, Events, held_bytes
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.votes import CanvasShape
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import EncoderParams, flag_events
-from amiwarp.kernels.launch import RecordedLaunch, background_worker, launch
+from amiwarp.kernels.launch import RecordedLaunch, background_worker, launch, pool
+from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
+from amiwarp.kernels.page_locked import PageLockedPool
 from amiwarp.validation import guarded, whole
 
 if TYPE_CHECKING:
@@ -31,6 +32,93 @@ if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.encoder_stream import EncoderStream
     from amiwarp.optics.models import Model
+
+
+# Copying of packets into the columns of a batch: by NumPy, or by several threads of native code if the batch is long.
+
+PIECE = 1 << 17
+"""Number of events from which several threads copy a batch, and into which longer packets are cut."""
+THREADS = 2
+"""Number of threads that copy a long batch together with the calling thread."""
+CALLER_SHARE = 8
+"""Share of the packets that the calling thread copies: one packet in eight.
+
+While its native code runs, the other threads can take Python's lock and start. Without packets to copy, the caller
+would keep the lock, and the threads would start only once the caller waits for them.
+"""
+WIDTHS = (2, 2, 8, 1)
+"""Bytes per event of x, y, t and p."""
+
+
+class ColumnCheck(NamedTuple):
+    """Properties of packets that are found while they are copied."""
+
+    unsorted: bool
+    """Whether the times decrease within any packet."""
+    max_x: int
+    """Largest x of all events [px]."""
+    max_y: int
+    """Largest y of all events [px]."""
+
+
+def join_packets(parts: list[Events], to: list[NDArray[Any]]) -> ColumnCheck:
+    """Copy packets into the columns x, y, t and, if it is given, p. Times must not decrease between packets."""
+    for name, column in zip("xytp", to, strict=False):
+        if len(parts) == 1:  # faster by 1 us for each column
+            column[:] = getattr(parts[0], name)
+        else:
+            np.concatenate([getattr(part, name) for part in parts], out=column)
+    x, y, t, *_ = to
+    return ColumnCheck(bool((t[1:] < t[:-1]).any()), int(x.max()), int(y.max()))
+
+
+class PacketCopier:
+    """Does what :func:`join_packets` does by several threads, see :mod:`amiwarp.kernels.packet_copy`.
+
+    Threads that call NumPy would wait for Python's lock at each column of each packet. One copy at a time.
+    """
+
+    def __init__(self) -> None:
+        self._allocate(64)
+
+    def _allocate(self, rows: int) -> None:
+        """Allocate a table of copies with ``rows`` rows."""
+        table = wp.zeros(rows * ROW, dtype=wp.uint64, device="cpu")
+        found = wp.zeros(rows * FOUND, dtype=int, device="cpu")
+        self._table, self._found = table.numpy().reshape(-1, ROW), found.numpy().reshape(-1, FOUND)
+        self._commands = [RecordedLaunch(gather_parts, [table, found, 0], [], device="cpu") for _ in range(1 + THREADS)]
+
+    def __call__(self, parts: list[Events], to: list[NDArray[Any]]) -> Callable[[], ColumnCheck]:
+        """Start to copy packets; return a function that waits. Call it before the next copy."""
+        rows = len(parts)
+        if rows > len(self._table):
+            self._allocate(2 * rows)
+        sources = [[np.ascontiguousarray(getattr(part, name)) for part in parts] for name in "xytp"[: len(to)]]
+        counts = np.array([part.t.size for part in parts])
+        offsets = np.concatenate([[0], np.cumsum(counts)[:-1]])
+        table = self._table[:rows]
+        table[:] = 0
+        for k, (source, column, width) in enumerate(zip(sources, to, WIDTHS, strict=False)):
+            table[:, k] = [_address(values) for values in source]
+            table[:, 4 + k] = _address(column) + width * offsets
+        table[:, 8] = counts
+        ours = rows // CALLER_SHARE
+        edges = [0, *(ours + (rows - ours) * k // THREADS for k in range(THREADS + 1))]
+        jobs = [pool().submit(self._commands[k], edges[k], edges[k + 1] - edges[k]) for k in range(1, THREADS + 1)]
+        self._commands[0](0, ours)
+        return partial(self._wait, jobs, rows, sources)
+
+    def _wait(self, jobs: list[Future[None]], rows: int, _sources: object) -> ColumnCheck:
+        """Wait for the copy of ``rows`` packets, whose columns live until then, because threads only have addresses."""
+        for job in jobs:
+            job.result()
+        unsorted, max_x, max_y = self._found[:rows].max(axis=0).tolist()
+        return ColumnCheck(bool(unsorted), max_x, max_y)
+
+
+def _address(array: NDArray[Any]) -> int:
+    """Return the address of an array's first value."""
+    return int(array.__array_interface__["data"][0])
 
 
 # Batches of a stream's events on a device: packets are joined, compensated, fetched and voted into an image.
@@ -44,6 +132,9 @@ LEAST_PARALLEL = 4096
 LEAST_DIRECT = 1 << 16
 """Number of events from which a GPU writes its results directly to the arrays that the caller gets, not to the buffers.
 """
+MOST_HELD = 16
+"""Largest number of page-locked arrays of a type that a caller may keep. Locking the memory of one takes a millisecond,
+and a batch needs five, while it is compensated in less than two."""
 RESULTS = ("out_x", "out_y", "inside")
 """Names of the columns that the kernel writes."""
 
@@ -58,8 +149,8 @@ class StagedBatch:
     t: NDArray[np.int64]
     p: NDArray[np.uint8]
     arrived_us: int
-    pooled_t: PooledArray | None
-    """Array of the pool that receives the event times for the caller; None if the times stay in the staging buffers."""
+    locked_t: wp.array | None
+    """Page-locked array of ``t``; None if the times stay in the staging buffers."""
     wait: Callable[[], ColumnCheck]
     """Function that waits until the packets are copied, and returns the properties found while copying."""
 
@@ -90,7 +181,8 @@ class BatchPipeline:
 
     def __init__(self, model: Model, batch: int, device: Any) -> None:
         """Allocate the buffers for batches of at most ``batch`` events."""
-        self._device, self._at = device, 0
+        self._device, self._batch, self._at = device, batch, 0
+        self._pool = PageLockedPool(most=MOST_HELD)
         self._encoder: Any = None
         self._unvoted: list[tuple[int, int]] = []  # ranges of the buffers
         self._voting: deque[tuple[int, int, Future[None]]] = deque()
@@ -104,17 +196,17 @@ class BatchPipeline:
         self._host_columns = columns if device.is_cpu else Columns()
         if not device.is_cpu:
             for name, dtype in dtypes.items():
-                setattr(self._host_columns, name, wp.zeros(self._room, dtype=dtype, device="cpu", pinned=True))
+                setattr(self._host_columns, name, self._pool.array(self, (self._room,), dtype))
         self._host = {name: getattr(self._host_columns, name).numpy() for name in dtypes}
         self._layer = wp.zeros(self._room, dtype=wp.uint8, device=device)
         self._recorded: dict[bool, RecordedLaunch] = {}
-        self._pool = PinnedPool(batch)
-        self._copiers = [PacketCopier(), PacketCopier()]  # two, because the first may still copy the previous batch
+        # two, because the first may still copy the previous batch
+        self._copiers = [PacketCopier(), PacketCopier()] if batch > PIECE else []
         self._votes = Votes(CanvasShape(*self._plan.size), device)
         self._vote_range = self._votes.range_voter(columns.out_x, columns.out_y, self._layer)
         if device.is_cuda and batch > LEAST_DIRECT:
             # for the batches in flight, and as many again that the caller holds
-            self._pool.fill({np.int64: 2 * ROUNDS, np.float32: 4 * ROUNDS, np.uint8: 4 * ROUNDS})
+            self._pool.fill(batch, [wp.int64] * 2 * ROUNDS + [wp.float32, wp.uint8] * 4 * ROUNDS)
 
     def set_encoder(self, encoder: Encoder, first: int, last: int) -> None:
         """Copy the encoder's pieces over a span of event times [us] to the device.
@@ -145,18 +237,17 @@ class BatchPipeline:
         n, several = sum(part.t.size for part in parts), len(parts) > 1
         at, end = self._reserve(n)
         direct, p = self._device.is_cuda and n > LEAST_DIRECT, parts[0].p
-        pooled_t = self._pool(n, np.int64) if direct else None
-        t = self._host["t"][at:end] if pooled_t is None else pooled_t[1]
+        locked_t, t = self._pool.result(self._batch, n, wp.int64) if direct else (None, self._host["t"][at:end])
+        to = [self._host["x"][at:end], self._host["y"][at:end], t]
         if several:
-            p = self._pool(n, np.uint8)[1] if direct else np.empty(n, np.uint8)
-        to = [self._host["x"][at:end], self._host["y"][at:end], t, p]
-        if several or n > PIECE:
+            p = self._pool.result(self._batch, n, wp.uint8)[1] if direct else np.empty(n, np.uint8)
+            to.append(p)
+        if n > PIECE:
             self._copiers.reverse()
-            wait = self._copiers[0](parts, n, [address(column) for column in to], with_p=several).wait
-        else:  # a single short packet is copied fastest without threads
-            to[0][:], to[1][:], to[2][:] = parts[0].x, parts[0].y, parts[0].t
-            wait = partial(ColumnCheck, bool((t[1:] < t[:-1]).any()), int(to[0].max()), int(to[1].max()))
-        return StagedBatch(parts=parts, at=at, end=end, t=t, p=p, arrived_us=arrived_us, pooled_t=pooled_t, wait=wait)
+            wait = self._copiers[0](parts, to)
+        else:
+            wait = partial(ColumnCheck, *join_packets(parts, to))
+        return StagedBatch(parts=parts, at=at, end=end, t=t, p=p, arrived_us=arrived_us, locked_t=locked_t, wait=wait)
 
     def _reserve(self, n: int) -> tuple[int, int]:
         """Return start and end of a free range of ``n`` events of the buffers; wait for votes that still use it."""
@@ -182,9 +273,9 @@ class BatchPipeline:
                 f"events of {s.parts[0].t[0]} to {s.parts[-1].t[-1]} us are not sorted; sort each packet by time"
             )
         if self._device.is_cuda:
-            self._copy(self._columns, self._host_columns, ("x", "y") if s.pooled_t else ("x", "y", "t"), at, end)
-            if s.pooled_t is not None:
-                wp.copy(self._columns.t, s.pooled_t[0], dest_offset=at, count=n)
+            self._copy(self._columns, self._host_columns, "xyt" if s.locked_t is None else "xy", at, end)
+            if s.locked_t is not None:
+                wp.copy(self._columns.t, s.locked_t, dest_offset=at, count=n)
         padded = self._plan.padded(n)
         if unknown < n:
             # the kernel also compensates the padding of the last block, so that must hold valid events
@@ -197,10 +288,10 @@ class BatchPipeline:
         self._unvoted.append((at, at + padded))
         out, done = None, None
         if self._device.is_cuda:
-            out = self._copy_back(at, end, s.pooled_t is not None)
+            out = self._copy_back(at, end, s.locked_t is not None)
             done = self._device.stream.record_event()
         self._vote(least=LEAST_VOTED)
-        t = s.t if s.pooled_t else s.t.copy() if len(s.parts) > 1 else s.parts[0].t
+        t = s.t if s.locked_t is not None else s.t.copy() if len(s.parts) > 1 else s.parts[0].t
         return BatchInFlight(at=at, end=end, t=t, p=s.p, unknown=unknown, arrived_us=s.arrived_us, out=out, done=done)
 
     def finish(self, in_flight: BatchInFlight) -> list[NDArray[Any]]:
@@ -243,12 +334,15 @@ class BatchPipeline:
         if not direct:
             self._copy(self._host_columns, self._columns, RESULTS, at, end)
             return None
-        pooled = [self._pool(end - at, dtype) for dtype in (np.float32, np.float32, np.uint8)]
-        for name, (array, _) in zip(RESULTS, pooled, strict=True):
-            wp.copy(array, getattr(self._columns, name), src_offset=at, count=end - at)
-        return [view for _, view in pooled]
+        views = []
+        for name in RESULTS:
+            column = getattr(self._columns, name)
+            array, view = self._pool.result(self._batch, end - at, column.dtype)
+            wp.copy(array, column, src_offset=at, count=end - at)
+            views.append(view)
+        return views
 
-    def _copy(self, to: Any, source: Any, names: tuple[str, ...], at: int, end: int) -> None:
+    def _copy(self, to: Any, source: Any, names: Iterable[str], at: int, end: int) -> None:
         for name in names:
             columns = getattr(to, name), getattr(source, name)
             wp.copy(*columns, dest_offset=at, src_offset=at, count=end - at)
@@ -260,7 +354,7 @@ class BatchPipeline:
             return
         command = self._recorded.get(outside)
         if command is None:
-            command = self._recorded[outside] = RecordedLaunch(kernel, inputs, [], device=self._device)
+            command = self._recorded[outside] = RecordedLaunch(kernel, [*inputs, 0], [], device=self._device)
         command(first, blocks)
 
     def _invalidate(self, start: int, stop: int) -> None:
@@ -327,10 +421,6 @@ LEAST_RETURNED = 2
 computes. The next call returns those."""
 AHEAD_US = 100_000
 """Span of encoder samples that is copied to the device at once, if the samples are available [us]."""
-EVENT_BYTES = 13
-"""Memory of an event from a sensor [bytes]."""
-OVERHEAD = 1024
-"""Memory of a packet's Python objects in addition to its arrays [bytes]."""
 QueuedPacket: TypeAlias = tuple[Events | DeviceEvents, int, int, int]
 """Queued packet, its last event time, the time when it was queued, and its time of arrival [us]."""
 
@@ -382,13 +472,6 @@ class DeviceCompensated:
     """Sum of :data:`OUTSIDE`, :data:`EXTRAPOLATED` and :data:`NO_ANGLE` for each event, uint8, shape ``(n,)``."""
     arrived_us: int = 0
     """Arrival time of the packet, by the caller's clock [us]."""
-
-
-def held_bytes(events: Events | DeviceEvents) -> int:
-    """Return the memory of a waiting packet of events [bytes], including its Python objects."""
-    if isinstance(events, DeviceEvents):
-        return OVERHEAD + EVENT_BYTES * len(events)
-    return OVERHEAD + events.x.nbytes + events.y.nbytes + events.t.nbytes + events.p.nbytes
 
 
 @guarded
@@ -495,11 +578,11 @@ class Compensator:
             raise AmiwarpError(
                 f"a packet starts at {t[0]} us, the previous one ended at {self._t_last} us; sort the packets by time"
             )
-        parts = [events]
-        if t.size > self.batch:
-            if (t[self.batch :: self.batch] < t[self.batch - 1 : -1 : self.batch]).any():
+        parts, most = [events], min(self.batch, PIECE)
+        if t.size > most:
+            if (t[most::most] < t[most - 1 : -1 : most]).any():
                 raise AmiwarpError(f"events of {t[0]} to {t[-1]} us are not sorted; sort each packet")
-            parts = [events[start : start + self.batch] for start in range(0, t.size, self.batch)]
+            parts = [events[start : start + most] for start in range(0, t.size, most)]
         self._t_last = t.item(-1)
         self.waiting += t.size
         self.waiting_bytes += sum(map(held_bytes, parts))

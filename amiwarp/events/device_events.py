@@ -410,6 +410,12 @@ def check_order(events: Events | DeviceEvents) -> None:
         checks.check_order(events.to_host(), where="events")  # it names the event
 
 
+def check_sensor(events: Events | DeviceEvents) -> None:
+    """Raise :class:`AmiwarpError` for compensated events; events from a sensor have uint16 coordinates."""
+    if not events.whole_pixels:
+        raise AmiwarpError("event coordinates are float32, already compensated; give events from a sensor (uint16)")
+
+
 def time_span(events: Events | DeviceEvents) -> tuple[int, int]:
     """Return the times of the first and the last of sorted events, of which there is at least one [us]."""
     if isinstance(events, DeviceEvents):

@@ -7,10 +7,10 @@ blocks, so that recordings of any length are processed in constant memory.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,10 +19,6 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import array as as_numbers
 from amiwarp.validation import guarded, instance, one_of, whole
-
-if TYPE_CHECKING:
-    from amiwarp.events.device_events import DeviceEvents
-
 
 # Conversion and checks of event arrays: types, time limits, frame and order.
 
@@ -120,12 +116,6 @@ def check_order(events: Events, *, where: str, first_index: int = 0) -> None:
     if falls.any():
         falls = np.concatenate([[False], falls])
         _fail(events, where, first_index, falls, "is earlier than the one before; sort by time")
-
-
-def check_sensor(events: Events | DeviceEvents) -> None:
-    """Raise :class:`AmiwarpError` for compensated events; events from a sensor have uint16 coordinates."""
-    if not events.whole_pixels:
-        raise AmiwarpError("event coordinates are float32, already compensated; give events from a sensor (uint16)")
 
 
 def check_events(
@@ -511,3 +501,18 @@ def _by_duration(chunks: Iterable[Events], duration_us: int) -> Iterator[Events]
             held_window = int(window[start])
     if held:
         yield Events.concatenate(held)
+
+
+EVENT_BYTES = 13
+"""Memory of an event from a sensor [bytes]."""
+
+
+OVERHEAD = 1024
+"""Memory of a packet's Python objects in addition to its arrays [bytes]."""
+
+
+def held_bytes(events: Events | Sized) -> int:
+    """Return the memory of a waiting packet of events [bytes], including its Python objects."""
+    if not isinstance(events, Events):  # on a device
+        return OVERHEAD + EVENT_BYTES * len(events)
+    return OVERHEAD + events.x.nbytes + events.y.nbytes + events.t.nbytes + events.p.nbytes

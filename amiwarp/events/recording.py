@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import EventSource, as_times
 from amiwarp.events.sensors import ImageStore, ImuSamples
-from amiwarp.events.truth import EventTruth, EventValues, FrameStore, KnownStore, PoseStore, WorldLabels
+from amiwarp.events.truth import EventTruth, EventValues, FrameStore, KnownStore, PointStore, PoseStore, WorldLabels
 from amiwarp.validation import array, guarded
 
 if TYPE_CHECKING:
@@ -21,13 +21,6 @@ if TYPE_CHECKING:
 
 MetadataValue: TypeAlias = str | int | float | bool
 """Type of a value in a recording's metadata."""
-
-
-class PointStore(Protocol):
-    """Array of points that is indexed by slices: in memory, or in a file that is read on demand (protocol)."""
-
-    def __getitem__(self, which: slice, /) -> NDArray[np.float32]:
-        """Return the points of a slice [px], shape ``(n, 2)``, float32."""
 
 
 @guarded

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.truth import StoredInstants
 from amiwarp.validation import guarded
 
 
@@ -76,22 +77,15 @@ def mean_rate(t: NDArray[np.int64]) -> float | None:
     return (len(t) - 1) * 1e6 / span if span > 0 else None
 
 
-class ImageStore(Protocol):
-    """Protocol of the frames of a recording, in memory or in a file that is read on demand.
+class ImageStore(StoredInstants[NDArray[Any]], Protocol):
+    """Protocol of the frames of a recording: grey levels, uint8 or uint16, shape ``(height, width)``.
 
-    All frames have the same size and data type.
+    All frames have the same size and data type. Their times do not decrease.
     """
-
-    @property
-    def t(self) -> NDArray[np.int64]:
-        """Times of the frames, on the clock of the events [us], not decreasing, shape ``(k,)``."""
 
     @property
     def size(self) -> tuple[int, int]:
         """Size (width, height) of the frames [px]."""
-
-    def __getitem__(self, index: int, /) -> NDArray[Any]:
-        """Return a frame: grey levels, uint8 or uint16, shape ``(height, width)``."""
 
 
 @guarded

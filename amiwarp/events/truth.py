@@ -5,13 +5,16 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.validation import guarded, shown
+
+Item = TypeVar("Item", covariant=True)
+"""What a store returns: an array, or a record."""
 
 
 class Cause(enum.StrEnum):
@@ -40,14 +43,30 @@ class Cause(enum.StrEnum):
         return list(Cause).index(self)
 
 
-class EventValues(Protocol):
-    """Protocol of arrays with one row per event, in memory or in a file that is read on demand.
+class StoredRows(Protocol[Item]):
+    """Protocol of rows that are read by slicing, in memory or in a file that is read on demand."""
 
-    The rows are read by slicing.
-    """
+    def __getitem__(self, which: slice, /) -> Item:
+        """Return the rows in a slice."""
 
-    def __getitem__(self, which: slice, /) -> NDArray[Any]:
-        """Return the rows in a slice of events, shape ``(n,)`` or ``(n, k)``."""
+
+class StoredInstants(Protocol[Item]):
+    """Protocol of records at several times, in memory or in a file that is read on demand."""
+
+    @property
+    def t(self) -> NDArray[np.int64]:
+        """Times of the records, on the clock of the events, in order [us], shape ``(k,)``."""
+
+    def __getitem__(self, index: int, /) -> Item:
+        """Return the record at ``t[index]``."""
+
+
+class EventValues(StoredRows[NDArray[Any]], Protocol):
+    """Protocol of arrays with one row per event, shape ``(n,)`` or ``(n, k)``."""
+
+
+class PointStore(StoredRows[NDArray[np.float32]], Protocol):
+    """Protocol of one point per event [px], shape ``(n, 2)``, float32."""
 
 
 @guarded
@@ -76,6 +95,15 @@ class EventTruth:
     """Depth of each event's surface along the optical axis [m], shape ``(n,)``; infinite for the sky."""
     place: NDArray[np.float32] | None = None
     """Point that each event saw, in the world's frame [m], shape ``(n, 3)``; NaN for the sky."""
+
+
+EVENT_COLUMNS: dict[str, tuple[type[np.generic], tuple[int, ...]]] = {
+    "cause": (np.uint8, ()),
+    "instance": (np.uint16, ()),
+    "depth": (np.float32, ()),
+    "place": (np.float32, (3,)),
+}
+"""Arrays of :class:`EventTruth` other than the points: data type, and shape of a row."""
 
 
 @guarded
@@ -171,15 +199,8 @@ def check_truth(name: str, values: NDArray[Any]) -> None:
         raise AmiwarpError(f"'{name}' holds {values[bad][0]}, which has no meaning there; give finite numbers")
 
 
-class FrameStore(Protocol):
-    """Protocol of the ground truth of several instants, in memory or in a file that is read on demand."""
-
-    @property
-    def t(self) -> NDArray[np.int64]:
-        """Times of the instants [us], increasing, shape ``(k,)``."""
-
-    def __getitem__(self, index: int, /) -> FrameTruth:
-        """Return the ground truth of the instant ``t[index]``."""
+class FrameStore(StoredInstants[FrameTruth], Protocol):
+    """Protocol of the ground truth of all pixels at several instants, at increasing times."""
 
 
 class MemoryFrames:
@@ -270,15 +291,11 @@ def rotation_of(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(Rotation.from_quat(pose[3:]).as_matrix())
 
 
-class KnownStore(Protocol):
-    """Masks of the pixels whose scene is known, at several times: in memory, or a file that is read on demand."""
+class KnownStore(StoredInstants[NDArray[np.bool_]], Protocol):
+    """Protocol of masks of the pixels whose scene is known, shape ``(height, width)``.
 
-    @property
-    def t(self) -> NDArray[np.int64]:
-        """Times from which the masks hold, each until the next, rising [us], shape ``(k,)``."""
-
-    def __getitem__(self, index: int, /) -> NDArray[np.bool_]:
-        """Return the mask that holds from ``t[index]``, shape ``(height, width)``."""
+    Each holds from its time until the next. The times increase.
+    """
 
 
 class MemoryMasks:
@@ -295,14 +312,8 @@ class MemoryMasks:
         return np.unpackbits(self._bits[index], count=rows * columns).reshape(self._shape).astype(np.bool_)
 
 
-class PoseStore(Protocol):
-    """Protocol of tables of poses: :class:`amiwarp.Poses`, or a file that is read on demand.
-
-    The poses are read by slicing.
-    """
+class PoseStore(StoredRows[Poses], Protocol):
+    """Protocol of tables of poses: :class:`amiwarp.Poses`, or a file that is read on demand."""
 
     def __len__(self) -> int:
         """Return the number of times."""
-
-    def __getitem__(self, which: slice, /) -> Poses:
-        """Return the poses at the times in a slice."""

@@ -10,8 +10,8 @@ import warp as wp
 from amiwarp.choices import CornerMethod
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, device_for, limits, wait
-from amiwarp.events.events import TIME_LIMIT, Events, check_events, check_sensor
+from amiwarp.events.device_events import DeviceEvents, check_sensor, device_for, limits, wait
+from amiwarp.events.events import TIME_LIMIT, Events, check_events
 from amiwarp.kernels import corners as kernels
 from amiwarp.kernels import events as event_kernels
 from amiwarp.kernels.launch import launch, load

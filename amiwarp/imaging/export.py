@@ -10,7 +10,6 @@ import itertools
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from amiwarp.imaging.iwe import PIECE, Votes
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
 from amiwarp.imaging.votes import CanvasShape
 from amiwarp.io.atomic_output import NewFile, allocate, check_output
-from amiwarp.io.output_formats import check_ending
+from amiwarp.io.formats import check_ending
 from amiwarp.validation import choice
 
 if TYPE_CHECKING:
@@ -122,9 +121,7 @@ class IweFiles:
     def __enter__(self) -> IweFiles:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             if kind is None:
                 self._finish()

@@ -11,6 +11,9 @@ PINK = "#cc79a7"
 SKY_BLUE = "#56b4e9"
 VERMILION = "#d55e00"
 
+MODEL_COLOURS = (ORANGE, GREEN, BLUE, VERMILION, PINK, SKY_BLUE)
+"""Colours of the optical models in figures: of the approximations, then of the model that they approximate."""
+
 OFF_COLOUR, ON_COLOUR = BLUE, VERMILION
 """Colours of OFF and ON events on a light ground."""
 OFF_ON_BLACK, ON_ON_BLACK = (0.20, 0.55, 1.00), (1.00, 0.55, 0.10)

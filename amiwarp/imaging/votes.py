@@ -14,12 +14,12 @@ import warp as wp
 from amiwarp.choices import Vote
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, azimuths, encoder_params, time_span
-from amiwarp.events.events import check_sensor
+from amiwarp.events.device_events import DeviceEvents, azimuths, check_sensor, encoder_params, time_span
 from amiwarp.kernels import tiles as kernels
 from amiwarp.kernels.camera import CameraRotationParams
 from amiwarp.kernels.iwe import CPU_WIDTH, Frame, add_sums, add_totals, empty_words, read_sums, read_votes
 from amiwarp.kernels.launch import Program, RecordedLaunch, launch, launch_slices, run_together, specialised
+from amiwarp.kernels.page_locked import page_locked
 from amiwarp.kernels.pixel_votes import (
     BLOCK,
     CAPACITY,
@@ -27,7 +27,6 @@ from amiwarp.kernels.pixel_votes import (
     vote_point_blocks,
     vote_rotating_camera_blocks,
 )
-from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams
 from amiwarp.kernels.tiles import AT_ONCE, THREADS, read_tiles, vote_tiles
 from amiwarp.kernels.votes import (
     Canvas,
@@ -42,10 +41,7 @@ from amiwarp.kernels.votes import (
 from amiwarp.kernels.word_votes import TRASH, Cells, vote_events, vote_points, vote_quickly, vote_rotating_camera
 from amiwarp.optics.camera import LARGEST_SIZE, pinhole_params
 from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
 from amiwarp.optics.displacement import model_camera
-from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel
 from amiwarp.validation import choice, whole
 
 if TYPE_CHECKING:
@@ -435,7 +431,8 @@ class PixelVotes:
 
     def range_voter(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
         """Return a function that votes a range of blocks of points in the calling thread."""
-        vote = RecordedLaunch(vote_point_blocks, [x, y, layer, self._canvas, len(x)], [self._slices[0]], device="cpu")
+        inputs = [x, y, layer, self._canvas, len(x), 0]
+        vote = RecordedLaunch(vote_point_blocks, inputs, [self._slices[0]], device="cpu")
 
         def vote_range(first: int, blocks: int) -> None:
             self._reserve(blocks * int(BLOCK))
@@ -509,8 +506,8 @@ class WordVotes:
         self._batches: list[tuple[list[Any], int, int]] = []  # voted by the fast kernel, not verified yet
         self._batches_fit: bool | None = None
         self._batch = FIRST_BATCH
-        self._recorded: tuple[list[Any], Any] | None = None  # inputs of the last fast vote, and its recorded launch
-        self._read: tuple[Image, Any] | None = None
+        self._recorded: tuple[list[Any], RecordedLaunch] | None = None  # inputs of the last fast vote, and its launch
+        self._read: tuple[Image, RecordedLaunch] | None = None
         self._record_launches()
 
     def _record_launches(self) -> None:
@@ -518,13 +515,11 @@ class WordVotes:
         self._counts = wp.zeros((64, 1024), dtype=wp.int64, device=self.device)
         self._fullest = wp.zeros(1, dtype=int, device=self.device)
         fast = self._fast
-        self._clear_words = wp.launch(
-            empty_words, len(fast.words), [self._params, fast, 0], [self._counts, self._fullest], device=self.device,
-            record_cmd=True,
-        )  # fmt: skip
-        inputs = [fast.totals, self._counts.flatten()]
-        n, to = max(len(fast.totals), self._counts.size), [self._cells.totals]
-        self._add_fast_totals = wp.launch(add_totals, n, inputs, to, device=self.device, record_cmd=True)
+        inputs, to = [self._params, fast, 0], [self._counts, self._fullest]
+        self._clear_words = RecordedLaunch(empty_words, inputs, to, device=self.device, n=len(fast.words))
+        inputs, to = [fast.totals, self._counts.flatten()], [self._cells.totals]
+        n = max(len(fast.totals), self._counts.size)
+        self._add_fast_totals = RecordedLaunch(add_totals, inputs, to, device=self.device, n=n)
 
     def clear(self) -> None:
         """Discard all votes."""
@@ -547,7 +542,7 @@ class WordVotes:
 
     def range_voter(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
         """Return a function that votes a range of points."""
-        return RecordedLaunch(vote_points, [x, y, layer, self._params], [self._cells], device=self.device)
+        return RecordedLaunch(vote_points, [x, y, layer, self._params, 0], [self._cells], device=self.device)
 
     def _vote_exactly(self, kernel: Any, inputs: list[Any], count: int, first: int = 0) -> None:
         """Vote by the exact kernel, which checks for overflow at every addition."""
@@ -562,28 +557,24 @@ class WordVotes:
                 self._vote_exactly(vote_events, inputs, count - start, start)
                 return
             vote = vote or self._recorded_vote(inputs)
-            vote.set_dim(batch)
-            vote.set_param_at_index(len(inputs) + 1, start)
-            vote.launch()
-            self._clear_words.set_param_at_index(2, len(self._batches))
-            self._clear_words.launch()
+            vote(start, batch)
+            self._clear_words.set(2, len(self._batches))
+            self._clear_words.repeat()
             self._fast.words.zero_()
             self._batches.append((inputs, batch, start))
             if self._batches_fit is None or len(self._batches) == len(self._counts):
                 self._verify_batches()
             start += batch
 
-    def _recorded_vote(self, inputs: list[Any]) -> Any:
+    def _recorded_vote(self, inputs: list[Any]) -> RecordedLaunch:
         """Return the recorded launch of the fast kernel, which takes a tenth of the time of a new launch."""
         if self._recorded is not None:
             before, vote = self._recorded
             if type(inputs[0]) is type(before[0]) and all(a is b for a, b in zip(inputs[1:], before[1:], strict=True)):
-                vote.set_param_at_index(0, inputs[0])
+                vote.set(0, inputs[0])
                 self._recorded = inputs, vote
                 return vote
-        given = [*inputs, self._trash, 0]
-        kernel = specialised(vote_quickly, given)
-        vote = wp.launch(kernel, 1, given, [self._fast], device=self.device, record_cmd=True)
+        vote = RecordedLaunch(vote_quickly, [*inputs, self._trash, 0], [self._fast], device=self.device)
         self._recorded = inputs, vote
         return vote
 
@@ -598,7 +589,7 @@ class WordVotes:
             )
         self._batches_fit = bool((counts == [count for _, count, _ in self._batches]).all())
         if self._batches_fit:
-            self._add_fast_totals.launch()
+            self._add_fast_totals.repeat()
             self._batches.clear()
             return
         for inputs, count, first in self._batches:
@@ -617,8 +608,8 @@ class WordVotes:
         self._verify_batches()
         if self._read is None or self._read[0] is not image:
             given, to = [self._cells, self._params, image.frame, 0], [image.pixels]
-            self._read = image, wp.launch(read_votes, image.blocks, given, to, device=self.device, record_cmd=True)
-        self._read[1].launch()
+            self._read = image, RecordedLaunch(read_votes, given, to, device=self.device, n=image.blocks)
+        self._read[1].repeat()
 
 
 # Events prepared for repeated voting on CUDA, for several candidate parameter sets per pass.
@@ -649,9 +640,8 @@ class TileVotes:
         frame, self._layout = image.frame, kernels.Layout()
         self._layout.stride, self._layout.layer, self._layout.first = frame.stride, frame.layer, frame.first
         self._layout.shift = (canvas.pad + 0.5) * canvas.scale - 0.5
-        kind = {CircleModel: CircleParams, RadialCircleModel: RadialCircleParams, ExactModel: ExactParams}[type(like)]
-        dtypes = (kind,) if still else (kind, float, CameraRotationParams)
-        self._host = [wp.zeros(candidates, dtype=dtype, device="cpu", pinned=True) for dtype in dtypes]
+        dtypes = (like.STRUCT,) if still else (like.STRUCT, float, CameraRotationParams)
+        self._host = [page_locked(self, (candidates,), dtype, device, written_by_host=True) for dtype in dtypes]
         self._on_device = [wp.zeros(candidates, dtype=array.dtype, device=device) for array in self._host]
         self._rows = self._host[0].numpy()
         self._drifts = None if still else self._host[1].numpy()
@@ -659,6 +649,8 @@ class TileVotes:
         if not still:
             self._motion = kernels.Motion()
             self._motion.drift, self._motion.camera_rotation = self._on_device[1:]
+        self._inputs = [self._on_device[0], self._camera, self._arrays, self._motion, self._params, self._layout]
+        self._kernel = specialised(vote_tiles, self._inputs)
 
     def _sort(self, events: UploadedEvents) -> Any:
         """Sort the events by tile and pack each event into one word."""
@@ -705,7 +697,6 @@ class TileVotes:
 
         ``drift`` and ``camera_rotation`` move only events that have slopes or times.
         """
-        assert not isinstance(model, EllipseModel)
         self._rows[k] = model.kernel_values()
         if self._drifts is not None:
             self._drifts[k] = drift
@@ -717,8 +708,10 @@ class TileVotes:
             wp.copy(there, host)
         self.votes.zero_()
         blocks = len(self._arrays.chunks) * -(-self.candidates // int(AT_ONCE))
-        inputs = [self._on_device[0], self._camera, self._arrays, self._motion, self._params, self._layout]
-        wp.launch(vote_tiles, (blocks, int(THREADS)), inputs, [self.votes], device=self.device, block_dim=int(THREADS))
+        wp.launch(
+            self._kernel, (blocks, int(THREADS)), self._inputs, [self.votes], device=self.device,
+            block_dim=int(THREADS),
+        )  # fmt: skip
 
     def read(self, k: int, image: Image) -> None:
         """Write the image of candidate ``k`` [events] to ``image``."""

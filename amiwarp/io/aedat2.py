@@ -21,8 +21,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.events.sensors import ImuSamples
-from amiwarp.io.encoder_files import last_word, unwrapped
-from amiwarp.io.file_scan import GRAVITY, FileEvents, Packet, head_limit, imu_of, only_counted
+from amiwarp.io import file_scan
+from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name, open_input
 
 # Reader of the IMU samples in AEDAT 2.0 files of the DAVIS cameras.
@@ -69,7 +69,7 @@ def read_ranges(path: Path, offset: int) -> tuple[int, int] | None:
 
 def read_imu(path: Path, records: Records, ranges: tuple[int, int]) -> ImuSamples:
     """Return all complete samples."""
-    return imu_of(path, _columns(records, STEPS_PER_G[ranges[0]], STEPS_PER_DEG_S[ranges[1]]))
+    return file_scan.imu_of(path, _columns(records, STEPS_PER_G[ranges[0]], STEPS_PER_DEG_S[ranges[1]]))
 
 
 def _columns(records: Records, steps_per_g: float, steps_per_deg_s: float) -> Iterator[tuple[NDArray[Any], ...]]:
@@ -81,7 +81,7 @@ def _columns(records: Records, steps_per_g: float, steps_per_deg_s: float) -> It
         starts = _starts(words >> 28 & 7)
         values = (words[starts[:, None] + np.arange(RECORDS_OF_SAMPLE)] >> 12 & 0xFFFF).astype(np.uint16).view(np.int16)
         turning = np.radians(values[:, 4:] / steps_per_deg_s)
-        pulling = values[:, :3] / steps_per_g * GRAVITY
+        pulling = values[:, :3] / steps_per_g * file_scan.GRAVITY
         yield t[starts], *turning.T, *pulling.T
         # The records of the last sample may continue in the next block.
         rest = max(0, len(words) - RECORDS_OF_SAMPLE + 1, int(starts[-1]) + RECORDS_OF_SAMPLE if len(starts) else 0)
@@ -123,28 +123,23 @@ def open_aedat2(path: Path) -> Recording:
     """Open the events of an AEDAT 2.0 file."""
     with errors_name(path, lambda: "reading the header"):
         chip, offset = _read_header(path)
-    read, last = partial(_packets, path, chip, offset), partial(_last_time, path, offset)
+    read, last = partial(_packets, path, chip, offset), partial(file_scan.last_word, path, offset, ">u4")
     events = FileEvents(path, read, size=(chip.width, chip.height), last_time=last)
     imu, notes = _imu(path, chip, offset, events)
-    notes |= only_counted(events.records, "frames")
+    notes |= file_scan.only_counted(events.records, "frames")
     metadata = {"format": "aedat2", **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu)
 
 
 def _imu(path: Path, chip: Chip, offset: int, events: FileEvents) -> tuple[ImuSamples | None, dict[str, MetadataValue]]:
     """Return the IMU samples, unless only the head of the file was read, and notes about them."""
-    if not events.records.get("imu_samples") or head_limit() is not None:
+    if not events.records.get("imu_samples") or file_scan.head_limit() is not None:
         return None, {}
     ranges = read_ranges(path, offset)
     notes: dict[str, MetadataValue] = {}
     if ranges is None:
         notes["imu_ranges"] = f"assumed: {RANGES[0]} g and {RANGES[1]} deg/s, the defaults of jAER"
     return read_imu(path, _records(path, offset, {}), ranges or RANGES), notes
-
-
-def _last_time(path: Path, offset: int, estimate: int) -> int | None:
-    """Return the time of the last record [us]."""
-    return last_word(path, offset, ">u4", estimate)
 
 
 def trigger_packets(path: Path) -> Iterator[Packet]:
@@ -177,17 +172,10 @@ def _read_header(path: Path) -> tuple[Chip, int]:
 def _records(path: Path, offset: int, notes: dict[str, int]) -> Iterator[tuple[NDArray[Any], NDArray[np.int64]]]:
     """Yield addresses and unwrapped times [us]."""
     last: int | None = None
-    notes["total"] = path.stat().st_size
-    with open_input(path) as file:
-        file.seek(offset)
-        while data := file.read(8 * DEFAULT_BLOCK):
-            notes["read"] = file.tell()
-            if len(data) % 8:
-                notes["truncated_bytes"] = len(data) % 8
-            words = np.frombuffer(data, ">u4", len(data) // 8 * 2).reshape(-1, 2)
-            t = unwrapped(words[:, 1].astype(np.int64), 32, last)
-            last = int(t[-1]) if t.size else last
-            yield words[:, 0].astype(np.int64), t
+    for words in file_scan.read_words(path, offset, ">u4", DEFAULT_BLOCK, notes):
+        t = file_scan.unwrapped(words[:, 1].astype(np.int64), 32, last)
+        last = int(t[-1]) if t.size else last
+        yield words[:, 0].astype(np.int64), t
 
 
 def _packets(path: Path, chip: Chip, offset: int, notes: dict[str, int]) -> Iterator[Packet]:

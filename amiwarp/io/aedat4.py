@@ -17,10 +17,9 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import GRAVITY, FileEvents, Packet, read_sensors
+from amiwarp.io.formats import Outline
 from amiwarp.io.input_files import errors_name, open_input
-from amiwarp.io.output_formats import Outline
-from amiwarp.io.reading_process import packets, run
-from amiwarp.io.reading_server import Reply, noting_progress
+from amiwarp.io.reading_process import Reply, noting_progress, packets, run
 
 # Reader of iniVation's AEDAT 4.0 files, with faery: the first streams of events, frames and IMU samples.
 #
@@ -43,10 +42,10 @@ def open_aedat4(path: Path) -> Recording:
     with errors_name(path, lambda: "reading the header"):
         with open_input(path) as file:
             _check_frame(path, file)
-        width, height, number = run("amiwarp.io.aedat4:read_head", path.absolute())
-    source = partial(packets, "amiwarp.io.aedat4:read_packets", path.absolute(), number, False)
+        width, height, number = run(read_head, path.absolute())
+    source = partial(packets, read_packets, path.absolute(), number, False)
     events = FileEvents(path, source, size=(width, height))
-    imu, frames, notes = read_sensors(path, events.records, "aedat_sensors")
+    imu, frames, notes = read_sensors(path, events.records, __name__)
     metadata = {"format": "aedat4", **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
 
@@ -112,7 +111,7 @@ def trigger_packets(path: Path) -> Iterator[Packet]:
     """Yield the edges at the external input, of channel 0."""
     with open_input(path) as file:
         _check_frame(path, file)
-    return packets("amiwarp.io.aedat4:read_packets", path.absolute(), -1, True, {})
+    return packets(read_packets, path.absolute(), -1, True, {})
 
 
 def read_packets(notes: dict[str, int], path: str, number: int, triggers: bool) -> Iterator[Packet]:

@@ -27,6 +27,7 @@ from types import TracebackType
 from typing import IO
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.io.formats import check_folder
 from amiwarp.io.input_files import KINDS, inputs_in_use, inputs_noted, note_output, same_file
 
 UNFINISHED = re.compile(r"\.(?:.+\.)?(?P<owner>(?P<system>[0-9a-f]{12})-[0-9a-f]{8})(?:-[0-9a-f]{8})?\.part")
@@ -308,8 +309,6 @@ def write_text(path: Path, text: str, *, overwrite: bool = False) -> None:
 
 def make_folder(path: Path) -> None:
     """Create a folder and its parents. Raises :class:`AmiwarpError` if that fails, or for the name of a file."""
-    from amiwarp.io.output_formats import check_folder  # on use, because it loads NumPy
-
     for new in (path, *path.parents):
         if not os.path.lexists(new):
             check_folder(new)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, fields
+from dataclasses import asdict, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,14 +67,13 @@ def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[A
     return instance(text, kind, what)
 
 
-def camera_attributes(camera: Camera) -> dict[str, int | float | str | list[float]]:
+def camera_attributes(camera: Camera) -> dict[str, Any]:
     """Return a camera as attributes of an HDF5 group, by name."""
-    attributes: dict[str, int | float | str | list[float]] = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
-    attributes["distortion_model"] = "none"
-    for name, kind in DISTORTIONS.items():
-        if isinstance(camera.distortion, kind):
-            attributes["distortion_model"] = name
-            attributes["distortion"] = [float(value) for value in astuple(camera.distortion)]
+    attributes = camera_to_json(camera)
+    lens = attributes.pop("distortion", {"kind": "none"})
+    attributes["distortion_model"] = lens.pop("kind")
+    if lens:
+        attributes["distortion"] = [float(value) for value in lens.values()]
     return attributes
 
 
@@ -87,15 +86,14 @@ def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
                    f"{where} attribute 'distortion_model'")  # fmt: skip
     distortion: Distortion | None = None
     if model in DISTORTIONS:
-        kind = DISTORTIONS[model]
-        length = len(fields(kind))
+        length = len(fields(DISTORTIONS[model]))
         coefficients = array(attributes.get("distortion", ()), f"{where} attribute 'distortion'")
         if coefficients.shape != (length,):
             raise AmiwarpError(f"camera distortion is {shown(coefficients)}; expected {length} numbers for {model}")
-        distortion = kind(*coefficients.tolist())
-    width, height = (attribute(attributes, where, name, int) for name in ("width", "height"))
-    fx, fy, cx, cy = (attribute(attributes, where, name, float) for name in ("fx", "fy", "cx", "cy"))
-    return Camera(width, height, fx, fy, cx, cy, distortion)
+        distortion = DISTORTIONS[model](*coefficients.tolist())
+    kinds = dict(zip(CAMERA_NUMBERS, (int, int, float, float, float, float), strict=True))
+    numbers = {name: attribute(attributes, where, name, kind) for name, kind in kinds.items()}
+    return Camera(**numbers, distortion=distortion)
 
 
 def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:

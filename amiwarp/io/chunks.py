@@ -1,4 +1,4 @@
-"""Encoder and decoder of the chunks of native recordings, in parallel threads. HDF5 itself uses one thread at a time.
+"""Chunks of native recordings, which parallel threads encode, decode, read and write. HDF5 itself uses one thread.
 
 A stored chunk is a Blosc frame (version 1, as written by HDF5's filter 32001) or deflated bytes, followed by its
 Fletcher-32 checksum. HDF5 itself reads the deflated chunks of :attr:`Codec.GZIP`.
@@ -6,19 +6,25 @@ Fletcher-32 checksum. HDF5 itself reads the deflated chunks of :attr:`Codec.GZIP
 
 from __future__ import annotations
 
-import enum
+import contextlib
+import io
 import os
+import threading
 import zlib
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache
-from typing import Any, TypeVar
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.cpu_threads import cpu_threads
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.atomic_output import interrupts_later
+from amiwarp.io.formats import Codec
 
 Result = TypeVar("Result")
 
@@ -51,21 +57,6 @@ GZIP_LEVEL = 1
 
 _kernel: Callable[[Sequence[bytes | memoryview]], list[int]] | None = None
 """Function that computes checksums with a kernel, after :func:`compile_checksums`."""
-
-
-class Codec(enum.StrEnum):
-    """Compression of native recordings.
-
-    Examples
-    --------
-    >>> amiwarp.Codec("gzip")
-    <Codec.GZIP: 'gzip'>
-    """
-
-    BLOSC = "blosc"
-    """Blosc (LZ4, shuffle of bits; of bytes for times): fastest. Other programs need HDF5's Blosc filter to read it."""
-    GZIP = "gzip"
-    """Deflate with byte shuffle, which every HDF5 library reads."""
 
 
 def in_order(jobs: Iterable[Callable[[], Result]]) -> Generator[Result, None, None]:
@@ -258,8 +249,271 @@ class StoredColumn:
         return out if decode([self.encoded(at) for at in range(first, last + 1)], out) else None
 
 
+def make_dataset(
+    file: Any,
+    name: str,
+    dtype: Any,
+    row: tuple[int, ...] = (),
+    chunk_rows: int = CHUNK,
+    codec: Codec = Codec.BLOSC,
+) -> Any:
+    """Create an empty dataset of the native layout, whose rows have the shape ``row``."""
+    import hdf5plugin
+
+    blosc = {"compression": hdf5plugin.Blosc(cname="lz4", clevel=1, shuffle=blosc_shuffle(np.dtype(dtype)))}
+    gzip = {"compression": "gzip", "compression_opts": GZIP_LEVEL, "shuffle": True}
+    # The checksum covers the compressed bytes. Its cost is too small to measure. LZ4 alone misses most damage.
+    return file.create_dataset(
+        name,
+        shape=(0, *row),
+        maxshape=(None, *row),
+        chunks=(chunk_rows, *row),
+        dtype=dtype,
+        fletcher32=True,
+        **(blosc if codec is Codec.BLOSC else gzip),
+    )
+
+
 def append_chunk(dataset: Any, start: int, stored: bytes, count: int) -> None:
     """Append an encoded chunk of ``count`` elements to a dataset of ``start`` elements, a whole number of chunks."""
     row = dataset.shape[1:]
     dataset.id.set_extent((start + count, *row))
     dataset.id.write_direct_chunk((start, *(0 for _ in row)), stored)
+
+
+def append_values(dataset: Any, start: int, values: NDArray[Any], codec: Codec) -> None:
+    """Append the values of a chunk, as :func:`append_chunk`."""
+    append_chunk(dataset, start, encode(values, codec), len(values))
+
+
+# A new HDF5 file whose encoded chunks several threads write at the same time.
+#
+# HDF5 uses one thread at a time, and h5py holds Python's lock while HDF5 writes. Here HDF5 only finds the place of a
+# chunk in the file; the thread that encoded the chunk writes it there.
+#
+# HDF5 crashes the process, at the latest when the process ends, if it cannot write a file that it closes. So HDF5 never
+# learns of a full disk: :class:`ChunkFile` notes the error and raises it outside HDF5.
+
+
+class EncodedChunk(NamedTuple):
+    """Chunk of a column."""
+
+    name: str
+    """Name of the column."""
+    start: int
+    """Index of its first element."""
+    values: NDArray[Any]
+    """Its values."""
+    parts: Sequence[bytes]
+    """Its encoded bytes, in one or several parts."""
+
+    @classmethod
+    def of(cls, name: str, start: int, column: NDArray[Any], parts: Iterable[Sequence[bytes]]) -> list[EncodedChunk]:
+        """Return the chunks of a column from element ``start`` on, whose encoded bytes are ``parts``."""
+        return [cls(name, start + k * CHUNK, column[k * CHUNK : (k + 1) * CHUNK], part) for k, part in enumerate(parts)]
+
+
+class ChunkFile:
+    """HDF5 file that is being written. Threads write chunks of its datasets at places that they get in turn.
+
+    Data that HDF5 could not write wait in memory. Call :meth:`check` regularly, so that they stay few.
+    """
+
+    def __init__(self, path: Path, libver: tuple[str, str] | None = ("v110", "v110")) -> None:
+        """Create the file. ``libver`` are h5py's bounds of the format. Raises OSError if the file exists."""
+        import h5py
+
+        self._columns: dict[str, ChunkedColumn] = {}
+        self._turns = threading.Condition()
+        self._turn = 0
+        self._stopped = False
+        with contextlib.ExitStack() as undo:
+            with interrupts_later():
+                self.output = _Output(path)
+                undo.callback(self.output.close)
+                # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
+                self.hdf5 = h5py.File(self.output, "w", libver=libver)
+                """The file as h5py gives it."""
+                undo.callback(self.hdf5.close)
+            undo.pop_all()
+
+    @contextlib.contextmanager
+    def turn(self, number: int) -> Iterator[None]:
+        """Wait until all lower numbers, from 0 on, had their turn, and keep out other turns.
+
+        Chunks get their places in turn, so the bytes of a file do not depend on the speed of the threads. Raises
+        :class:`AmiwarpError` if another thread failed.
+        """
+        with self._turns:
+            self._turns.wait_for(lambda: self._turn == number or self._stopped)
+            if self._stopped:
+                raise AmiwarpError("another thread could not write its part")
+            yield
+            self._turn += 1
+            self._turns.notify_all()
+
+    @contextlib.contextmanager
+    def stopping(self) -> Iterator[None]:
+        """If the work of a thread in the ``with`` block fails, end the waiting of the others."""
+        try:
+            yield
+        except BaseException:
+            with self._turns:
+                self._stopped = True
+                self._turns.notify_all()
+            raise
+
+    def write(
+        self, turn: int, chunks: Sequence[EncodedChunk], dataset_of: Callable[[EncodedChunk], Any],
+        before: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
+        """Write encoded chunks at places that they get in turn.
+
+        ``dataset_of`` makes the dataset of a column's first chunk. ``before`` is called first in turn.
+        """
+        rows = {chunk.name: chunk.start + len(chunk.values) for chunk in chunks}
+        placed = []
+        with self.turn(turn):
+            before()
+            for chunk in chunks:
+                if chunk.name not in self._columns:
+                    self._columns[chunk.name] = ChunkedColumn(self, dataset_of(chunk))
+                column = self._columns[chunk.name]
+                placed.append((column.place(chunk.start, chunk.parts, rows[chunk.name]), chunk.parts))
+        for at, parts in placed:
+            if at is not None:
+                self.output.write_at(parts, at)
+        self.check()
+
+    def check(self) -> None:
+        """Raise the error of the first write of HDF5 that failed, such as OSError for a full disk."""
+        if self.output.failure is not None:
+            raise self.output.failure
+
+    def close(self) -> None:
+        """Close the file, after all threads have written their chunks. Raises an error as :meth:`check` does."""
+        try:
+            self.hdf5.close()
+        finally:
+            self.output.close()
+        self.check()
+
+
+class ChunkedColumn:
+    """Dataset of a :class:`ChunkFile`, whose chunks are written in any order."""
+
+    def __init__(self, file: ChunkFile, dataset: Any) -> None:
+        self._output, self._id = file.output, dataset.id
+        self._rows, *self._row = dataset.shape
+
+    def place(self, start: int, stored: Sequence[bytes], rows: int) -> int | None:
+        """Return the place in the file [bytes] of an encoded chunk from element ``start`` on.
+
+        ``stored`` are the bytes of the chunk, in one or several parts. A dataset of fewer than ``rows`` elements grows
+        to this number. If the place cannot be found, the chunk is written at once and None is returned. Call this
+        method in turn.
+        """
+        size, offset = sum(map(len, stored)), (start, *(0 for _ in self._row))
+        if self._rows < rows:
+            self._rows = rows
+            self._id.set_extent((self._rows, *self._row))
+        at = self._output.place_of(size, partial(self._id.write_direct_chunk, offset))
+        if at is None:
+            self._id.write_direct_chunk(offset, b"".join(stored))
+        return at
+
+
+class _Output(io.RawIOBase):
+    """File that HDF5 writes through, which can find the place of data instead of writing them.
+
+    HDF5's writes never fail. If one cannot be done, its data and those of all later ones stay in memory.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        self._position = 0
+        self._token = os.urandom(16)
+        self._stand_in = memoryview(self._token)
+        self._sought: int | None = None
+        self._found: int | None = None
+        self.failure: BaseException | None = None
+        """Error of the first write that failed."""
+        self._unwritten: list[tuple[int, bytes]] = []
+        """Data that could not be written, with their places [bytes]."""
+
+    def place_of(self, size: int, write: Callable[[Any], Any]) -> int | None:
+        """Return the place [bytes] at which ``write(data)`` writes ``size`` bytes in one piece, without writing them.
+
+        The data are a random token and zeros. Returns None if HDF5 writes them in another way. Anything else that it
+        writes meanwhile is written.
+        """
+        if len(self._stand_in) < size:
+            self._stand_in = memoryview(self._token + bytes(size))
+        self._sought, self._found = size, None
+        try:
+            write(self._stand_in[:size])
+        finally:
+            self._sought = None
+        return self._found
+
+    def write_at(self, parts: Iterable[Any], place: int) -> None:
+        """Write data in several parts, one after the other, at a place [bytes]. Any thread may call it."""
+        rest = [memoryview(part) for part in parts]
+        while rest:
+            done = os.pwritev(self._handle, rest, place)
+            place += done
+            while rest and done >= len(rest[0]):
+                done -= len(rest.pop(0))
+            if done:
+                rest[0] = rest[0][done:]
+
+    def write(self, data: Any) -> int:
+        size = len(data)
+        if size == self._sought and memoryview(data)[: len(self._token)] == self._token[:size]:
+            self._found = self._position
+        else:
+            self._write_or_keep(data)
+        self._position += size
+        return size
+
+    def _write_or_keep(self, data: Any) -> None:
+        """Write data at the position, or keep them in memory if that or an earlier write failed."""
+        if self.failure is None:
+            try:
+                self.write_at([data], self._position)
+                return
+            except BaseException as error:  # an interrupt too must not reach HDF5
+                self.failure = error
+        self._unwritten.append((self._position, bytes(data)))
+
+    def readinto(self, buffer: Any) -> int:
+        count = os.preadv(self._handle, [buffer], self._position)
+        view = memoryview(buffer).cast("B")
+        for at, data in self._unwritten:
+            first, last = max(at - self._position, 0), min(at - self._position + len(data), len(view))
+            if first < last:
+                view[first:last] = data[first + self._position - at : last + self._position - at]
+                count = max(count, last)
+        return count
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        if whence == os.SEEK_END:
+            offset += max(os.fstat(self._handle).st_size, *(at + len(data) for at, data in self._unwritten), 0)
+        self._position = offset
+        return self._position
+
+    def tell(self) -> int:
+        return self._position
+
+    def truncate(self, size: int | None = None) -> int:
+        size = self._position if size is None else size
+        try:
+            os.ftruncate(self._handle, size)
+        except OSError as error:
+            self.failure = self.failure or error
+        return size
+
+    def close(self) -> None:
+        if not self.closed:
+            os.close(self._handle)
+        super().close()

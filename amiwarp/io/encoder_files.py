@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 from array import array
 from collections.abc import Sequence
@@ -15,46 +14,9 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder, UnwrapError
-from amiwarp.io.formats import Format, detect_format
-from amiwarp.io.input_files import errors_name, open_input, text_lines
+from amiwarp.io.formats import OPENERS, TRIGGERS, Format, detect_format, io_function
+from amiwarp.io.input_files import errors_name, text_lines
 from amiwarp.validation import whole
-
-# Times of a counter that wraps around.
-
-
-def nearest(value: int, bits: int, estimate: int) -> int:
-    """Return the value of a counter of ``bits`` bits with the number of wraps that brings it nearest to an estimate."""
-    return value + ((estimate - value + (1 << bits >> 1)) >> bits << bits)
-
-
-def unwrapped(values: NDArray[np.int64], bits: int, before: int | None = None) -> NDArray[np.int64]:
-    """Return the values of a counter of ``bits`` bits, from 0 on, without its wraps.
-
-    ``before`` is the unwrapped value that they continue. A step of more than half the range is a wrap of the counter,
-    forwards or backwards. A smaller step backwards is a value out of order.
-    """
-    if not values.size:
-        return values
-    size = 1 << bits
-    start = int(values[0]) if before is None else before
-    step = np.diff(values, prepend=start % size)
-    wraps = np.cumsum((step < -(size // 2)).astype(np.int64) - (step > size // 2))
-    return values + (start // size + wraps) * size
-
-
-def last_word(path: Path, offset: int, dtype: str, estimate: int) -> int | None:
-    """Return the 32-bit time of the last record of 8 bytes in a file, unwrapped next to an estimate, or None.
-
-    ``offset`` is the position of the first record. The time is the first word of ``dtype`` "<u4", the second of ">u4".
-    """
-    count = (path.stat().st_size - offset) // 8
-    if not count:
-        return None
-    with open_input(path) as file:
-        file.seek(offset + 8 * (count - 1))
-        words = np.frombuffer(file.read(8), dtype)
-    return nearest(int(words[0 if dtype == "<u4" else 1]), 32, estimate)
-
 
 # Reader of encoder logs in CSV: columns ``t_us``, ``angle_deg`` or ``count``, and optionally ``index`` (0 or 1).
 
@@ -176,16 +138,6 @@ def _column_names(path: Path, header: str) -> list[str]:
 
 # The prism's encoder from the external trigger edges that a camera recorded with its events.
 
-READERS = {
-    Format.EVT: "prophesee",
-    Format.AEDAT4: "aedat",
-    Format.AEDAT3: "aedat3",
-    Format.AEDAT2: "aedat2",
-    Format.ROSBAG: "rosbag",
-    Format.HDF5: "hdf5_rows",
-}
-"""Modules of amiwarp.io whose ``trigger_packets`` reads the edges of a format."""
-
 MOST_EDGES = 1 << 26
 """Largest number of edges that is read: 5 hours at 3.6 kHz."""
 
@@ -210,8 +162,8 @@ def read_encoder_triggers(
     if direction not in (1, -1):
         raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
     found = detect_format(path)
-    if found not in READERS:
-        formats = ", ".join(one.value for one in READERS)
+    if found not in TRIGGERS:
+        formats = ", ".join(one.value for one in TRIGGERS)
         raise AmiwarpError(f"{path}: files of the format {found.value} store no triggers; expected one of {formats}")
     with errors_name(path, lambda: "reading the triggers"):
         channels, t, rising = _edges(path, found, topic)
@@ -227,9 +179,8 @@ def read_encoder_triggers(
 
 def _edges(path: Path, found: Format, topic: str | None) -> tuple[Any, Any, Any]:
     """Return channel, time [us] and whether it rises, of each edge."""
-    module: Any = importlib.import_module(f"amiwarp.io.{READERS[found]}")
-    chosen = (topic,) if found is Format.ROSBAG else ()
-    source: Any = module.trigger_packets(path, *chosen)
+    read = io_function(f"{OPENERS[found].partition(':')[0]}:trigger_packets")
+    source: Any = read(path, *((topic,) if found is Format.ROSBAG else ()))
     parts: list[tuple[Any, ...]] = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.bool_))]
     count = 0
     with contextlib.closing(source):

@@ -10,15 +10,14 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name
-from amiwarp.io.reading_process import packets, run
-from amiwarp.io.reading_server import Reply, noting_progress
+from amiwarp.io.reading_process import Reply, noting_progress, packets, run
 
 
 def open_es(path: Path) -> Recording:
     """Open an Event Stream file. Its rows are counted from the bottom, so they are flipped."""
     with errors_name(path, lambda: "reading the header"):
-        width, height = run("amiwarp.io.event_stream:read_head", path.absolute())
-    source = partial(packets, "amiwarp.io.event_stream:read_packets", path.absolute(), height)
+        width, height = run(read_head, path.absolute())
+    source = partial(packets, read_packets, path.absolute(), height)
     events = FileEvents(path, source, size=(width, height))
     return Recording(events=events, metadata={"format": "es", **events.metadata}, name=path.stem)
 

@@ -13,23 +13,12 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import SENSOR_DTYPE, Events, EventSource
+from amiwarp.io import formats
 from amiwarp.io.atomic_output import NewFile, check_output
-from amiwarp.io.chunks import Codec
 from amiwarp.io.file_scan import RECORDS, FileEvents
-from amiwarp.io.formats import open_recording
+from amiwarp.io.formats import LIMITS, Bag, Codec, Limits, Outline, OutputFormat, Rounding, open_recording
 from amiwarp.io.input_files import errors_name
-from amiwarp.io.native_writer import RecordingWriter, copy_events
-from amiwarp.io.output_formats import (
-    LIMITS,
-    Bag,
-    Limits,
-    Outline,
-    OutputFormat,
-    Rounding,
-    check_codec,
-    check_rounding,
-    output_format,
-)
+from amiwarp.io.native_writer import write_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded, whole
@@ -69,7 +58,7 @@ def export(
     outline = Outline(path, *size, *ends, codec, bag)
     _check_limits(outline, limits)
     pixels = Pixels(limits, size, rounding, seed)
-    write = _writer(chosen)
+    write: Writer = formats.io_function(formats.WRITERS[chosen])
     with NewFile(path, overwrite=overwrite) as new, errors_name(path, lambda: f"writing {limits.label}"):
         write(new.part, _written(source.blocks() if blocks is None else blocks, pixels, len(source), progress), outline)
     return pixels.dropped
@@ -130,9 +119,10 @@ class Pixels:
         if self._limits.fractional:
             return events
         names = " or ".join(Rounding)
+        exact = (end for end, one in formats.EXTENSIONS.items() if one in LIMITS and LIMITS[one].fractional)
         raise AmiwarpError(
             f"events are compensated and have fractional pixels, {self._limits.label} holds whole pixels; "
-            f"give --round (rounding= in Python) {names}, or write .h5, .npz or .txt"
+            f"give --round (rounding= in Python) {names}, or write .h5, {' or '.join(exact)}"
         )
 
     def _rounded(self, events: Events, rounding: Rounding) -> Events:
@@ -144,24 +134,6 @@ class Pixels:
         x, y = (at[inside].astype(SENSOR_DTYPE) for at in places)
         self.dropped += len(events) - len(x)
         return Events(x, y, events.t[inside], events.p[inside])
-
-
-def _writer(chosen: OutputFormat) -> Writer:
-    """Return the function that writes a format."""
-    # Each writer is imported on use, because its library takes time to load.
-    if chosen is OutputFormat.DSEC:
-        from amiwarp.io.native_writer import write_dsec as writer
-    elif chosen is OutputFormat.EVT3:
-        from amiwarp.io.prophesee import write_evt3 as writer
-    elif chosen is OutputFormat.AEDAT4:
-        from amiwarp.io.aedat4 import write_aedat4 as writer
-    elif chosen is OutputFormat.NPZ:
-        from amiwarp.io.npz import write_npz as writer
-    elif chosen is OutputFormat.TEXT:
-        from amiwarp.io.text import write_text as writer
-    else:
-        from amiwarp.io.ros import write_ros2 as writer
-    return writer
 
 
 # Conversion of a recording from any format to the native one or to others.
@@ -245,8 +217,7 @@ def convert(
     source_path : str or path-like
         The recording to read, in any format of :class:`Format`.
     out_path : str or path-like
-        The file to write. Its extension gives the format: ``.h5`` or ``.hdf5`` (native), ``.raw`` (Prophesee EVT 3.0),
-        ``.aedat4``, ``.npz``, ``.txt``, and ``.mcap`` or ``.db3`` (ROS 2 bag).
+        The file to write. Its extension gives the format, see :class:`OutputFormat`.
     encoder : Encoder, optional
         Replaces the encoder of the file.
     camera : Camera, optional
@@ -298,9 +269,9 @@ def convert(
     """
     out_path = Path(out_path)
     check_output(out_path, overwrite=overwrite)
-    chosen = output_format(out_path, format)
-    codec = check_codec(out_path, codec, chosen)
-    rounding = check_rounding(out_path, rounding, chosen)
+    chosen = formats.output_format(out_path, format)
+    codec = formats.check_codec(out_path, codec, chosen)
+    rounding = formats.check_rounding(out_path, rounding, chosen)
     opened = open_recording(source_path, topic=topic)
     recording = replace(
         opened, encoder=encoder or opened.encoder, camera=camera or opened.camera, prism=prism or opened.prism
@@ -310,40 +281,17 @@ def convert(
         size = recording.camera.width, recording.camera.height
     dropped = 0
     if chosen is OutputFormat.NATIVE:
-        _write_native(recording, out_path, size, codec, progress, overwrite)
+        source = dict(zip(SOURCE_NAMES, (recording.name, recording.metadata["format"]), strict=True))
+        metadata = {**source, **{name: value for name, value in recording.metadata.items() if name != "format"}}
+        write_recording(
+            out_path, replace(recording, metadata=metadata), size, codec=codec, progress=progress, overwrite=overwrite
+        )
     else:
         dropped = export(
             recording.events, out_path, chosen, size, codec=codec, progress=progress, overwrite=overwrite,
             rounding=rounding, seed=seed, bag=bag_of(recording),
         )  # fmt: skip
     return _summary(recording, size, chosen, rounding, dropped)
-
-
-def _write_native(
-    recording: Recording,
-    path: Path,
-    size: tuple[int, int],
-    codec: Codec,
-    progress: Progress | None,
-    overwrite: bool,
-) -> None:
-    """Write a native recording. Its metadata name the source."""
-    metadata = {name: value for name, value in recording.metadata.items() if name != "format"}
-    source = recording.name, recording.metadata["format"]
-    with RecordingWriter(
-        path,
-        width=size[0],
-        height=size[1],
-        camera=recording.camera,
-        prism=recording.prism,
-        encoder=recording.encoder,
-        truth_parameters=None if recording.truth is None else recording.truth.parameters,
-        truth_labels=None if recording.truth is None else recording.truth.labels,
-        metadata={**dict(zip(SOURCE_NAMES, source, strict=True)), **metadata},
-        overwrite=overwrite,
-        codec=codec,
-    ) as writer:
-        copy_events(recording, writer, size, progress)
 
 
 def _summary(

@@ -24,7 +24,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK, Events, as_coordinate, regroup, rounded_times
 from amiwarp.events.recording import MetadataValue
 from amiwarp.events.sensors import ImuSamples
-from amiwarp.io.input_files import errors_name, register_reader
+from amiwarp.io.input_files import errors_name, open_input, register_reader
 from amiwarp.io.reading_process import packets
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
 
@@ -311,6 +311,61 @@ class FileEvents:
         return Events(x, y, ordered, (p > 0).astype(np.uint8))
 
 
+# Pieces of a file, and times of a counter that wraps around.
+
+
+def read_pieces(path: Path, offset: int, size: int, notes: dict[str, int]) -> Iterator[bytes]:
+    """Yield pieces of ``size`` bytes of a file from ``offset`` on, and note how much of it was read."""
+    notes["total"] = path.stat().st_size
+    with open_input(path) as file:
+        file.seek(offset)
+        while data := file.read(size):
+            notes["read"] = file.tell()
+            yield data
+
+
+def read_words(path: Path, offset: int, dtype: str, count: int, notes: dict[str, int]) -> Iterator[NDArray[Any]]:
+    """Yield ``count`` records of two 32-bit words at a time, shape ``(n, 2)``. A record that is cut off is noted."""
+    for data in read_pieces(path, offset, 8 * count, notes):
+        if len(data) % 8:
+            notes["truncated_bytes"] = len(data) % 8
+        yield np.frombuffer(data, dtype, len(data) // 8 * 2).reshape(-1, 2)
+
+
+def nearest(value: int, bits: int, estimate: int) -> int:
+    """Return the value of a counter of ``bits`` bits with the number of wraps that brings it nearest to an estimate."""
+    return value + ((estimate - value + (1 << bits >> 1)) >> bits << bits)
+
+
+def unwrapped(values: NDArray[np.int64], bits: int, before: int | None = None) -> NDArray[np.int64]:
+    """Return the values of a counter of ``bits`` bits, from 0 on, without its wraps.
+
+    ``before`` is the unwrapped value that they continue. A step of more than half the range is a wrap of the counter,
+    forwards or backwards. A smaller step backwards is a value out of order.
+    """
+    if not values.size:
+        return values
+    size = 1 << bits
+    start = int(values[0]) if before is None else before
+    step = np.diff(values, prepend=start % size)
+    wraps = np.cumsum((step < -(size // 2)).astype(np.int64) - (step > size // 2))
+    return values + (start // size + wraps) * size
+
+
+def last_word(path: Path, offset: int, dtype: str, estimate: int) -> int | None:
+    """Return the 32-bit time of the last record of 8 bytes in a file, unwrapped next to an estimate, or None.
+
+    ``offset`` is the position of the first record. The time is the first word of ``dtype`` "<u4", the second of ">u4".
+    """
+    count = (path.stat().st_size - offset) // 8
+    if not count:
+        return None
+    with open_input(path) as file:
+        file.seek(offset + 8 * (count - 1))
+        words = np.frombuffer(file.read(8), dtype)
+    return nearest(int(words[0 if dtype == "<u4" else 1]), 32, estimate)
+
+
 # IMU samples and frames of files that are read only from their start.
 #
 # They are read after the events, and only if the file is read completely: of the first part of a large file, which
@@ -408,15 +463,15 @@ def read_sensors(
 ) -> tuple[ImuSamples | None, StreamedImages | None, dict[str, MetadataValue]]:
     """Return the IMU samples and frames that were counted, and for those that cannot be read a note that says why.
 
-    ``module`` has the functions ``read_imu``, ``read_heads`` and ``read_images``, which run in the reading process and
-    get the absolute path and ``arguments``.
+    ``module`` is the name of the module with ``read_imu``, ``read_heads`` and ``read_images``, which run in the reading
+    process and get the absolute path and ``arguments``.
     """
     notes: dict[str, MetadataValue] = {}
     if head_limit() is not None:
         return None, None, notes
 
     def start(function: str) -> Packets:
-        return packets(f"amiwarp.io.{module}:{function}", path.absolute(), *arguments, {})
+        return packets(f"{module}:{function}", path.absolute(), *arguments, {})
 
     imu = frames = None
     if counts.get("imu_samples"):

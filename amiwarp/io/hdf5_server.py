@@ -1,7 +1,7 @@
 """Part of the HDF5 reader that runs in the reading process. It checks every group, attribute and dataset before use.
 
 HDF5 allows links, external storage and virtual datasets that refer to other files. They are refused. Sizes that exceed
-the file are refused too. :mod:`amiwarp.io.hdf5` receives the description of a file as JSON.
+the file are refused too. :mod:`amiwarp.io.hdf5_reader` receives the description of a file as JSON.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.chunks import BLOSC, CHUNK, FLETCHER32
 from amiwarp.io.file_scan import microseconds, whole_pixels
-from amiwarp.io.native_layout import FORMAT
+from amiwarp.io.native_writer import FORMAT
 from amiwarp.io.prophesee import Columns
-from amiwarp.io.reading_server import Reply, keep, kept
+from amiwarp.io.reading_process import Reply, keep, kept
 
 # Layouts of other data sets' HDF5 files: M3ED, MVSEC and Prophesee's. Runs in the reading process.
 #

@@ -26,12 +26,11 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, as_times, check_events
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.atomic_output import NewFile, allocate, check_output, link_new, put_in_place
-from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order
+from amiwarp.io.chunks import CHUNK, append_chunk, encode, in_order, make_dataset
+from amiwarp.io.formats import check_native
+from amiwarp.io.hdf5_reader import open_hdf5
 from amiwarp.io.input_files import errors_name
-from amiwarp.io.native_layout import Columns, check_frame, check_lengths, make_dataset, ms_entries, write_header
-from amiwarp.io.native_reader import open_native
-from amiwarp.io.native_writer import save_recording
-from amiwarp.io.output_formats import check_native
+from amiwarp.io.native_writer import Columns, check_frame, check_lengths, ms_entries, save_recording, write_header
 from amiwarp.optics.camera import Camera
 
 if TYPE_CHECKING:
@@ -337,7 +336,7 @@ class LiveWriter:
                 file.truncate(int.from_bytes(file.read(8), "little"))
             if tidy and os.path.getsize(self.part) > 2 * stored + MAX_WASTE_BYTES:
                 with contextlib.suppress(AmiwarpError):  # if the disk is full, the part itself is renamed
-                    tidied = dataclasses.replace(open_native(self.part), metadata=self._metadata)
+                    tidied = dataclasses.replace(open_hdf5(self.part), metadata=self._metadata)
                     save_recording(self.path, tidied, overwrite=self._overwrite)
                     self.part.unlink()
                     return

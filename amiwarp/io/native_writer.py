@@ -6,16 +6,14 @@ The format is described in ``docs/reference/recording-format.md``.
 from __future__ import annotations
 
 import contextlib
-import io
 import itertools
 import os
-import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,24 +23,13 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, check_coordinates, check_events, inside_image, regroup
 from amiwarp.events.recording import MetadataValue
 from amiwarp.events.sensors import ImuSamples, check_image
-from amiwarp.events.truth import EventTruth, FrameTruth, Poses, WorldLabels
-from amiwarp.io.atomic_output import NewFile, interrupts_later
-from amiwarp.io.chunks import CHUNK, Codec, append_chunk, encode, encode_parts, in_order
+from amiwarp.events.truth import EVENT_COLUMNS, MAPS, EventTruth, FrameTruth, Poses, WorldLabels, as_poses, check_truth
+from amiwarp.io.atomic_output import NewFile
+from amiwarp.io.camera_files import camera_attributes, prism_attributes
+from amiwarp.io.chunks import CHUNK, ChunkFile, EncodedChunk, append_values, encode_parts, in_order, make_dataset
+from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
 from amiwarp.io.input_files import errors_name
-from amiwarp.io.native_layout import (
-    ROWS,
-    Columns,
-    RowWriter,
-    check_frame,
-    check_lengths,
-    describe_columns,
-    make_dataset,
-    ms_entries,
-    write_header,
-)
-from amiwarp.io.native_truth import TruthWriter, event_columns
-from amiwarp.io.output_formats import Outline, check_native
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import Camera, check_size
 from amiwarp.validation import choice, guarded, shown
 
 if TYPE_CHECKING:
@@ -51,13 +38,185 @@ if TYPE_CHECKING:
     from amiwarp.progress import Progress
 
 
-# Writer of the IMU samples and frames of a native recording.
-#
-# ``docs/reference/recording-format.md`` describes the format.
+# Layout of the file: header, datasets, chunks and the millisecond index.
+
+FORMAT = "amiwarp-recording"
+"""Value of the attribute ``format`` of native recordings."""
+
+FORMAT_VERSION = 1
+"""Newest version of the format that is read, and the version that is written."""
+
+Columns: TypeAlias = dict[str, NDArray[Any]]
+"""Arrays of a block of events, by the names of their datasets in the file."""
 
 
-class SensorWriter(RowWriter):
-    """Writer of IMU samples and frames into an open HDF5 file."""
+def check_frame(path: Path, width: int, height: int, camera: Camera | None) -> None:
+    """Raise :class:`AmiwarpError` for an impossible sensor size, or a size that differs from the camera's."""
+    check_size(width, height, path)
+    if camera is not None and (camera.width, camera.height) != (width, height):
+        given = f"camera is {camera.width}x{camera.height}, the recording {width}x{height}"
+        raise AmiwarpError(f"{path}: {given}; give both the same size")
+
+
+def check_lengths(columns: Columns, count: int) -> None:
+    """Raise :class:`AmiwarpError` for a column whose number of elements or rows differs from the number of events."""
+    for name, column in columns.items():
+        if column.shape[:1] != (count,) or (column.ndim > 1 and not name.startswith("truth/")):
+            raise AmiwarpError(f"{name} has shape {column.shape}; expected ({count},)")
+
+
+def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) -> Iterator[NDArray[np.int64]]:
+    """Yield entries of the millisecond index ms_to_idx from entry ``first_ms`` on.
+
+    ``t`` are the times of new events [us], which follow ``before`` earlier events.
+    """
+    last_ms = (int(t[-1]) - t_offset) // 1000
+    if last_ms > MAX_MS:
+        span = f"{t_offset} .. {int(t[-1])} us"
+        raise AmiwarpError(f"events span {span}, beyond {MAX_MS // 3_600_000} h; a timestamp is damaged")
+    for first in range(first_ms, last_ms + 1, 1 << 20):
+        ms = np.arange(first, min(first + (1 << 20), last_ms + 1), dtype=np.int64)
+        yield np.searchsorted(t, ms * 1000 + t_offset) + before
+
+
+def describe_columns(columns: Mapping[str, np.dtype[Any]]) -> str:
+    """Return names and data types of columns as text for messages."""
+    return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
+
+
+def write_header(
+    file: Any,
+    size: tuple[int, int],
+    camera: Camera | None,
+    prism: NominalPrism | None,
+    metadata: Mapping[str, MetadataValue],
+) -> None:
+    """Write the parts of a file that are known before the first event: format, size, camera, prism and metadata."""
+    file.attrs["format"] = FORMAT
+    file.attrs["format_version"] = FORMAT_VERSION
+    file.attrs["width"], file.attrs["height"] = size
+    if camera is not None:
+        file.create_group("camera").attrs.update(camera_attributes(camera))
+    if prism is not None:
+        file.create_group("prism").attrs.update(prism_attributes(prism))
+    group = file.create_group("metadata")
+    for name, item in metadata.items():
+        group.attrs[name] = item
+
+
+def event_columns(truth: EventTruth, count: int) -> Columns:
+    """Return the ground truth of ``count`` events as datasets.
+
+    Raises :class:`AmiwarpError` for arrays of another length or shape, and for values without meaning.
+    """
+    columns: Columns = {}
+    if truth.points is not None:
+        points = np.asarray(truth.points, np.float32)
+        if points.shape != (count, 2):
+            raise AmiwarpError(f"truth points have shape {points.shape}; expected ({count}, 2)")
+        columns["truth/x"], columns["truth/y"] = points[:, 0], points[:, 1]
+    for name, (dtype, row) in EVENT_COLUMNS.items():
+        given = getattr(truth, name)
+        if given is not None:
+            values = np.asarray(given, dtype)
+            if values.shape != (count, *row):
+                raise AmiwarpError(f"truth of {name} has shape {values.shape}; expected {(count, *row)}")
+            columns[f"truth/events/{name}"] = values
+    for name, values in columns.items():
+        check_truth(name, values)
+    return columns
+
+
+ROWS = 1024
+"""Number of rows per HDF5 chunk in datasets of small rows, such as poses."""
+
+
+class RecordWriter:
+    """Writer of all but the events into an open HDF5 file: ground truth, IMU samples and frames.
+
+    Datasets are created at their first rows. All instants must have the same joints. All tables of poses must have the
+    same bodies and joints.
+    """
+
+    def __init__(self, file: Any, path: Path, size: tuple[int, int], codec: Codec) -> None:
+        """Set up the writer; ``size`` is the width and height of the sensor [px]."""
+        self._file, self._path, self._size, self._codec = file, path, size, codec
+        self._datasets: dict[str, Any] = {}
+        self._names: dict[str, tuple[str, ...]] = {}
+
+    def write_truth_header(self, parameters: Mapping[str, float] | None, labels: WorldLabels | None) -> None:
+        """Write the true parameters of a simulation, and the names of a world's instances and their classes."""
+        if parameters is not None:
+            group = self._file.create_group("truth")
+            for name, value in parameters.items():
+                group.attrs[name] = float(value)
+        if labels is None:
+            return
+        self._file.require_group("truth/world").attrs["name"] = labels.name
+        self._write_names("truth/world/instances", labels.instances)
+        self._write_names("truth/world/categories", labels.categories)
+
+    def append_frame(self, frame: FrameTruth) -> None:
+        """Append the ground truth of an instant, which must be later than the previous instants."""
+        width, height = self._size
+        rows: dict[str, NDArray[Any]] = {}
+        for name, (dtype, tail) in MAPS.items():
+            rows[name] = np.asarray(getattr(frame, name), dtype)
+            if rows[name].shape != (height, width, *tail):
+                raise AmiwarpError(
+                    f"{self._path}: {name} of the instant {frame.t_us} us has shape {rows[name].shape}; "
+                    f"expected {(height, width, *tail)}"
+                )
+        self._check_later("truth/frames/t", frame.t_us)
+        self._append("truth/frames/t", np.array([frame.t_us], np.int64), ROWS)
+        self._append("truth/frames/pose", as_poses(frame.rotation, frame.position)[None], ROWS)
+        self._append_joints("truth/frames/joints", {name: at[None] for name, at in frame.joints.items()})
+        for name, values in rows.items():
+            self._append(f"truth/frames/{name}", values[None], 1)
+
+    def append_poses(self, poses: Poses) -> None:
+        """Append a table of poses, which must be later than the previous poses."""
+        if not len(poses):
+            return
+        self._check_later("truth/poses/t", int(poses.t[0]))
+        self._append("truth/poses/t", np.asarray(poses.t, np.int64), ROWS)
+        self._append("truth/poses/camera", np.asarray(poses.camera, np.float64), ROWS)
+        self._append_joints("truth/joints/position", poses.joints)
+        if poses.bodies:
+            self._keep_names("truth/poses/body_names", poses.bodies)
+            self._append("truth/poses/bodies", np.stack(list(poses.bodies.values()), axis=1), ROWS)
+
+    def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
+        """Append a mask of known pixels, which holds from a time later than those before."""
+        width, height = self._size
+        if mask.shape != (height, width):
+            raise AmiwarpError(f"{self._path}: mask at {t_us} us has shape {mask.shape}; expected {(height, width)}")
+        self._check_later("truth/known/t", t_us)
+        self._append("truth/known/t", np.array([t_us], np.int64), ROWS)
+        self._append("truth/known/mask", np.asarray(mask, np.uint8)[None], 1)
+
+    def _append_joints(self, name: str, joints: Mapping[str, NDArray[np.float64]]) -> None:
+        """Append the positions of joints [m], shape (k, 3) each, to the dataset ``name``."""
+        if joints:
+            self._keep_names("truth/joints/names", joints)
+            self._append(name, np.stack(list(joints.values()), axis=1).astype(np.float64), ROWS)
+
+    def _keep_names(self, name: str, given: Iterable[str]) -> None:
+        """Write the names at the first call, and check that later calls give the same names."""
+        names = tuple(given)
+        if name not in self._names:
+            self._names[name] = names
+            self._write_names(name, names)
+        elif self._names[name] != names:
+            raise AmiwarpError(f"{self._path}: {name} changed between calls; give the same names in the same order")
+
+    def _write_names(self, name: str, names: tuple[str, ...]) -> None:
+        """Write names to a dataset of UTF-8 strings."""
+        import h5py
+
+        encoded = [text.encode("utf-8", "replace") for text in names]
+        kind = h5py.string_dtype("utf-8", max([1, *(len(text) for text in encoded)]))
+        self._file.create_dataset(name, data=np.array(encoded, kind))
 
     def append_imu(self, samples: ImuSamples) -> None:
         """Append samples, which must not be earlier than those before."""
@@ -78,334 +237,33 @@ class SensorWriter(RowWriter):
         self._append("frames/t", np.array([t_us], np.int64), ROWS)
         self._append("frames/image", image[None], 1)
 
+    def _append(self, name: str, values: NDArray[Any], chunk_rows: int) -> None:
+        """Append rows to a dataset, which is created at the first call with ``chunk_rows`` rows per chunk."""
+        if name.startswith("truth/"):
+            check_truth(name, values)
+        if name not in self._datasets:
+            self._datasets[name] = make_dataset(
+                self._file, name, values.dtype, values.shape[1:], chunk_rows, self._codec
+            )
+        dataset = self._datasets[name]
+        if dataset.shape[1:] != values.shape[1:]:
+            raise AmiwarpError(
+                f"{self._path}: rows of {name} have shape {values.shape[1:]}; expected {dataset.shape[1:]}"
+            )
+        start = dataset.shape[0]
+        dataset.resize(start + len(values), axis=0)
+        dataset[start:] = values
 
-# Methods of the writer of native recordings that append anything other than events.
+    def _check_later(self, name: str, t: int, *, equal: bool = False) -> None:
+        """Raise :class:`AmiwarpError` if the time ``t`` [us] does not follow the last time in a dataset.
 
-
-class RecordAppender:
-    """Base of :class:`amiwarp.RecordingWriter`: appends ground truth, IMU samples and frames."""
-
-    path: Path
-    _chunks: Any = None
-    _truth: TruthWriter | None = None
-    _sensors: SensorWriter | None = None
-
-    def append_frame(self, frame: FrameTruth) -> None:
-        """Append the ground truth of an instant.
-
-        Parameters
-        ----------
-        frame : FrameTruth
-            Ground truth of all pixels, at a later time than the frame before.
+        ``equal``: whether the same time is allowed too.
         """
-        with self._appending(lambda: f"truth of the instant {frame.t_us} us"):
-            self._open_truth().append_frame(frame)
-
-    def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
-        """Append a mask of the pixels whose scene is known.
-
-        Parameters
-        ----------
-        t_us : int
-            Time from which the mask holds [us], later than that of the mask before.
-        mask : numpy.ndarray
-            Whether the scene at each pixel without the prism is known, shape ``(height, width)``.
-        """
-        with self._appending(lambda: f"mask at {t_us} us"):
-            self._open_truth().append_known(t_us, mask)
-
-    def append_poses(self, poses: Poses) -> None:
-        """Append true poses of camera, bodies and joints.
-
-        Parameters
-        ----------
-        poses : Poses
-            Poses at later times than those before.
-        """
-        with self._appending(lambda: "true poses"):
-            self._open_truth().append_poses(poses)
-
-    def append_imu(self, samples: ImuSamples) -> None:
-        """Append samples of an inertial measurement unit.
-
-        Parameters
-        ----------
-        samples : ImuSamples
-            Samples, not earlier than those before.
-        """
-        with self._appending(lambda: "IMU samples"):
-            self._open_sensors().append_imu(samples)
-
-    def append_image(self, t_us: int, image: NDArray[Any]) -> None:
-        """Append a frame.
-
-        Parameters
-        ----------
-        t_us : int
-            Time of the frame [us], not earlier than that of the frame before.
-        image : numpy.ndarray
-            Grey levels, uint8 or uint16, shape ``(height, width)``, as those of the frames before.
-        """
-        with self._appending(lambda: f"frame at {t_us} us"):
-            self._open_sensors().append_image(t_us, image)
-
-    @contextlib.contextmanager
-    def _appending(self, place: Callable[[], str]) -> Iterator[None]:
-        """Name the file and the place in errors, and raise the error of a full disk."""
-        with errors_name(self.path, place):
-            yield
-            if self._chunks is not None:
-                self._chunks.check()
-
-    def _open_records(self, file: Any, size: tuple[int, int], codec: Codec) -> None:
-        """Set up the writers of an open file. ``size``: width and height of the sensor [px]."""
-        self._truth = TruthWriter(file, self.path, size, codec)
-        self._sensors = SensorWriter(file, self.path, codec)
-
-    def _open_truth(self) -> TruthWriter:
-        if self._truth is None:
-            raise AmiwarpError(f"{self.path}: append outside the writer's with block; call it inside")
-        return self._truth
-
-    def _open_sensors(self) -> SensorWriter:
-        if self._sensors is None:
-            raise AmiwarpError(f"{self.path}: append outside the writer's with block; call it inside")
-        return self._sensors
-
-
-# New HDF5 file whose encoded chunks several threads write at the same time.
-#
-# HDF5 uses one thread at a time, and h5py holds Python's lock while HDF5 writes. Here HDF5 only finds the place of a
-# chunk in the file; the thread that encoded the chunk writes it there.
-#
-# HDF5 crashes the process, at the latest when the process ends, if it cannot write a file that it closes. So HDF5 never
-# learns of a full disk: :class:`ChunkFile` notes the error and raises it outside HDF5.
-
-
-class EncodedChunk(NamedTuple):
-    """Chunk of a column."""
-
-    name: str
-    """Name of the column."""
-    start: int
-    """Index of its first element."""
-    values: NDArray[Any]
-    """Its values."""
-    parts: Sequence[bytes]
-    """Its encoded bytes, in one or several parts."""
-
-
-def chunks_of(name: str, start: int, column: NDArray[Any], parts: Iterable[Sequence[bytes]]) -> list[EncodedChunk]:
-    """Return the chunks of a column whose first element is element ``start``, and whose encoded bytes are ``parts``."""
-    return [
-        EncodedChunk(name, start + k * CHUNK, column[k * CHUNK : (k + 1) * CHUNK], part) for k, part in enumerate(parts)
-    ]
-
-
-class ChunkFile:
-    """HDF5 file that is being written. Threads write chunks of its datasets at places that they get in turn.
-
-    Data that HDF5 could not write wait in memory. Call :meth:`check` regularly, so that they stay few.
-    """
-
-    def __init__(self, path: Path, libver: tuple[str, str] | None = ("v110", "v110")) -> None:
-        """Create the file. ``libver`` are h5py's bounds of the format. Raises OSError if the file exists."""
-        import h5py
-
-        self._columns: dict[str, ChunkedColumn] = {}
-        self._turns = threading.Condition()
-        self._turn = 0
-        self._stopped = False
-        with contextlib.ExitStack() as undo:
-            with interrupts_later():
-                self.output = _Output(path)
-                undo.callback(self.output.close)
-                # From HDF5 1.10 on, the file's structure has checksums, so that damage is detected.
-                self.hdf5 = h5py.File(self.output, "w", libver=libver)
-                """The file as h5py gives it."""
-                undo.callback(self.hdf5.close)
-            undo.pop_all()
-
-    @contextlib.contextmanager
-    def turn(self, number: int) -> Iterator[None]:
-        """Wait until all lower numbers, from 0 on, had their turn, and keep out other turns.
-
-        Chunks get their places in turn, so the bytes of a file do not depend on the speed of the threads. Raises
-        :class:`AmiwarpError` if another thread failed.
-        """
-        with self._turns:
-            self._turns.wait_for(lambda: self._turn == number or self._stopped)
-            if self._stopped:
-                raise AmiwarpError("another thread could not write its part")
-            yield
-            self._turn += 1
-            self._turns.notify_all()
-
-    @contextlib.contextmanager
-    def stopping(self) -> Iterator[None]:
-        """If the work of a thread in the ``with`` block fails, end the waiting of the others."""
-        try:
-            yield
-        except BaseException:
-            with self._turns:
-                self._stopped = True
-                self._turns.notify_all()
-            raise
-
-    def write(
-        self, turn: int, chunks: Sequence[EncodedChunk], dataset_of: Callable[[EncodedChunk], Any],
-        before: Callable[[], None] = lambda: None,
-    ) -> None:  # fmt: skip
-        """Write encoded chunks at places that they get in turn.
-
-        ``dataset_of`` makes the dataset of a column's first chunk. ``before`` is called first in turn.
-        """
-        rows = {chunk.name: chunk.start + len(chunk.values) for chunk in chunks}
-        placed = []
-        with self.turn(turn):
-            before()
-            for chunk in chunks:
-                if chunk.name not in self._columns:
-                    self._columns[chunk.name] = ChunkedColumn(self, dataset_of(chunk))
-                column = self._columns[chunk.name]
-                placed.append((column.place(chunk.start, chunk.parts, rows[chunk.name]), chunk.parts))
-        for at, parts in placed:
-            if at is not None:
-                self.output.write_at(parts, at)
-        self.check()
-
-    def check(self) -> None:
-        """Raise the error of the first write of HDF5 that failed, such as OSError for a full disk."""
-        if self.output.failure is not None:
-            raise self.output.failure
-
-    def close(self) -> None:
-        """Close the file, after all threads have written their chunks. Raises an error as :meth:`check` does."""
-        try:
-            self.hdf5.close()
-        finally:
-            self.output.close()
-        self.check()
-
-
-class ChunkedColumn:
-    """Dataset of a :class:`ChunkFile`, whose chunks are written in any order."""
-
-    def __init__(self, file: ChunkFile, dataset: Any) -> None:
-        self._output, self._id = file.output, dataset.id
-        self._rows, *self._row = dataset.shape
-
-    def place(self, start: int, stored: Sequence[bytes], rows: int) -> int | None:
-        """Return the place in the file [bytes] of an encoded chunk from element ``start`` on.
-
-        ``stored`` are the bytes of the chunk, in one or several parts. A dataset of fewer than ``rows`` elements grows
-        to this number. If the place cannot be found, the chunk is written at once and None is returned. Call this
-        method in turn.
-        """
-        size, offset = sum(map(len, stored)), (start, *(0 for _ in self._row))
-        if self._rows < rows:
-            self._rows = rows
-            self._id.set_extent((self._rows, *self._row))
-        at = self._output.place_of(size, partial(self._id.write_direct_chunk, offset))
-        if at is None:
-            self._id.write_direct_chunk(offset, b"".join(stored))
-        return at
-
-
-class _Output(io.RawIOBase):
-    """File that HDF5 writes through, which can find the place of data instead of writing them.
-
-    HDF5's writes never fail. If one cannot be done, its data and those of all later ones stay in memory.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        self._position = 0
-        self._token = os.urandom(16)
-        self._stand_in = memoryview(self._token)
-        self._sought: int | None = None
-        self._found: int | None = None
-        self.failure: BaseException | None = None
-        """Error of the first write that failed."""
-        self._unwritten: list[tuple[int, bytes]] = []
-        """Data that could not be written, with their places [bytes]."""
-
-    def place_of(self, size: int, write: Callable[[Any], Any]) -> int | None:
-        """Return the place [bytes] at which ``write(data)`` writes ``size`` bytes in one piece, without writing them.
-
-        The data are a random token and zeros. Returns None if HDF5 writes them in another way. Anything else that it
-        writes meanwhile is written.
-        """
-        if len(self._stand_in) < size:
-            self._stand_in = memoryview(self._token + bytes(size))
-        self._sought, self._found = size, None
-        try:
-            write(self._stand_in[:size])
-        finally:
-            self._sought = None
-        return self._found
-
-    def write_at(self, parts: Iterable[Any], place: int) -> None:
-        """Write data in several parts, one after the other, at a place [bytes]. Any thread may call it."""
-        rest = [memoryview(part) for part in parts]
-        while rest:
-            done = os.pwritev(self._handle, rest, place)
-            place += done
-            while rest and done >= len(rest[0]):
-                done -= len(rest.pop(0))
-            if done:
-                rest[0] = rest[0][done:]
-
-    def write(self, data: Any) -> int:
-        size = len(data)
-        if size == self._sought and memoryview(data)[: len(self._token)] == self._token[:size]:
-            self._found = self._position
-        else:
-            self._write_or_keep(data)
-        self._position += size
-        return size
-
-    def _write_or_keep(self, data: Any) -> None:
-        """Write data at the position, or keep them in memory if that or an earlier write failed."""
-        if self.failure is None:
-            try:
-                self.write_at([data], self._position)
-                return
-            except BaseException as error:  # an interrupt too must not reach HDF5
-                self.failure = error
-        self._unwritten.append((self._position, bytes(data)))
-
-    def readinto(self, buffer: Any) -> int:
-        count = os.preadv(self._handle, [buffer], self._position)
-        view = memoryview(buffer).cast("B")
-        for at, data in self._unwritten:
-            first, last = max(at - self._position, 0), min(at - self._position + len(data), len(view))
-            if first < last:
-                view[first:last] = data[first + self._position - at : last + self._position - at]
-                count = max(count, last)
-        return count
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        if whence == os.SEEK_END:
-            offset += max(os.fstat(self._handle).st_size, *(at + len(data) for at, data in self._unwritten), 0)
-        self._position = offset
-        return self._position
-
-    def tell(self) -> int:
-        return self._position
-
-    def truncate(self, size: int | None = None) -> int:
-        size = self._position if size is None else size
-        try:
-            os.ftruncate(self._handle, size)
-        except OSError as error:
-            self.failure = self.failure or error
-        return size
-
-    def close(self) -> None:
-        if not self.closed:
-            os.close(self._handle)
-        super().close()
+        stored = self._datasets.get(name)
+        if stored is not None and len(stored) and (t < int(stored[-1]) or (t == int(stored[-1]) and not equal)):
+            raise AmiwarpError(
+                f"{self._path}: {name} {t} us does not follow {int(stored[-1])} us; append in order of time"
+            )
 
 
 FlaggedEvents: TypeAlias = tuple[Events, NDArray[np.uint8], Mapping[str, Sequence[bytes]]]
@@ -414,7 +272,7 @@ that are encoded already, by the name of the dataset."""
 
 
 @guarded
-class RecordingWriter(RecordAppender):
+class RecordingWriter:
     """Writer that streams a recording into a native HDF5 file.
 
     Use it in a ``with`` block. The file appears under its name when the block ends without an exception. After an
@@ -481,6 +339,8 @@ class RecordingWriter(RecordAppender):
         self._camera, self._prism, self._encoder = camera, prism, encoder
         self._truth_parameters, self._truth_labels = truth_parameters, truth_labels
         self._metadata = dict(metadata or {})
+        self._chunks: Any = None
+        self._records: RecordWriter | None = None
         self._file: Any = None
         self._datasets: dict[str, Any] = {}
         self._turns = itertools.count()
@@ -501,8 +361,9 @@ class RecordingWriter(RecordAppender):
             with errors_name(self.path, lambda: "making the file"):
                 self._chunks = ChunkFile(self._new.part)
                 self._file = self._chunks.hdf5
-                self._open_records(self._file, self._size, self._codec)
-                self._write_header()
+                self._records = RecordWriter(self._file, self.path, self._size, self._codec)
+                write_header(self._file, self._size, self._camera, self._prism, self._metadata)
+                self._records.write_truth_header(self._truth_parameters, self._truth_labels)
         except BaseException:
             self._discard()
             raise
@@ -627,7 +488,7 @@ class RecordingWriter(RecordAppender):
                     stored: Sequence[Sequence[bytes]] = [(part,) for part in known.get(name, ())]
                     if len(stored) * CHUNK < len(column):
                         stored = encode_parts(column, self._codec)
-                    chunks += chunks_of(name, start, column, stored)
+                    chunks += EncodedChunk.of(name, start, column, stored)
                 self._chunks.write(turn, chunks, self._dataset_of, lambda: self._follow(events, start))
         return events, inside
 
@@ -646,6 +507,78 @@ class RecordingWriter(RecordAppender):
 
     def _check(self, events: Events, first_index: int, **how: Any) -> None:
         check_events(events, *self._size, where=str(self.path), first_index=first_index, **how)
+
+    def append_frame(self, frame: FrameTruth) -> None:
+        """Append the ground truth of an instant.
+
+        Parameters
+        ----------
+        frame : FrameTruth
+            Ground truth of all pixels, at a later time than the frame before.
+        """
+        with self._appending(lambda: f"truth of the instant {frame.t_us} us"):
+            self._open_records().append_frame(frame)
+
+    def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
+        """Append a mask of the pixels whose scene is known.
+
+        Parameters
+        ----------
+        t_us : int
+            Time from which the mask holds [us], later than that of the mask before.
+        mask : numpy.ndarray
+            Whether the scene at each pixel without the prism is known, shape ``(height, width)``.
+        """
+        with self._appending(lambda: f"mask at {t_us} us"):
+            self._open_records().append_known(t_us, mask)
+
+    def append_poses(self, poses: Poses) -> None:
+        """Append true poses of camera, bodies and joints.
+
+        Parameters
+        ----------
+        poses : Poses
+            Poses at later times than those before.
+        """
+        with self._appending(lambda: "true poses"):
+            self._open_records().append_poses(poses)
+
+    def append_imu(self, samples: ImuSamples) -> None:
+        """Append samples of an inertial measurement unit.
+
+        Parameters
+        ----------
+        samples : ImuSamples
+            Samples, not earlier than those before.
+        """
+        with self._appending(lambda: "IMU samples"):
+            self._open_records().append_imu(samples)
+
+    def append_image(self, t_us: int, image: NDArray[Any]) -> None:
+        """Append a frame.
+
+        Parameters
+        ----------
+        t_us : int
+            Time of the frame [us], not earlier than that of the frame before.
+        image : numpy.ndarray
+            Grey levels, uint8 or uint16, shape ``(height, width)``, as those of the frames before.
+        """
+        with self._appending(lambda: f"frame at {t_us} us"):
+            self._open_records().append_image(t_us, image)
+
+    @contextlib.contextmanager
+    def _appending(self, place: Callable[[], str]) -> Iterator[None]:
+        """Name the file and the place in errors, and raise the error of a full disk."""
+        with errors_name(self.path, place):
+            yield
+            if self._chunks is not None:
+                self._chunks.check()
+
+    def _open_records(self) -> RecordWriter:
+        if self._records is None:
+            raise AmiwarpError(f"{self.path}: append outside the writer's with block; call it inside")
+        return self._records
 
     def set_encoder(self, encoder: Encoder) -> None:
         """Set or replace the encoder, which is written at the end.
@@ -709,7 +642,7 @@ class RecordingWriter(RecordAppender):
     def _write_chunk(self, name: str, start: int, values: NDArray[Any], turn: int) -> None:
         """Encode and write the values of a chunk that begins at element ``start``. Runs in a thread."""
         with self._chunks.stopping():
-            chunks = chunks_of(name, start, values, encode_parts(values, self._codec))
+            chunks = EncodedChunk.of(name, start, values, encode_parts(values, self._codec))
             self._chunks.write(turn, chunks, self._dataset_of)
 
     def _dataset_of(self, chunk: EncodedChunk) -> Any:
@@ -726,10 +659,6 @@ class RecordingWriter(RecordAppender):
         if name not in self._datasets:
             self._datasets[name] = make_dataset(self._file, name, dtype, row, codec=self._codec)
         return self._datasets[name]
-
-    def _write_header(self) -> None:
-        write_header(self._file, self._size, self._camera, self._prism, self._metadata)
-        self._open_truth().write_header(self._truth_parameters, self._truth_labels)
 
     def _finish(self) -> None:
         self._flush(whole=self._pending_count)
@@ -782,18 +711,13 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
                 ms += entries.size
             columns = {"x": events.x, "y": events.y, "t": events.t - about.t_first, "p": events.p}
             for name, dtype in COLUMNS.items():
-                _append(datasets[name], written, columns[name].astype(dtype), about.codec)
+                append_values(datasets[name], written, columns[name].astype(dtype), about.codec)
             written += len(events)
             chunks.check()
         stored = create("ms_to_idx", np.uint64)
         found = np.concatenate(index).astype(np.uint64)
         for start in range(0, ms, CHUNK):
-            _append(stored, start, found[start : start + CHUNK], about.codec)
-
-
-def _append(dataset: Any, start: int, values: NDArray[Any], codec: Codec) -> None:
-    """Append a chunk without HDF5's buffers."""
-    append_chunk(dataset, start, encode(values, codec), len(values))
+            append_values(stored, start, found[start : start + CHUNK], about.codec)
 
 
 # Copy of a recording into a native file.
@@ -802,8 +726,23 @@ POSE_BLOCK = 1 << 16
 """Number of poses that are copied at a time."""
 
 
-def copy_events(
-    recording: Recording, writer: RecordingWriter, size: tuple[int, int], progress: Progress | None = None
+def write_recording(
+    path: str | os.PathLike[str], recording: Recording, size: tuple[int, int], *,
+    codec: Codec = Codec.BLOSC, progress: Progress | None = None, overwrite: bool = False,
+) -> None:  # fmt: skip
+    """Write a recording to a native file. ``size`` is that of the image [px]."""
+    truth = recording.truth
+    parameters, labels = (None, None) if truth is None else (truth.parameters, truth.labels)
+    with RecordingWriter(
+        path, width=size[0], height=size[1], camera=recording.camera, prism=recording.prism, encoder=recording.encoder,
+        metadata=recording.metadata, overwrite=overwrite, codec=codec,
+        truth_parameters=parameters, truth_labels=labels,
+    ) as writer:  # fmt: skip
+        _copy_events(recording, writer, size, progress)
+
+
+def _copy_events(
+    recording: Recording, writer: RecordingWriter, size: tuple[int, int], progress: Progress | None
 ) -> None:
     """Append all events of a recording to a writer, with their ground truth and flags, IMU samples and frames.
 
@@ -868,18 +807,4 @@ def save_recording(path: str | os.PathLike[str], recording: Recording, *, overwr
     >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, width=4, height=4))
     >>> amiwarp.save_recording("short.h5", recording)
     """
-    source = recording.events
-    width, height = source.size
-    with RecordingWriter(
-        path,
-        width=width,
-        height=height,
-        camera=recording.camera,
-        prism=recording.prism,
-        encoder=recording.encoder,
-        truth_parameters=None if recording.truth is None else recording.truth.parameters,
-        truth_labels=None if recording.truth is None else recording.truth.labels,
-        metadata=recording.metadata,
-        overwrite=overwrite,
-    ) as writer:
-        copy_events(recording, writer, source.size)
+    write_recording(path, recording, recording.events.size, overwrite=overwrite)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK
 from amiwarp.events.recording import Recording
-from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.file_scan import FileEvents, Packet, read_pieces
 from amiwarp.io.input_files import errors_name, open_input
 
 EVENT_BYTES = 5
@@ -59,13 +59,10 @@ def _columns(data: NDArray[np.uint8]) -> Packet:
 
 def _packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
     marks = 0
-    notes["total"] = path.stat().st_size
-    with open_input(path) as file:
-        while data := file.read(EVENT_BYTES * DEFAULT_BLOCK):
-            notes["read"] = file.tell()
-            x, y, t, p = _columns(np.frombuffer(data, np.uint8))
-            is_mark = y == MARK_ROW
-            t = t + (marks + np.cumsum(is_mark)) * MARK_US
-            marks += int(np.count_nonzero(is_mark))
-            notes["overflow_marks"] = marks
-            yield x[~is_mark], y[~is_mark], t[~is_mark], p[~is_mark]
+    for data in read_pieces(path, 0, EVENT_BYTES * DEFAULT_BLOCK, notes):
+        x, y, t, p = _columns(np.frombuffer(data, np.uint8))
+        is_mark = y == MARK_ROW
+        t = t + (marks + np.cumsum(is_mark)) * MARK_US
+        marks += int(np.count_nonzero(is_mark))
+        notes["overflow_marks"] = marks
+        yield x[~is_mark], y[~is_mark], t[~is_mark], p[~is_mark]

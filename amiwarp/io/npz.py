@@ -28,8 +28,8 @@ from amiwarp.events.events import DEFAULT_BLOCK, Events
 from amiwarp.events.recording import Recording
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.io.file_scan import FileEvents, Packet, microseconds, whole_pixels
+from amiwarp.io.formats import Outline
 from amiwarp.io.input_files import errors_name, input_path, open_input
-from amiwarp.io.output_formats import Outline
 
 PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods that NumPy writes. Others are refused, because they may take any amount of memory."""

@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK, Events
 from amiwarp.events.recording import Recording
-from amiwarp.io.encoder_files import last_word, nearest, unwrapped
-from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.file_scan import FileEvents, Packet, last_word, nearest, read_pieces, read_words, unwrapped
+from amiwarp.io.formats import LONGEST_US, Outline
 from amiwarp.io.input_files import errors_name, open_input
-from amiwarp.io.output_formats import LONGEST_US, Outline
-from amiwarp.io.reading_process import packets
-from amiwarp.io.reading_server import noting_progress
+from amiwarp.io.reading_process import noting_progress, packets
 
 # Decoders of Prophesee's EVT words with NumPy: EVT 2.0, 2.1 and 3.0, for streams that arrive in pieces.
 #
@@ -196,7 +194,7 @@ def open_evt(path: Path) -> Recording:
     if word == 8:
         version, source = "2.1", partial(_evt21_packets, path, offset, swapped, False)
     else:
-        source = partial(packets, "amiwarp.io.prophesee:read_evt_packets", path.absolute(), False)
+        source = partial(packets, read_evt_packets, path.absolute(), False)
     last = None if word == 2 else partial(_last_evt_time, path, offset, word, swapped)
     events = FileEvents(path, source, size=_evt_size(fields), last_time=last)
     truncated = (path.stat().st_size - offset) % word
@@ -238,21 +236,17 @@ def trigger_packets(path: Path) -> Iterator[Packet]:
     fields, offset = _read_header(path)
     if fields.get("evt", fields.get("format", "")).startswith(("2.1", "EVT21")):
         return _evt21_packets(path, offset, _is_swapped(path, offset, fields.get("format", "")), True, {})
-    return packets("amiwarp.io.prophesee:read_evt_packets", path.absolute(), True, {})
+    return packets(read_evt_packets, path.absolute(), True, {})
 
 
 def _evt21_packets(path: Path, offset: int, swapped: bool, triggers: bool, notes: dict[str, int]) -> Iterator[Packet]:
     """Yield the events, or the triggers, of EVT 2.1, which faery does not read."""
     decoder = Evt2Decoder(vectors=True)
-    notes["total"] = path.stat().st_size
-    with open_input(path) as file:
-        file.seek(offset)
-        while data := file.read(8 * EVT21_BLOCK):
-            notes["read"] = file.tell()
-            words = words_of(data, "2.1")
-            events, edges = decoder.decode(swap_halves(words) if swapped else words)
-            notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
-            yield edges if triggers else events
+    for data in read_pieces(path, offset, 8 * EVT21_BLOCK, notes):
+        words = words_of(data, "2.1")
+        events, edges = decoder.decode(swap_halves(words) if swapped else words)
+        notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
+        yield edges if triggers else events
 
 
 def _last_evt_time(path: Path, offset: int, word: int, swapped: bool, estimate: int) -> int | None:
@@ -315,22 +309,15 @@ def _dat_packets(path: Path, offset: int, version: str, notes: dict[str, int]) -
     # Bits of the second word, according to Prophesee's documentation of the format.
     bits, y_shift, p_shift = ((9, 8), 9, 17) if version == "1" else ((14, 14), 14, 28)
     last: int | None = None
-    with open_input(path) as file:
-        file.seek(offset)
-        notes["total"] = path.stat().st_size
-        while data := file.read(8 * DEFAULT_BLOCK):
-            notes["read"] = file.tell()
-            if len(data) % 8:
-                notes["truncated_bytes"] = len(data) % 8
-            words = np.frombuffer(data[: len(data) // 8 * 8], "<u4").reshape(-1, 2)
-            low, rest = words[:, 0].astype(np.int64), words[:, 1]
-            if not low.size:
-                return
-            t = unwrapped(low, 32, last)
-            last = int(t[-1])
-            x = rest & ((1 << bits[0]) - 1)
-            y = (rest >> y_shift) & ((1 << bits[1]) - 1)
-            yield x, y, t, (rest >> p_shift) & 1
+    for words in read_words(path, offset, "<u4", DEFAULT_BLOCK, notes):
+        rest = words[:, 1]
+        if not rest.size:
+            return
+        t = unwrapped(words[:, 0].astype(np.int64), 32, last)
+        last = int(t[-1])
+        x = rest & ((1 << bits[0]) - 1)
+        y = (rest >> y_shift) & ((1 << bits[1]) - 1)
+        yield x, y, t, (rest >> p_shift) & 1
 
 
 # Encoder of events in Prophesee's EVT 3.0, and writer of RAW files with them.

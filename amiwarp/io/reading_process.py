@@ -2,13 +2,14 @@
 
 HDF5 with its filters and the compiled decoders of other formats trust a file's content. The process that runs them is
 started by ``subprocess``, not ``multiprocessing``, so that a user's script is not imported again. It runs functions of
-amiwarp that return a JSON value and arrays, which are sent through pipes. :mod:`amiwarp.io.reading_server` is the part
-that runs in the process.
+amiwarp that return a JSON value and arrays, which are sent through pipes. The second part of
+this file runs in the process.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import signal
@@ -16,10 +17,11 @@ import struct
 import subprocess
 import sys
 import threading
+import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +39,12 @@ PIPE_BYTES = 1 << 20
 """Size of the pipe from the reading process [bytes], if the system supports it. A larger pipe needs fewer process
 switches."""
 
-START = "import sys; sys.path[:] = sys.argv[1:]; from amiwarp.io.reading_server import serve; serve()"
+START = "import sys; sys.path[:] = sys.argv[1:]; from amiwarp.io.reading_process import serve; serve()"
 """Python program that the reading process runs."""
+
+
+Function: TypeAlias = str | Callable[..., Any]
+"""Function of amiwarp that the process runs: itself, or ``module:function`` if only the process imports its module."""
 
 
 class ReadingProcess:
@@ -74,8 +80,8 @@ class ReadingProcess:
         """Whether the process is alive and was started by this process. A fork of its owner cannot use it."""
         return self.close.alive and self.owner == os.getpid() and self._child.poll() is None
 
-    def call(self, function: str, *arguments: Any) -> tuple[Any, list[NDArray[Any]]]:
-        """Run ``module:function`` of amiwarp, and return its JSON value and its arrays, each of shape ``(n,)``.
+    def call(self, function: Function, *arguments: Any) -> tuple[Any, list[NDArray[Any]]]:
+        """Run a function of amiwarp, and return its JSON value and its arrays, each of shape ``(n,)``.
 
         Raises
         ------
@@ -87,10 +93,10 @@ class ReadingProcess:
 
     def prepare(self, module: str) -> None:
         """Let the process import a module, without waiting for it. The next call waits."""
-        self.send("amiwarp.io.reading_server:prepare", module)
+        self.send(prepare, module)
         self._preparing = True
 
-    def send(self, function: str, *arguments: Any) -> None:
+    def send(self, function: Function, *arguments: Any) -> None:
         """Send a call to the process; :meth:`receive` returns its result.
 
         A path among the arguments is an input: it is checked and noted here, and sent as an absolute path.
@@ -100,7 +106,7 @@ class ReadingProcess:
             self.receive()
         arguments = tuple(_absolute(value) if isinstance(value, Path) else value for value in arguments)
         limits = {"cpu_s": CPU_SECONDS, "memory_bytes": MEMORY_BYTES}
-        request = json.dumps({"function": function, "arguments": arguments, **limits}).encode()
+        request = json.dumps({"function": _name_of(function), "arguments": arguments, **limits}).encode()
         try:
             self._requests.write(request + b"\n")
             self._requests.flush()
@@ -140,6 +146,10 @@ class ReadingProcess:
             return AmiwarpError(f"reading crashed its process ({signal.Signals(-code).name}); the file is damaged")
         remedy = f"check that '{sys.executable}' is Python and that enough memory is free"
         return AmiwarpError(f"the reading process ended with code {code}; {remedy}")
+
+
+def _name_of(function: Function) -> str:
+    return function if isinstance(function, str) else f"{function.__module__}:{function.__name__}"
 
 
 def _absolute(path: Path) -> str:
@@ -182,7 +192,7 @@ def give_back(process: ReadingProcess) -> None:
     """Keep a reading process for the next reader, or end it. Starting one takes about 0.3 s."""
     if process.usable:
         with contextlib.suppress(AmiwarpError):
-            process.call("amiwarp.io.reading_server:forget")
+            process.call(forget)
             _keep_idle(process)
             return
     process.close()
@@ -197,7 +207,7 @@ def _keep_idle(process: ReadingProcess) -> None:
     process.close()
 
 
-def run(function: str, *arguments: Any) -> Any:
+def run(function: Function, *arguments: Any) -> Any:
     """Run one function in a reading process, and return its JSON value."""
     process = borrow()
     try:
@@ -206,8 +216,8 @@ def run(function: str, *arguments: Any) -> Any:
         give_back(process)
 
 
-def packets(function: str, *arguments: Any) -> Iterator[Any]:
-    """Yield the packets of a generator ``module:function`` that runs in a reading process.
+def packets(function: Function, *arguments: Any) -> Iterator[Any]:
+    """Yield the packets of a generator that runs in a reading process.
 
     A packet is a tuple of arrays. Small packets are joined to larger ones. The process decodes one packet ahead. The
     last argument is a dictionary of counts, which is updated from the dictionary that the generator gets first.
@@ -215,8 +225,8 @@ def packets(function: str, *arguments: Any) -> Iterator[Any]:
     *given, notes = arguments
     process = borrow()
     try:
-        process.call("amiwarp.io.reading_server:begin", function, *given)
-        process.send("amiwarp.io.reading_server:advance")
+        process.call(begin, _name_of(function), *given)
+        process.send(advance)
         waiting = True
         try:
             while True:
@@ -225,7 +235,7 @@ def packets(function: str, *arguments: Any) -> Iterator[Any]:
                 notes.update(found)
                 if not arrays:
                     return
-                process.send("amiwarp.io.reading_server:advance")
+                process.send(advance)
                 waiting = True
                 yield tuple(arrays)
         finally:
@@ -234,3 +244,144 @@ def packets(function: str, *arguments: Any) -> Iterator[Any]:
                     process.receive()
     finally:
         give_back(process)
+
+
+# The part that runs in the process: it reads requests and sends results.
+
+PACKET = 1 << 17
+"""Number of events that are joined to one packet before it is sent."""
+
+PACKET_S = 2.0
+"""Processor time after which packets are sent, however few they are [s]. A request has a limit of time."""
+
+Reply = tuple[Any, list[NDArray[Any]]]
+"""Reply to a request: a JSON value, and arrays of shape ``(n,)``."""
+
+_state: dict[str, Any] = {}
+"""Values that are kept between requests, by name."""
+
+
+def serve() -> None:
+    """Serve requests until the other process closes its pipe or ends."""
+    requests = sys.stdin.buffer
+    replies = os.fdopen(os.dup(1), "wb")
+    # Text that a library prints must not mix with the replies.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    with contextlib.suppress(BrokenPipeError):
+        while line := requests.readline():
+            request = json.loads(line)
+            _limit(request["cpu_s"], request["memory_bytes"])
+            head, arrays = _answer(request)
+            encoded = json.dumps(head).encode()
+            replies.write(struct.pack("<I", len(encoded)) + encoded)
+            for array in arrays:
+                replies.write(array.data if array.size else b"")
+            replies.flush()
+    os._exit(0)
+
+
+def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], list[NDArray[Any]]]:
+    """Run the function of a request, and return its result or its error."""
+    module, _, name = request["function"].partition(":")
+    try:
+        result, arrays = getattr(importlib.import_module(module), name)(*request["arguments"])
+        arrays = [np.ascontiguousarray(array) for array in arrays]
+        return {"result": result, "arrays": [(array.dtype.str, array.size) for array in arrays]}, arrays
+    except AmiwarpError as error:
+        return {"error": str(error)}, []
+    except MemoryError:
+        most = request["memory_bytes"] >> 20
+        return {"error": f"needs over {most} MiB of memory at once; the file is damaged or too large"}, []
+    except BaseException as error:  # panics of compiled decoders derive from BaseException
+        return {"error": " ".join(str(error).split())[:300] or type(error).__name__}, []
+
+
+def _limit(cpu_s: int, memory_bytes: int) -> None:
+    """Limit processor time and memory of one request, if the system supports it."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
+        hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+        soft = int(used.ru_utime + used.ru_stime) + 1 + cpu_s
+        resource.setrlimit(resource.RLIMIT_CPU, (soft if hard < 0 else min(soft, hard), hard))
+        with open("/proc/self/statm") as sizes:
+            taken = int(sizes.read().split()[0]) * resource.getpagesize()
+        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        soft = taken + memory_bytes
+        resource.setrlimit(resource.RLIMIT_AS, (soft if hard < 0 else min(soft, hard), hard))
+
+
+def prepare(module: str) -> Reply:
+    """Import a module of which a function will be called. An error of the import is reported by that call."""
+    with contextlib.suppress(Exception):
+        importlib.import_module(module)
+    return None, []
+
+
+def keep(name: str, value: Any) -> None:
+    """Keep a value between requests, until :func:`forget` is called."""
+    _state[name] = value
+
+
+def kept(name: str) -> Any:
+    """Return a value that :func:`keep` stored."""
+    return _state[name]
+
+
+def forget() -> Reply:
+    """Close and drop all values that were kept for a reader."""
+    for value in _state.values():
+        with contextlib.suppress(Exception):
+            value.close()
+    _state.clear()
+    return None, []
+
+
+def begin(function: str, *arguments: Any) -> Reply:
+    """Start a generator of packets. Its first argument is a dictionary for counts."""
+    module, _, name = function.partition(":")
+    notes: dict[str, int] = {}
+    keep("notes", notes)
+    keep("packets", getattr(importlib.import_module(module), name)(notes, *arguments))
+    return None, []
+
+
+def advance() -> Reply:
+    """Return the counts and the next packets of the started generator, joined; no arrays at the end."""
+    found: list[tuple[NDArray[Any], ...]] = []
+    for packet in _next_packets(kept("packets")):
+        found.append(packet)
+    return kept("notes"), [np.concatenate(parts) for parts in zip(*found, strict=True)]
+
+
+def _next_packets(source: Iterator[tuple[NDArray[Any], ...]]) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield packets until they hold at least :data:`PACKET` events, or took :data:`PACKET_S`, if they hold few."""
+    count, began = 0, time.process_time()
+    for packet in source:
+        count += len(packet[0])
+        yield packet
+        if count >= PACKET or time.process_time() - began > PACKET_S:
+            return
+
+
+def noting_progress(decoder: Iterator[Any], path: str, notes: dict[str, int]) -> Iterator[Any]:
+    """Yield the packets of a compiled decoder, and note how much of its file it has read, on Linux."""
+    number = _open_file(path)
+    for packet in decoder:
+        if number is not None:
+            with contextlib.suppress(OSError, ValueError), open(f"/proc/self/fdinfo/{number}") as about:
+                notes["read"] = int(about.readline().split()[1])
+                notes["total"] = os.path.getsize(path)
+        yield packet
+
+
+def _open_file(path: str) -> str | None:
+    """Return the number of the open file with this path, on Linux."""
+    with contextlib.suppress(OSError):
+        for number in os.listdir("/proc/self/fd"):
+            with contextlib.suppress(OSError):
+                if os.path.samefile(f"/proc/self/fd/{number}", path):
+                    return number
+    return None

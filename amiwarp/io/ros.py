@@ -21,11 +21,10 @@ from amiwarp.events.events import Events, regroup
 from amiwarp.events.recording import Recording
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.io.file_scan import FileEvents, Packet, read_sensors
+from amiwarp.io.formats import Bag, Outline
 from amiwarp.io.input_files import errors_name
-from amiwarp.io.output_formats import Bag, Outline
 from amiwarp.io.prophesee import Columns, Evt2Decoder, Evt3Decoder, Evt3Encoder, origin_of, swap_halves, words_of
-from amiwarp.io.reading_process import packets, run
-from amiwarp.io.reading_server import Reply
+from amiwarp.io.reading_process import Reply, packets, run
 
 # Decoders of the ROS messages that hold events: arrays of events, and packets of a sensor's own words.
 #
@@ -217,11 +216,11 @@ def open_rosbag(path: Path, topic: str | None = None) -> Recording:
     """Open the events of a topic of a bag: a file, or the folder of a ROS 2 bag."""
     source = path.absolute()
     with errors_name(path, lambda: "opening the bag"):
-        about = run("amiwarp.io.ros:read_head", source, topic)
-    read = partial(packets, "amiwarp.io.ros:read_packets", source, about["topic"], False)
+        about = run(read_head, source, topic)
+    read = partial(packets, read_packets, source, about["topic"], False)
     size = tuple(about["size"]) if min(about["size"]) else None
     events = FileEvents(path, read, size=size)
-    imu, frames, notes = read_sensors(path, about["counts"], "ros_sensors", about["topic"])
+    imu, frames, notes = read_sensors(path, about["counts"], __name__, about["topic"])
     metadata = {"format": about["format"], "topic": about["topic"], **about["counts"], **events.metadata, **notes}
     return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
 
@@ -229,8 +228,8 @@ def open_rosbag(path: Path, topic: str | None = None) -> Recording:
 def trigger_packets(path: Path, topic: str | None = None) -> Iterator[Packet]:
     """Yield the trigger edges of the packets of a topic."""
     source = path.absolute()
-    about = run("amiwarp.io.ros:read_head", source, topic)
-    return packets("amiwarp.io.ros:read_packets", source, about["topic"], True, {})
+    about = run(read_head, source, topic)
+    return packets(read_packets, source, about["topic"], True, {})
 
 
 def read_head(path: str, topic: str | None) -> Reply:
@@ -567,7 +566,7 @@ class _Clock:
         """Read the times of the messages of a bag."""
         parts = [(np.zeros(1, np.int64),) * 3]
         if bag is not None:
-            parts = list(packets("amiwarp.io.ros:read_stamps", bag.path, bag.topic, {}))
+            parts = list(packets(read_stamps, bag.path, bag.topic, {}))
         t, self._recorded, self._stamps = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         self._t = np.maximum.accumulate(t)
 
@@ -591,8 +590,8 @@ class _Clock:
 def _others(writer: Any, bag: Bag) -> Generator[tuple[int, Any, Any], None, None]:
     """Add the other topics of a bag to a writer, and yield their messages: time of the recording [ns], topic, bytes."""
     path = bag.path
-    topics = [_add_topic(writer, about) for about in run("amiwarp.io.ros:read_topics", path, bag.topic)]
-    source = packets("amiwarp.io.ros:read_others", path, bag.topic, {})
+    topics = [_add_topic(writer, about) for about in run(read_topics, path, bag.topic)]
+    source = packets(read_others, path, bag.topic, {})
     for data, lengths, recorded, places in source:
         ends = np.cumsum(lengths).tolist()
         for end, length, time, at in zip(ends, lengths.tolist(), recorded.tolist(), places.tolist(), strict=True):

@@ -16,8 +16,8 @@ from amiwarp.events.events import Events, regroup
 from amiwarp.events.recording import Recording
 from amiwarp.io.chunks import in_order
 from amiwarp.io.file_scan import FileEvents, Packet
+from amiwarp.io.formats import Outline
 from amiwarp.io.input_files import LONGEST_LINE, errors_name, open_input
-from amiwarp.io.output_formats import Outline
 from amiwarp.optics.camera import Camera, RadialTangential
 
 # Reader of text in the format of the Event Camera Dataset: one event ``t x y p`` per line, t in seconds, p 1 or 0.

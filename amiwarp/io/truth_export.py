@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.truth import FrameStore, Poses, PoseStore
 from amiwarp.io.atomic_output import NewFile, make_folder
-from amiwarp.io.output_formats import POSE_ENDINGS, check_ending
+from amiwarp.io.formats import POSE_ENDINGS, check_ending
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded, instance, shown
 

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.kernels.launch import load
+from amiwarp.kernels.launch import RecordedLaunch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -64,7 +64,7 @@ class Checksums:
 
     def __init__(self) -> None:
         """Load the kernel."""
-        self._idle: list[tuple[wp.Launch, NDArray[np.uint64]]] = [_recorded()]
+        self._idle: list[tuple[RecordedLaunch, NDArray[np.uint64]]] = [_recorded()]
 
     def __call__(self, parts: Sequence[bytes | memoryview]) -> list[int]:
         """Return the checksum of each block, as :func:`amiwarp.io.chunks.checksum`."""
@@ -77,14 +77,13 @@ class Checksums:
             launch, table = _recorded()
         table[:, 1] = 0
         table[: len(parts), :2] = [(np.frombuffer(part, np.uint8).ctypes.data, len(part)) for part in parts]
-        launch.launch()
+        launch.repeat()
         found: list[int] = table[: len(parts), 2].tolist()
         self._idle.append((launch, table))
         return found
 
 
-def _recorded() -> tuple[wp.Launch, NDArray[np.uint64]]:
+def _recorded() -> tuple[RecordedLaunch, NDArray[np.uint64]]:
     """Return a recorded launch of the kernel, and its table."""
     table = wp.zeros((ROWS, 3), dtype=wp.uint64, device="cpu")
-    load(compute_checksums, table.device)
-    return wp.launch(compute_checksums, ROWS, [table], device="cpu", record_cmd=True), table.numpy()
+    return RecordedLaunch(compute_checksums, [table], [], device="cpu", n=ROWS), table.numpy()

@@ -1,10 +1,9 @@
-"""Kernel launches: single ones, slices on a thread pool, recorded programs, and page-locked memory for results."""
+"""Kernel launches: single ones, slices on a thread pool, and recorded programs."""
 
 import contextlib
 import os
 import sys
 import tempfile
-import weakref
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,7 +14,6 @@ from threading import Lock, Thread, main_thread
 from typing import Any
 
 import warp as wp
-from numpy.typing import NDArray
 
 from amiwarp.cpu_threads import cpu_threads
 
@@ -27,7 +25,12 @@ _Job = tuple[Callable[[], object], "SimpleQueue[BaseException | None]"]
 """Function to run, and the queue that gets its error, or None."""
 _specialising = Lock()
 _loading: defaultdict[str, Lock] = defaultdict(Lock)
+BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks
 SMALLEST_SLICE = 1 << 15  # fewest threads per slice: launching a smaller slice takes longer than running it
+
+
+# Background work has two kinds of worker: a job with a result runs in a pool, and a loop that runs until it is closed
+# has a daemon thread of its own. The helpers are a pool that hands over faster, for the jobs of one launch.
 
 
 @cache
@@ -101,13 +104,17 @@ def specialised(kernel: Any, inputs: Sequence[Any]) -> Any:
     if not generic:
         return kernel
     with _specialising:
-        return _specialised(kernel, tuple(inputs[k]._cls for k in generic))
+        return _specialised(kernel, tuple(getattr(inputs[k], "_cls", None) or inputs[k].dtype for k in generic))
 
 
 @cache
-def _generic_arguments(kernel: Any) -> dict[int, str]:
-    """Return the names of a kernel's generic arguments by their positions."""
-    return {k: argument.label for k, argument in enumerate(kernel.adj.args) if argument.type is Any}
+def _generic_arguments(kernel: Any) -> dict[int, Any]:
+    """Return a kernel's generic arguments by their positions: structs, and arrays of structs.
+
+    A kernel that has overloads already is not generic.
+    """
+    arguments = enumerate(() if kernel.overloads else kernel.adj.args)
+    return {k: argument for k, argument in arguments if Any in (argument.type, getattr(argument.type, "dtype", None))}
 
 
 @cache
@@ -115,8 +122,12 @@ def _specialised(kernel: Any, structs: tuple[Any, ...]) -> Any:
     """Return a generic kernel for the structs in the order of its generic arguments."""
     module = wp.get_module(".".join([kernel.module.name, kernel.key, *(struct.key for struct in structs)]))
     module.options.update(kernel.module.options)
-    names = _generic_arguments(kernel).values()
-    return wp.overload(wp.kernel(kernel.func, module=module), dict(zip(names, structs, strict=True)))
+    types = {
+        argument.label: struct if argument.type is Any else wp.array(dtype=struct)
+        for argument, struct in zip(_generic_arguments(kernel).values(), structs, strict=True)
+    }
+    bounds = kernel.options.get("launch_bounds")
+    return wp.overload(wp.kernel(kernel.func, module=module, launch_bounds=bounds), types)
 
 
 def load(kernel: Any, device: Any) -> None:
@@ -222,26 +233,29 @@ def launch_slices(
 
 
 class RecordedLaunch:
-    """Recorded kernel launch that can be repeated, which takes a tenth of the time of a new launch.
+    """Recorded kernel launch that can be repeated, which takes a tenth of the time of a new launch."""
 
-    The kernel's last input must be ``start: int``.
-    """
-
-    def __init__(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any) -> None:
-        """Record the launch without running it. Each repeat uses the same input and output arrays."""
+    def __init__(self, kernel: Any, inputs: Sequence[Any], outputs: Sequence[Any], *, device: Any, n: int = 1) -> None:
+        """Record the launch over ``range(n)`` without running it. Each repeat uses the same arrays."""
         device, kernel = wp.get_device(device), specialised(kernel, inputs)
         load(kernel, device)
-        self._start = len(inputs)
-        self._command = wp.launch(kernel, 1, [*inputs, 0], list(outputs), device=device, record_cmd=True)
+        self._start, self._first = len(inputs) - 1, inputs[-1]
+        self._command = wp.launch(
+            kernel, n, list(inputs), list(outputs), device=device, block_dim=BLOCK_DIM, record_cmd=True
+        )
+        self.repeat: Callable[[], None] = self._command.launch
+        """Function that runs the kernel once more; on a CPU in the calling thread only."""
 
     def set(self, index: int, value: Any) -> None:
-        """Replace the input at ``index`` for all later runs."""
+        """Replace the argument at ``index`` for all later runs."""
         self._command.set_param_at_index(index, value)
 
     def __call__(self, first: int, n: int) -> None:
-        """Run the kernel over ``range(first, first + n)``; on a CPU in the calling thread only."""
+        """Run a kernel whose last input is ``start: int`` over ``range(first, first + n)``, as :attr:`repeat` does."""
         self._command.set_dim(n)
-        self._command.set_param_at_index(self._start, first)
+        if first != self._first:
+            self._first = first
+            self._command.set_param_at_index(self._start, first)
         self._command.launch()
 
 
@@ -254,7 +268,7 @@ class RepeatedLaunches:
 
     def __init__(self, device: Any) -> None:
         self._device = wp.get_device(device)
-        self._last: dict[Any, tuple[Any, list[Any]]] = {}
+        self._last: dict[Any, tuple[RecordedLaunch, list[Any]]] = {}
 
     def __call__(
         self,
@@ -270,16 +284,14 @@ class RepeatedLaunches:
             launch(kernel, n, inputs, outputs, device=self._device, smallest=smallest)
             return
         kernel, arguments = specialised(kernel, inputs), [*inputs, 0, *outputs]
-        command, last = self._last.pop(kernel, (None, ()))
-        if command is None:
-            command = wp.launch(kernel, n, [*inputs, 0], list(outputs), device=self._device, record_cmd=True)
-        else:
-            command.set_dim(n)
-            for k, (value, old) in enumerate(zip(arguments, last, strict=True)):
-                if value is not old or hasattr(value, "_cls"):  # the values of a struct may have changed
-                    command.set_param_at_index(k, value)
-        self._last[kernel] = command, arguments
-        command.launch()
+        recorded, last = self._last.pop(kernel, (None, []))
+        if recorded is None:
+            recorded, last = RecordedLaunch(kernel, [*inputs, 0], outputs, device=self._device), arguments
+        for k, (value, old) in enumerate(zip(arguments, last, strict=True)):
+            if value is not old or hasattr(value, "_cls"):  # the values of a struct may have changed
+                recorded.set(k, value)
+        self._last[kernel] = recorded, arguments
+        recorded(0, n)
 
 
 def slice_count(device: Any) -> int:
@@ -289,7 +301,6 @@ def slice_count(device: Any) -> int:
 
 # Programs of launches that run repeatedly on the same arrays: a CUDA graph, or recorded CPU slices.
 
-BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks
 FEW_LAUNCHES = 6  # launches that take less time than the capture of a graph
 MOST_RUNS = 6  # runs that one CUDA graph may hold: launching a graph takes longer than a few small kernels
 
@@ -302,7 +313,7 @@ class Program:
 
     def __init__(self, device: Any) -> None:
         self.device = wp.get_device(device)
-        self._stages: list[list[Any]] = []
+        self._stages: list[list[Callable[[], None]]] = []
         self._graphs: dict[int, Any] = {}
 
     def add(
@@ -320,11 +331,10 @@ class Program:
         """
         if n == 0:
             return
-        if not self.device.is_cpu:
-            self._stages.append([self._record(kernel, -(-n // BLOCK_DIM) * BLOCK_DIM, [*inputs, 0], outputs)])
-            return
-        ranges = slices(n, cpu_threads(), smallest)
-        self._stages.append([self._record(kernel, b - a, [*inputs, a], outputs) for a, b in ranges])
+        ranges = [(0, -(-n // BLOCK_DIM) * BLOCK_DIM)]
+        if self.device.is_cpu:
+            ranges = slices(n, cpu_threads(), smallest)
+        self._stages.append([self._record(kernel, span, inputs, outputs) for span in ranges])
 
     def add_slices(
         self, kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[Any], *, smallest: int = SMALLEST_SLICE
@@ -337,16 +347,14 @@ class Program:
             return
         ranges = slices(n, len(outputs), smallest) if self.device.is_cpu else [(0, n)]
         jobs = zip(ranges, outputs, strict=False)
-        self._stages.append([self._record(kernel, b - a, [*inputs, a], [out]) for (a, b), out in jobs])
+        self._stages.append([self._record(kernel, span, inputs, [out]) for span, out in jobs])
 
-    def _record(self, kernel: Any, n: int, inputs: Sequence[Any], outputs: Sequence[Any]) -> Any:
-        """Load the kernel and return a function that repeats its launch."""
-        kernel.module.load(self.device, block_dim=1 if self.device.is_cpu else BLOCK_DIM)
-        recorded = wp.launch(
-            kernel, dim=n, inputs=list(inputs), outputs=list(outputs), device=self.device, block_dim=BLOCK_DIM,
-            record_cmd=True,
-        )  # fmt: skip
-        return recorded.launch
+    def _record(
+        self, kernel: Any, span: tuple[int, int], inputs: Sequence[Any], outputs: Sequence[Any]
+    ) -> Callable[[], None]:
+        """Return a function that repeats the kernel's launch over a range."""
+        first, stop = span
+        return RecordedLaunch(kernel, [*inputs, first], outputs, device=self.device, n=stop - first).repeat
 
     def launch(self) -> None:
         """Run all stages once, in the order in which they were added."""
@@ -372,48 +380,6 @@ class Program:
                     self.launch()
             self._graphs[runs] = capture.graph
         return self._graphs[runs]
-
-
-# Small page-locked arrays that are used again: locking memory takes up to two milliseconds.
-
-_idle: defaultdict[tuple[tuple[int, ...], Any, str], list[wp.array]] = defaultdict(list)
-
-
-def page_locked(owner: object, shape: tuple[int, ...], dtype: Any, device: Any) -> wp.array:
-    """Return a page-locked array with undefined values, which another owner may get once ``owner`` is deleted.
-
-    Only ``device`` may write to it, on Warp's stream, so that what an earlier owner left there comes first. Keep no
-    reference to it beyond ``owner``.
-    """
-    idle = _idle[shape, dtype, str(device)]
-    try:
-        array = idle.pop()
-    except IndexError:
-        array = wp.empty(shape, dtype=dtype, device="cpu", pinned=True)
-    weakref.finalize(owner, idle.append, array).atexit = False
-    return array
-
-
-def start_read(array: wp.array) -> Callable[[], NDArray[Any]]:
-    """Start to copy a small contiguous array of numbers to the host. Return a function that waits and returns a copy.
-
-    It does not wait for what is launched later.
-    """
-    if array.device.is_cpu:
-        found = array.numpy().copy()
-        return lambda: found
-    size = array.size * wp.types.type_size_in_bytes(array.dtype)
-
-    def result() -> NDArray[Any]:
-        wp.synchronize_event(copied)
-        values: NDArray[Any] = host.numpy()[:size].view(wp.dtype_to_numpy(array.dtype))
-        return values.reshape(array.shape).copy()
-
-    # sizes are powers of two, so that arrays of other sizes can use the memory, too
-    host = page_locked(result, (1 << (size - 1).bit_length(),), wp.uint8, array.device)
-    wp.copy(host, wp.array(ptr=array.ptr, dtype=wp.uint8, shape=size, device=array.device), count=size)
-    copied = array.device.stream.record_event()
-    return result
 
 
 # Start of Warp without the warning of a missing GPU driver.

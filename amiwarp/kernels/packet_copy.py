@@ -7,11 +7,10 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-ROW = 10
+ROW = 9
 """Number of entries per row of the table of packets.
 
-The entries are: addresses of the pointers to x, y, t and p; destination addresses (p: 0 to skip it); number of events;
-and 1 if the event before the first one in memory also precedes it in time.
+The entries are: addresses of x, y, t and p; destination addresses (p: 0 to skip it); and number of events.
 """
 FOUND = 3
 """Number of results per row of the table of packets: 1 if the times are out of order, else 0; largest x [px]; largest y
@@ -19,12 +18,12 @@ FOUND = 3
 
 
 @wp.func_native("""
-    const uint64_t* row = (const uint64_t*)table.data + 10 * i;
+    const uint64_t* row = (const uint64_t*)table.data + 9 * i;
     const int64_t n = (int64_t)row[8];
-    const uint16_t* __restrict__ x = *(const uint16_t**)row[0];
-    const uint16_t* __restrict__ y = *(const uint16_t**)row[1];
-    const int64_t* __restrict__ t = *(const int64_t**)row[2];
-    const uint8_t* __restrict__ p = *(const uint8_t**)row[3];
+    const uint16_t* __restrict__ x = (const uint16_t*)row[0];
+    const uint16_t* __restrict__ y = (const uint16_t*)row[1];
+    const int64_t* __restrict__ t = (const int64_t*)row[2];
+    const uint8_t* __restrict__ p = (const uint8_t*)row[3];
     uint16_t* __restrict__ to_x = (uint16_t*)row[4];
     uint16_t* __restrict__ to_y = (uint16_t*)row[5];
     int64_t* __restrict__ to_t = (int64_t*)row[6];
@@ -32,7 +31,7 @@ FOUND = 3
     uint16_t most_x = 0, most_y = 0;
     for (int64_t k = 0; k < n; ++k) { to_x[k] = x[k]; most_x = x[k] > most_x ? x[k] : most_x; }
     for (int64_t k = 0; k < n; ++k) { to_y[k] = y[k]; most_y = y[k] > most_y ? y[k] : most_y; }
-    int64_t back = row[9] && t[0] < t[-1];
+    int64_t back = 0;
     to_t[0] = t[0];
     for (int64_t k = 1; k < n; ++k) { to_t[k] = t[k]; back |= (int64_t)(t[k] < t[k - 1]); }
     if (to_p) for (int64_t k = 0; k < n; ++k) to_p[k] = p[k];

@@ -9,10 +9,10 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
+from amiwarp.kernels.camera import CameraParams, CameraRotationParams, undo_camera_rotation
 from amiwarp.kernels.events import THETA_U16_RAD
 from amiwarp.kernels.native_code import add_to_word, get_word, load_uint32, set_word, wait_for_block, window
-from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams, displace
+from amiwarp.kernels.refraction import displace
 from amiwarp.kernels.votes import Canvas, dither_offset, events_of
 
 # Fast math is on: these sums need not equal those of a CPU bit for bit.
@@ -362,11 +362,6 @@ def vote_tiles(
             left += 4 * cast_event(c, camera, motion, events, canvas.nearest, words + 2 * SIZE, first + 2, i, event)
         cast_remaining(models, camera, motion, events, canvas, layout, chunk, images, first, left, i, event)
     flush_window(layout, canvas, chunk, images, words, first, thread, many)
-
-
-for _struct in (CircleParams, RadialCircleParams, ExactParams):
-    for _camera, _motion in ((PinholeParams, Still), (CameraParams, Still), (CameraParams, Motion)):
-        wp.overload(vote_tiles, {"models": wp.array(dtype=_struct), "camera": _camera, "motion": _motion})
 
 
 @wp.kernel

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import warp as wp
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels import camera as kernels
 from amiwarp.validation import INT64, array, guarded, real, shown, whole
+
+if TYPE_CHECKING:
+    from amiwarp.kernels import camera as kernels
 
 # Models of lens distortion.
 
@@ -98,7 +99,7 @@ LEAST_FOV = 1e-9
 CAMERA_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
 """Names of the fields of :class:`Camera` without the distortion, in the order in which files and streams use them."""
 
-Rows = TypeVar("Rows")
+Vectors = TypeVar("Vectors")
 """Type of the rows of vectors given to a camera: NumPy array (n, 2) or (n, 3), or Warp array of vec2 or vec3. Results
 have the same type."""
 
@@ -192,7 +193,7 @@ class Camera:
         """Horizontal field of view without distortion [rad]."""
         return 2.0 * math.atan(self.width / (2.0 * self.fx))
 
-    def pixels_to_rays(self, xy: Rows) -> Rows:
+    def pixels_to_rays(self, xy: Vectors) -> Vectors:
         """Return the unit bearing vector of each pixel.
 
         Parameters
@@ -218,7 +219,7 @@ class Camera:
         """
         return _run("pixels_to_rays", self, xy, (2, 3))
 
-    def rays_to_pixels(self, rays: Rows) -> Rows:
+    def rays_to_pixels(self, rays: Vectors) -> Vectors:
         """Return the pixel of each bearing vector.
 
         Parameters
@@ -275,6 +276,10 @@ def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) ->
 @lru_cache(maxsize=16)
 def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
     """Return the camera's parameters on ``device``, with a table of bearing vectors if the lens distorts."""
+    import warp as wp
+
+    from amiwarp.kernels import camera as kernels
+
     c = kernels.CameraParams()
     c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
     c.width, c.height = camera.width, camera.height
@@ -299,6 +304,8 @@ def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
 @lru_cache(maxsize=16)
 def pinhole_params(camera: Camera) -> kernels.PinholeParams | None:
     """Return the camera's parameters for kernels without a distortion branch, or None if the lens distorts."""
+    from amiwarp.kernels import camera as kernels
+
     if camera.distortion is not None:
         return None
     c = kernels.PinholeParams()

@@ -3,19 +3,53 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, Self
 
 from amiwarp.kernels.refraction import CircleParams, RadialCircleParams
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.displacement import PointDisplacement, phase_values, struct_of
-from amiwarp.optics.prism import FlatSide, Prism, check_index, check_phase
+from amiwarp.optics.displacement import PHASE, Model, Parameter, phase_values
+from amiwarp.optics.prism import (
+    FlatSide,
+    NominalPrism,
+    Prism,
+    apex_from_deflection,
+    check_index,
+    check_phase,
+    deflection_from_apex,
+)
 from amiwarp.validation import choice, guarded, instance, real
+
+
+class _DeflectionModel(Model):
+    """Model that is sized by the deflection on the optical axis."""
+
+    PARAMETERS = (Parameter("deflection", "rad"), PHASE)
+
+    deflection: float
+    flat_side: FlatSide
+
+    def __post_init__(self) -> None:
+        instance(self.camera, Camera, "camera")
+        below = math.nextafter(math.pi / 2.0, 0.0)
+        hint = " rad; for a negative deflection, add pi to the phase"
+        object.__setattr__(self, "deflection", real(self.deflection, "deflection", 0.0, below, hint))
+        object.__setattr__(self, "phase", check_phase(self.phase))
+        object.__setattr__(self, "flat_side", choice(FlatSide, self.flat_side, "flat_side"))
+
+    @classmethod
+    def size_from_apex(cls, apex: float, prism: NominalPrism) -> float:
+        return deflection_from_apex(apex, prism.index, prism.flat_side)
+
+    @classmethod
+    def apex_from_size(cls, size: float, prism: NominalPrism) -> float:
+        return apex_from_deflection(size, prism.index, prism.flat_side)
 
 
 @guarded
 @dataclass(frozen=True)
-class CircleModel(PointDisplacement):
+class CircleModel(_DeflectionModel):
     """Circle model: rotates every bearing vector by one constant angle.
 
     Raises
@@ -37,8 +71,9 @@ class CircleModel(PointDisplacement):
     array([[330., 240.]])
     """
 
-    FREE: ClassVar[tuple[str, ...]] = ("deflection", "phase")
-    """Names of the parameters that a calibration can find."""
+    NAME, TEXT, NUMBERS, STRUCT = "circle", "circle", "2", CircleParams
+    SIMPLIFIES = "radial"
+
     camera: Camera
     """Camera intrinsics."""
     deflection: float
@@ -48,59 +83,18 @@ class CircleModel(PointDisplacement):
     flat_side: FlatSide = FlatSide.SCENE
     """Side that the prism's flat face points to: scene or camera."""
 
-    def __post_init__(self) -> None:
-        _check_circle(self)
-
     @classmethod
-    def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> CircleModel:
-        """Create the circle model that is exact on the optical axis.
-
-        Parameters
-        ----------
-        camera : Camera
-            The camera.
-        prism : Prism
-            The prism.
-        phase : float, default 0.0
-            Added to the encoder's angle [rad].
-
-        Returns
-        -------
-        CircleModel
-            The model with the prism's deflection.
-        """
-        return cls(camera, prism.deflection, phase, prism.flat_side)
-
-    def params(self, device: Any) -> Any:
-        """Return the parameters for kernels.
-
-        Parameters
-        ----------
-        device : str or warp.Device
-            The device that runs the kernels.
-
-        Returns
-        -------
-        amiwarp.kernels.refraction.CircleParams
-            Deflection and phase as a Warp struct.
-        """
-        return struct_of(CircleParams, self.kernel_values())
+    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        return cls(camera, values["deflection"], values["phase"], prism.flat_side)
 
     def kernel_values(self) -> tuple[Any, ...]:
-        """Return the values of the parameters for kernels, in the order of the fields of their struct.
-
-        Returns
-        -------
-        tuple
-            The fields of :class:`amiwarp.kernels.refraction.CircleParams`.
-        """
         sine = math.sin(self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection)
         return sine, 2.0 * math.sin(self.deflection / 2.0) ** 2, *phase_values(self.phase)
 
 
 @guarded
 @dataclass(frozen=True)
-class RadialCircleModel(PointDisplacement):
+class RadialCircleModel(_DeflectionModel):
     """Radial circle model: rotates each bearing vector by an angle that grows away from the optical axis.
 
     Raises
@@ -123,8 +117,9 @@ class RadialCircleModel(PointDisplacement):
     0.0155
     """
 
-    FREE: ClassVar[tuple[str, ...]] = ("deflection", "phase")
-    """Names of the parameters that a calibration can find."""
+    NAME, TEXT, NUMBERS, STRUCT = "radial", "radial", "2, index given", RadialCircleParams
+    SIMPLIFIES = "exact"
+
     camera: Camera
     """Camera intrinsics."""
     deflection: float
@@ -137,61 +132,13 @@ class RadialCircleModel(PointDisplacement):
     """Side that the prism's flat face points to: scene or camera."""
 
     def __post_init__(self) -> None:
-        _check_circle(self)
+        super().__post_init__()
         object.__setattr__(self, "index", check_index(self.index, "index"))
 
     @classmethod
-    def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> RadialCircleModel:
-        """Create the model of a prism.
-
-        Parameters
-        ----------
-        camera : Camera
-            The camera.
-        prism : Prism
-            The prism.
-        phase : float, default 0.0
-            Added to the encoder's angle [rad].
-
-        Returns
-        -------
-        RadialCircleModel
-            The model with the deflection and index of the prism.
-        """
-        return cls(camera, prism.deflection, phase, prism.index, prism.flat_side)
-
-    def params(self, device: Any) -> Any:
-        """Return the parameters for kernels.
-
-        Parameters
-        ----------
-        device : str or warp.Device
-            The device that runs the kernels.
-
-        Returns
-        -------
-        amiwarp.kernels.refraction.RadialCircleParams
-            Deflection, phase and index as a Warp struct.
-        """
-        return struct_of(RadialCircleParams, self.kernel_values())
+    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        return cls(camera, values["deflection"], values["phase"], prism.index, prism.flat_side)
 
     def kernel_values(self) -> tuple[Any, ...]:
-        """Return the values of the parameters for kernels, in the order of the fields of their struct.
-
-        Returns
-        -------
-        tuple
-            The fields of :class:`amiwarp.kernels.refraction.RadialCircleParams`.
-        """
         deflection = self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection
         return deflection, *phase_values(self.phase), self.index
-
-
-def _check_circle(model: CircleModel | RadialCircleModel) -> None:
-    """Check and convert the fields that both circle models share."""
-    instance(model.camera, Camera, "camera")
-    below = math.nextafter(math.pi / 2.0, 0.0)
-    hint = " rad; for a negative deflection, add pi to the phase"
-    object.__setattr__(model, "deflection", real(model.deflection, "deflection", 0.0, below, hint))
-    object.__setattr__(model, "phase", check_phase(model.phase))
-    object.__setattr__(model, "flat_side", choice(FlatSide, model.flat_side, "flat_side"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 import warp as wp
@@ -14,15 +14,16 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.refraction import EllipseParams, fit_harmonics
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.displacement import PointDisplacement, model_camera, phase_values
+from amiwarp.optics.displacement import Model, model_camera, phase_values, struct_of
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import check_phase
 from amiwarp.validation import array, guarded, instance, whole
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
-    from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
     from amiwarp.optics.prism import Prism
 
 HARMONIC_ANGLES = 16
@@ -31,7 +32,7 @@ HARMONIC_ANGLES = 16
 
 @guarded
 @dataclass(frozen=True, eq=False)
-class EllipseModel(PointDisplacement):
+class EllipseModel(Model):
     """Ellipse model: stores the mean and the first harmonic of the displacement for every observed pixel.
 
     Raises
@@ -51,8 +52,10 @@ class EllipseModel(PointDisplacement):
     (24, 32, 2)
     """
 
-    FREE: ClassVar[tuple[str, ...]] = ("apex", "phase")
-    """Names of the parameters that a calibration can find."""
+    NAME, TEXT, NUMBERS, STRUCT = "ellipse", "ellipse (table)", "6 a pixel", EllipseParams
+    PARAMETERS = ExactModel.PARAMETERS
+    SIMPLIFIES = "exact"
+
     camera: Camera
     """Camera intrinsics."""
     offset: NDArray[np.float32] = field(repr=False)
@@ -75,33 +78,21 @@ class EllipseModel(PointDisplacement):
             object.__setattr__(self, name, table.astype(np.float32, copy=False))
 
     @classmethod
-    def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> EllipseModel:
-        """Create the model of a prism, with tables fitted to the exact model.
-
-        Parameters
-        ----------
-        camera : Camera
-            The camera.
-        prism : Prism
-            The prism.
-        phase : float, default 0.0
-            Added to the encoder's angle [rad].
-
-        Returns
-        -------
-        EllipseModel
-            The model.
-        """
-        return cls.from_model(ExactModel(camera, prism, phase))
+    def closed_form(cls) -> type[Model]:
+        return ExactModel
 
     @classmethod
-    def from_model(cls, model: CircleModel | RadialCircleModel | ExactModel, device: Any = "cpu") -> EllipseModel:
+    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        return cls.from_model(ExactModel.from_values(camera, prism, values))
+
+    @classmethod
+    def from_model(cls, model: Model, device: Any = "cpu") -> Self:
         """Fit the tables to another model, by least squares over 16 angles for each pixel.
 
         Parameters
         ----------
-        model : CircleModel, RadialCircleModel or ExactModel
-            The model to approximate.
+        model : Model
+            The model to approximate, which is no ellipse model.
         device : str or warp.Device, default "cpu"
             The device that does the fit.
 
@@ -114,7 +105,7 @@ class EllipseModel(PointDisplacement):
         table = wp.empty((height, width, 6), dtype=float, device=device)
         phi = math.tau * np.arange(HARMONIC_ANGLES) / HARMONIC_ANGLES
         angles = wp.array(np.stack([np.cos(phi), np.sin(phi)], axis=1), dtype=wp.vec2, device=device)
-        inputs = [replace(model, phase=0.0).params(device), model_camera(model, device), angles]
+        inputs = [replace(cast("Any", model), phase=0.0).params(device), model_camera(model, device), angles]
         launch(fit_harmonics, height * width, inputs, [table], device=device)
         offset, cosine, sine = np.split(table.numpy(), 3, axis=2)
         return cls(model.camera, offset, cosine, sine, model.phase)
@@ -179,29 +170,18 @@ class EllipseModel(PointDisplacement):
         tables = np.stack([pixels @ part for part in np.split(solution, 3)]).reshape(shape).astype(np.float32)
         return cls(camera, tables[0], tables[1], tables[2])
 
+    def kernel_values(self) -> tuple[Any, ...]:
+        return *phase_values(self.phase), np.concatenate([self.offset, self.cosine, self.sine], axis=2)
+
     @cached_property
     def _tables(self) -> dict[str, Any]:
         return {}
 
     def params(self, device: Any) -> Any:
-        """Return the parameters for kernels. They are kept for each device.
-
-        Parameters
-        ----------
-        device : str or warp.Device
-            The device that runs the kernels.
-
-        Returns
-        -------
-        amiwarp.kernels.refraction.EllipseParams
-            The tables and the phase as a Warp struct.
-        """
         if str(device) not in self._tables:
-            p = EllipseParams()
-            table = np.concatenate([self.offset, self.cosine, self.sine], axis=2)
-            p.table = wp.array(table, dtype=float, device=device)
-            p.phase, p.phase_cos, p.phase_sin = phase_values(self.phase)
-            self._tables[str(device)] = p
+            *phase, table = self.kernel_values()
+            on_device = wp.array(table, dtype=float, device=device)
+            self._tables[str(device)] = struct_of(EllipseParams, [*phase, on_device])
         return self._tables[str(device)]
 
 

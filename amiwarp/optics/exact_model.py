@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import warp as wp
 
 from amiwarp.kernels.refraction import ExactParams
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.displacement import PointDisplacement, phase_values, struct_of
+from amiwarp.optics.displacement import PHASE, Model, Parameter, phase_values, struct_of
 from amiwarp.optics.prism import FlatSide, Prism, check_phase, check_tilt
 from amiwarp.validation import guarded, instance
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
 UPRIGHT = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -25,7 +27,7 @@ UPRIGHT_ROWS = np.eye(3)
 
 @guarded
 @dataclass(frozen=True)
-class ExactModel(PointDisplacement):
+class ExactModel(Model):
     """Exact model: refracts each ray at both faces of the prism, in closed form.
 
     Raises
@@ -47,8 +49,20 @@ class ExactModel(PointDisplacement):
     array([[100., 200.]])
     """
 
-    FREE: ClassVar[tuple[str, ...]] = ("apex", "phase", "index", "tilt_x", "tilt_y")
-    """Names of the parameters that a calibration can find."""
+    NAME, TEXT, NUMBERS, STRUCT = "exact", "exact (closed form)", "2, index given", ExactParams
+    PARAMETERS = (
+        Parameter("apex", "rad"),
+        PHASE,
+        *(
+            Parameter(
+                f"tilt_{axis}", "rad", math.radians(5.0), limits=(-45.0, 45.0), label=f"tilt in {axis}",
+                slider=(-5.0, 5.0, 0.05),
+            )
+            for axis in "xy"
+        ),
+        Parameter("index", "1", 0.2, like_size=True, limits=(1.0, 5.0)),
+    )  # fmt: skip
+
     camera: Camera
     """Camera intrinsics."""
     prism: Prism
@@ -65,50 +79,16 @@ class ExactModel(PointDisplacement):
         object.__setattr__(self, "tilt", check_tilt(self.tilt))
 
     @classmethod
-    def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> ExactModel:
-        """Create the model of a prism whose axis is not tilted.
-
-        Parameters
-        ----------
-        camera : Camera
-            The camera.
-        prism : Prism
-            The prism.
-        phase : float, default 0.0
-            Added to the encoder's angle [rad].
-
-        Returns
-        -------
-        ExactModel
-            The model.
-        """
-        return cls(camera, prism, phase)
+    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        wedge = Prism(values["apex"], values.get("index", prism.index), prism.flat_side)
+        return cls(camera, wedge, values["phase"], (values.get("tilt_x", 0.0), values.get("tilt_y", 0.0)))
 
     def params(self, device: Any) -> Any:
-        """Return the parameters for kernels.
-
-        Parameters
-        ----------
-        device : str or warp.Device
-            The device that runs the kernels.
-
-        Returns
-        -------
-        amiwarp.kernels.refraction.ExactParams
-            Apex angle, index, phase and tilt as a Warp struct.
-        """
         *numbers, axis = self.kernel_values()
         matrix = UPRIGHT if axis is UPRIGHT_ROWS else wp.mat33(*axis.ravel().tolist())
         return struct_of(ExactParams, [*numbers, matrix])
 
     def kernel_values(self) -> tuple[Any, ...]:
-        """Return the values of the parameters for kernels, in the order of the fields of their struct.
-
-        Returns
-        -------
-        tuple
-            The fields of :class:`amiwarp.kernels.refraction.ExactParams`.
-        """
         tilted = any(self.tilt)
         return (
             math.sin(self.prism.apex), math.cos(self.prism.apex), self.prism.index**2, *phase_values(self.phase),

@@ -12,6 +12,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
+from amiwarp.optics.displacement import Model as Model
 from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.validation import guarded, whole
@@ -20,14 +21,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-Model = CircleModel | RadialCircleModel | EllipseModel | ExactModel
 MODELS: dict[str, type[Model]] = {
-    "circle": CircleModel,
-    "exact": ExactModel,
-    "radial": RadialCircleModel,
-    "ellipse": EllipseModel,
+    model.NAME: model for model in (CircleModel, ExactModel, RadialCircleModel, EllipseModel)
 }
 """Optical models by name, ordered by their number of calibrated parameters, then by their measured cost per event."""
+
+
+def size_names() -> set[str]:
+    """Return the names of the parameters that are the size of a model."""
+    return {model.SIZE for model in MODELS.values()}
+
+
+def rungs(name: str = ExactModel.NAME) -> dict[str, type[Model]]:
+    """Return a model and all that approximate it, directly or not, by name in the order of :data:`MODELS`."""
+
+    def approximates(other: str | None) -> bool:
+        return other is not None and (other == name or approximates(MODELS[other].SIMPLIFIES))
+
+    return {other: model for other, model in MODELS.items() if approximates(other)}
 
 
 # Distance between two optical models over the image and one turn of the prism.

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.calib.calibration_events import thin
-from amiwarp.calib.parameters import size_name
 from amiwarp.calib.result import cost_surface
 from amiwarp.choices import Tone
 from amiwarp.compensation.recordings import compensate_events
@@ -21,7 +20,8 @@ from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
 from amiwarp.io.atomic_output import write_text
-from amiwarp.io.output_formats import check_ending
+from amiwarp.io.formats import check_ending
+from amiwarp.optics.models import MODELS
 from amiwarp.plotting import clouds
 from amiwarp.reconstruction.export import limits, tones
 
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from amiwarp.imaging.metrics import PictureQuality
     from amiwarp.plotting.clouds import Renderer
     from amiwarp.reconstruction.picture import Picture
-
 
 EVENTS = 2_000_000
 """Largest number of events in the image of a figure; more events are thinned evenly."""
@@ -105,7 +104,7 @@ def draw_cost(figure: Any, ax: Any, calibration: Calibration, truth: tuple[float
     ``truth`` is the true size and phase [rad]. Without a global search only the samples are drawn.
     """
     calibration = calibration.exact
-    size = size_name(calibration.model_name)
+    size = MODELS[calibration.model_name].SIZE
     samples = cost_surface(calibration.stages, size)
     x, y = (np.degrees(samples[:, 0]) * f(samples[:, 1]) for f in (np.cos, np.sin))
     coarse = np.array([stage.name == "global" for stage in calibration.stages], bool)[samples[:, 3].astype(int)]

@@ -13,7 +13,7 @@ from amiwarp.choices import CONTRAST, Tone
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.export import encode_image
 from amiwarp.io.atomic_output import NewFile, check_output
-from amiwarp.io.output_formats import check_ending
+from amiwarp.io.formats import check_ending
 from amiwarp.validation import choice
 
 if TYPE_CHECKING:

@@ -31,8 +31,8 @@ from amiwarp.simulation.worlds.sight import WorldSight, image_speed
 from amiwarp.simulation.worlds.world import WorldScene
 
 if TYPE_CHECKING:
+    from amiwarp.simulation.description import SimulationValues
     from amiwarp.simulation.sensor import SensorModel
-    from amiwarp.simulation.simulator import Simulation
 
 
 # Buffer on the device for the events that pixels generate, as sortable keys.
@@ -128,7 +128,7 @@ LONGEST_SCAN_US = 10_000.0
 class Readout:
     """Readout of one simulated sensor. Only the state of the bus is kept between blocks of events."""
 
-    def __init__(self, simulation: Simulation, device: Any) -> None:
+    def __init__(self, simulation: SimulationValues, device: Any) -> None:
         """Set up the readout; raise :class:`AmiwarpError` if reading all rows takes too long."""
         sensor, camera = simulation.sensor, simulation.camera
         scan_us = sensor.row_us * camera.height
@@ -267,7 +267,7 @@ class DeviceBlock:
 class Engine:
     """One run of a simulation from start to end."""
 
-    def __init__(self, simulation: Simulation, chunk_us: int | None = None) -> None:
+    def __init__(self, simulation: SimulationValues, chunk_us: int | None = None) -> None:
         """Place the scene and allocate the pixels' states.
 
         ``chunk_us``: length of a chunk of simulated time [us]; None for the default.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -17,11 +16,11 @@ from amiwarp.kernels import prism_view
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import camera_params
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.simulation.pictures import Placement, linear_luminance, log_map, place_picture, read_picture
-from amiwarp.validation import guarded, real
+from amiwarp.simulation.description import Scene
+from amiwarp.simulation.pictures import Placement, log_map, place_picture
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.simulator import Simulation
+    from amiwarp.simulation.description import SimulationValues
 
 
 # Device memory for the maps of a simulation: pictures of the scene in which pixels look up their light.
@@ -58,107 +57,6 @@ class MapSlots:
 # The scene in front of a simulated camera: pictures, which may change with time.
 
 
-class Frames(Protocol):
-    """Pictures with times, which are read one after the other (protocol)."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of each picture [px]."""
-
-    @property
-    def interval_us(self) -> float | None:
-        """Typical time between pictures [us]; None for a still picture."""
-
-    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """Yield times and pictures.
-
-        Yields
-        ------
-        tuple
-            Time [us], increasing, the first no later than 0; and linear luminance, float32, shape ``(height, width)``.
-        """
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Still:
-    """Single picture that never changes."""
-
-    light: NDArray[np.float32]
-    """Linear luminance of the picture, shape (height, width); white is 1."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height of the picture [px]."""
-        return self.light.shape[1], self.light.shape[0]
-
-    @property
-    def interval_us(self) -> None:
-        """Time between pictures: None, because there is only one picture."""
-        return None
-
-    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
-        """Yield the picture at time 0."""
-        yield 0, self.light
-
-
-@guarded
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """Scene in front of the camera: pictures on a plane at infinity.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> amiwarp.Scene.from_picture(np.ones((48, 64), np.float32)).frames.size
-    (64, 48)
-    """
-
-    frames: Frames
-    """Pictures of the scene, in order of time."""
-    fov: float | None = None
-    """Horizontal field of view of the picture [rad]. Beyond its edges the picture is mirrored.
-
-    None: the picture is just large enough to cover everything that the camera sees through the turning prism.
-    """
-    blur: float = 0.5
-    """Standard deviation of the optical blur [sensor px], which includes the pixel's aperture."""
-
-    def __post_init__(self) -> None:
-        if self.fov is not None:
-            below = math.nextafter(math.pi, 0.0)
-            hint = " rad, 0 .. 180 deg; is it given in degrees?"
-            object.__setattr__(self, "fov", real(self.fov, "scene fov", 1e-9, below, hint))
-        object.__setattr__(self, "blur", real(self.blur, "scene blur", 0.0, 20.0, " px"))
-
-    @classmethod
-    def from_picture(cls, picture: str | Path | NDArray[Any], *, fov: float | None = None, blur: float = 0.5) -> Scene:
-        """Make a still scene from a picture.
-
-        Parameters
-        ----------
-        picture : str, Path or ndarray
-            Picture file, or pixel values of shape ``(height, width)`` or ``(height, width, 3)``. uint8 and uint16
-            values are sRGB-encoded; floating values are linear, with white at 1.
-        fov : float, optional
-            Horizontal field of view of the picture [rad]. By default the picture is just large enough to cover
-            everything that the camera sees through the turning prism.
-        blur : float, optional
-            Standard deviation of the optical blur [sensor px].
-
-        Returns
-        -------
-        Scene
-            The scene.
-
-        Raises
-        ------
-        AmiwarpError
-            If the picture cannot be read, or has another shape or type.
-        """
-        light = read_picture(picture) if isinstance(picture, str | Path) else linear_luminance(picture)
-        return cls(Still(light), fov, blur)
-
-
 # View of the simulated camera: placement of the picture, speed of the image, and maps of pictures on the device.
 
 LARGEST_MOTION = 0.5
@@ -193,7 +91,7 @@ class ImageMotion:
     """Largest motion of the image per rotation angle of the camera about each of its axes [px/rad], shape (3,)."""
 
 
-def step_us(simulation: Simulation, *, world_speed: float = 0.0, longest: float = math.inf) -> int:
+def step_us(simulation: SimulationValues, *, world_speed: float = 0.0, longest: float = math.inf) -> int:
     """Return the length of a time step [us]: in it the image moves by at most half a pixel, and nearly straight.
 
     ``world_speed``: speed of the image of a world, prism excluded [px/s]; ``longest``: upper bound of the step [us].
@@ -215,7 +113,7 @@ def step_us(simulation: Simulation, *, world_speed: float = 0.0, longest: float 
     return int(step)
 
 
-def image_motion(simulation: Simulation) -> ImageMotion:
+def image_motion(simulation: SimulationValues) -> ImageMotion:
     """Return the largest motion of the image on a grid of pixels, corners included, over one turn of the prism."""
     camera, device = simulation.camera, simulation.device
     grid = np.stack(
@@ -233,7 +131,7 @@ def image_motion(simulation: Simulation) -> ImageMotion:
     return ImageMotion(prism, _camera_image_motion(simulation, grid))
 
 
-def _camera_image_motion(simulation: Simulation, grid: NDArray[np.float64]) -> NDArray[np.float64]:
+def _camera_image_motion(simulation: SimulationValues, grid: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the largest motion of the image per rotation angle of the camera about each axis [px/rad], shape (3,).
 
     ``grid``: pixels at which the motion is computed, shape (n, 2).
@@ -249,7 +147,7 @@ def _camera_image_motion(simulation: Simulation, grid: NDArray[np.float64]) -> N
     return np.array(result) * 1.02  # margin, because the grid and the finite angle may miss the largest value
 
 
-def seen_bearings(simulation: Simulation) -> NDArray[np.float64]:
+def seen_bearings(simulation: SimulationValues) -> NDArray[np.float64]:
     """Return the directions that pixels on the image's border see over one turn of the prism, shape (n, 3).
 
     The directions are in the camera's frame. Pixels without a valid ray are left out.
@@ -273,7 +171,7 @@ def seen_bearings(simulation: Simulation) -> NDArray[np.float64]:
     return np.asarray(bearings[np.isfinite(bearings).all(axis=1)])
 
 
-def place_scene(simulation: Simulation) -> Placement:
+def place_scene(simulation: SimulationValues) -> Placement:
     """Place the picture so that it covers everything that the camera sees through the turning prism.
 
     Raises :class:`AmiwarpError` if the camera turns too far away from the picture.
@@ -300,7 +198,7 @@ def place_scene(simulation: Simulation) -> Placement:
     return place_picture(scene.frames.size, view, TEXELS_PER_PIXEL * focal, fov=scene.fov)
 
 
-def _pictures(simulation: Simulation) -> Scene:
+def _pictures(simulation: SimulationValues) -> Scene:
     """Return the picture scene of a simulation; raise :class:`AmiwarpError` for a world."""
     if not isinstance(simulation.scene, Scene):
         raise AmiwarpError("the scene is a world, which has no picture at infinity; give a Scene")
@@ -313,7 +211,7 @@ class MapRing:
     A map is the log intensity of a picture, resampled and blurred. Pictures are read when they are needed.
     """
 
-    def __init__(self, simulation: Simulation, placement: Placement) -> None:
+    def __init__(self, simulation: SimulationValues, placement: Placement) -> None:
         """Open the pictures without reading them."""
         focal = max(simulation.camera.fx, simulation.camera.fy)
         scene = _pictures(simulation)
@@ -373,7 +271,7 @@ def bilinear_pieces(texels: NDArray[np.float32]) -> NDArray[np.float32]:
     return pieces
 
 
-def log_view(simulation: Simulation) -> NDArray[np.float32]:
+def log_view(simulation: SimulationValues) -> NDArray[np.float32]:
     """Return the first picture as the camera would see it without the prism at time 0.
 
     The result is the log intensity, shape (height, width).
@@ -409,7 +307,7 @@ class PartlyKnown(Protocol):
 class KnownPixels:
     """Masks of the pixels whose scene is known, without the prism. They are taken from the pictures while these run."""
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: SimulationValues) -> None:
         """Find the pixel of the pictures that each pixel of the camera sees."""
         scene = simulation.scene
         self._frames = scene.frames if isinstance(scene, Scene) and isinstance(scene.frames, PartlyKnown) else None
@@ -427,7 +325,7 @@ class KnownPixels:
                 yield t, mask
 
 
-def picture_pixels(simulation: Simulation) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+def picture_pixels(simulation: SimulationValues) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """Return row and column of the picture that each pixel of the camera sees without the prism, and if it is inside.
 
     Each has the shape (height, width) of the camera. Rows and columns outside the picture are those nearest to it.

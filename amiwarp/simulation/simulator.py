@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import NAMES, DeviceEvents, DeviceMemoryEvents, DeviceValues, join, wait
 from amiwarp.events.events import Events, EventSource, MemoryEvents
 from amiwarp.events.recording import MetadataValue, Recording
@@ -20,13 +19,14 @@ from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
+from amiwarp.simulation import scenery
+from amiwarp.simulation.description import Scene, SimulationValues
 from amiwarp.simulation.engine import DeviceBlock, Engine
-from amiwarp.simulation.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
-from amiwarp.simulation.scenery import Scene
+from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.simulation.worlds.world_truth import RecordedTruth, chosen_instants
-from amiwarp.validation import guarded, instance, real, whole
+from amiwarp.validation import guarded
 
 if TYPE_CHECKING:
     import warp as wp
@@ -38,24 +38,7 @@ if TYPE_CHECKING:
 # Values of a simulation: their checks, and the true parameters that they mean.
 
 
-def check_values(simulation: Simulation) -> None:
-    """Raise :class:`AmiwarpError` if a value is of another class or out of range."""
-    if not isinstance(simulation.scene, WorldScene):
-        instance(simulation.scene, Scene, "simulation's scene")
-    kinds: dict[str, type] = {"camera": Camera, "prism": Prism, "motion": PrismMotion, "sensor": SensorModel,
-             "camera_motion": CameraMotion}  # fmt: skip
-    if simulation.encoder_model is not None:
-        kinds["encoder_model"] = EncoderModel
-    for name, kind in kinds.items():
-        instance(getattr(simulation, name), kind, f"simulation's {name}")
-    real(simulation.duration_s, "duration_s", 1e-3, LONGEST_S, " s")
-    if simulation.camera.width * simulation.camera.height > 1 << 22:
-        given = f"{simulation.camera.width}x{simulation.camera.height}"
-        raise AmiwarpError(f"camera of {given} has more than 4194304 pixels; give a smaller camera")
-    whole(simulation.seed, "seed", 0, (1 << 31) - 1)
-
-
-def true_parameters(simulation: Simulation) -> dict[str, float]:
+def true_parameters(simulation: SimulationValues) -> dict[str, float]:
     """Return the true values by the names that calibration uses, and those of the sensor."""
     constant = simulation.camera_motion.constant and not (
         isinstance(simulation.scene, WorldScene) and simulation.scene.trajectory.moves
@@ -108,8 +91,8 @@ class CollectedEvents:
 
 @guarded
 @dataclass(frozen=True, eq=False)
-class Simulation:
-    """Description of a simulated recording: all that determines its events.
+class Simulation(SimulationValues):
+    """Description of a simulated recording, :class:`SimulationValues`, and the methods that simulate it.
 
     Equal values give equal events, bit for bit, on one kind of device.
 
@@ -124,39 +107,6 @@ class Simulation:
     >>> recording.events.size
     (32, 24)
     """
-
-    scene: Scene | WorldScene
-    """Scene in front of the camera: pictures at infinity, or a world."""
-    camera: Camera
-    """Camera intrinsics, of at most 4194304 pixels."""
-    prism: Prism
-    """Prism in front of the camera, with its true parameters."""
-    duration_s: float
-    """Duration of the recording [s]."""
-    motion: PrismMotion = field(default_factory=PrismMotion)
-    """Motion of the prism: speed, phase and tilt."""
-    camera_motion: CameraMotion = field(default_factory=CameraMotion)
-    """Rotation of the camera; by default none."""
-    sensor: SensorModel = field(default_factory=SensorModel)
-    """Model of the sensor's pixels and readout."""
-    encoder_model: EncoderModel | None = field(default_factory=EncoderModel)
-    """Errors of the encoder; None for a camera without a prism, whose recording has neither encoder nor prism."""
-    nominal_prism: Prism | None = None
-    """Nominal prism that is stored with the recording; None for the true prism."""
-    seed: int = 0
-    """Seed of all random numbers of the simulation."""
-    device: str = "cpu"
-    """Device that computes, such as ``cpu`` or ``cuda:0``."""
-    source: Mapping[str, MetadataValue] = field(default_factory=dict)
-    """Description of what the scene was made from; it becomes part of the recording's metadata."""
-
-    def __post_init__(self) -> None:
-        check_values(self)
-
-    @property
-    def duration_us(self) -> int:
-        """Duration of the recording, rounded [us]."""
-        return round(self.duration_s * 1e6)
 
     def without_prism(self) -> Simulation:
         """Return this simulation with the prism taken out, which makes it that of a plain event camera.
@@ -278,9 +228,7 @@ class Simulation:
         ndarray
             Log intensity, float32, shape ``(height, width)``.
         """
-        from amiwarp.simulation.scenery import log_view
-
-        return log_view(self)
+        return scenery.log_view(self)
 
     def run(
         self,

@@ -17,8 +17,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import warp as wp
-
 from amiwarp._version import __version__
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
@@ -191,6 +189,8 @@ def processor() -> str:
 
 def machine(device: str) -> str:
     """Return the name of the GPU; for ``cpu`` the name of the CPU, with the number of cores that may be used."""
+    import warp as wp  # here, because the command line imports this module at its start
+
     there = wp.get_device(device)
     return str(there.name) if there.is_cuda else f"{cpu_threads()} cores of {processor()}"
 

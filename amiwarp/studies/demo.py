@@ -15,6 +15,7 @@ import numpy as np
 from amiwarp.brightness.event_pairs import SensorTiming
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.calibration_events import thin
+from amiwarp.calib.model_choice import CIRCLES
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.imaging import metrics
@@ -34,18 +35,19 @@ from amiwarp.kernels.map_positions import find_places, place_blocks
 from amiwarp.kernels.multilevel import prolong
 from amiwarp.kernels.pairs import mark_spans
 from amiwarp.kernels.pixel_votes import vote_event_blocks, vote_point_blocks
-from amiwarp.kernels.refraction import CircleParams, ExactParams, RadialCircleParams, compensate_points
+from amiwarp.kernels.refraction import ExactParams, compensate_points
 from amiwarp.kernels.slow_pixels import find_time_constants
 from amiwarp.kernels.votes import turn_events
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting.clouds import Renderer
 from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.export import save_picture
 from amiwarp.reconstruction.picture import Picture, Reconstruction
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 
@@ -85,7 +87,7 @@ EXACT_KERNELS = (
 )
 """Kernels of calibration, compensation and reconstruction by the exact model, in the order of their use."""
 FIGURE_KERNELS = (
-    *((compensate_points, struct) for struct in (CircleParams, RadialCircleParams)),
+    *((compensate_points, MODELS[name].STRUCT) for name in CIRCLES),
     (vote_point_blocks,),
 )
 """Kernels of the demo's figure and of its comparison of simpler models."""

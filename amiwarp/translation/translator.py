@@ -15,9 +15,9 @@ from amiwarp.io.formats import detect_format, open_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.progress import Progress
 from amiwarp.simulation import sequences
+from amiwarp.simulation.description import Scene, Still
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import read_picture
-from amiwarp.simulation.scenery import Scene, Still
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.sequences import Pictures
 from amiwarp.simulation.simulator import Simulation
@@ -29,8 +29,7 @@ from amiwarp.validation import check_names, choice, guarded
 
 if TYPE_CHECKING:
     from amiwarp.optics.prism import Prism
-    from amiwarp.simulation.scenery import Frames
-
+    from amiwarp.simulation.description import Frames
 
 # What the translators read: pictures, pictures with events, or events alone, as pictures for the simulator.
 

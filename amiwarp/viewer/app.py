@@ -27,7 +27,8 @@ from amiwarp.io.atomic_output import check_output, interrupts_later
 from amiwarp.validation import guarded
 from amiwarp.viewer.clouds import Look, Scene
 from amiwarp.viewer.inspector import Inspector, Library
-from amiwarp.viewer.panel import RECORDED, SETTABLE, Panel
+from amiwarp.viewer.layout import SETTABLE
+from amiwarp.viewer.panel import RECORDED, Panel
 from amiwarp.viewer.serve import serve
 
 if TYPE_CHECKING:
@@ -65,13 +66,10 @@ def serve_panel(
 async def _serve(
     make_inspector: Callable[[], Inspector], library: Library | None, host: str, port: int, ready: Callable[[str], None]
 ) -> None:
-    token = secrets.token_urlsafe(16)
-    build = partial(_build_tab, make_inspector, library)
-    await serve(build, settable=SETTABLE, host=host, port=port, token=token, ready=ready)
+    def build(server: Any) -> Callable[[], None]:
+        return Panel(server, make_inspector(), library).close
 
-
-def _build_tab(make_inspector: Callable[[], Inspector], library: Library | None, server: Any) -> Callable[[], None]:
-    return Panel(server, make_inspector(), library).close
+    await serve(build, settable=SETTABLE, host=host, port=port, token=secrets.token_urlsafe(16), ready=ready)
 
 
 def open_window(make_inspector: Callable[[], Inspector], library: Library | None, ready: Callable[[str], None]) -> None:

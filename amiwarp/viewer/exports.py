@@ -1,20 +1,17 @@
-"""Files that the page offers as downloads: pictures, images, events, calibrations and films."""
+"""Files that the page offers as downloads: images, events and films."""
 
 from __future__ import annotations
 
-import asyncio
 import itertools
 import re
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
-from functools import partial
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.choices import Axis, Colour, View
 from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
@@ -23,22 +20,21 @@ from amiwarp.imaging.export import encode_image, encode_png
 from amiwarp.io import RecordingWriter
 from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.file_scan import FileEvents
-from amiwarp.io.output_formats import check_ending
+from amiwarp.io.formats import check_ending
 from amiwarp.reconstruction.export import save_film
-from amiwarp.viewer.clouds import Look, Scene, orbit_lines
-from amiwarp.viewer.images import ImageKind, make_images
-from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.jobs import JobCancelled
+from amiwarp.viewer.clouds import Scene, orbit_lines
 from amiwarp.viewer.window import kept
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.choices import View
+    from amiwarp.progress import Progress
+    from amiwarp.viewer.clouds import Look
     from amiwarp.viewer.images import ShownImages
-    from amiwarp.viewer.panel import Panel
+    from amiwarp.viewer.inspector import Inspector
+    from amiwarp.viewer.window import Knobs
 
-
-# Files that the page offers as downloads: events of the window, images and calibrations.
 
 BLOCK = 1 << 20
 """Number of events that are written at a time."""
@@ -145,7 +141,7 @@ def _cut(encoder: Encoder, first_us: int, last_us: int) -> Encoder:
     return Encoder(t, encoder.angle[first:stop], encoder.clock_offset_us, pulses)
 
 
-# Downloads of a page: pictures, images, events, the calibration and films. No file is written on the server.
+# Films of the clouds, and the downloads that a page offers. No file is written on the server.
 
 FRAMES, FPS = 90, 25.0
 """Number of pictures of a film, and pictures per second."""
@@ -163,108 +159,47 @@ FILMS = ("turntable", "film")
 """Downloads that take long."""
 
 
-class Exports:
-    """Downloads of one page."""
+def download_name(recording: str, what: str) -> str:
+    """Return the file name of a download. ``recording``: name of the recording, which may be that of a stream."""
+    name = re.sub(r"[^\w.+=@-]+", "_", recording)[:60].strip("._-~ ") or "recording"
+    return f"{name}.{what}{EXPORTS[what][1]}"
 
-    def __init__(self, panel: Panel) -> None:
-        self._panel, self._ended = panel, False
 
-    def end(self) -> None:
-        """Stop a film that is being made."""
-        self._ended = True
+def write_film(
+    path: Path, inspector: Inspector, look: Look, view: View, progress: Progress, *, what: str,
+    against: Knobs | None, with_orbit: bool, speed: float,
+) -> None:  # fmt: skip
+    """Write a film of the clouds to a new file.
 
-    def export(self, what: str) -> None:
-        """Give the browser a file; ``what`` is a name in :data:`EXPORTS`."""
-        if what == "picture":
-            s = self._panel.state
-            words = [s.name, s.events, f"sharpness {s.sharpness}"]
-            self._panel.server.js_call("page", "picture", self._name(what), words)
-        elif what in EXPORTS and not (what in FILMS and self._panel.state.busy):
-            self._panel.start_job(self._film(what) if what in FILMS else self._write(what))
+    ``what``: "turntable" for a camera that moves once around the clouds of the inspector's window, or "film" for a time
+    window that moves on from there with ``speed`` times real time. ``against``: parameters of the left cloud; None for
+    the recorded events. ``progress`` may raise an error to stop the film.
+    """
 
-    def _name(self, what: str) -> str:
-        """Return the name of a download, made of the recording's name, which may be that of a stream."""
-        name = re.sub(r"[^\w.+=@-]+", "_", self._panel.inspector.recording.name)[:60].strip("._-~ ") or "recording"
-        return f"{name}.{what}{EXPORTS[what][1]}"
+    def draw(scene: Scene) -> None:
+        shown = inspector.show(against=against)
+        orbit, column = orbit_lines(inspector, shown)
+        lines = (orbit if against is None else column, column)
+        scene.show(shown, look, lines if with_orbit else ())
 
-    async def _write(self, what: str) -> None:
-        panel, inspector = self._panel, self._panel.inspector
-        kind, against = ImageKind(panel.state.kind), panel.comparison.knobs
-        write: dict[str, Callable[[Path], object]] = {
-            "image": lambda path: write_image(make_images(inspector, kind, against=against), path),
-            "values": lambda path: write_image(make_images(inspector, kind, against=against), path),
-            "events": partial(write_events, inspector, compensated=False),
-            "compensated": partial(write_events, inspector, compensated=True),
-            "calibration": lambda path: inspector.as_calibration().save(path),
-        }
-        with panel.errors_shown("export"):
-            async with panel.device_lock, panel.buffers_lock:
-                content = await panel.in_thread(as_bytes, EXPORTS[what][1], write[what])
-            self._give(what, content)
-        panel.state.flush()
-
-    async def _film(self, what: str) -> None:
-        panel, state = self._panel, self._panel.state
-        inspector = Inspector(panel.inspector.recording, device=panel.inspector.device)
-        inspector.set(panel.inspector.knobs)
-        window, selection, step_us = panel.inspector.window, panel.inspector.selection, 1e6 / FPS * float(state.speed)
-        look = Look(Colour(state.colour), Axis(state.axis), float(state.point_size), float(state.opacity),
-                    dark=bool(state.dark), overlaid=bool(state.overlaid))  # fmt: skip
-        look, against = look.for_clouds([title for _, title in state.titles]), panel.comparison.knobs
-        view, loop = View(state.view[0]), asyncio.get_running_loop()
-        with_orbit = bool(state.orbit_shown) and look.axis is Axis.ANGLE and panel.compensates
-        assert window is not None
-
-        def draw(scene: Scene) -> None:
-            shown = inspector.show(against=against)
-            orbit, column = orbit_lines(inspector, shown)
-            lines = (orbit if against is None else column, column)
-            scene.show(shown, look, lines if with_orbit else ())
-
-        def pictures() -> Iterator[NDArray[np.uint8]]:
-            inspector.open(*window, selection)
-            with closing(Scene(FILM_SIZE)) as scene:
-                draw(scene)
-                scene.look_from(view, look)
-                if what == "turntable":
-                    yield from scene.turntable(FRAMES)
-                    return
-                start_us, last_us = float(window[0]), inspector.recording.events.t_last + 1 - window[1]
-                while (start_us := start_us + step_us) <= last_us:
-                    yield scene.picture()
-                    inspector.open(round(start_us), window[1], selection)
-                    draw(scene)
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        with closing(Scene(FILM_SIZE)) as scene:
+            draw(scene)
+            scene.look_from(view, look)
+            if what == "turntable":
+                yield from scene.turntable(FRAMES)
+                return
+            span = inspector.loaded.span
+            start_us, last_us = float(span.start_us), inspector.recording.events.t_last + 1 - span.length_us
+            while (start_us := start_us + 1e6 / FPS * speed) <= last_us:
                 yield scene.picture()
+                inspector.open(round(start_us), span.length_us)
+                draw(scene)
+            yield scene.picture()
 
-        def counted() -> Iterator[NDArray[np.uint8]]:
-            for k, picture in enumerate(itertools.islice(pictures(), FRAMES)):
-                if self._ended:
-                    raise JobCancelled
-                loop.call_soon_threadsafe(self._show_progress, k / FRAMES)
-                yield picture
+    def counted() -> Iterator[NDArray[np.uint8]]:
+        for k, picture in enumerate(itertools.islice(pictures(), FRAMES)):
+            progress(f"making the {EXPORTS[what][0]}", k / FRAMES)
+            yield picture
 
-        with state:
-            state.update({"busy": f"making the {EXPORTS[what][0]}", "progress": 0})
-        try:
-            with suppress(JobCancelled), panel.errors_shown("export"):
-                write = partial(save_film, counted(), fps=FPS)
-                async with panel.device_lock:
-                    content = await panel.in_thread(as_bytes, EXPORTS[what][1], write)
-                self._give(what, content)
-        finally:
-            with state:
-                state.busy = ""
-
-    def _show_progress(self, share: float) -> None:
-        with self._panel.state:
-            self._panel.state.progress = round(100.0 * share)
-
-    def _give(self, what: str, content: bytes) -> None:
-        name = self._name(what)
-        self._panel.server.js_call("page", "download", name, content, EXPORTS[what][2])
-        self._panel.show_message(f"{name}: {len(content) / 1e3:,.0f} kB, in the browser's downloads", "success")
-
-
-def export_state() -> dict[str, Any]:
-    """Return the state variable of the downloads: name, text and whether the download takes long."""
-    return {"exports": [[name, text, name in FILMS] for name, (text, *_) in EXPORTS.items()]}
+    save_film(counted(), path, fps=FPS)

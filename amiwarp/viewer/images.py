@@ -53,26 +53,11 @@ class SelectedPart:
 def select_part(
     inspector: Inspector, window: LoadedWindow, part: Region, *, most: float = math.inf, longest_us: float = math.inf
 ) -> SelectedPart:
-    """Return the selected events of a part of the image.
+    """Return the selected events of a part of the image in a window of the inspector.
 
-    Parameters
-    ----------
-    inspector : Inspector
-        The inspector.
-    window : LoadedWindow
-        Its window.
-    part : tuple of int
-        Left, top, right and bottom of the part [px]; right and bottom are exclusive.
-    most : float
-        Largest number of events and pixels together. For a larger part, every second (third, ...) column and row is
-        used.
-    longest_us : float
-        Longest duration [us]. Of a longer window, and of one with too many events, the middle is used.
-
-    Returns
-    -------
-    SelectedPart
-        The part.
+    ``most``: largest number of events and pixels together; of a larger part, every second (third, ...) column and row
+    is used. ``longest_us``: longest duration [us]; of a longer window, and of one with too many events, the middle is
+    used.
     """
     span, events = window.span, window.events
     share = min(1.0, longest_us / span.length_us, MOST_EVENTS / max(span.count, 1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
@@ -21,25 +21,13 @@ from amiwarp.events.encoder import turn_between
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import PERCENTILE
 from amiwarp.imaging.sharpness import random_variance
+from amiwarp.imaging.votes import upload_events
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import MODELS, size_names
 from amiwarp.reconstruction.picture import border_displacements
 from amiwarp.viewer import window
 from amiwarp.viewer.timeline import Span, read_span
-from amiwarp.viewer.window import (
-    CURVE_HALF_WIDTH,
-    SMOOTHING_PX,
-    DisplayedWindow,
-    Knobs,
-    LoadedWindow,
-    MeasuredImage,
-    Selection,
-    Source,
-    WindowAngles,
-    WindowImager,
-    load_window,
-    margin,
-    upload,
-)
+from amiwarp.viewer.window import Knobs, Selection, Source, WindowImager
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -48,7 +36,6 @@ if TYPE_CHECKING:
     from amiwarp.events.events import Events
     from amiwarp.imaging.votes import UploadedEvents
     from amiwarp.optics.models import Model
-    from amiwarp.viewer.window import Region
 
 
 # Region of the image that the inspector shows first: where compensation gains most sharpness.
@@ -74,7 +61,7 @@ from outside."""
 class Suggestion:
     """Suggested region of the image."""
 
-    region: Region
+    region: window.Region
     """Left, top, right and bottom [px]; right and bottom are exclusive."""
     gains: bool
     """Whether compensation with the current parameters sharpens the region. Otherwise, the region has most structure.
@@ -106,7 +93,7 @@ def _best_box(
     """Return left and top of the best box of a size, and whether compensation sharpens it."""
     mean, over_mean = _of_boxes(before, width, height)
     mean_after, over_mean_after = _of_boxes(after, width, height)
-    noise = random_variance(SMOOTHING_PX)
+    noise = random_variance(window.SMOOTHING_PX)
     # the variance of random events stays in the divisor, so that a region without structure has no arbitrary factor
     factor = (over_mean_after - noise) / mean_after / (np.maximum(over_mean, noise) / mean)
     variance = mean_after * over_mean_after - mean * over_mean
@@ -136,7 +123,7 @@ def _of_boxes(image: NDArray[np.float32], width: int, height: int) -> tuple[NDAr
 
     positive = image[image > 0.0]
     limit = float(np.percentile(positive, PERCENTILE)) if positive.size else 1.0
-    smoothed = gaussian_filter(np.minimum(image, limit).astype(np.float64), SMOOTHING_PX, mode="constant")
+    smoothed = gaussian_filter(np.minimum(image, limit).astype(np.float64), window.SMOOTHING_PX, mode="constant")
     mean, square = (_box_means(values, width, height) for values in (smoothed, smoothed**2))
     mean = np.maximum(mean, 1e-6)
     return mean, np.maximum(square / mean - mean, 0.0)
@@ -159,6 +146,8 @@ CURVE_POINTS = 25
 """Number of points of a sharpness curve."""
 ORBIT_POINTS = 181
 """Number of points of the drawn orbit of a scene point."""
+LARGEST_APEX = math.radians(3.0)
+"""Apex angle up to which events that move into the region are in its images, if the nominal apex is smaller [rad]."""
 WINDOW_US = 100_000
 """Length of the first time window if the prism does not rotate [us]."""
 
@@ -188,8 +177,13 @@ class Inspector:
         no_speed = recording.encoder is None and calibration is None
         self.notes = (NO_ENCODER,) * no_speed + (NO_CAMERA,) * (recording.camera is None)
         """What is missing to compensate the prism's motion, one sentence each."""
-        self.sources = window.first_sources(recording)
-        """Where the value of each parameter, and the camera, come from."""
+        self.sources = {
+            "camera": Source.ASSUMED if recording.camera is None else Source.FILE,
+            "apex": Source.ASSUMED if getattr(recording.prism, "apex", None) is None else Source.FILE,
+            **dict.fromkeys(("model", "phase", *window.SLIDING), Source.ASSUMED),
+            **({"rpm": Source.ASSUMED} if recording.encoder is None else {"clock_offset": Source.FILE}),
+        }
+        """Where the value of each parameter that the page shows, and the camera, come from."""
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
         self.recording, self.device, self.latest = recording, device, latest
@@ -202,7 +196,7 @@ class Inspector:
         """Start and length of the time window [us]; None: that of :meth:`first_window`."""
         self.selection = Selection()
         self._found: tuple[Knobs, Calibration] | None = None
-        self._window: LoadedWindow | None = None
+        self._window: window.LoadedWindow | None = None
         self._span: Span | None = None
         self.lock = Lock()
         """Lock for the events on the device and the buffers of their images."""
@@ -249,8 +243,9 @@ class Inspector:
 
     @property
     def margin_px(self) -> int:
-        """How far outside a region the events of its images may be [px]."""
-        return margin(self.camera, self.prism)
+        """How far outside a region the events of its images may be: how far the prism may move them [px]."""
+        largest = replace(self.prism, apex=max(LARGEST_APEX, 2.0 * abs(self.prism.apex)))
+        return math.ceil(1.2 * math.tan(abs(largest.deflection)) * max(self.camera.fx, self.camera.fy))
 
     @property
     def model(self) -> Model:
@@ -294,17 +289,36 @@ class Inspector:
             )
         self.prism, self.recording = calibration.prism, replace(self.recording, camera=calibration.camera)
         self.set(self.knobs_of(calibration))
-        self.sources |= window.calibrated_sources(calibration, self.sources)
+        found, free = (
+            {"apex" if name in size_names() else name for name in names} & set(self.sources)
+            for names in (calibration.parameters, calibration.free)
+        )
+        self.sources |= dict.fromkeys(found, Source.FILE) | dict.fromkeys(("model", *free), Source.CALIBRATED)
         self._found = self.knobs, calibration
 
     def knobs_of(self, calibration: Calibration) -> Knobs:
         """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
-        return window.calibrated_knobs(calibration, offset_us=self._recorded_offset_us, zero_us=self.zero_us)
+        p, prism = calibration.parameters, calibration.prism
+        kind, rpm, phase = MODELS[calibration.model_name], p.get("rpm", 0.0), p["phase"]
+        if calibration.zero_us is not None:
+            phase += rpm * math.tau / 60e6 * (self.zero_us - calibration.zero_us)
+        offset = p.get("clock_offset", self._recorded_offset_us)
+        return Knobs.given(
+            p, model=kind.NAME, apex=kind.apex_from_size(p[kind.SIZE], prism), phase=phase, clock_offset=offset,
+            rpm=rpm, focal_length=p.get("focal_length"),
+        )  # fmt: skip
 
     @property
     def truth(self) -> Knobs | None:
-        """Known parameters of a simulated recording; None if the recording has no ground truth of its prism."""
-        return window.true_knobs(self.recording, rpm=self.knobs.rpm)
+        """Known parameters of a simulated recording, at the current speed, which ground truth does not hold.
+
+        None if the recording has no ground truth of its prism.
+        """
+        p = {} if self.recording.truth is None else self.recording.truth.parameters
+        if not {"apex", "phase"} <= set(p):
+            return None
+        offset = p.get("clock_offset_us", self._recorded_offset_us)
+        return Knobs.given(p, apex=p["apex"], phase=p["phase"], clock_offset=offset, rpm=self.knobs.rpm)
 
     def take_truth(self) -> None:
         """Set the parameters to the known truth. Raises :class:`AmiwarpError` if the recording has none."""
@@ -318,8 +332,11 @@ class Inspector:
         """Return the accepted calibration if no parameter was changed since, else one of the current parameters."""
         if self._found is not None and self._found[0] == self.knobs:
             return self._found[1]
-        k, w = self.knobs, self.loaded
-        kept = window.kept_values(k, self._values(k), has_encoder=self.has_encoder)
+        k, w, values = self.knobs, self.loaded, self._values(self.knobs)
+        kind = MODELS[k.model]
+        others = [name for name in kind.FREE if name in window.SLIDING]
+        time = {"clock_offset": k.clock_offset} if self.has_encoder else {"rpm": k.rpm}
+        kept = {name: values[name] for name in (kind.SIZE, *others, "phase", *k.calibrated_only)} | time
         before, after = self._unmoved(w), self._measured(w, k)
         return Calibration(
             model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
@@ -330,8 +347,9 @@ class Inspector:
 
     def set(self, knobs: Knobs) -> None:
         """Set the parameters of the prism. Parameters that change count as set by hand."""
-        changed = {f.name for f in fields(Knobs) if getattr(knobs, f.name) != getattr(self.knobs, f.name)}
-        self.sources |= dict.fromkeys(changed & set(self.sources), Source.HAND)
+        shown = self.sources.keys() - {"camera"}
+        changed = {name for name in shown if knobs.value(name) != self.knobs.value(name)}
+        self.sources |= dict.fromkeys(changed, Source.HAND)
         self.knobs = knobs
 
     def open(self, start_us: int, length_us: int, selection: Selection | None = None) -> None:
@@ -352,7 +370,7 @@ class Inspector:
         orbit_px = np.abs(border_displacements(self.model)).max(initial=0.0)
         return suggest_region(before, after, margin=math.ceil(orbit_px))
 
-    def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:
+    def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> window.DisplayedWindow:
         """Return the time window's images and points.
 
         ``knobs``: parameters to show, by default the current ones. ``against``: parameters to compare with; they
@@ -362,7 +380,7 @@ class Inspector:
         first = self._unmoved(w) if against is None else self._measured(w, against)
         xy = w.xy if against is None else self._moved(w, against)
         second, theta = self._measured(w, knobs), np.mod(self._theta(w, knobs), math.tau)
-        return DisplayedWindow(
+        return window.DisplayedWindow(
             w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), theta, first.image, second.image,
             first.sharpness, second.sharpness,
         )  # fmt: skip
@@ -370,20 +388,21 @@ class Inspector:
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return values of a parameter around its current one, in its unit, and the sharpness at each of them."""
         current = self.knobs
-        values = getattr(current, name) + np.linspace(-CURVE_HALF_WIDTH[name], CURVE_HALF_WIDTH[name], CURVE_POINTS)
+        half = window.CURVE_HALF_WIDTH[name]
+        values = (current.value(name) or 0.0) + np.linspace(-half, half, CURVE_POINTS)
         if name == "apex":
             values = values[values >= 0.0]
         sharpness = self.sharpness_meter(self._curve_imager)
-        changed = [replace(current, **{name: float(value)}) for value in values]  # type: ignore[arg-type]
+        changed = [current.with_values({name: float(value)}) for value in values]
         return values, np.array([sharpness(knobs) for knobs in changed])
 
-    def sharpness_meter(self, imager: WindowImager) -> Callable[[Knobs | None], float]:
+    def sharpness_meter(self, imager: WindowImager | None = None) -> Callable[[Knobs | None], float]:
         """Return a function that measures the sharpness of part of the window's events with given parameters.
 
         Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and belongs to the
-        thread that uses the imager.
+        thread that uses the imager; by default, it has an imager of its own.
         """
-        w = self.loaded
+        w, imager = self.loaded, imager or WindowImager(self.recording.events.size, self.device)
         on_device: dict[float, UploadedEvents] = {}
 
         def sharpness(knobs: Knobs | None) -> float:
@@ -391,7 +410,7 @@ class Inspector:
             rpm = 0.0 if self.has_encoder else given.rpm
             if rpm not in on_device:
                 on_device.clear()
-                on_device[rpm] = upload(w.curve_events, self._encoder(rpm), self.device, drifting=self.has_encoder)
+                on_device[rpm] = self._upload(w.curve_events, rpm)
             model, drift_us = self.model_of(given), self._drift_us(given)
             return imager.measure(model, on_device[rpm], drift_us, w.region).sharpness
 
@@ -412,7 +431,7 @@ class Inspector:
         return 0.0 if self.recording.encoder is None else self.recording.encoder.clock_offset_us
 
     @property
-    def loaded(self) -> LoadedWindow:
+    def loaded(self) -> window.LoadedWindow:
         """Selected events of the time window. They are read first if necessary."""
         if self._window is None:
             self.open(*(self.window or self.first_window()))
@@ -420,14 +439,15 @@ class Inspector:
         return self._window
 
     def _values(self, knobs: Knobs) -> dict[str, float]:
-        """Return the parameters of every optical model.
+        """Return the values of the optical model's parameters.
 
         A prism that does not rotate gets apex 0, so that nothing is compensated.
         """
         apex, more = knobs.apex if self.has_encoder or knobs.rpm else 0.0, knobs.calibrated_only
         prism = replace(self.prism, apex=apex, index=more.get("index", self.prism.index))
-        return {**more, "apex": apex, "deflection": prism.deflection, "phase": knobs.phase, "tilt_x": knobs.tilt_x,
-                "tilt_y": knobs.tilt_y}  # fmt: skip
+        kind = MODELS[knobs.model]
+        others = {name: knobs.value(name) or 0.0 for name in window.SLIDING}
+        return {**more, **others, kind.SIZE: kind.size_from_apex(apex, prism), "phase": knobs.phase}
 
     def model_of(self, knobs: Knobs, camera: Camera | None = None) -> Model:
         """Return the optical model with given parameters, of the recording's camera or another one."""
@@ -443,7 +463,7 @@ class Inspector:
         """Parameters that leave all events where they were recorded."""
         return replace(self.knobs, model="exact", apex=0.0)
 
-    def warped(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
+    def warped(self, w: window.LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
         """Return the model, the events on the device and their drift [us], to vote the events of a window.
 
         ``knobs``: the parameters; None for the events as recorded.
@@ -457,7 +477,7 @@ class Inspector:
         theta = self.encoder_of(knobs).angle_at(events.t).astype(np.float32)
         return np.asarray(self.model_of(knobs).compensate_points(xy, theta), np.float32)
 
-    def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:
+    def _load(self, start_us: int, length_us: int, selection: Selection) -> window.LoadedWindow:
         """Read and select the events of a time window. The events of the last one are not read again."""
         if self._span is None or (self._span.start_us, self._span.length_us) != (start_us, length_us):
             self._span = read_span(self.recording.events, start_us, length_us, most_events=MOST_EVENTS)
@@ -467,41 +487,47 @@ class Inspector:
         """Return the events of a time window that meet the selection."""
         return self._select(span, self.selection).events
 
-    def _select(self, span: Span, selection: Selection) -> LoadedWindow:
+    def _select(self, span: Span, selection: Selection) -> window.LoadedWindow:
         hot = self.hot if selection.hide_hot else None
-        return load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot)
+        return window.load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot)
 
     def _drift_us(self, knobs: Knobs) -> float:
         """Return how far the clock offset is from that of the recording's own encoder [us]."""
         return knobs.clock_offset - self._recorded_offset_us
 
-    def _angles(self, w: LoadedWindow, knobs: Knobs) -> WindowAngles:
+    def _angles(self, w: window.LoadedWindow, knobs: Knobs) -> window.WindowAngles:
         """Return the prism angles of a window; those of the two last speeds are kept."""
         rpm = 0.0 if self.has_encoder else knobs.rpm
         if rpm not in w.angles:
             encoder, t = self._encoder(rpm), w.drawn.t
             for old in list(w.angles)[:-1]:
                 del w.angles[old]
-            on_device = upload(w.events, encoder, self.device, drifting=self.has_encoder)
-            w.angles[rpm] = WindowAngles(on_device, encoder.angle_at(t), encoder.speed_at(t) * 1e-6)
+            angle, speed = encoder.angle_at(t), encoder.speed_at(t) * 1e-6
+            w.angles[rpm] = window.WindowAngles(self._upload(w.events, rpm), angle, speed)
         return w.angles[rpm]
 
-    def _theta(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
+    def _upload(self, events: Events, rpm: float) -> UploadedEvents:
+        """Upload events with their prism angles, so that the clock offset of the encoder can be changed afterwards."""
+        encoder = self._encoder(rpm)
+        slope = encoder.speed_at(events.t) * 1e-6 if self.has_encoder else None
+        return upload_events(events, encoder, self.device, slope=slope)
+
+    def _theta(self, w: window.LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
         """Return the prism angles of the drawn events [rad], shape ``(n,)``."""
         angles = self._angles(w, knobs)
         return angles.theta + angles.speed * self._drift_us(knobs)
 
-    def _moved(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float32]:
+    def _moved(self, w: window.LoadedWindow, knobs: Knobs) -> NDArray[np.float32]:
         """Return the compensated positions of the drawn events [px], shape ``(n, 2)``."""
         theta = self._theta(w, knobs).astype(np.float32)
         return np.asarray(self.model_of(knobs).compensate_points(w.xy, theta), np.float32)
 
-    def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> MeasuredImage:
+    def _measured(self, w: window.LoadedWindow, knobs: Knobs | None) -> window.MeasuredImage:
         """Return the image of a window with these parameters; as recorded if ``knobs`` is None."""
         with self.lock:
             return self._imager.measure(*self.warped(w, knobs), w.region)
 
-    def _unmoved(self, w: LoadedWindow) -> MeasuredImage:
+    def _unmoved(self, w: window.LoadedWindow) -> window.MeasuredImage:
         """Return the image of a window as recorded."""
         if not w.unmoved:
             w.unmoved.append(self._measured(w, None))

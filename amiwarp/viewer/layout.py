@@ -1,28 +1,45 @@
-"""Names, units and keys of the inspector's page, and the page's template."""
+"""Contents of the inspector's page: names, units, keys and texts, its template, and the values of its state."""
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING, Any
 
-from amiwarp.choices import View
-from amiwarp.viewer.serve import read_template
+from amiwarp.choices import Axis, Colour, View
+from amiwarp.optics.models import MODELS
+from amiwarp.viewer.clouds import NO_ORBIT
+from amiwarp.viewer.exports import EXPORTS, FILMS
+from amiwarp.viewer.images import ImageKind
+from amiwarp.viewer.inspector import NO_ENCODER
+from amiwarp.viewer.serve import Check, flag, number, one_of, read_template
+from amiwarp.viewer.window import SLIDING, Source, colours_on_offer, truth_text
+
+if TYPE_CHECKING:
+    from amiwarp.calib import Calibration
+    from amiwarp.viewer.inspector import Inspector
+    from amiwarp.viewer.jobs import CostSurface, FoundCalibration, LiveFigures
+    from amiwarp.viewer.window import DisplayedWindow
 
 UNITS = {
-    "apex": math.radians(1.0), "phase": math.radians(1.0), "clock_offset": 1.0, "tilt_x": math.radians(1.0),
-    "tilt_y": math.radians(1.0), "rpm": 1.0,
+    "apex": math.radians(1.0), "phase": math.radians(1.0), "clock_offset": 1.0,
+    **{name: math.radians(1.0) if p.unit == "rad" else 1.0 for name, p in SLIDING.items()}, "rpm": 1.0,
 }  # fmt: skip
 """Conversion from the page's units (angles in degrees) to the parameters' units (radians): factor per parameter."""
 NAMES = tuple(UNITS)
 """Names of the prism parameters that have a slider."""
-_TILTED = "model === 'exact' || model === 'ellipse'"
+EDITABLE = ("start_ms", "length_ms", "turns", "noise_ms")
+"""State variables with a number field, next to the prism's parameters."""
 SLIDERS = {
     "apex": ("apex angle", "°", ("0", "apex_most", "0.005"), "true"),
     "phase": ("phase", "°", ("-180", "180", "0.25"), "true"),
     "clock_offset": ("clock offset", "µs", ("-20000", "20000", "10"), "has_encoder"),
     "rpm": ("speed of the prism", "rpm", ("-3000", "3000", "0.5"), "!has_encoder"),
-    "tilt_x": ("tilt in x", "°", ("-5", "5", "0.05"), _TILTED),
-    "tilt_y": ("tilt in y", "°", ("-5", "5", "0.05"), _TILTED),
-}
+    **{
+        name: (p.label, "°" if p.unit == "rad" else "", tuple(f"{x:g}" for x in p.slider),
+               " || ".join(f"model === '{each.NAME}'" for each in MODELS.values() if name in each.FREE))
+        for name, p in SLIDING.items()
+    },
+}  # fmt: skip
 """Sliders of the page by parameter: label, unit, (minimum, maximum, step), and the condition for showing the slider."""
 SPEEDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10)
 """Choices of the playback speed, relative to real time."""
@@ -32,6 +49,11 @@ SCOPES = ("selection", "whole recording")
 """Choices of the events that a calibration uses."""
 TOOLS = (("region", "draw region"), ("move", "move"), ("measure", "measure"))
 """What a drag of the mouse does on the images: name and text."""
+AGAINST = {
+    "recorded": "as recorded", "B": "compensated with B", "found": "compensated with the result",
+    "truth": "compensated with the known truth",
+}  # fmt: skip
+"""What the left cloud and image can show: name, and title."""
 KEYS = (
     ("ArrowRight", ("step", 1), "forward by one turn, or by the window's length"),
     ("ArrowLeft", ("step", -1), "back by one turn, or by the window's length"),
@@ -57,6 +79,28 @@ KEYS = (
     ("?", ("toggle", "help_shown"), "show or hide this help"),
 )
 """Keys of the page: name of the key, method of the panel with its arguments, and help text."""
+CALLS = (
+    "key", "released", "choose", "typed", "edge", "draw", "whole", "suggest", "look_from", "step", "move_window",
+    "resize_window", "take_from_curve", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline",
+    "undo", "redo", "reset", "restore", "keep_b", "swap_b", "compare_found", "export", "open_file",
+)  # fmt: skip
+"""Methods of the panel that the page may call."""
+SETTABLE: dict[str, Check] = {
+    **dict.fromkeys(NAMES, number()), "point_size": number(1.0, 20.0), "opacity": number(0.0, 1.0),
+    "speed": one_of(*SPEEDS), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
+    "colour": one_of(*(each.value for each in Colour)), "axis": one_of(*(each.value for each in Axis)),
+    "kind": one_of(*(each.value for each in ImageKind)), "against": one_of(*AGAINST), "scope": one_of(*SCOPES),
+    "message": one_of(""),
+    **dict.fromkeys(("hide_hot", "noise_filter", "dark", "overlaid", "orbit_shown", "help_shown", "open_shown", "loop",
+                     "difference"),
+                    flag),
+}  # fmt: skip
+"""State variables that the page may set directly, with the check of their values. The page changes all others through
+:data:`CALLS`."""
+CLIENT_ONLY = ("hover", "measured", "tool")
+"""State variables that the browser keeps to itself."""
+NO_SCALE = {"bar": "", "ticks": [], "title": ""}
+"""Scale of an image before the first update."""
 
 
 def template() -> str:
@@ -72,3 +116,156 @@ def _knob(name: str) -> str:
         f"@typed=\"trigger('typed', ['{name}', $event])\" "
         f"@chosen=\"trigger('choose', ['{name}'])\"></KnobField>"
     )
+
+
+# State at the start, and the parts of it that follow from the recording and the inspector's parameters.
+
+
+def initial_state(inspector: Inspector) -> dict[str, Any]:
+    """Return the page's state at the start, without the events' window."""
+    recording = inspector.recording
+    size = recording.events.size
+    return {
+        **source_state(inspector), **knob_state(inspector), **prism_state(inspector), **NO_ORBIT,
+        "trame__title": f"amiwarp: {recording.name}", "trame_error_report_msg": "", "name": recording.name,
+        "size": list(size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
+        "has_encoder": inspector.has_encoder, "models": list(MODELS),
+        "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "truths": truths(inspector),
+        "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth),
+        "exports": [[name, text, name in FILMS] for name, (text, *_) in EXPORTS.items()],
+        "open_shown": False, "playing": False, "speed": 0.1, "speeds": list(SPEEDS), "loop": False, "polarity": "both",
+        "hide_hot": False, "noise_filter": False, "noise_ms": 2.0, "region_kind": "whole",
+        "region_wanted": [0, 0, *size], "region": [0, 0, *size], "knob": "apex",
+        "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
+        "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
+        "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
+        "views": [list(each) for each in VIEWS], "tool": "region", "tools": [list(each) for each in TOOLS],
+        "hover": "", "measured": "", "orbit_shown": True, "help_shown": False,
+        "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
+        "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
+        "rate_on": b"", "rate_off": b"", "rate_note": "", "picked_text": "",
+        **dict.fromkeys(("cloud_before", "cloud_after", "cloud_third", "colours_before", "colours_after"), b""),
+        "titles": [], "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
+        "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
+        "overview": "", "before": "", "after": "", "kind": ImageKind.COUNT.value,
+        "kinds": [each.value for each in ImageKind], "image_note": "", "image_slow": False, "image_scale": NO_SCALE,
+        "after_scale": NO_SCALE, "difference": False, "against_title": "",
+        "against_choices": [], "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
+        "curve_mark": 0.0, "against": "recorded", "has_b": False, "b_text": "", "busy": "", "calibrating": False,
+        "progress": 0, "found": "", "surface": None, "scope": SCOPES[0], "scopes": list(SCOPES), "calibrate_on": "",
+    }  # fmt: skip
+
+
+def source_state(inspector: Inspector) -> dict[str, Any]:
+    """Return the state variables that depend on the events; they change in a live stream."""
+    source = inspector.recording.events
+    whole_ms = (source.t_last - source.t_first + 1) * 1e-3
+    return {"whole_ms": whole_ms, "rate_span": [0.0, whole_ms]}
+
+
+def knob_values(inspector: Inspector) -> dict[str, float]:
+    """Return the prism's parameters in the page's units, rounded as the page shows them."""
+    return {name: round((inspector.knobs.value(name) or 0.0) / scale, 4) for name, scale in UNITS.items()}
+
+
+def knob_state(inspector: Inspector) -> dict[str, Any]:
+    """Return the state variables of the prism's parameters."""
+    sources = {name: str(source.value) for name, source in inspector.sources.items()}
+    return {**knob_values(inspector), "model": inspector.knobs.model, "sources": sources, "notes": notes(inspector)}
+
+
+def prism_state(inspector: Inspector) -> dict[str, Any]:
+    """Return the state variables that depend on whether the prism rotates, so that there is a motion to compensate."""
+    turns = math.isfinite(inspector.turn_us)
+    return {"turn_ms": inspector.turn_us * 1e-3 if turns else 0.0, "has_model": turns,
+            "step_name": "turn" if turns else "window"}  # fmt: skip
+
+
+def truths(inspector: Inspector) -> dict[str, float | None]:
+    """Return the known true parameters in the page's units; None for an unknown one."""
+    known = inspector.truth
+    return {n: None if known is None else round((known.value(n) or 0.0) / scale, 4) for n, scale in UNITS.items()}
+
+
+def notes(inspector: Inspector) -> list[str]:
+    """Return what the recording lacks or what is only assumed, for the place where it matters."""
+    texts = {
+        Source.ASSUMED: "phase assumed, not known: calibrate, or set it",
+        Source.ESTIMATED: "phase estimated from the events: calibrate for an accurate one",
+    }
+    phase = texts.get(inspector.sources["phase"], "") if math.isfinite(inspector.turn_us) else ""
+    missing = [note for note in inspector.notes if not (note == NO_ENCODER and inspector.knobs.rpm)]
+    return [*missing, *filter(None, [phase])]
+
+
+# Texts and figures about the shown window, a live stream and a calibration.
+
+
+def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:
+    """Return the sharpness of the images as text, with the gain if there are two images."""
+    before, after = shown.sharpness_before, shown.sharpness_after
+    if not compensated:
+        return f"{before:.3f}"
+    gain = f" (×{after / before:.2f})" if before > 1e-3 and after > 0.0 else ""
+    return f"{before:.3f} → {after:.3f}{gain}"
+
+
+def events_text(shown: DisplayedWindow) -> str:
+    """Return the numbers of events of the window, of those that were read, in the selection and drawn."""
+    total, read, drawn = shown.span.count, len(shown.span.events), len(shown.events)
+    thinned = "" if read == total else f", {read:,} of them read"
+    selected = "" if shown.selected == read else f", {shown.selected:,} selected"
+    return f"{total:,} events{thinned}{selected}, {'all' if drawn == shown.selected else f'{drawn:,}'} drawn"
+
+
+def live_state(f: LiveFigures) -> dict[str, Any]:
+    """Return the figures of a stream for the page: rows of name, value and whether it is bad, and what is wrong."""
+    angles, speed = f.connected and not f.no_angles, "unknown" if f.rpm is None else f"{f.rpm:.1f} rpm"
+    fresh = angles and f.turn_share >= 1.0
+    rows: list[tuple[str, str, bool]] = [
+        ("events", "receiving" if f.connected else "interrupted, last ones shown", not f.connected),
+        ("prism angles", "receiving" if angles else "interrupted, last turn shown", not angles),
+        ("rate", f"{f.rate_mev_s:.2f} million events/s", False),
+        ("latency", f"{f.latency_ms:.0f} ms" if f.connected else "–", f.connected and f.latency_ms > 1e3),
+        ("turn covered", f"{100.0 * f.turn_share:.0f} %", f.turn_share < 1.0),
+        ("speed of the prism", speed if fresh else f"{speed}, last measured", f.rpm is None or not fresh),
+        ("lost events", f"{f.dropped:,}", f.dropped > 0), ("out of order", f"{f.late:,}", f.late > 0),
+    ]  # fmt: skip
+    if f.connected and f.message:
+        rows.append(("last message", f.message, False))
+    message = "" if f.message == f.problem else f.message
+    note = "" if f.connected else f"The stream is interrupted: {f.problem}. {message}".strip()
+    if f.no_angles:
+        note = f"No prism angles arrive: {f.no_angles}. The last turn before it is shown, until they return."
+    return {"live_rows": [[name, text, "bad" if bad else ""] for name, text, bad in rows], "stream_note": note}
+
+
+def found_text(found: FoundCalibration) -> str:
+    """Return a description of the result of a calibration."""
+    c = found.calibration
+    p, exact = c.parameters, c.exact.parameters
+    warnings = "".join(f"; {text}" for text in c.warnings)
+    apex, phase = (math.degrees(x) for x in (exact.get("apex", 0.0), p["phase"]))
+    return (
+        f"found on {found.scope}: {c.model_name} model, apex {apex:.4g}°, phase {phase:.4g}°; sharpness of the region "
+        f"{found.before:.3g} as recorded, {found.current:.3g} now, {found.after:.3g} with the result; "
+        f"{c.seconds:.1f} s{warnings}"
+    )
+
+
+def surface_state(surface: CostSurface, inspector: Inspector, found: Calibration | None) -> dict[str, Any]:
+    """Return the map of sharpness for the page, with marks of the current, the found and the true parameters."""
+    names, scales = surface.names, [UNITS[name] for name in surface.names]
+    x, y = ((values / scale).tolist() for values, scale in zip(surface.values, scales, strict=True))
+    known = {"now": ("○", inspector.knobs), "truth": ("◇", inspector.truth),
+             "result": ("✕", None if found is None else inspector.knobs_of(found))}  # fmt: skip
+    marks = []
+    for title, (sign, knobs) in known.items():
+        if knobs is not None:
+            place = [getattr(knobs, name) / scale for name, scale in zip(names, scales, strict=True)]
+            if names[1] == "phase":
+                place[1] += 360.0 * round((inspector.knobs.phase / scales[1] - place[1]) / 360.0)
+            marks.append({"x": place[0], "y": place[1], "sign": sign, "title": title})
+    titles = [f"{SLIDERS[name][0]} ({SLIDERS[name][1]})" for name in names]
+    return {"x": x, "y": y, "values": surface.sharpness.tolist(), "marks": marks, "x_title": titles[0],
+            "y_title": titles[1]}  # fmt: skip

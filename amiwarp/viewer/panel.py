@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import math
-from collections.abc import Callable, Coroutine, Iterator
-from concurrent.futures import ThreadPoolExecutor
+import traceback
+import weakref
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -16,108 +16,368 @@ import numpy as np
 
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.models import MODELS
-from amiwarp.viewer.clouds import (
-    NO_ORBIT,
-    cloud_state,
-    difference_state,
-    event_text,
-    float_bytes,
-    jpeg,
-    orbit_lines,
-    scale_state,
-    whole_image,
-)
-from amiwarp.viewer.exports import Exports, export_state
-from amiwarp.viewer.images import ImageKind, ShownImages, count_images, make_images, prepare
-from amiwarp.viewer.inspector import NO_ENCODER
-from amiwarp.viewer.jobs import CalibrationJob, LiveSource, Playback, estimate_phase, scope_text
-from amiwarp.viewer.layout import KEYS, NAMES, SCOPES, SLIDERS, SPEEDS, TOOLS, UNITS, VIEWS, template
-from amiwarp.viewer.serve import Check, finite, flag, number, one_of, use_page
+from amiwarp.viewer import clouds, exports, images, jobs, layout
+from amiwarp.viewer.images import ImageKind
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.layout import NAMES, UNITS
+from amiwarp.viewer.serve import finite, use_page
 from amiwarp.viewer.timeline import EventRates
 from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
-from amiwarp.viewer.window import Selection, Source, colours_on_offer, truth_text
+from amiwarp.viewer.window import Selection
+from amiwarp.viewer.work import SLOW, JobCancelled, JobProgress, PageWork
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from pathlib import Path
 
-    from amiwarp.viewer.inspector import Inspector, Library
+    from amiwarp.calib import Calibration
+    from amiwarp.progress import Progress
+    from amiwarp.viewer.inspector import Library
     from amiwarp.viewer.window import DisplayedWindow, Knobs
-
-
-# Limit of the updates of one page to the rate at which the page takes them.
-
-MOST_IN_FLIGHT = 8
-"""Largest number of messages to the page that are unsent; while more are waiting, nothing is computed."""
-WAIT_S = 0.02
-"""Interval between two checks of the number of unsent messages [s]."""
-
-
-async def wait_until_page_keeps_up(server: Any) -> None:
-    """Wait until at most :data:`MOST_IN_FLIGHT` messages to the page are unsent."""
-    while _in_flight(server) > MOST_IN_FLIGHT:
-        await asyncio.sleep(WAIT_S)
-
-
-def _in_flight(server: Any) -> int:
-    return 0 if server.protocol is None else int(server.protocol.network_monitor.pending)
-
-
-# Parameters that the left cloud and image of a page can show: those kept as B, calibrated ones and the known truth.
-
-AGAINST = {
-    "recorded": "as recorded", "B": "compensated with B", "found": "compensated with the result",
-    "truth": "compensated with the known truth",
-}  # fmt: skip
-"""What the left cloud and image can show: name, and title."""
-
 
 RECORDED = "events as recorded"
 """Title of the only cloud, if there is no motion to compensate."""
+BINS = 400
+"""Number of points of the drawn event rates."""
+STEP_S = 0.2
+"""Duration of counting events after which the timeline shows what is counted [s]."""
+PLAY_S, FOLLOW_S = 0.05, 0.25
+"""Shortest interval between two pictures while a recording is played, and while a live stream is followed [s]."""
 
 
-class Comparison:
-    """Comparison of the current parameters of a page (A) with others."""
+class Panel:
+    """Panel that connects the page of one browser tab with its inspector. Call :meth:`close` when the tab is closed.
 
-    def __init__(self, panel: Panel) -> None:
-        self._panel = panel
+    The page may call the methods in :data:`amiwarp.viewer.layout.CALLS`. The server checks their arguments by their
+    annotations.
+    """
+
+    def __init__(self, server: Any, inspector: Inspector, library: Library | None = None) -> None:
+        """Build the page on a new trame server. ``library``: other recordings that the page may open."""
+        self.state, self.inspector, self._server, self._library = server.state, inspector, server, library
+        self.work = PageWork(server, inspector.device, self.make, self.make_slow)
+        self.shown: DisplayedWindow | None = None
+        """Window as the page shows it; None before the first update."""
+        self.found: Calibration | None = None
+        """Result of the calibration that the user has not accepted yet; None if there is none."""
         self.b: Knobs | None = None
         """Parameters that were kept as B."""
+        self.plays = False
+        """Whether the playback runs; after a stop it runs until it notices the stop."""
+        self._picked = -1
+        self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
+        self._history: History | None = None
+        self._wanted: ViewState | str | None = None
+        self._rates: EventRates
+        self._progress: JobProgress | None = None
+        use_page(server, layout.template())
+        self.state.client_only(*layout.CLIENT_ONLY)
+        self._listen()
+        self.start(inspector)
+
+    def start(self, inspector: Inspector) -> None:
+        """Show an inspector from its first state."""
+        self.inspector, self.shown, self.b, self.found, self._picked = inspector, None, None, None, -1
+        self._history = self._wanted = None
+        inspector.renew()  # a live stream may have gone on since the inspector was made
+        files = [] if self._library is None else self._library.files()
+        folder = "" if self._library is None else str(self._library.folder)
+        start, length = inspector.window or inspector.first_window()
+        self.state.update({**layout.initial_state(inspector), "files": files, "folder": folder,
+                           "start_ms": self._page_ms(start), "length_ms": round(length * 1e-3, 3)})  # fmt: skip
+        self._count_events()
+        self.request("window", *(["suggestion"] if self.compensates else []))
+        self.released()
+        self.work.request_slow("preparation")
+        if inspector.latest is not None:
+            self.play()
+        if isinstance(inspector.latest, jobs.LiveSource):
+            self.work.start_job(self._watch(inspector.latest))
+
+    def close(self) -> None:
+        """Stop all work of the browser tab."""
+        self.cancel()
+        self.work.close()
+
+    def cancel(self) -> None:
+        """Stop the calibration or the film that is being made."""
+        if self._progress is not None:
+            self._progress.cancelled = True
 
     @property
-    def choices(self) -> list[list[str]]:
-        """Names and titles of what the left cloud can show now."""
-        return [[name, title] for name, title in AGAINST.items() if name == "recorded" or self._knobs(name) is not None]
+    def offered(self) -> dict[str, Callable[..., None]]:
+        """Methods that the page may call, by name."""
+        return {name: getattr(self, name) for name in layout.CALLS}
 
     @property
-    def knobs(self) -> Knobs | None:
-        """Parameters that the left cloud shows; None for the recorded events."""
-        return self._knobs(self._panel.state.against)
+    def compensates(self) -> bool:
+        """Whether the prism rotates, so that there is a motion to compensate."""
+        return math.isfinite(self.inspector.turn_us)
 
-    @property
-    def title(self) -> str:
-        """Title of the left cloud."""
-        return AGAINST["recorded" if self.knobs is None else self._panel.state.against]
+    def request(self, *what: str, change: str = "") -> None:
+        """Request quick updates of the page.
+
+        ``change``: name of a change that lasts, such as a drag; it is undone in one step.
+        """
+        self._change = f"{change} {self._drags}" if change else ""
+        self.work.request(*what)
+
+    def _listen(self) -> None:
+        """Follow the state variables that the page sets, and offer the methods that it calls."""
+
+        def follow(names: tuple[str, ...], call: Callable[..., None], *given: str) -> None:
+            self.state.change(*names)(lambda **_: call(*given))  # trame gives the whole state
+
+        for name in NAMES:
+            follow((name,), self._dragged, name)
+        follow(("polarity", "hide_hot", "noise_filter"), self.request, "window")
+        follow(("colour", "axis", "dark", "orbit_shown"), self.request, "look")
+        follow(("model", "against", "kind", "difference"), self.request, "knobs")
+        follow(("model", "kind", "polarity", "hide_hot", "noise_filter"), self.released)
+        for name, call in self.offered.items():
+            self._server.trigger(name)(call)
+
+    # Buttons, keys, fields and the mouse
+
+    def key(self, key: str) -> None:
+        """Run the action of a key that was pressed outside of a text field."""
+        for known, (name, *given), _ in layout.KEYS:
+            if key == known:
+                getattr(self, name)(*given)
+
+    def released(self) -> None:
+        """Update the slow parts of the page after a change, and end what is undone in one step."""
+        self._drags += 1
+        self.work.request_slow(*SLOW)
+
+    def choose(self, name: str) -> None:
+        """Select the parameter over which the sharpness curve is drawn."""
+        if name in NAMES and name != self.state.knob:
+            self.state.knob = name
+            self.work.request_slow("curve")
+
+    def typed(self, name: str, text: str) -> None:
+        """Set the value that a user typed into a number field."""
+        if name not in (*NAMES, *layout.EDITABLE):
+            return
+        try:
+            value = finite(text)
+        except ValueError:
+            self.work.show_message(f"{text!r} is not a number; give a number such as 1.5", "error")
+            return
+        if name == "turns":
+            name, value = "length_ms", value * float(self.state.turn_ms)
+        self.state[name] = round(value, 4)
+        if name in NAMES:
+            self.state.knob = name
+        self.request("knobs" if name in NAMES else "window")
+        self.released()
+
+    def toggle(self, name: str) -> None:
+        """Invert a state variable that is true or false."""
+        self.state[name] = not self.state[name]
+
+    def toggle_axis(self) -> None:
+        """Switch the third axis between angle and time."""
+        angle, time = Axis.ANGLE.value, Axis.TIME.value
+        self.state.axis = time if self.state.axis == angle else angle
+
+    def look_from(self, view: str) -> None:
+        """Set the view, and reset a camera that the mouse has moved."""
+        if view in list(View):
+            self.state.view = [view, self.state.view[1] + 1]
+
+    def pick(self, k: int) -> None:
+        """Describe a drawn event, and show its orbit; -1 for none."""
+        known = self.shown is not None and 0 <= k < len(self.shown.events)
+        self._picked = int(k) if known else -1
+        self.request("look")
+
+    def open_file(self, name: str) -> None:
+        """Show another recording of the folder."""
+        self.state.open_shown = False
+        self.work.start_job(self._open_file(name))
+
+    async def _open_file(self, name: str) -> None:
+        if self._library is None:
+            return
+        if self.state.calibrating:
+            self.cancel()
+        self.state.playing = False
+        with self.work.errors_shown("file"):
+            inspector = await self.work.in_thread(self._library.open, name)
+            await self.work.until_drawn()
+            self.start(inspector)
+        self.state.flush()
+
+    # Region of the image
+
+    def edge(self, side: int, text: str) -> None:
+        """Set one side of the region (0: left, 1: top, 2: right, 3: bottom) to a typed number [px]."""
+        with contextlib.suppress(ValueError):
+            wanted = [*self.state.region]
+            if side in (0, 1, 2, 3):
+                wanted[int(side)] = round(finite(text))
+                self.draw(*wanted)
+
+    def draw(self, left: float, top: float, right: float, bottom: float) -> None:
+        """Show a region of the image [px] that was drawn or typed."""
+        self._show_region([int(each) for each in (left, top, right, bottom)], "drawn")
+
+    def whole(self) -> None:
+        """Show the whole image."""
+        self._show_region([0, 0, *self.state.size], "whole")
+
+    def suggest(self) -> None:
+        """Show the region in which compensation gains most sharpness."""
+        self.request("suggestion", "window")
+        self.released()
+
+    def _show_region(self, region: list[int], kind: str) -> None:
+        width, height = self.state.size
+        left, right = (min(max(x, 0), width) for x in region[::2])
+        top, bottom = (min(max(y, 0), height) for y in region[1::2])
+        self.state.update({"region_wanted": [left, top, right, bottom], "region_kind": kind})
+        self.request("window")
+        self.released()
+
+    # Time: window, timeline and playback. The page counts all times from the recording's first event.
+
+    def step(self, count: int) -> None:
+        """Move the time window by one turn, forward (1) or back (-1); without a prism, by the window's length."""
+        if count in (-1, 1):
+            turn = self.inspector.turn_us * 1e-3 if self.compensates else float(self.state.length_ms)
+            self._move(float(self.state.start_ms) + count * turn)
+            self.released()
+
+    def move_window(self, start_ms: float) -> None:
+        """Move the time window to a start [ms]; playing stops, except a live stream's."""
+        if not self.state.live:
+            self.state.playing = False
+        self._move(float(start_ms), change="start_ms")
+
+    def resize_window(self, start_ms: float, end_ms: float) -> None:
+        """Set the ends of the time window [ms]."""
+        start, end = max(0.0, float(start_ms)), min(float(end_ms), float(self.state.whole_ms))
+        if end > start:
+            self.state.update({"start_ms": round(start, 3), "length_ms": round(end - start, 3)})
+            self.request("window", change="length_ms")
+
+    def zoom_timeline(self, start_ms: float, end_ms: float) -> None:
+        """Show another part of the time on the timeline [ms]."""
+        start, end = max(0.0, float(start_ms)), min(float(end_ms), float(self.state.whole_ms))
+        if end - start > 1e-2:
+            self.state.rate_span = [start, end]
+            self._show_rates()
+
+    def play(self) -> None:
+        """Play the recording from the current window, or follow a live stream; stop if already playing."""
+        state = self.state
+        state.playing = not state.playing
+        if not state.playing or self.plays:
+            return
+        if self.inspector.latest is None and self._move(float(state.start_ms)):
+            self._move(0.0)  # restart after the end
+        self.plays = True
+        self.work.start_job(self._play())
+
+    async def _play(self) -> None:
+        try:
+            await (self._run() if self.inspector.latest is None else self._follow())
+        finally:
+            self.plays = False
+
+    async def _run(self) -> None:
+        state, loop, elapsed_s = self.state, asyncio.get_running_loop(), PLAY_S
+        while state.playing:
+            start_s = loop.time()
+            with state:
+                if self._move(float(state.start_ms) + 1e3 * elapsed_s * float(state.speed)):
+                    state.playing = bool(state.loop)
+                    self._move(0.0 if state.loop else float(state.start_ms))
+            await self.work.until_drawn()
+            await asyncio.sleep(max(0.0, PLAY_S - (loop.time() - start_s)))
+            elapsed_s = loop.time() - start_s
+        self.released()
+
+    async def _follow(self) -> None:
+        """Show the current events of a live stream, again and again."""
+        await self.work.until_drawn()  # with the suggested region
+        while self.state.playing:
+            with self.state:
+                with self.work.errors_shown("stream"):
+                    self.inspector.renew()
+                self.state.update(layout.source_state(self.inspector))
+                self._count_events()
+                self._move(float(self.state.whole_ms))
+            await self.work.until_drawn()
+            await asyncio.sleep(FOLLOW_S)
+        self.released()
+
+    async def _watch(self, source: jobs.LiveSource) -> None:
+        """Show the figures of a live stream, also while it is not followed, until the page is closed."""
+        while True:
+            with self.state as state:
+                state.update(layout.live_state(source.figures()))
+            await asyncio.sleep(FOLLOW_S)
+
+    def _move(self, start_ms: float, change: str = "") -> bool:
+        """Move the time window to a start [ms], limited to the recording. Return whether the window is at the end."""
+        last = max(0.0, float(self.state.whole_ms) - float(self.state.length_ms))
+        self.state.start_ms = round(min(max(start_ms, 0.0), last), 3)
+        self.request("window", change=change)
+        return start_ms >= last
+
+    def _page_ms(self, time_us: int) -> float:
+        return round((time_us - self.inspector.recording.events.t_first) * 1e-3, 3)
+
+    def _clock_us(self, time_ms: float) -> int:
+        return int(self.inspector.recording.events.t_first) + round(time_ms * 1e3)
+
+    def _count_events(self) -> None:
+        """Count the recording's events in the background, for the timeline."""
+        self._rates = EventRates(self.inspector.recording.events)
+        self.work.start_job(self._fill(self._rates))
+
+    async def _fill(self, rates: EventRates) -> None:
+        finished = False
+        while not finished and rates is self._rates:
+            finished = await self.work.in_thread(rates.fill, STEP_S)
+            with self.state:
+                self._show_rates()
+
+    def _show_rates(self) -> None:
+        start_ms, end_ms = self.state.rate_span
+        curve, share = self._rates.curve(self._clock_us(start_ms), self._clock_us(end_ms), BINS), self._rates.share
+        note = "" if share >= 1.0 else f"counting events: {100.0 * share:.0f} %"
+        on, off = map(clouds.float_bytes, (curve.on, curve.off))
+        self.state.update({"rate_on": on, "rate_off": off, "rate_note": note})
+
+    # Parameters of the prism, and those to compare with
+
+    def take_from_curve(self, value: float) -> None:
+        """Set the parameter of the sharpness curve to a clicked value."""
+        self.state[self.state.knob] = round(float(value), 4)
+        self.request("knobs")
+        self.released()
+
+    def take_truth(self) -> None:
+        """Set the parameters to the known truth of a simulated recording."""
+        with self.work.errors_shown("knobs"):
+            self.inspector.take_truth()
+        self._knobs_taken()
 
     def keep_b(self) -> None:
         """Keep the current parameters as B, and show them on the left."""
-        self.show_b(self._panel.inspector.knobs)
+        self.show_b(self.inspector.knobs)
 
     def swap_b(self) -> None:
         """Exchange the current parameters and B."""
-        panel = self._panel
         if self.b is not None:
-            now, knobs = panel.inspector.knobs, self.b
-            with panel.errors_shown("knobs"):
-                panel.inspector.set(knobs)
+            now = self.inspector.knobs
+            with self.work.errors_shown("knobs"):
+                self.inspector.set(self.b)
                 self.show_b(now)
-            panel.knobs_taken()
-
-    def compare_found(self) -> None:
-        """Show the result of the calibration on the left."""
-        if self._panel.calibration_job.found is not None:
-            self._panel.state.against = "found"
-            self._panel.request("knobs")
+            self._knobs_taken()
 
     def show_b(self, knobs: Knobs | None) -> None:
         """Show parameters on the left as B; None for the recorded events."""
@@ -126,785 +386,284 @@ class Comparison:
             f"{knobs.model}, apex {math.degrees(knobs.apex):.4g}°, phase {math.degrees(knobs.phase):.4g}°"
         )  # fmt: skip
         against = "recorded" if knobs is None else "B"
-        self._panel.state.update({"has_b": knobs is not None, "b_text": text, "against": against})
-        self._panel.request("knobs")
+        self.state.update({"has_b": knobs is not None, "b_text": text, "against": against})
+        self.request("knobs")
 
-    def _knobs(self, name: str) -> Knobs | None:
-        inspector, found = self._panel.inspector, self._panel.calibration_job.found
+    def compare_found(self) -> None:
+        """Show the result of the calibration on the left."""
+        if self.found is not None:
+            self.state.against = "found"
+            self.request("knobs")
+
+    def set_knobs(self) -> None:
+        """Give the inspector the parameters that the page shows, where they differ from the inspector's."""
+        known, shown = layout.knob_values(self.inspector), self.state
+        values = {name: float(shown[name]) * UNITS[name] for name in NAMES if shown[name] != known[name]}
+        self.inspector.set(replace(self.inspector.knobs.with_values(values), model=shown.model))
+
+    def show_knobs(self) -> None:
+        """Show the inspector's parameters on the page."""
+        self.state.update(layout.knob_state(self.inspector))
+
+    def _knobs_taken(self) -> None:
+        """Show parameters that the inspector has taken from elsewhere."""
+        self.show_knobs()
+        self.request("knobs")
+        self.released()
+
+    def _dragged(self, name: str) -> None:
+        """Follow a slider. Values that the server itself has set are ignored."""
+        if self.state[name] != layout.knob_values(self.inspector)[name]:
+            self.state.knob = name
+            self.request("knobs", change=name)
+
+    @property
+    def _against(self) -> Knobs | None:
+        """Parameters that the left cloud and image show; None for the recorded events."""
+        return self._compared(self.state.against)
+
+    def _compared(self, name: str) -> Knobs | None:
+        """Return the parameters of a name in :data:`AGAINST`; None if there are none."""
         if name == "found":
-            return None if found is None else inspector.knobs_of(found)
-        return {"B": self.b, "truth": inspector.truth}.get(name)
+            return None if self.found is None else self.inspector.knobs_of(self.found)
+        return {"B": self.b, "truth": self.inspector.truth}.get(name)
 
+    def _against_choices(self) -> list[list[str]]:
+        """Return names and titles of what the left cloud can show now."""
+        known = layout.AGAINST.items()
+        return [[name, title] for name, title in known if name == "recorded" or self._compared(name) is not None]
 
-# Values of the page's state: what the page may set, its state at the start, and texts.
+    # Calibration
 
-SETTABLE: dict[str, Check] = {
-    **dict.fromkeys(NAMES, number()), "point_size": number(1.0, 20.0), "opacity": number(0.0, 1.0),
-    "speed": one_of(*SPEEDS), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
-    "colour": one_of(*(each.value for each in Colour)), "axis": one_of(*(each.value for each in Axis)),
-    "kind": one_of(*(each.value for each in ImageKind)), "against": one_of(*AGAINST), "scope": one_of(*SCOPES),
-    "message": one_of(""),
-    **dict.fromkeys(("hide_hot", "noise_filter", "dark", "overlaid", "orbit_shown", "help_shown", "open_shown", "loop",
-                     "difference"),
-                    flag),
-}  # fmt: skip
-"""State variables that the page may set directly, with the check of their values. The page changes all others through
-calls."""
-CLIENT_ONLY = ("hover", "hover_region", "measured", "tool")
-"""State variables that the browser keeps to itself."""
-NO_SCALE = {"bar": "", "ticks": [], "title": ""}
-"""Scale of an image before the first update."""
+    def calibrate(self) -> None:
+        """Start a calibration, or cancel the running one."""
+        if not self.state.busy:
+            self.found = None
+            self.state.update({"busy": "calibrating", "calibrating": True, "progress": 0, "found": "", "surface": None})
+            self._progress = JobProgress(self._show_progress)
+            self.work.start_job(self._calibrate(self._progress))
+        elif self.state.calibrating:
+            self.cancel()
+            self.state.busy = "calibrating: cancelling"
 
+    async def _calibrate(self, progress: JobProgress) -> None:
+        """Calibrate in a thread, and show the result with a map of sharpness about it."""
+        inspector, state = self.inspector, self.state
+        try:
+            find = partial(jobs.find_calibration, whole=state.scope != layout.SCOPES[0])
+            found = await self._guarded_in_thread(find, inspector, progress)
+            if isinstance(found, str):
+                text, severity = ("calibration cancelled", "info") if progress.cancelled else (found, "error")
+                self.work.show_message(text, severity)
+                return
+            self.found = found.calibration
+            with state:
+                state.update({"found": layout.found_text(found), "against_choices": self._against_choices()})
+            surface = await self._guarded_in_thread(jobs.cost_surface, inspector, progress)
+            if not isinstance(surface, str) and self.inspector is inspector:
+                with state:
+                    state.surface = layout.surface_state(surface, inspector, self.found)
+        finally:
+            with state:
+                state.update({"busy": "", "calibrating": False})
 
-def initial_state(inspector: Inspector) -> dict[str, Any]:
-    """Return the page's state at the start, without the events' window and the prism's parameters."""
-    recording = inspector.recording
-    return {
-        **source_state(inspector), **NO_ORBIT, "trame__title": f"amiwarp: {recording.name}",
-        "trame_error_report_msg": "", "name": recording.name,
-        "size": list(recording.events.size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
-        "notes": notes(inspector), "has_encoder": inspector.has_encoder, "models": list(MODELS),
-        "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "truths": truths(inspector),
-        "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth), **export_state(),
-        "open_shown": False, "playing": False, "speed": 0.1, "speeds": list(SPEEDS), "loop": False, "polarity": "both",
-        "hide_hot": False, "noise_filter": False, "noise_ms": 2.0, "region_kind": "whole",
-        "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
-        "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
-        "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
-        "views": [list(each) for each in VIEWS], "tool": "region", "tools": [list(each) for each in TOOLS],
-        "hover": "", "hover_region": "", "measured": "", "orbit_shown": True, "help_shown": False,
-        "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
-        "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
-        "rate_on": b"", "rate_off": b"", "rate_note": "",
-        "picked_text": "",
-        "overview": "", "before": "", "after": "", "kind": ImageKind.COUNT.value,
-        "kinds": [each.value for each in ImageKind], "image_note": "", "image_slow": False, "image_scale": NO_SCALE,
-        "after_scale": NO_SCALE, "difference": False, "against_title": "",
-        "against_choices": [], "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
-        "curve_mark": 0.0, "against": "recorded", "has_b": False, "b_text": "", "busy": "", "calibrating": False,
-        "progress": 0, "found": "", "surface": None, "scope": SCOPES[0], "scopes": list(SCOPES), "calibrate_on": "",
-    }  # fmt: skip
+    async def _guarded_in_thread(self, call: Callable[..., Any], inspector: Inspector, progress: Progress) -> Any:
+        """Return the result of a call with progress, or the text of its error."""
+        async with self.work.device_lock:
+            return await self.work.in_thread(_guarded, call, weakref.ref(inspector), progress)
 
+    def _show_progress(self, what: str, share: float) -> None:
+        """Show the current step of a calibration or a film, and the finished share, 0 to 1."""
+        with self.state:
+            self.state.update({"busy": what, "progress": round(100 * min(share, 1.0))})
 
-def source_state(inspector: Inspector) -> dict[str, Any]:
-    """Return the state variables that depend on the events; they change in a live stream."""
-    source = inspector.recording.events
-    whole_ms = (source.t_last - source.t_first + 1) * 1e-3
-    return {"whole_ms": whole_ms, "rate_span": [0.0, whole_ms]}
+    def accept(self) -> None:
+        """Set the prism's parameters to the result of the calibration."""
+        if self.found is not None:
+            with self.work.errors_shown("knobs"):
+                self.inspector.accept(self.found)
+            self.discard()
+            self._knobs_taken()
 
+    def discard(self) -> None:
+        """Forget the result of the calibration."""
+        self.found = None
+        self.state.update({"found": "", "surface": None})
+        if self.state.against == "found":
+            self.show_b(self.b)
 
-def truths(inspector: Inspector) -> dict[str, float | None]:
-    """Return the known true parameters in the page's units; None for an unknown one."""
-    known = inspector.truth
-    return {n: None if known is None else round(getattr(known, n) / scale, 4) for n, scale in UNITS.items()}
+    # Downloads
 
+    def export(self, what: str) -> None:
+        """Give the browser a file; ``what`` is a name in :data:`amiwarp.viewer.exports.EXPORTS`."""
+        s = self.state
+        if what == "picture":
+            words = [s.name, s.events, f"sharpness {s.sharpness}"]
+            self._server.js_call("page", "picture", exports.download_name(self.inspector.recording.name, what), words)
+        elif what in exports.EXPORTS and not (what in exports.FILMS and s.busy):
+            self.work.start_job(self._film(what) if what in exports.FILMS else self._write(what))
 
-def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:
-    """Return the sharpness of the images as text, with the gain if there are two images."""
-    before, after = shown.sharpness_before, shown.sharpness_after
-    if not compensated:
-        return f"{before:.3f}"
-    gain = f" (×{after / before:.2f})" if before > 1e-3 and after > 0.0 else ""
-    return f"{before:.3f} → {after:.3f}{gain}"
+    async def _write(self, what: str) -> None:
+        inspector, kind, against = self.inspector, ImageKind(self.state.kind), self._against
 
+        def write_image(path: Path) -> None:
+            exports.write_image(images.make_images(inspector, kind, against=against), path)
 
-def events_text(shown: DisplayedWindow) -> str:
-    """Return the numbers of events of the window, of those that were read, in the selection and drawn."""
-    total, read, drawn = shown.span.count, len(shown.span.events), len(shown.events)
-    thinned = "" if read == total else f", {read:,} of them read"
-    selected = "" if shown.selected == read else f", {shown.selected:,} selected"
-    return f"{total:,} events{thinned}{selected}, {'all' if drawn == shown.selected else f'{drawn:,}'} drawn"
+        write: dict[str, Callable[[Path], object]] = {
+            "image": write_image, "values": write_image,
+            "events": partial(exports.write_events, inspector, compensated=False),
+            "compensated": partial(exports.write_events, inspector, compensated=True),
+            "calibration": lambda path: inspector.as_calibration().save(path),
+        }  # fmt: skip
+        async with self.work.device_lock, self.work.buffers_lock:
+            await self._download(what, write[what])
 
+    async def _film(self, what: str) -> None:
+        s, inspector = self.state, Inspector(self.inspector.recording, device=self.inspector.device)
+        inspector.set(self.inspector.knobs)
+        inspector.window, inspector.selection = self.inspector.window, self.inspector.selection
+        look = clouds.Look(Colour(s.colour), Axis(s.axis), float(s.point_size), float(s.opacity), dark=bool(s.dark),
+                           overlaid=bool(s.overlaid)).for_clouds([title for _, title in s.titles])  # fmt: skip
+        self._progress = progress = JobProgress(self._show_progress)
+        film = partial(
+            exports.write_film, inspector=inspector, look=look, view=View(s.view[0]), progress=progress, what=what,
+            against=self._against, with_orbit=self._orbit_drawn, speed=float(s.speed),
+        )  # fmt: skip
+        with s:
+            s.update({"busy": f"making the {exports.EXPORTS[what][0]}", "progress": 0})
+        try:
+            with contextlib.suppress(JobCancelled):
+                async with self.work.device_lock:
+                    await self._download(what, film)
+        finally:
+            with s:
+                s.busy = ""
 
-def notes(inspector: Inspector) -> list[str]:
-    """Return what the recording lacks or what is only assumed, for the place where it matters."""
-    texts = {
-        Source.ASSUMED: "phase assumed, not known: calibrate, or set it",
-        Source.ESTIMATED: "phase estimated from the events: calibrate for an accurate one",
-    }
-    phase = texts.get(inspector.sources["phase"], "") if math.isfinite(inspector.turn_us) else ""
-    missing = [note for note in inspector.notes if not (note == NO_ENCODER and inspector.knobs.rpm)]
-    return [*missing, *filter(None, [phase])]
+    async def _download(self, what: str, write: Callable[[Path], object]) -> None:
+        """Write a file in a thread, and give it to the browser."""
+        name, (_, suffix, kind) = exports.download_name(self.inspector.recording.name, what), exports.EXPORTS[what]
+        with self.work.errors_shown("export"):
+            content = await self.work.in_thread(exports.as_bytes, suffix, write)
+            self._server.js_call("page", "download", name, content, kind)
+            size = f"{len(content) / 1e3:,.0f} kB"
+            self.work.show_message(f"{name}: {size}, in the browser's downloads", "success")
+        self.state.flush()
 
-
-# History of a page: undo, redo, reset, and the state in the page's address.
-
-
-class PageHistory:
-    """States that a page has shown."""
-
-    def __init__(self, panel: Panel) -> None:
-        self._panel = panel
-        self._history: History | None = None
-        self._default: ViewState | None = None
-        self._wanted: ViewState | str | None = None
-
-    def forget(self) -> None:
-        """Forget all states, because the page shows another recording."""
-        self._history = self._default = self._wanted = None
-
-    def remember(self, change: str) -> None:
-        """Add what the page shows now to the history. Equal ``change`` of successive states make one step."""
-        state = self._current()
-        if self._history is None:
-            self._history, self._default = History(state), state
-        self._history.add(state, change)
-        self._show()
+    # Undo, redo, reset, and the state in the page's address
 
     def undo(self) -> None:
         """Go back by one step."""
-        if self._history is not None:
-            self._want(self._history.undo())
+        self._travel(History.undo)
 
     def redo(self) -> None:
         """Go forward by one step that was undone."""
-        if self._history is not None:
-            self._want(self._history.redo())
+        self._travel(History.redo)
 
     def reset(self) -> None:
         """Show the first state again."""
-        if self._history is not None and self._default is not None:
-            self._history.add(self._default)
-            self._want(self._default)
+        self._travel(History.reset)
 
     def restore(self, address: str) -> None:
         """Show the state that an address describes."""
-        self._want(address)
+        self._wanted = address
+        self.request("state")
+        self.released()
 
-    async def apply(self) -> None:
-        """Show the requested state. Raises :class:`AmiwarpError` if it selects no events."""
-        panel, wanted = self._panel, self._wanted
-        self._wanted = None
-        if wanted is None or self._default is None:
-            return
-        source = panel.inspector.recording.events
-        if isinstance(wanted, str):
-            duration_us = source.t_last - source.t_first + 1
-            wanted, wrong = decode_state(wanted, self._default, size=source.size, duration_us=duration_us)
-            if wrong:
-                panel.show_message("; ".join(wrong), "error")
-        await panel.in_thread(apply_state, panel.inspector, wanted)
-        self._take(wanted)
+    def _travel(self, step: Callable[[History], ViewState]) -> None:
+        if self._history is not None:
+            self._wanted = step(self._history)
+            self.request("state")
+            self.released()
 
-    def _want(self, state: ViewState | str) -> None:
-        self._wanted = state
-        self._panel.request("state")
-        self._panel.slider_released()
-
-    def _current(self) -> ViewState:
-        """Return the state that the page shows."""
-        s, panel = self._panel.state, self._panel
-        return replace(
-            current_state(panel.inspector), against=panel.comparison.knobs, image=ImageKind(s.kind), axis=Axis(s.axis),
+    def remember(self, change: str) -> None:
+        """Add what the page shows now to the history. Equal ``change`` of successive states make one step."""
+        s = self.state
+        now = replace(
+            current_state(self.inspector), against=self._against, image=ImageKind(s.kind), axis=Axis(s.axis),
             colour=Colour(s.colour), view=View(s.view[0]), overlaid=bool(s.overlaid),
         )  # fmt: skip
+        self._history = history = self._history or History(now)
+        history.add(now, change)
+        address = encode_state(history.state, history.first)
+        s.update({"can_undo": history.can_undo, "can_redo": history.can_redo, "address": address})
 
-    def _take(self, state: ViewState) -> None:
-        """Set the page's state variables to a state."""
-        s, selection = self._panel.state, state.selection
-        width, height = s.size
-        region = selection.region or (0, 0, width, height)
-        kind = s.region_kind if list(region) == s.region_wanted else "whole" if selection.region is None else "drawn"
+    async def _apply_wanted(self) -> None:
+        """Show the requested state. Raises :class:`AmiwarpError` if it selects no events."""
+        wanted, self._wanted = self._wanted, None
+        if wanted is None or self._history is None:
+            return
+        if isinstance(wanted, str):
+            source = self.inspector.recording.events
+            duration_us = source.t_last - source.t_first + 1
+            wanted, wrong = decode_state(wanted, self._history.first, size=source.size, duration_us=duration_us)
+            if wrong:
+                self.work.show_message("; ".join(wrong), "error")
+        await self.work.in_thread(apply_state, self.inspector, wanted)
+        s, selection = self.state, wanted.selection
+        region = list(selection.region or (0, 0, *s.size))
+        kind = s.region_kind if region == s.region_wanted else "whole" if selection.region is None else "drawn"
         s.update({
-            "start_ms": round(state.start_us * 1e-3, 3), "length_ms": round(state.length_us * 1e-3, 3),
+            "start_ms": round(wanted.start_us * 1e-3, 3), "length_ms": round(wanted.length_us * 1e-3, 3),
             "polarity": {None: "both", 1: "ON", 0: "OFF"}[selection.polarity], "hide_hot": selection.hide_hot,
-            "noise_filter": selection.noise_us is not None, "region_wanted": list(region), "region_kind": kind,
-            "kind": state.image.value, "colour": state.colour.value, "axis": state.axis.value,
-            "view": [state.view.value, s.view[1] + int(state.view.value != s.view[0])], "overlaid": state.overlaid,
+            "noise_filter": selection.noise_us is not None, "region_wanted": region, "region_kind": kind,
+            "kind": wanted.image.value, "colour": wanted.colour.value, "axis": wanted.axis.value,
+            "view": [wanted.view.value, s.view[1] + int(wanted.view.value != s.view[0])], "overlaid": wanted.overlaid,
         })  # fmt: skip
         if selection.noise_us is not None:
             s.noise_ms = selection.noise_us * 1e-3
-        if state.against != self._panel.comparison.knobs:
-            self._panel.comparison.show_b(state.against)
-        self._panel.show_knobs()
+        if wanted.against != self._against:
+            self.show_b(wanted.against)
+        self.show_knobs()
 
-    def _show(self) -> None:
-        assert self._history is not None
-        assert self._default is not None
-        history = self._history
-        address = encode_state(history.state, self._default)
-        self._panel.state.update({"can_undo": history.can_undo, "can_redo": history.can_redo, "address": address})
-
-
-# Event rates on a page's timeline: counted in the background, and shown for the part of the time that is visible.
-
-BINS = 400
-"""Number of points of the drawn rates."""
-STEP_S = 0.2
-"""Duration of counting after which the timeline shows what is counted [s]."""
-
-
-class RateView:
-    """Rates of ON and OFF events of a page's recording."""
-
-    def __init__(self, panel: Panel) -> None:
-        self._panel = panel
-        self._rates: EventRates | None = None
-
-    def start(self) -> None:
-        """Count the events of the page's recording."""
-        self._rates = rates = EventRates(self._panel.inspector.recording.events)
-        self._panel.start_job(self._fill(rates))
-
-    def zoom(self, start_ms: float, end_ms: float) -> None:
-        """Show the rates between two times [ms]."""
-        whole = float(self._panel.state.whole_ms)
-        start, end = max(0.0, start_ms), min(end_ms, whole)
-        if end - start > 1e-2:
-            self._panel.state.rate_span = [start, end]
-            self.show()
-
-    def show(self) -> None:
-        """Show the rates of the visible time."""
-        if self._rates is None:
-            return
-        zero_us, (start, end) = self._panel.zero_us, self._panel.state.rate_span
-        curve = self._rates.curve(zero_us + round(start * 1e3), zero_us + round(end * 1e3), BINS)
-        share = self._rates.share
-        note = "" if share >= 1.0 else f"counting events: {100.0 * share:.0f} %"
-        self._panel.state.update({"rate_on": _bytes(curve.on), "rate_off": _bytes(curve.off), "rate_note": note})
-
-    async def _fill(self, rates: EventRates) -> None:
-        finished = False
-        while not finished and rates is self._rates:
-            finished = await self._panel.in_thread(rates.fill, STEP_S)
-            with self._panel.state:
-                self.show()
-
-
-def _bytes(values: NDArray[np.float64]) -> bytes:
-    return values.astype(np.float32).tobytes()
-
-
-# Updates of a page: windows, parameters and looks are computed in threads, and their results sent to the browser.
-
-
-class Updates:
-    """Makes the updates of one page."""
-
-    def __init__(self, panel: Panel) -> None:
-        self._panel, self._state = panel, panel.state
-        self.shown: DisplayedWindow | None = None
-        """Window as the page shows it; None before the first update."""
-        self._picked = -1
-
-    def first(self) -> None:
-        """Forget what another recording has left, and show what there is before the first update."""
-        self.shown, self._picked = None, -1
-        nothing = np.zeros((0, 2), np.float32).tobytes()
-        names = ("cloud_before", "cloud_after", "cloud_third", "colours_before", "colours_after")
-        self._state.update({**dict.fromkeys(names, nothing), "region": [0, 0, *self._state.size], "titles": [],
-                            "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
-                            "third_axis": {"low": 0.0, "high": 1.0, "title": ""}})  # fmt: skip
-        self._show_prism()
+    # Updates of what the page shows
 
     async def make(self, todo: set[str]) -> None:
         """Make quick updates: "suggestion", "window", "knobs", "look" and "state"."""
-        panel, state = self._panel, self._state
+        state = self.state
         if todo & {"window", "suggestion"}:
-            with panel.errors_shown("window"):
+            with self.work.errors_shown("window"):
                 try:
                     await self._open(suggest="suggestion" in todo)
                 except AmiwarpError:
                     self._return_to_open_window()
                     raise
-        with panel.errors_shown("knobs"):
+        with self.work.errors_shown("knobs"):
             if "knobs" in todo:
-                panel.set_knobs()
+                self.set_knobs()
             if self.shown is None:
-                panel.history.remember("")
+                self.remember("")
             if "state" in todo:
-                await panel.history.apply()
-            panel.show_knobs()  # not after the computation: a value that is typed meanwhile would be lost
-            shown, values = await panel.in_thread(self._compute)
-            self.shown = shown
-            state.update(values)
-            state.curve_mark = float(state[state.knob])
-            self._show_prism()
+                await self._apply_wanted()
+            self.show_knobs()  # not after the computation: a value that is typed meanwhile would be lost
+            self.shown, values = await self.work.in_thread(self._compute)
+            state.update({**values, **layout.prism_state(self.inspector), "curve_mark": float(state[state.knob])})
             if not state.playing:
-                panel.history.remember("" if todo & {"suggestion", "state"} else panel.change)
+                self.remember("" if todo & {"suggestion", "state"} else self._change)
 
     async def make_slow(self, name: str) -> None:
         """Make a slow update: "curve", "picture", or "preparation" of the first picture."""
         if name == "preparation":
-            await self._panel.in_thread(prepare, self._panel.inspector)
+            await self.work.in_thread(images.prepare, self.inspector)
         else:
             await (self._curve() if name == "curve" else self._picture())
 
-    def pick(self, k: int) -> None:
-        """Describe a drawn event, and show its orbit; -1 for none."""
-        known = self.shown is not None and 0 <= k < len(self.shown.events)
-        self._picked = k if known else -1
-        self._panel.request("look")
-
     async def _open(self, *, suggest: bool) -> None:
         """Read the window and the selection that the page shows."""
-        panel, s = self._panel, self._state
+        s, inspector, in_thread = self.state, self.inspector, self.work.in_thread
         start, length = float(s.start_ms), min(float(s.length_ms), float(s.whole_ms))
         if not length > 0.0:
             raise AmiwarpError(f"a window of {length:g} ms; give a length above 0")
-        start_us, length_us = panel.zero_us + round(start * 1e3), max(1, round(length * 1e3))
-        await panel.in_thread(panel.inspector.open, start_us, length_us, panel.selection())
+        start_us, length_us = self._clock_us(start), max(1, round(length * 1e3))
+        await in_thread(inspector.open, start_us, length_us, self._selection())
         if suggest:
-            if await panel.in_thread(estimate_phase, panel.inspector):
-                panel.show_knobs()
-            region = (await panel.in_thread(panel.inspector.suggest_region)).region
+            if await in_thread(jobs.estimate_phase, inspector):
+                self.show_knobs()
+            region = (await in_thread(inspector.suggest_region)).region
             s.update({"region_wanted": list(region), "region_kind": "suggested"})
-            await panel.in_thread(panel.inspector.open, start_us, length_us, panel.selection())
+            await in_thread(inspector.open, start_us, length_us, self._selection())
         self._picked = -1
 
-    def _return_to_open_window(self) -> None:
-        """Show time and region of the window that is still shown. Playback goes on through a time without events."""
-        inspector, s = self._panel.inspector, self._state
-        if inspector.window is not None and not s.playing:
-            start_us, length_us = inspector.window
-            s.start_ms, s.length_ms = round((start_us - self._panel.zero_us) * 1e-3, 3), round(length_us * 1e-3, 3)
-            s.region_wanted = list(inspector.loaded.region)
-
-    def _compute(self) -> tuple[DisplayedWindow, dict[str, Any]]:
-        """Return what is to be shown, and the state variables that show it."""
-        panel, s, inspector = self._panel, self._state, self._panel.inspector
-        new = self.shown is None
-        shown = inspector.show(against=panel.comparison.knobs)
-        values = cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
-        values |= self._images(shown) | self._orbit(shown)
-        if new or shown.span is not self.shown.span:  # type: ignore[union-attr]
-            values["overview"] = whole_image(shown.span.events, inspector.recording.events.size)
-        compensated = panel.compensates
-        left = panel.comparison.title
-        pair = [[0, left], [1, "compensated" if s.against == "recorded" else "compensated with A"]]
-        text = "" if self._picked < 0 else event_text(shown, self._picked)
-        return shown, {
-            **values, "titles": pair if compensated else [[0, RECORDED]], "events": events_text(shown),
-            "sharpness": sharpness_text(shown, compensated=compensated), "picked": self._picked, "picked_text": text,
-            "against_title": left, "against_choices": panel.comparison.choices,
-        }  # fmt: skip
-
-    def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
-        """Return the state variables of the images of the region; of slow kinds, only that they are."""
-        s, kind = self._state, ImageKind(self._state.kind)
-        if kind is ImageKind.LOG_INTENSITY:
-            return {"image_slow": True}
-        images = count_images(shown) if kind is ImageKind.COUNT else self._make_images()
-        return {"image_slow": False, **self._image_values(images)} | (
-            difference_state(images.before, images.after)
-            if s.difference and kind is ImageKind.COUNT and images.before is not None
-            else {}
-        )
-
-    def _make_images(self) -> ShownImages:
-        panel = self._panel
-        return make_images(panel.inspector, ImageKind(self._state.kind), against=panel.comparison.knobs)
-
-    def _image_values(self, images: ShownImages) -> dict[str, Any]:
-        scale = scale_state(images.scale)
-        before, after = (
-            "" if image is None else jpeg(images.scale.rgb(image)) for image in (images.before, images.after)
-        )
-        return {"before": before, "after": after, "image_scale": scale, "after_scale": scale, "image_note": images.note}
-
-    def _orbit(self, shown: DisplayedWindow) -> dict[str, Any]:
-        """Return the orbit of the scene point of the picked event, or of the middle of the region."""
-        s, inspector = self._state, self._panel.inspector
-        if not (s.orbit_shown and s.axis == Axis.ANGLE.value and self._panel.compensates):
-            return NO_ORBIT
-        orbit, column = map(float_bytes, orbit_lines(inspector, shown, self._picked))
-        recorded = self._panel.comparison.knobs is None  # otherwise, both clouds are compensated
-        return {"orbit": orbit if recorded else column, "column": column, "has_orbit": True}
-
-    def _show_prism(self) -> None:
-        """Show what depends on the rotation of the prism."""
-        turn, compensates = self._panel.inspector.turn_us, self._panel.compensates
-        self._state.update({"turn_ms": turn * 1e-3 if compensates else 0.0, "has_model": compensates,
-                            "step_name": "turn" if compensates else "window"})  # fmt: skip
-
-    async def _curve(self) -> None:
-        panel, s, name = self._panel, self._state, self._state.knob
-        s.calibrate_on = await panel.in_thread(scope_text, panel.inspector)
-        if not panel.compensates:
-            return
-        values, scores = await panel.in_thread(panel.inspector.curve, name)
-        label, title = panel.knob_title()
-        x = (values / UNITS[name]).tolist()
-        if not x:
-            return
-        best = int(np.argmax(scores))
-        peak = f"{'at the edge ' if best in (0, len(x) - 1) else ''}{x[best]:.4g}"
-        s.curve = {"name": label, "title": title, "text": f"peak {peak}, now {s[name]:.4g}", "x": x,
-                   "y": scores.tolist(), "truth": truths(panel.inspector)[name]}  # fmt: skip
-        s.curve_mark = float(s[name])
-
-    async def _picture(self) -> None:
-        """Make images of a slow kind."""
-        s = self._state
-        if s.kind != ImageKind.LOG_INTENSITY.value or self.shown is None:
-            return
-        try:
-            s.update(await self._panel.in_thread(lambda: self._image_values(self._make_images())))
-        except AmiwarpError as error:
-            s.update({"before": "", "after": "", "image_note": str(error)})
-
-
-# Functions that the page calls: what buttons, keys, fields and the mouse do.
-
-EDITABLE = ("start_ms", "length_ms", "turns", "noise_ms")
-"""State variables with a number field, next to the prism's parameters."""
-
-
-class PageCalls:
-    """Functions that one page calls. The server checks their arguments by their annotations."""
-
-    def __init__(self, panel: Panel) -> None:
-        self._panel, self._state = panel, panel.state
-
-    @property
-    def offered(self) -> dict[str, Callable[..., None]]:
-        """Functions that the page may call, by name."""
-        comparison, history = self._panel.comparison, self._panel.history
-        own = (
-            self.key, self.released, self.choose, self.typed, self.edge, self.draw, self.whole, self.suggest,
-            self.look_from, self.step, self.move_window, self.resize_window, self.take_from_curve, self.pick, self.play,
-            self.calibrate, self.accept, self.discard, self.take_truth, self.zoom_timeline, self.undo, self.redo,
-            self.reset, self.keep_b, self.export, self.open_file,
-        )  # fmt: skip
-        return {call.__name__: call for call in (*own, comparison.swap_b, comparison.compare_found, history.restore)}
-
-    def key(self, key: str) -> None:
-        """Run the action of a key that was pressed outside of a text field."""
-        for known, (name, *given), _ in KEYS:
-            if key == known:
-                getattr(self, name)(*given)
-
-    def released(self) -> None:
-        """Update the slow parts of the page after a slider or the timeline was released."""
-        self._panel.slider_released()
-
-    def choose(self, name: str) -> None:
-        """Select the parameter over which the sharpness curve is drawn."""
-        if name in NAMES and name != self._state.knob:
-            self._state.knob = name
-            self._panel.request_slow("curve")
-
-    def typed(self, name: str, text: str) -> None:
-        """Set the value that a user typed into a number field."""
-        if name not in (*NAMES, *EDITABLE):
-            return
-        try:
-            value = finite(text)
-        except ValueError:
-            self._panel.show_message(f"{text!r} is not a number; give a number such as 1.5", "error")
-            return
-        if name == "turns":
-            name, value = "length_ms", value * float(self._state.turn_ms)
-        self._state[name] = round(value, 4)
-        if name in NAMES:
-            self._state.knob = name
-            self._panel.request("knobs")
-        else:
-            self._panel.request("window")
-        self._panel.slider_released()
-
-    def edge(self, side: int, text: str) -> None:
-        """Set one side of the region (0: left, 1: top, 2: right, 3: bottom) to a typed number [px]."""
-        with contextlib.suppress(ValueError):
-            wanted = [*self._state.region]
-            if side in (0, 1, 2, 3):
-                wanted[int(side)] = round(finite(text))
-                self.draw(*wanted)
-
-    def draw(self, left: float, top: float, right: float, bottom: float) -> None:
-        """Show a region of the image [px] that was drawn or typed."""
-        self._panel.show_region([int(each) for each in (left, top, right, bottom)], "drawn")
-
-    def whole(self) -> None:
-        """Show the whole image."""
-        self._panel.show_region([0, 0, *self._state.size], "whole")
-
-    def suggest(self) -> None:
-        """Show the region in which compensation gains most sharpness."""
-        self._panel.request("suggestion", "window")
-        self._panel.slider_released()
-
-    def toggle(self, name: str) -> None:
-        """Invert a state variable that is true or false."""
-        self._state[name] = not self._state[name]
-
-    def toggle_axis(self) -> None:
-        """Switch the third axis between angle and time."""
-        angle, time = Axis.ANGLE.value, Axis.TIME.value
-        self._state.axis = time if self._state.axis == angle else angle
-
-    def look_from(self, view: str) -> None:
-        """Set the view, and reset a camera that the mouse has moved."""
-        if view in list(View):
-            self._state.view = [view, self._state.view[1] + 1]
-
-    def step(self, count: int) -> None:
-        """Move the time window by one turn, forward (1) or back (-1); without a prism, by the window's length."""
-        if count in (-1, 1):
-            turn = self._panel.inspector.turn_us * 1e-3 if self._panel.compensates else float(self._state.length_ms)
-            self._panel.move(float(self._state.start_ms) + count * turn)
-            self._panel.slider_released()
-
-    def move_window(self, start_ms: float) -> None:
-        """Move the time window to a start [ms]; playing stops, except a live stream's."""
-        if not self._state.live:
-            self._state.playing = False
-        self._panel.move(float(start_ms), change="start_ms")
-
-    def resize_window(self, start_ms: float, end_ms: float) -> None:
-        """Set the ends of the time window [ms]."""
-        start, end = max(0.0, float(start_ms)), min(float(end_ms), float(self._state.whole_ms))
-        if end > start:
-            self._state.update({"start_ms": round(start, 3), "length_ms": round(end - start, 3)})
-            self._panel.request("window", change="length_ms")
-
-    def take_from_curve(self, value: float) -> None:
-        """Set the parameter of the sharpness curve to a clicked value."""
-        self._state[self._state.knob] = round(float(value), 4)
-        self._panel.request("knobs")
-        self._panel.slider_released()
-
-    def pick(self, k: int) -> None:
-        """Describe a drawn event; -1 for none."""
-        self._panel.updates.pick(int(k))
-
-    def play(self) -> None:
-        self._panel.playback.toggle()
-
-    def calibrate(self) -> None:
-        self._panel.calibration_job.toggle()
-
-    def accept(self) -> None:
-        """Set the prism's parameters to the result of the calibration."""
-        if self._panel.calibration_job.found is not None:
-            with self._panel.errors_shown("knobs"):
-                self._panel.inspector.accept(self._panel.calibration_job.found)
-            self.discard()
-            self._panel.knobs_taken()
-
-    def discard(self) -> None:
-        """Forget the result of the calibration."""
-        self._panel.calibration_job.found = None
-        self._state.update({"found": "", "surface": None})
-        if self._state.against == "found":
-            self._panel.comparison.show_b(self._panel.comparison.b)
-
-    def undo(self) -> None:
-        self._panel.history.undo()
-
-    def redo(self) -> None:
-        self._panel.history.redo()
-
-    def reset(self) -> None:
-        self._panel.history.reset()
-
-    def keep_b(self) -> None:
-        self._panel.comparison.keep_b()
-
-    def zoom_timeline(self, start_ms: float, end_ms: float) -> None:
-        """Show another part of the time on the timeline [ms]."""
-        self._panel.rates.zoom(float(start_ms), float(end_ms))
-
-    def export(self, what: str) -> None:
-        """Give the browser a file."""
-        self._panel.exports.export(what)
-
-    def open_file(self, name: str) -> None:
-        """Show another recording of the folder."""
-        self._state.open_shown = False
-        self._panel.start_job(self._panel.open_file(name))
-
-    def take_truth(self) -> None:
-        """Set the parameters to the known truth of a simulated recording."""
-        with self._panel.errors_shown("knobs"):
-            self._panel.inspector.take_truth()
-        self._panel.knobs_taken()
-
-
-# Page of the inspector: passes input from the browser to the inspector, and the inspector's results to the browser.
-#
-# Each browser tab has one panel with its own inspector and state. Slow work runs in threads. If a slider moves several
-# times meanwhile, only its last position is used. What waits for an update is marked on the page.
-
-_CUDA_LOCK = asyncio.Lock()
-"""Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""
-QUICK = {**dict.fromkeys(("window", "suggestion", "state", "knobs"), ("clouds", "images")), "look": ("clouds",)}
-SLOW = ("curve", "picture")
-"""Updates that are made at once, with the parts of the page that wait for them, and updates that take longer."""
-
-
-class Panel:
-    """Panel that connects the page of one browser tab with its inspector. Call :meth:`close` when the tab is closed."""
-
-    def __init__(self, server: Any, inspector: Inspector, library: Library | None = None) -> None:
-        """Build the page on a new trame server. ``library``: other recordings that the page may open."""
-        self.server, self.state, self.inspector, self.library = server, server.state, inspector, library
-        self.buffers_lock = asyncio.Lock()
-        """Lock of the inspector's buffers on the device, which only one thread may use at a time."""
-        self.device_lock: Any = _CUDA_LOCK if "cuda" in str(inspector.device) else contextlib.nullcontext()
-        self.calibration_job, self.playback, self.updates = CalibrationJob(self), Playback(self), Updates(self)
-        self.calls = PageCalls(self)
-        self.comparison, self.history, self.rates = Comparison(self), PageHistory(self), RateView(self)
-        self.exports = Exports(self)
-        self.change = ""
-        """What the user changes; successive changes of one name are undone together."""
-        self._drags = 0
-        self._quick_requests: set[str] = set()
-        self._slow_requests: set[str] = set()
-        self._doing: set[str] = set()
-        self._quick: asyncio.Task[None] | None = None
-        self._slow: asyncio.Task[None] | None = None
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._error_source = ""
-        self._threads = ThreadPoolExecutor(3, "amiwarp-tab")  # calibration or film; curve or picture; quick updates
-        use_page(server, template())
-        self.state.client_only(*CLIENT_ONLY)
-        self._listen()
-        self.start(inspector)
-
-    def start(self, inspector: Inspector) -> None:
-        """Show an inspector from its first state."""
-        self.inspector, state = inspector, self.state
-        inspector.renew()  # a live stream may have gone on since the inspector was made
-        files = [] if self.library is None else self.library.files()
-        folder = "" if self.library is None else str(self.library.folder)
-        state.update({**initial_state(inspector), "files": files, "folder": folder})
-        start, length = inspector.window or inspector.first_window()
-        state.update({"start_ms": round((start - self.zero_us) * 1e-3, 3), "length_ms": round(length * 1e-3, 3),
-                      "region_wanted": [0, 0, *inspector.recording.events.size], "knob": "apex"})  # fmt: skip
-        self.show_knobs()
-        self.updates.first()
-        self.history.forget()
-        self.comparison.b = None
-        self.rates.start()
-        self.request("window", *(["suggestion"] if self.compensates else []))
-        self.slider_released()
-        self.request_slow("preparation")
-        if inspector.latest is not None:
-            self.playback.toggle()
-        if isinstance(inspector.latest, LiveSource):
-            self.start_job(self.playback.watch(inspector.latest))
-
-    async def open_file(self, name: str) -> None:
-        """Show another recording of the library."""
-        if self.library is None:
-            return
-        self.calibration_job.cancel()
-        self.state.playing = False
-        with self.errors_shown("file"):
-            inspector = await self.in_thread(self.library.open, name)
-            await self.wait_until_drawn()
-            self.start(inspector)
-        self.state.flush()
-
-    def close(self) -> None:
-        """Stop all work of the browser tab. A thread ends when its current work is done."""
-        self.calibration_job.cancel()
-        self.playback.end()
-        self.exports.end()
-        for task in [*self._tasks, *filter(None, [self._quick, self._slow])]:
-            task.cancel()
-        self._threads.shutdown(wait=False, cancel_futures=True)
-
-    @property
-    def zero_us(self) -> int:
-        """Time of the recording's first event, from which the page counts all times [us]."""
-        return int(self.inspector.recording.events.t_first)
-
-    @property
-    def compensates(self) -> bool:
-        """Whether the prism rotates, so that there is a motion to compensate."""
-        return math.isfinite(self.inspector.turn_us)
-
-    def knobs_taken(self) -> None:
-        """Show parameters that the inspector has taken from elsewhere."""
-        self.show_knobs()
-        self.request("knobs")
-        self.slider_released()
-
-    def slider_released(self) -> None:
-        """Update the slow parts of the page after a change, and end what is undone in one step."""
-        self._drags += 1
-        self.request_slow(*SLOW)
-
-    def show_region(self, region: list[int], kind: str) -> None:
-        """Show a region of the image [px]. ``kind`` is "drawn", "whole" or "suggested"."""
-        width, height = self.state.size
-        left, right = (min(max(x, 0), width) for x in region[::2])
-        top, bottom = (min(max(y, 0), height) for y in region[1::2])
-        self.state.update({"region_wanted": [left, top, right, bottom], "region_kind": kind})
-        self.request("window")
-        self.slider_released()
-
-    def request(self, *what: str, change: str = "") -> None:
-        """Request quick updates of the page: "window", "knobs", "look", "suggestion" or "state".
-
-        ``change``: name of a change that lasts, such as a drag; it is undone in one step.
-        """
-        self.change = f"{change} {self._drags}" if change else ""
-        self._quick_requests.update(what)
-        self._show_pending()
-        if self._quick is None:
-            self._quick = self._task(self._work())
-
-    def request_slow(self, *what: str) -> None:
-        """Request updates that run in a thread after all quick updates: "curve", "picture" or "preparation"."""
-        self._slow_requests.update(what)
-        self._show_pending()
-        if self._slow is None:
-            self._slow = self._task(self._work_slowly())
-
-    async def wait_until_drawn(self) -> None:
-        """Wait until no quick update is pending."""
-        while self._quick is not None:
-            await asyncio.sleep(0.005)
-
-    def start_job(self, work: Coroutine[Any, Any, None]) -> None:
-        """Run a job until it ends or the browser tab is closed."""
-        self._tasks.add(task := self._task(work))
-        task.add_done_callback(self._tasks.discard)
-
-    async def in_thread(self, work: Callable[..., Any], *args: Any, **options: Any) -> Any:
-        """Call ``work`` in one of the browser tab's threads, and return its result."""
-        return await asyncio.get_running_loop().run_in_executor(self._threads, partial(work, *args, **options))
-
-    def show_message(self, text: str, severity: str) -> None:
-        with self.state:
-            self.state.update({"message": text, "severity": severity})
-
-    @contextlib.contextmanager
-    def errors_shown(self, what: str) -> Iterator[None]:
-        """Show errors of the enclosed code as a message, until the same kind of action (``what``) succeeds."""
-        try:
-            yield
-        except (AmiwarpError, OSError) as error:
-            self._error_source = what
-            self.state.update({"message": str(error), "severity": "error"})
-        else:
-            if self.state.severity == "error" and self._error_source == what:
-                self.state.update({"message": "", "severity": "info"})
-
-    def move(self, start_ms: float, change: str = "") -> bool:
-        """Move the time window to a start [ms], limited to the recording. Return whether the window is at the end."""
-        last = max(0.0, float(self.state.whole_ms) - float(self.state.length_ms))
-        self.state.start_ms = round(min(max(start_ms, 0.0), last), 3)
-        self.request("window", change=change)
-        return start_ms >= last
-
-    def renew(self) -> None:
-        """Take the current events of a live stream, and move the window to their end."""
-        with self.errors_shown("stream"):
-            self.inspector.renew()
-        self.state.update(source_state(self.inspector))
-        self.rates.start()
-        self.move(float(self.state.whole_ms))
-
-    def download(self, name: str, content: bytes, kind: str) -> None:
-        """Give the browser a file to save; ``kind`` is its media type."""
-        self.server.js_call("page", "download", name, content, kind)
-
-    def selection(self) -> Selection:
+    def _selection(self) -> Selection:
         """Return the conditions for events that the page shows."""
         s = self.state
         region, whole = tuple(s.region_wanted), (0, 0, *s.size)
@@ -912,103 +671,102 @@ class Panel:
         return Selection({"both": None, "ON": 1, "OFF": 0}[s.polarity], None if region == whole else region,
                          bool(s.hide_hot), noise_us)  # fmt: skip
 
-    def show_knobs(self) -> None:
-        """Show the inspector's parameters on the page."""
-        inspector = self.inspector
-        sources = {name: str(source.value) for name, source in inspector.sources.items()}
-        self.state.update(
-            {**self._knobs(), "model": inspector.knobs.model, "sources": sources, "notes": notes(inspector)}
-        )
+    def _return_to_open_window(self) -> None:
+        """Show time and region of the window that is still shown. Playback goes on through a time without events."""
+        s, window = self.state, self.inspector.window
+        if window is not None and not s.playing:
+            s.start_ms, s.length_ms = self._page_ms(window[0]), round(window[1] * 1e-3, 3)
+            s.region_wanted = list(self.inspector.loaded.region)
 
-    # internal
+    def _compute(self) -> tuple[DisplayedWindow, dict[str, Any]]:
+        """Return what is to be shown, and the state variables that show it."""
+        s, before, against = self.state, self.shown, self._against
+        shown = self.inspector.show(against=against)
+        values = clouds.cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
+        values |= self._images(shown) | self._orbit(shown)
+        if before is None or shown.span is not before.span:
+            values["overview"] = clouds.whole_image(shown.span.events, self.inspector.recording.events.size)
+        left = layout.AGAINST["recorded" if against is None else s.against]
+        pair = [[0, left], [1, "compensated" if s.against == "recorded" else "compensated with A"]]
+        return shown, {
+            **values, "titles": pair if self.compensates else [[0, RECORDED]], "events": layout.events_text(shown),
+            "sharpness": layout.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
+            "picked_text": "" if self._picked < 0 else clouds.event_text(shown, self._picked),
+            "against_title": left, "against_choices": self._against_choices(),
+        }  # fmt: skip
 
-    def _listen(self) -> None:
-        """Follow the state variables that the page sets, and offer the functions that it calls."""
-        for name in NAMES:
-            self.state.change(name)(_without_state(self._dragged, name))
-        for what, names in {
-            "window": ("polarity", "hide_hot", "noise_filter"), "look": ("colour", "axis", "dark", "orbit_shown"),
-            "knobs": ("model", "against", "kind", "difference"),
-        }.items():  # fmt: skip
-            self.state.change(*names)(_without_state(self.request, what))
-        self.state.change("model", "kind", "polarity", "hide_hot", "noise_filter")(_without_state(self.slider_released))
-        for name, call in self.calls.offered.items():
-            self.server.trigger(name)(call)
+    def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
+        """Return the state variables of the images of the region; of slow kinds, only that they are."""
+        kind = ImageKind(self.state.kind)
+        if kind is ImageKind.LOG_INTENSITY:
+            return {"image_slow": True}
+        if kind is not ImageKind.COUNT:
+            return {"image_slow": False, **self._other_images()}
+        pair = images.count_images(shown)
+        values = {"image_slow": False, **_image_state(pair)}
+        if self.state.difference and pair.before is not None:
+            values |= clouds.difference_state(pair.before, pair.after)
+        return values
 
-    def _dragged(self, name: str) -> None:
-        """Follow a slider. Values that the server itself has set are ignored."""
-        if self.state[name] != self._knobs()[name]:
-            self.state.knob = name
-            self.request("knobs", change=name)
+    def _other_images(self) -> dict[str, Any]:
+        return _image_state(images.make_images(self.inspector, ImageKind(self.state.kind), against=self._against))
 
-    def _knobs(self) -> dict[str, float]:
-        """Return the prism's parameters in the page's units, rounded as the page shows them."""
-        return {name: round(getattr(self.inspector.knobs, name) / scale, 4) for name, scale in UNITS.items()}
+    @property
+    def _orbit_drawn(self) -> bool:
+        return bool(self.state.orbit_shown) and self.state.axis == Axis.ANGLE.value and self.compensates
 
-    def _show_pending(self) -> None:
-        """Show which parts of the page wait for an update."""
-        quick = self._quick_requests | self._doing
-        parts = {part for what in quick for part in QUICK.get(what, ())} | (self._slow_requests | self._doing) & {*SLOW}
-        self.state.updating = sorted(parts)
+    def _orbit(self, shown: DisplayedWindow) -> dict[str, Any]:
+        """Return the orbit of the scene point of the picked event, or of the middle of the region."""
+        if not self._orbit_drawn:
+            return clouds.NO_ORBIT
+        orbit, column = map(clouds.float_bytes, clouds.orbit_lines(self.inspector, shown, self._picked))
+        recorded = self._against is None  # otherwise, both clouds are compensated
+        return {"orbit": orbit if recorded else column, "column": column, "has_orbit": True}
 
-    def _task(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        task = asyncio.get_running_loop().create_task(work)
-        task.add_done_callback(self._ended)
-        return task
+    async def _curve(self) -> None:
+        s, name = self.state, self.state.knob
+        s.calibrate_on = await self.work.in_thread(jobs.scope_text, self.inspector)
+        if not self.compensates:
+            return
+        values, scores = await self.work.in_thread(self.inspector.curve, name)
+        x: list[float] = (values / UNITS[name]).tolist()
+        if not x:
+            return
+        label, unit, *_ = layout.SLIDERS[name]
+        best = int(np.argmax(scores))
+        peak = f"{'at the edge ' if best in (0, len(x) - 1) else ''}{x[best]:.4g}"
+        s.curve = {"name": label, "title": f"{label} ({unit})", "text": f"peak {peak}, now {s[name]:.4g}", "x": x,
+                   "y": scores.tolist(), "truth": layout.truths(self.inspector)[name]}  # fmt: skip
+        s.curve_mark = float(s[name])
 
-    def _ended(self, task: asyncio.Task[None]) -> None:
-        if not task.cancelled() and (error := task.exception()) is not None:
-            logging.getLogger(__name__).error("the page's work failed", exc_info=error)
-            text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
-            self.show_message(text, "error")
-
-    async def _work(self) -> None:
+    async def _picture(self) -> None:
+        """Make images of a slow kind."""
+        s = self.state
+        if s.kind != ImageKind.LOG_INTENSITY.value or self.shown is None:
+            return
         try:
-            while self._quick_requests:
-                await wait_until_page_keeps_up(self.server)
-                todo, self._quick_requests = self._quick_requests, set()
-                async with self._done(todo), self.device_lock, self.buffers_lock:
-                    await self.updates.make(todo)
-                await asyncio.sleep(0)
-        finally:
-            self._quick = None
-
-    async def _work_slowly(self) -> None:
-        try:
-            while self._slow_requests:
-                await self.wait_until_drawn()
-                name = min(self._slow_requests)  # in alphabetical order: the curve first, the preparation last
-                self._slow_requests.discard(name)
-                async with self._done({name}), self.device_lock:
-                    with self.errors_shown(name):
-                        await self.updates.make_slow(name)
-        finally:
-            self._slow = None
-
-    @contextlib.asynccontextmanager
-    async def _done(self, todo: set[str]) -> Any:
-        """Mark updates as being made, and send the state to the browser when they are made."""
-        self._doing |= todo
-        try:
-            yield
-        finally:
-            self._doing -= todo
-            with self.state:
-                self._show_pending()
-
-    def set_knobs(self) -> None:
-        """Give the inspector the parameters that the page shows, where they differ from the inspector's."""
-        rounded = self._knobs()
-        values = {name: float(self.state[name]) * UNITS[name] for name in NAMES
-                  if self.state[name] != rounded[name]}  # fmt: skip
-        self.inspector.set(replace(self.inspector.knobs, model=self.state.model, **values))
-
-    def knob_title(self) -> tuple[str, str]:
-        """Return the name of the sharpness curve's parameter, and its name with the unit."""
-        label, unit, *_ = SLIDERS[self.state.knob]
-        return label, f"{label} ({unit})"
+            s.update(await self.work.in_thread(self._other_images))
+        except AmiwarpError as error:
+            s.update({"before": "", "after": "", "image_note": str(error)})
 
 
-def _without_state(call: Callable[..., None], *args: str) -> Callable[..., None]:
-    """Return a function that ignores the page's state, which trame passes to it, and calls ``call``."""
-    return lambda **_: call(*args)
+def _image_state(pair: images.ShownImages) -> dict[str, Any]:
+    """Return the state variables of the images of the region."""
+    scale = clouds.scale_state(pair.scale)
+    before, after = ("" if image is None else clouds.jpeg(pair.scale.rgb(image)) for image in (pair.before, pair.after))
+    return {"before": before, "after": after, "image_scale": scale, "after_scale": scale, "image_note": pair.note}
+
+
+def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progress: Progress) -> Any:
+    """Return the result of a call, or the text of its error; None if the inspector is gone.
+
+    NLopt keeps the last error, and its traceback would keep all local variables of this call and its callers alive.
+    """
+    known = inspector()
+    try:
+        return None if known is None else call(known, progress=progress)
+    except (AmiwarpError, JobCancelled) as error:
+        traceback.clear_frames(error.__traceback__)
+        return str(error)
+    finally:
+        known = None

@@ -11,7 +11,7 @@ from urllib.parse import parse_qsl, urlencode
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.images import ImageKind
-from amiwarp.viewer.window import Knobs, Selection, Source
+from amiwarp.viewer.window import OTHERS, SLIDING, Knobs, Selection, Source
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector
@@ -76,10 +76,11 @@ def apply_state(inspector: Inspector, state: ViewState) -> None:
 
 
 class History:
-    """States that can be undone and redone."""
+    """States that can be undone and redone, from the first one on."""
 
-    def __init__(self, state: ViewState) -> None:
-        self._states, self._at, self._change = [state], 0, ""
+    def __init__(self, first: ViewState) -> None:
+        self.first = first
+        self._states, self._at, self._change = [first], 0, ""
 
     @property
     def state(self) -> ViewState:
@@ -118,15 +119,20 @@ class History:
         self._at, self._change = min(self._at + 1, len(self._states) - 1), ""
         return self.state
 
+    def reset(self) -> ViewState:
+        """Add the first state again, and return it."""
+        self.add(self.first)
+        return self.first
+
 
 # text in the address
 
-ANGLES = ("apex", "phase", "tilt_x", "tilt_y")
+ANGLES = ("apex", "phase", *(name for name, p in OTHERS.items() if p.unit == "rad"))
 """Parameters that the address gives in degrees."""
 LIMITS = {
     "apex": (0.0, 60.0), "phase": (-3600.0, 3600.0), "clock_offset": (-LARGEST_OFFSET_US, LARGEST_OFFSET_US),
-    "tilt_x": (-45.0, 45.0), "tilt_y": (-45.0, 45.0), "rpm": (-LARGEST_RPM, LARGEST_RPM), "index": (1.0, 5.0),
-    "focal_length": (0.1, 1e6),
+    **{name: p.limits for name, p in SLIDING.items()}, "rpm": (-LARGEST_RPM, LARGEST_RPM),
+    **{name: p.limits for name, p in OTHERS.items()}, "focal_length": (0.1, 1e6),
 }  # fmt: skip
 """Smallest and largest value of each parameter in an address: angles in degrees, others in their own units."""
 CHOICES: dict[str, Any] = {"image": ImageKind, "colour": Colour, "axis": Axis, "view": View}
@@ -179,7 +185,7 @@ def _knob_texts(knobs: Knobs, before: str) -> dict[str, str]:
     """Return the values of parameters as texts, with ``before`` in front of their names."""
     out = {f"{before}model": knobs.model}
     for name in LIMITS:
-        if (value := getattr(knobs, name)) is not None:
+        if (value := knobs.value(name)) is not None:
             out[before + name] = f"{math.degrees(value) if name in ANGLES else value:.10g}"
     return out
 
@@ -207,13 +213,10 @@ def _with_value(state: ViewState, key: str, text: str, size: tuple[int, int], du
 
 def _with_knob(knobs: Knobs, name: str, text: str) -> Knobs:
     """Return parameters with one value of an address."""
-    if name == "model":
-        return replace(knobs, model=text if text in MODELS else _fail(text))
-    low, high = LIMITS[name]
-    value = float(text)
-    if not low <= value <= high:
-        raise ValueError(text)
-    return replace(knobs, **{name: math.radians(value) if name in ANGLES else value})  # type: ignore[arg-type]
+    if name == "model" and text in MODELS:
+        return replace(knobs, model=text)
+    value = _within(float(text), *LIMITS[name])
+    return knobs.with_values({name: math.radians(value) if name in ANGLES else value})
 
 
 def _selected(state: ViewState, **changes: Any) -> ViewState:
@@ -224,9 +227,7 @@ def _region(text: str, size: tuple[int, int]) -> tuple[int, int, int, int] | Non
     if text == "all":
         return None
     left, top, right, bottom = (_whole(each, 0, max(size)) for each in text.split(","))
-    if not (left < right <= size[0] and top < bottom <= size[1]):
-        raise ValueError(text)
-    return left, top, right, bottom
+    return left, top, int(_within(right, left + 1, size[0])), int(_within(bottom, top + 1, size[1]))
 
 
 def _sources(text: str, known: tuple[tuple[str, Source], ...]) -> tuple[tuple[str, Source], ...]:
@@ -238,15 +239,17 @@ def _sources(text: str, known: tuple[tuple[str, Source], ...]) -> tuple[tuple[st
 
 def _time(text: str, low: int, high: int) -> int:
     """Return a time in us from a text in ms."""
-    time_us = round(float(text) * 1e3)
-    return time_us if low <= time_us <= high else _fail(text)
+    return int(_within(round(float(text) * 1e3), low, high))
 
 
 def _whole(text: str, low: int, high: int) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 12):
         raise ValueError(text)
-    return int(text) if low <= int(text) <= high else _fail(text)
+    return int(_within(int(text), low, high))
 
 
-def _fail(text: str) -> Any:
-    raise ValueError(text)
+def _within(value: float, low: float, high: float) -> float:
+    """Return a value in a range. Raises ValueError for any other, such as NaN."""
+    if not low <= value <= high:
+        raise ValueError(value)
+    return value

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from amiwarp.calib.parameters import optical_parameters
 from amiwarp.choices import Colour, Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
@@ -16,21 +17,18 @@ from amiwarp.events.truth import Cause
 from amiwarp.imaging.corners import find_background_activity
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter, relative_variance
-from amiwarp.imaging.votes import CanvasShape, UploadedEvents, upload_events
-from amiwarp.optics.prism import apex_from_deflection
+from amiwarp.imaging.votes import CanvasShape, UploadedEvents
+from amiwarp.optics.displacement import PHASE
+from amiwarp.optics.models import size_names
 from amiwarp.viewer.timeline import Span
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
-    from amiwarp.calib.result import Calibration
-    from amiwarp.events.encoder import Encoder
     from amiwarp.events.recording import Recording, Truth
-    from amiwarp.optics.camera import Camera
     from amiwarp.optics.models import Model
-    from amiwarp.optics.prism import Prism
     from amiwarp.reconstruction.picture import Picture
 
 
@@ -191,27 +189,45 @@ class Knobs:
     """Phase θ_b of the prism [rad]."""
     clock_offset: float = 0.0
     """Offset between the clocks of encoder and camera, as in :class:`Encoder` [us]."""
-    tilt_x: float = 0.0
-    """Tilt of the axis of rotation, x component [rad]."""
-    tilt_y: float = 0.0
-    """Tilt of the axis of rotation, y component [rad]."""
     rpm: float = 0.0
     """Speed of the prism if the recording has no encoder [1/min]."""
-    index: float | None = None
-    """Refractive index, if a calibration or the known truth gave it; None: that of the nominal prism."""
     focal_length: float | None = None
     """Calibrated focal length [px]; None: that of the camera."""
+    others: tuple[tuple[str, float], ...] = ()
+    """Names and values of other parameters of optical models that are not 0, sorted by name."""
+
+    @classmethod
+    def given(cls, values: Mapping[str, float], **known: Any) -> Knobs:
+        """Return parameters with ``known`` fields, and the other parameters of optical models among the ``values``."""
+        return cls(**known).with_values({name: values[name] for name in OTHERS if name in values})
+
+    def value(self, name: str) -> float | None:
+        """Return the value of a parameter; None if it is not known and has no slider."""
+        if name not in OTHERS:
+            known: float | None = getattr(self, name)
+            return known
+        return dict(self.others).get(name, 0.0 if name in SLIDING else None)
+
+    def with_values(self, values: Mapping[str, float]) -> Knobs:
+        """Return the parameters with other values of some of them."""
+        others = dict(self.others) | {name: value for name, value in values.items() if name in OTHERS}
+        fields: dict[str, Any] = {name: value for name, value in values.items() if name not in OTHERS}
+        return replace(self, **fields, others=tuple(sorted((n, v) for n, v in others.items() if v)))
 
     @property
     def calibrated_only(self) -> dict[str, float]:
         """Parameters by name that the page cannot change, and that a calibration or the known truth gave."""
-        found = {"index": self.index, "focal_length": self.focal_length}
+        found = {name: self.value(name) for name in (*(n for n in OTHERS if n not in SLIDING), "focal_length")}
         return {name: value for name, value in found.items() if value is not None}
 
 
+OTHERS = {name: p for name, p in optical_parameters().items() if name not in (*size_names(), PHASE.name)}
+"""Parameters of the optical models but for sizes and phase, by name."""
+SLIDING = {name: p for name, p in OTHERS.items() if p.label}
+"""Those among :data:`OTHERS` that have a slider."""
 CURVE_HALF_WIDTH = {
-    "apex": math.radians(0.4), "phase": math.radians(30.0), "clock_offset": 5000.0, "tilt_x": math.radians(5.0),
-    "tilt_y": math.radians(5.0), "rpm": 6.0,
+    "apex": math.radians(0.4), "phase": math.radians(30.0), "clock_offset": 5000.0, "rpm": 6.0,
+    **{name: p.half_range for name, p in SLIDING.items()},
 }  # fmt: skip
 """Half width of the range of each parameter over which its sharpness curve is drawn, in the parameter's unit."""
 
@@ -228,62 +244,6 @@ class Selection:
     """Whether the events of hot pixels are left out."""
     noise_us: int | None = None
     """Time within which an earlier event at a neighbouring pixel must support an event [us]; None: no noise filter."""
-
-
-def first_sources(recording: Recording) -> dict[str, Source]:
-    """Return the sources of a recording's camera and of the parameters that the page shows, without a calibration."""
-    apex = getattr(recording.prism, "apex", None)
-    return {
-        "camera": Source.ASSUMED if recording.camera is None else Source.FILE,
-        "apex": Source.ASSUMED if apex is None else Source.FILE,
-        **dict.fromkeys(("model", "phase", "tilt_x", "tilt_y"), Source.ASSUMED),
-        **({"rpm": Source.ASSUMED} if recording.encoder is None else {"clock_offset": Source.FILE}),
-    }
-
-
-def true_knobs(recording: Recording, *, rpm: float) -> Knobs | None:
-    """Return the known parameters of a simulated recording; None without ground truth of its prism.
-
-    ``rpm``: the speed, which ground truth does not hold [1/min].
-    """
-    p = {} if recording.truth is None else recording.truth.parameters
-    if not {"apex", "phase"} <= set(p):
-        return None
-    recorded_us = 0.0 if recording.encoder is None else recording.encoder.clock_offset_us
-    tilts = p.get("tilt_x", 0.0), p.get("tilt_y", 0.0)
-    return Knobs("exact", p["apex"], p["phase"], p.get("clock_offset_us", recorded_us), *tilts, rpm, p.get("index"))
-
-
-def calibrated_knobs(calibration: Calibration, *, offset_us: float, zero_us: int) -> Knobs:
-    """Return the parameters of a calibration.
-
-    ``offset_us``: clock offset if the calibration has none [us]. ``zero_us``: time at which the angle of a
-    prism without encoder is 0 [us]; the phase is converted to it.
-    """
-    p, prism = calibration.parameters, calibration.prism
-    apex = p["apex"] if "apex" in p else apex_from_deflection(p["deflection"], prism.index, prism.flat_side)
-    offset, tilts = p.get("clock_offset", offset_us), (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0))
-    rpm, phase = p.get("rpm", 0.0), p["phase"]
-    if calibration.zero_us is not None:
-        phase += rpm * math.tau / 60e6 * (zero_us - calibration.zero_us)
-    return Knobs(calibration.model_name, apex, phase, offset, *tilts, rpm, p.get("index"), p.get("focal_length"))
-
-
-def calibrated_sources(calibration: Calibration, known: Iterable[str]) -> dict[str, Source]:
-    """Return the sources of those ``known`` parameters that a calibration has."""
-
-    def named(names: Iterable[str]) -> set[str]:
-        return {"apex" if name == "deflection" else name for name in names} & set(known)
-
-    given = dict.fromkeys(named(calibration.parameters), Source.FILE)
-    return given | dict.fromkeys(("model", *named(calibration.free)), Source.CALIBRATED)
-
-
-def kept_values(knobs: Knobs, values: Mapping[str, float], *, has_encoder: bool) -> dict[str, float]:
-    """Return the parameters that a calibration file of a model keeps, of the ``values`` for all models."""
-    size = ("deflection",) if knobs.model in ("circle", "radial") else ("apex", "tilt_x", "tilt_y")
-    time = {"clock_offset": knobs.clock_offset} if has_encoder else {"rpm": knobs.rpm}
-    return {name: values[name] for name in (*size, "phase", *knobs.calibrated_only)} | time
 
 
 # Time windows of the inspector: their selected events, and what the page shows of them.
@@ -365,8 +325,6 @@ MOST_POINTS = 100_000
 """Largest number of points in each event cloud."""
 CURVE_EVENTS = 200_000
 """Largest number of events that a sharpness curve uses."""
-LARGEST_APEX = math.radians(3.0)
-"""Apex angle up to which events that move into the region are in its images, if the nominal apex is smaller [rad]."""
 
 
 def load_window(
@@ -395,20 +353,6 @@ def load_window(
     xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
     curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
     return LoadedWindow(span, region, n, drawn, truth, xy, events, curve_events)
-
-
-def upload(events: Events, encoder: Encoder, device: Any, *, drifting: bool) -> UploadedEvents:
-    """Upload events with their prism angles.
-
-    ``drifting``: whether the clock offset of the encoder can be changed afterwards.
-    """
-    return upload_events(events, encoder, device, slope=encoder.speed_at(events.t) * 1e-6 if drifting else None)
-
-
-def margin(camera: Camera, prism: Prism) -> int:
-    """Return how far a prism may move events [px]: the margin around a region."""
-    largest = replace(prism, apex=max(LARGEST_APEX, 2.0 * abs(prism.apex)))
-    return math.ceil(1.2 * math.tan(abs(largest.deflection)) * max(camera.fx, camera.fy))
 
 
 def kept(

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,14 +16,13 @@ from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
 from amiwarp.brightness.multigrid import Tiles
 from amiwarp.calib.calibration_events import EventsAhead
 from amiwarp.calib.nlopt_solver import SearchStage, best_of
-from amiwarp.calib.parameters import RATES, widened
+from amiwarp.calib.parameters import RATES
 from amiwarp.calib.settings import GAUSS_NEWTON
 from amiwarp.calib.sharpness import reach
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import MemoryEvents
 from amiwarp.kernels.iwe import sum_segments
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -40,67 +39,6 @@ if TYPE_CHECKING:
 
     Vector = NDArray[np.float64]
 
-# Causes of an answer that does not hold everywhere in the image: what may be wrong in the given camera and prism.
-
-FLAT_SIDE = "flat_side"
-"""Name of the unknown that is 0 for the given flat side of the prism, and 1 for the other."""
-
-
-@dataclass(frozen=True)
-class Cause:
-    """One thing that may be wrong, and the parameters that correct it."""
-
-    words: str
-    """What is wrong, in words."""
-    names: tuple[str, ...]
-    """Names of the parameters that correct it."""
-
-    @property
-    def rank(self) -> int:
-        """Position in :data:`CAUSES`: of causes with equal evidence, the first one counts."""
-        return CAUSES.index(self)
-
-
-CENTER = Cause("the principal point", ("center_x", "center_y"))
-CAUSES = (
-    Cause("the focal length", ("focal_length",)),
-    CENTER,
-    Cause("the flat side of the prism", (FLAT_SIDE,)),
-    Cause("the lens distortion k1", ("k1",)),
-    Cause("the direction of the prism's axis", ("tilt_x", "tilt_y")),
-)
-"""All causes that the photometric stage can name and correct, the likeliest first."""
-SCREENED = CAUSES[:3]
-"""Causes that every answer is tested for. The effects of the others resemble those of the first two."""
-
-
-def turned(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, float]:
-    """Return values that deflect the axial ray as before if the prism's other side is flat."""
-    prism, index = space.prism, values.get("index", space.prism.index)
-    deflection = Prism(values["apex"], index, prism.flat_side).deflection
-    phase = math.remainder(values["phase"] + math.pi, math.tau)
-    return {**values, "apex": apex_from_deflection(deflection, index, _other(prism)), "phase": phase}
-
-
-def other_side(space: ParameterSpace) -> ParameterSpace:
-    """Return the parameter space with the prism's other side flat."""
-    prism = space.prism
-    apex = apex_from_deflection(prism.deflection, prism.index, _other(prism))
-    return replace(space, prism=Prism(apex, prism.index, _other(prism)), start=turned(space, space.start))
-
-
-def _other(prism: Prism) -> FlatSide:
-    return FlatSide.CAMERA if prism.flat_side is FlatSide.SCENE else FlatSide.SCENE
-
-
-def with_cause(space: ParameterSpace, cause: Cause, values: Mapping[str, float]) -> tuple[ParameterSpace, Vector]:
-    """Return the space in which a cause is corrected or free, and the vector of ``values`` there."""
-    if cause.names == (FLAT_SIDE,):
-        space, values = other_side(space), turned(space, values)
-    else:
-        space = widened(space, tuple(n for n in cause.names if n not in space.names))
-    return space, space.to_vector({**space.start, **values})
-
 
 def place_arguments(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, Any]:
     """Return the keyword arguments of :meth:`BrightnessMap.place` for parameter values."""
@@ -115,8 +53,6 @@ FIRST_SCALE = 1.0
 """Scale of the Cauchy weights before the first brightness map is solved [thresholds]."""
 SLOPE_PX = 0.005
 """Step of the finite differences that give the derivatives of the residuals [px]."""
-
-
 PREDICTED_PX = 0.5
 """Longest step for which the change of the brightness map is predicted [px]."""
 
@@ -240,7 +176,16 @@ class Cost:
     def start_slopes(self, v: NDArray[np.float64], *, with_parts: bool = False) -> Callable[[], Slopes]:
         """Start to compute :meth:`slopes`. Return a function that waits for them."""
         b, n = self.brightness, len(v)
-        left = self._unexplained_slopes(v)
+        if self._solved is None or not np.array_equal(self._solved, v):
+            self.residuals(v)
+        b.prepare_projection()
+        steps, slopes = np.eye(n) * SLOPE_PX, []
+        for step in steps:
+            slopes.append(b.find_slope(self.at(v + step), self.at(v - step), 2.0 * SLOPE_PX))
+        left, changes, self._changes = [], self._changes or [None] * n, []
+        for slope, change in zip(slopes, changes, strict=True):
+            left.append(b.unexplained(slope, change, steps=self.steps // 2))
+            self._changes.append(b.explaining_change())
         upper = np.triu_indices(n)
         pairs = [(left[i], left[j]) for i, j in zip(*upper, strict=True)]
         products = b.residuals.start_products([*pairs, *((row, b.residuals.values) for row in left)])
@@ -254,20 +199,15 @@ class Cost:
 
         return result
 
-    def _unexplained_slopes(self, v: NDArray[np.float64]) -> list[Any]:
-        """Return for each parameter the part of the residuals' derivative that no change of the map explains."""
-        b, n = self.brightness, len(v)
-        if self._solved is None or not np.array_equal(self._solved, v):
-            self.residuals(v)
-        changes = self._changes or [None] * n
-        b.prepare_projection()
-        steps = np.eye(n) * SLOPE_PX
-        slopes = [b.find_slope(self.at(v + step), self.at(v - step), 2.0 * SLOPE_PX) for step in steps]
-        left, self._changes = [], []
-        for slope, change in zip(slopes, changes, strict=True):
-            left.append(b.unexplained(slope, change, steps=self.steps // 2))
-            self._changes.append(b.explaining_change())
-        return left
+
+def size_and_phase_directions(space: ParameterSpace, best: Vector) -> list[Vector]:
+    """Return unit vectors of the search space along the prism's size and phase, if these are free."""
+    if space.cartesian:
+        x, y = best[:2] / max(float(np.linalg.norm(best[:2])), 1e-9)
+        rest = np.zeros(len(best) - 2)
+        return [np.array([x, y, *rest]), np.array([-y, x, *rest])]
+    unit = np.eye(len(best))
+    return [unit[k] for k, name in enumerate(space.names) if name in (space.size_name, "phase")]
 
 
 # Choice of the parts of the scene that the photometric stage maps.
@@ -361,10 +301,9 @@ class _PairCollector:
         tile_of: NDArray[np.int32],
         near: NDArray[np.int32],
         sensor: SensorTiming,
-        ahead: EventsAhead | None,
     ) -> None:
         """``tile_of`` is the tile of each pixel of the map, or -1; events of the pixels with ``near`` >= 0 are used."""
-        self.recording, self.search, self.sensor, self._ahead = recording, search, sensor, ahead
+        self.recording, self.search, self.sensor = recording, search, sensor
         self._tile_of, self._near = (wp.array(a, dtype=int, device=search.device) for a in (tile_of, near))
         self._found: list[PairSet] = []
         self._done = 0
@@ -386,7 +325,7 @@ class _PairCollector:
     def _new_pairs(self, spans: list[tuple[int, int]]) -> PairSet:
         search, source = self.search, self.recording.events
         space, best, calibration_events = search.space, search.best, search.calibration_events
-        joined = None if self._ahead is None else self._ahead.take(spans)
+        joined = None if search.ahead is None else search.ahead.take(spans)
         table = EventTable([source.between(*span) for span in spans], self._near, search.device, joined=joined)
         pairs = table.pairs(
             calibration_events.encoder, longest_gap_us=LONGEST_GAP_US, shortest_gap_us=2.0 * self.sensor.refractory_us,
@@ -430,13 +369,11 @@ def upload_ahead(recording: Recording, search: Search) -> AbstractContextManager
     return EventsAhead(source, time_spans(recording, search), most, device)
 
 
-def collect_pairs(
-    recording: Recording, search: Search, settings: PhotometricSettings, ahead: EventsAhead | None = None
-) -> tuple[PairSet, Tiles]:
+def collect_pairs(recording: Recording, search: Search, settings: PhotometricSettings) -> tuple[PairSet, Tiles]:
     """Return about ``settings.pairs`` pairs of events, from whole turns spread over the recording, and the map's tiles.
 
     At least :data:`FEWEST_TURNS` turns are used, if the recording has them. If these hold too many pairs, whole tiles
-    are left out: fewer pairs on the same tiles would not determine the map. ``ahead``: events already on the device.
+    are left out: fewer pairs on the same tiles would not determine the map.
     """
     first = recording.events.t_first
     turn = turn_length(recording, search.calibration_events.encoder)
@@ -446,7 +383,7 @@ def collect_pairs(
     else:
         tile_of, tiles = choose_tiles(search.fine.image(search.best), search.pad, settings.density, margin)
     near = near_tiles(tiles, margin, math.ceil(reach(search.space, search.best)) + 1, tile_of.shape)
-    collector = _PairCollector(recording, search, tile_of, near, settings.sensor, ahead)
+    collector = _PairCollector(recording, search, tile_of, near, settings.sensor)
     spans = time_spans(recording, search)
     many = min(FEWEST_TURNS, len(spans))
     found = collector.read(spans[:many])
@@ -491,12 +428,8 @@ def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
 
 MOST_STEPS = 15
 """Largest number of Gauss-Newton steps."""
-
-
 LONGEST_STEP_PX = 1.0
 """Largest change of any parameter in one Gauss-Newton step [px]."""
-
-
 HALVINGS = 4
 """Number of step lengths that are tried along a Gauss-Newton direction, each half of the previous one."""
 
@@ -541,6 +474,11 @@ def _inverse(hessian: Vector) -> Vector:
     return np.asarray(vectors @ np.diag(1.0 / np.maximum(values, 1e-9 * max(float(values[-1]), 1e-12))) @ vectors.T)
 
 
+UNDETERMINED_PX, LEAST_CURVATURE = 0.3, 1e-3
+"""A parameter is undetermined if its standard deviation exceeds the first value [px], or if its curvature is below the
+second, a share of the largest curvature."""
+
+
 def determined(slopes: Slopes, space: ParameterSpace, left: float) -> tuple[str, ...]:
     """Return the names of the free parameters that the events determine.
 
@@ -574,29 +512,31 @@ def iterate(
     high: Vector,
     tolerance: float,
     report: Callable[[int, int], None],
+    early: bool = True,
 ) -> SearchStage:
     """Maximise a score by Gauss-Newton steps until they are shorter than ``tolerance`` [px] in every parameter.
 
     A step that lowers the score is halved. The search stays in the box ``low .. high`` [px]. Its answer is the best
     evaluated point. ``report`` gets the number of steps done and the largest number. ``start_score`` and
-    ``start_slopes`` return functions that wait for the result at a point; slopes are also started where the score may
-    turn out lower, and then not waited for.
+    ``start_slopes`` return functions that wait for the result at a point. If ``early``, slopes are also started where
+    the score may turn out lower, and then not waited for.
     """
     began = time.perf_counter()
     v, points, scores, ended = np.clip(start, low, high), [], [], "budget"
-    waiting, slopes = start_score(v), start_slopes(v)
+    waiting = start_score(v)
+    slopes = start_slopes(v) if early else None
     here = waiting()
     points.append(v)
     scores.append(here)
     for k in range(MOST_STEPS):
         report(k, MOST_STEPS)
-        step = slopes().step()
+        step = (slopes or start_slopes(v))().step()
         step *= min(1.0, LONGEST_STEP_PX / max(float(np.abs(step).max()), 1e-12))
         for _ in range(HALVINGS):
             trial = np.clip(v + step, low, high)
             moved = float(np.abs(trial - v).max())
             waiting = start_score(trial)
-            following = start_slopes(trial) if moved >= tolerance and k + 1 < MOST_STEPS else None
+            slopes = start_slopes(trial) if early and moved >= tolerance and k + 1 < MOST_STEPS else None
             value = waiting()
             points.append(trial)
             scores.append(value)
@@ -608,10 +548,4 @@ def iterate(
         if moved < tolerance or value < here:
             ended = "tolerance" if moved < tolerance else "no better step"
             break
-        slopes = following or slopes
     return best_of(GAUSS_NEWTON, points, scores, seconds=time.perf_counter() - began, ended=ended)
-
-
-UNDETERMINED_PX, LEAST_CURVATURE = 0.3, 1e-3
-"""A parameter is undetermined if its standard deviation exceeds the first value [px], or if its curvature is below the
-second, a share of the largest curvature."""

@@ -2,65 +2,662 @@
 
 Sharpness is biased by the sensor's hysteresis. This stage models the hysteresis by its equations, see
 :mod:`amiwarp.brightness.solver`. For given parameters the map is the solution of a linear least-squares problem. The
-parameters minimise its robust residual.
+parameters minimise its robust residual. :func:`refine` collects the equations, searches for the answer, corrects the
+sensor's timing and then the given camera and prism, where the events contradict them.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from amiwarp.brightness.event_pairs import SensorTiming, off_excess
-from amiwarp.brightness.solver import BrightnessMap
-from amiwarp.calib.parameters import DEGENERATE_WITH_APEX, LENS
-from amiwarp.calib.photometric.answer_search import (
-    LARGEST_COST_RATIO,
-    LARGEST_EXAMINED_COST,
-    LARGEST_STILL_COST,
-    AnswerSearch,
-    join_runs,
-    judge_consistency,
-    judge_lag,
-)
-from amiwarp.calib.photometric.consistency import SIGNIFICANT, Consistency, check_consistency
+from amiwarp.brightness.multigrid import Tiles
+from amiwarp.brightness.solver import BrightnessMap, darkness, set_lags
+from amiwarp.calib.nlopt_solver import SearchStage, maximise
+from amiwarp.calib.parameters import LENS, MOTION, ParameterSpace, like_size
+from amiwarp.calib.photometric import consistency
 from amiwarp.calib.photometric.cost import (
-    FLAT_SIDE,
     Cost,
     check_pairs,
     collect_pairs,
     determined,
     fine_map_is_determined,
-    turned,
-    with_cause,
-)
-from amiwarp.calib.photometric.sensor_timing import (
-    find_refractory,
-    find_time_constant,
-    timing_can_be_found,
-    timing_notes,
-    timing_steps,
+    iterate,
+    size_and_phase_directions,
 )
 from amiwarp.calib.result import PhotometricSummary, StageSummary
-from amiwarp.calib.settings import PhotometricSettings, stage_share
+from amiwarp.calib.settings import GAUSS_NEWTON, LINEAR_UNKNOWNS, PhotometricSettings
+from amiwarp.calib.sharpness import Search
+from amiwarp.events.recording import Recording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from numpy.typing import NDArray
 
-    from amiwarp.brightness.event_pairs import PairSet
-    from amiwarp.brightness.multigrid import Tiles
-    from amiwarp.calib.calibration_events import EventsAhead
-    from amiwarp.calib.parameters import ParameterSpace
-    from amiwarp.calib.photometric.answer_search import Answer
-    from amiwarp.calib.photometric.consistency import Finding
-    from amiwarp.calib.photometric.cost import Cause
-    from amiwarp.calib.sharpness import Search
-    from amiwarp.events.recording import Recording
-    from amiwarp.progress import Progress
+    Vector = NDArray[np.float64]
+
+
+def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, StageSummary, ParameterSpace]:
+    """Run the photometric stage, which starts at the result of the sharpness stage ``search``.
+
+    Return the result, the summary of the search, and the space of the result, whose camera and prism are corrected.
+    Raises :class:`AmiwarpError` for too few pairs.
+    """
+    given = search.settings.photometric.sensor
+    found = _Equations(recording, search, given)
+    answer = found.answers.search(found.start)
+    rpm, sensor, time_constant = search.calibration_events.encoder.rpm, given, 0.0
+    rad_per_us, direction = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm)
+    if timing_can_be_found(answer, found.answers.cost) and rpm:
+        v = answer.stage.x
+        pause, lag = timing_steps(found.answers.cost, v, direction)
+        if pause and not given.refractory_us:
+            turn = find_refractory(found.coarse(), v, pause, direction)
+            sensor = replace(given, refractory_us=turn / rad_per_us)
+            found = _Equations(recording, search, sensor)
+            answer = found.answers.search(found.start)
+            _, lag = timing_steps(found.answers.cost, answer.stage.x, direction)
+        if lag:
+            answer, turn = found.with_slow_pixels(answer, lag, direction)
+            time_constant = turn / rad_per_us
+        if len(v) == len(answer.stage.x):
+            found.answers.timing = answer.stage.x - v
+    answers = found.answers
+    answer = checked(answers, answer).judged(*judge_lag(time_constant * rad_per_us))
+    notes = (*timing_notes(sensor.refractory_us - given.refractory_us, time_constant), *answer.result.warnings)
+    result = replace(
+        answer.result, sharpness_parameters=answers.sharpest, pairs=len(found.pairs), held=found.held, warnings=notes,
+        refractory_us=sensor.refractory_us, time_constant_us=time_constant,
+    )  # fmt: skip
+    space = answers.cost.space
+    values = map(space.to_values, answer.stage.points)
+    return result, StageSummary.of("photometric", answer.stage, space.names, values), space
+
+
+# Equations of the stage.
+
+LARGEST_FINE_COST = 0.3
+"""Largest cost, relative to that without a map, for which a map has more than one node per pixel along each axis. Where
+half of the events are noise, a finer map follows them, and orbits come out too small."""
+
+
+class _Equations:
+    """Equations of the stage: pairs of events, a map, and the search on it."""
+
+    def __init__(self, recording: Recording, search: Search, sensor: SensorTiming) -> None:
+        """Collect the pairs and solve a first map. Raises :class:`AmiwarpError` for too few pairs."""
+        self._search, self._settings = search, replace(search.settings.photometric, sensor=sensor)
+        self.pairs, tiles = collect_pairs(recording, search, self._settings)
+        best, full = search.best, search.full_space
+        self._linear = tuple(n for n in search.settings.free or () if n in LINEAR_UNKNOWNS)
+        # the count of OFF and ON events gives the ratio of thresholds only if brightness returns after a whole turn
+        duration_us = recording.events.t_last - recording.events.t_first
+        whole_turn = abs(search.calibration_events.encoder.rpm) * duration_us >= 60e6
+        self._off_excess = off_excess(self.pairs, with_leak="leak" in self._linear) if whole_turn else 0.0
+        space = full.holding({n: x for n, x in best.items() if n not in full.names})
+        v = space.to_vector({**space.start, **best})
+        cost = self.cost_on(tiles, space)
+        cost.warm_up(v)
+        mean, coverage = cost.start_mean(), cost.brightness.coverage(cost.scale)
+        few = not fine_map_is_determined(coverage, len(self.pairs))
+        noisy = mean() > LARGEST_FINE_COST
+        # a fine map converges too slowly for parameters that make nearly the same motion
+        if tiles.density > 1.0 and (few or noisy or like_size(space.names)):
+            cost = self.cost_on(tiles.at_density(1.0), space)
+            cost.warm_up(v)
+            coverage = cost.brightness.coverage(cost.scale)
+        left = check_pairs(recording.name, coverage, len(self.pairs))
+        keep = determined(cost.slopes(v, with_parts=True), space, left)
+        self.held = tuple(n for n in space.names if n not in keep)
+        """Free parameters that the events do not determine."""
+        # undetermined parameters stay at the answer of sharpness, because the others were found together with them
+        cost.space = space = space.without(self.held).holding({n: x for n, x in best.items() if n in self.held})
+        self.start = space.to_vector({**space.start, **best})
+        """Search vector of the sharpness stage's result."""
+        if self.held:
+            cost.warm_up(self.start)
+        self.answers = AnswerSearch(cost, dict(best), left, self._settings, self._report)
+
+    def _report(self, share: float) -> None:
+        self._search.report("photometric", share)
+
+    def cost_on(self, tiles: Tiles, space: ParameterSpace) -> Cost:
+        """Return a cost with a new map on tiles, which must be solved yet."""
+        brightness = BrightnessMap(
+            self.pairs, tiles, off_excess=None if "off_ratio" in self._linear else self._off_excess,
+            with_leak="leak" in self._linear, middle_us=space.middle_us,
+        )  # fmt: skip
+        return Cost(space, brightness, self._settings.steps, self._search.meanwhile)
+
+    def _solved_on(self, tiles: Tiles) -> Cost:
+        """Return a cost with a new map on tiles, solved at the sharpness stage's result."""
+        space = self.answers.cost.space
+        cost = self.cost_on(tiles, space)
+        cost.warm_up(space.to_vector({**space.start, **self._search.best}))
+        return cost
+
+    def coarse(self) -> AnswerSearch:
+        """Return the search on a new map with one node per pixel."""
+        tiles = self.answers.cost.brightness.tiles
+        return replace(self.answers, cost=self._solved_on(tiles.at_density(1.0)))
+
+    def with_slow_pixels(self, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:
+        """Return the answer for pixels with slow photoreceptors, and the angle per time constant [rad]; 0 if it fails.
+
+        ``first`` is a first estimate of that angle. The search has a new map then.
+        """
+        answers, v = self.answers, answer.stage.x
+        self.pairs.clear_lags()
+        turn = find_time_constant(self.coarse(), v, first, direction)
+        answers.cost = self._solved_on(answers.cost.brightness.tiles)
+        again = answers.search(v)
+        return replace(again, stage=join_runs(answer.stage, again.stage)), turn
+
+
+# Search for the answer of the photometric stage on one brightness map, from the result of the sharpness stage.
+
+LARGEST_ROTATION_MOVE_PX = 4.0
+"""Largest distance from the sharpness optimum that is searched in the parameters of the camera's rotation [px]."""
+RESTARTS = 3
+"""Largest number of further searches, each from a point near the previous result that has a lower cost."""
+FIRST_STEP_PX = 0.2
+"""First step of an NLopt algorithm's first run [px]."""
+POLISH_STEP_PX = 0.05
+"""First step of an NLopt algorithm's second run, which starts at the result of the first run [px]."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Result of a search, with the evidence for it."""
+
+    stage: SearchStage
+    """The search that found it."""
+    result: PhotometricSummary
+    """The result, and whether it is accepted."""
+    covariance: Vector
+    """Covariance of the search vector from the scatter between places [px²], shape (n, n)."""
+
+    def judged(self, accepted: bool, reason: str) -> Answer:
+        """Return the answer, rejected for ``reason`` unless it is ``accepted`` or was rejected before."""
+        if accepted or not self.result.accepted:
+            return self
+        return replace(self, result=replace(self.result, accepted=False, verdict=reason))
+
+
+@dataclass
+class AnswerSearch:
+    """Searches on one brightness map, from the result of the sharpness stage."""
+
+    cost: Cost
+    sharpest: dict[str, float]
+    """Parameter values that the sharpness stage found, in their units."""
+    left: float
+    """Share of equations of :func:`check_pairs`."""
+    settings: PhotometricSettings
+    report: Callable[[float], None]
+    timing: Vector = field(default_factory=lambda: np.zeros(0))
+    """Change of the first answer by a correction of the sensor's timing [px]; empty for none."""
+
+    @property
+    def origin(self) -> Vector:
+        """Search vector of the sharpness stage's result [px]."""
+        space = self.cost.space
+        return space.to_vector({**space.start, **self.sharpest})
+
+    def search(self, start: Vector) -> Answer:
+        """Search from ``start``, and again from any point near the new result with a lower cost.
+
+        If there are few events, the map can adapt to wrong parameters so well that no single step lowers the cost.
+        """
+        cost = self.cost
+        stage = self.descend(start)
+        answer, around = _evaluate(cost, stage, self.origin, self.left)
+        for _ in range(RESTARTS):
+            lower = [point for point, rise in around if rise < 0.0]
+            if not lower:
+                break
+            cost.renew(lower[0])
+            stage = join_runs(stage, self.descend(lower[0]))
+            answer, around = _evaluate(cost, stage, self.origin, self.left)
+        return answer
+
+    def descend(self, start: Vector) -> SearchStage:
+        """Run one search from ``start``, in the box about the sharpness stage's result."""
+        cost, settings = self.cost, self.settings
+        low, high = search_box(cost.space, self.origin)
+
+        def report_steps(done: int, budget: int) -> None:
+            self.report(done / budget)
+
+        def score(at: Vector) -> float:
+            report_steps(cost.evaluations, 2 * settings.evaluations)
+            return cost(at)
+
+        if settings.algorithm == GAUSS_NEWTON:
+            # A GPU computes slopes while the host waits for the score. A CPU would do so in vain if the score is low.
+            # After a low score, the map on a GPU converges from the derivatives there, to the same solution.
+            return iterate(
+                cost.start_settled, cost.start_slopes, start, low=low, high=high, tolerance=settings.tolerance_px,
+                report=report_steps, early=not cost.brightness.device.is_cpu,
+            )  # fmt: skip
+
+        def run(at: Vector, step: float) -> SearchStage:
+            return maximise(
+                score, settings.algorithm, low=low, high=high, start=at, evaluations=settings.evaluations,
+                tolerance=settings.tolerance_px, step=step,
+            )  # fmt: skip
+
+        stage = run(start, FIRST_STEP_PX)
+        # during long steps the map is not fully converged, so a second run starts nearby with a better map
+        cost.steps *= 2
+        return join_runs(stage, run(stage.x, POLISH_STEP_PX))
+
+
+def join_runs(first: SearchStage, second: SearchStage) -> SearchStage:
+    """Return two successive runs with the same free parameters as one.
+
+    The result is that of the second run, whose brightness map was better converged.
+    """
+    return replace(
+        second,
+        evaluations=first.evaluations + second.evaluations,
+        seconds=first.seconds + second.seconds,
+        points=np.concatenate([first.points, second.points]),
+        scores=np.concatenate([first.scores, second.scores]),
+    )
+
+
+def _evaluate(
+    cost: Cost,
+    stage: SearchStage,
+    v: Vector,
+    left: float,
+) -> tuple[Answer, list[tuple[Vector, float]]]:
+    """Evaluate the optimum of ``stage``: final map, covariance and acceptance.
+
+    ``v`` is the answer of the sharpness stage, ``left`` the share of equations of :func:`check_pairs`. Return the
+    answer, and points near the optimum with their rise in cost, the lowest first.
+    """
+    space, best = cost.space, stage.x
+    cost.predict(best)
+    cost.residuals(best, rounds=2)
+    # everything is started before the first result is waited for
+    waiting_final, residuals = cost.start_mean(), cost.brightness.residuals
+    waiting_residual = residuals.start_median(residuals.count)
+    waiting_slopes = cost.start_slopes(best, with_parts=True)
+    solved = cost.brightness.copy_unknowns()
+    waiting_around = start_costs_around(cost, best, waiting_final)
+    # the map is better converged now than at the start of the search, so the cost at the start is measured again
+    cost.predict(v)
+    cost.residuals(v)
+    waiting_at_start = cost.start_mean()
+    cost.replace_map(solved)
+    cost.residuals(best, rounds=0)
+    slopes, final, around = waiting_slopes(), waiting_final(), waiting_around()
+    covariance = slopes.covariance() / left**2
+    unsharp = like_size(space.names)
+    of_sharpness = np.array([n not in unsharp for n in space.names])
+    of_prism = np.array([n not in (*unsharp, *MOTION) for n in space.names])
+    leak, excess = (float(x) for x in cost.brightness.extra)
+    rise = around[0][1] if around else math.inf
+    next_step = float(np.linalg.norm(slopes.step()[of_prism]))
+    moved = float(np.linalg.norm((best - v)[of_prism]))
+    accepted, verdict = judge_optimum(final, rise=rise, moved=moved, next_step=next_step)
+    found = PhotometricSummary(
+        accepted=accepted,
+        verdict=verdict,
+        parameters=space.to_values(best),
+        uncertainty=space.deviations(best, covariance),
+        sharpness_parameters={},
+        moved_px=float(np.linalg.norm((best - v)[of_sharpness])),
+        cost=final,
+        cost_at_sharpness=waiting_at_start(),
+        residual=waiting_residual(),
+        pairs=0,
+        off_over_on=1.0 + excess,
+        leak=leak,
+    )
+    return Answer(stage, found, covariance), around
+
+
+def search_box(space: ParameterSpace, v: Vector) -> tuple[Vector, Vector]:
+    """Return the corners of the box about the sharpness stage's result ``v`` in which this stage searches."""
+
+    unsharp = like_size(space.names)
+
+    def largest_move(name: str) -> float:
+        if name in unsharp:
+            return math.inf
+        return LARGEST_ROTATION_MOVE_PX if name in MOTION else LARGEST_MOVE_PX
+
+    most = np.array([largest_move(n) for n in space.names])
+    low, high = space.bounds()
+    return np.clip(low, v - most, v + most), np.clip(high, v - most, v + most)
+
+
+# Acceptance of the photometric stage's optimum.
+#
+# Each limit was set by failures that it prevents; ``docs/explanation/stability.md`` describes them.
+
+LARGEST_MOVE_PX = 1.5
+"""Largest accepted distance between the optima of the photometric and the sharpness stage, in the prism's parameters
+[px]."""
+PERTURBATION_PX, LEAST_COST_RISE = 0.3, 0.01
+"""Reject the photometric optimum if changing the prism's orbit by ``PERTURBATION_PX`` [px] raises the cost by less than
+``LEAST_COST_RISE``.
+
+Without such a rise there is no distinct optimum, or a brightness map of few events fits any orbit. The cost is relative
+to that without a brightness map.
+"""
+RISE_SHARE, SMALLEST_RISE = 0.1, 0.003
+"""A rise below ``LEAST_COST_RISE`` suffices if it is this share of the cost, and at least ``SMALLEST_RISE``.
+
+Few edges leave a small cost, and small rises. In recordings that determined the orbit the share was 0.11 to 0.25, in
+those that did not, 0.02 at most.
+"""
+LARGEST_NEXT_STEP_PX = 0.06
+"""Largest Gauss-Newton step that may remain when the search ends [px]. The step is about 0.01 px if the search
+converged."""
+LARGEST_COST = 0.75
+"""Largest accepted cost, relative to the cost without a brightness map. Above it the map explains too little of the
+events."""
+
+LARGEST_EXAMINED_COST = 0.5
+"""Largest cost, relative to that without a map, of an answer that is examined for causes of an error."""
+LARGEST_STILL_COST = 0.2
+"""Largest cost of the photometric stage, relative to that without a brightness map, that a still camera and a correct
+encoder scale leave."""
+LARGEST_ROTATION_GAIN = 0.05
+"""Largest share of the squared residuals that a camera rotation may explain before it is freed. Cameras that turned at
+0.1 to 1 deg/s left 0.1 to 0.5; still ones 0.007 at most, whatever the noise."""
+LARGEST_COST_RATIO = 0.75
+"""Ratio of the new to the previous cost up to which another explanation is accepted if the previous cost was high: a
+camera rotation, a corrected encoder scale, or a corrected lens."""
+LARGEST_INCONSISTENCY_PX = 0.1
+"""Largest accepted error that the check of the answer's consistency leaves [px]."""
+
+
+LARGEST_LAG_RAD = 0.35
+"""Largest angle by which the prism may turn within the time constant of slow photoreceptors [rad]. At 0.2 an error of
+0.02 px remains, at 0.4 one of 0.14 px."""
+
+
+def judge_lag(turn: float) -> tuple[bool, str]:
+    """Return whether to accept an answer for pixels within whose time constant the prism turns by an angle [rad]."""
+    if turn <= LARGEST_LAG_RAD:
+        return True, ""
+    return False, (
+        f"the pixels are too slow: the prism turns by {math.degrees(turn):.0f} deg within their time constant; use "
+        "more light, a larger bandwidth or a slower prism"
+    )
+
+
+def judge_consistency(error_px: float, cause: str) -> tuple[bool, str]:
+    """Return whether to accept an answer that differs over the image and over time by ``error_px``, and the reason.
+
+    ``cause`` is the likeliest cause, in words.
+    """
+    if error_px <= LARGEST_INCONSISTENCY_PX:
+        return True, ""
+    return False, f"the answer differs by {error_px:.2f} px between parts of the image or of the recording: {cause}"
+
+
+def judge_optimum(cost: float, *, rise: float, moved: float, next_step: float) -> tuple[bool, str]:
+    """Return whether to accept an optimum of the photometric stage, and the reason.
+
+    Parameters
+    ----------
+    cost : float
+        Remaining cost, relative to that without a map.
+    rise : float
+        Smallest rise of the cost for an orbit that is :data:`PERTURBATION_PX` larger, smaller or rotated either way.
+    moved : float
+        Distance from the answer of the sharpness stage [px].
+    next_step : float
+        Length of the next Gauss-Newton step [px].
+
+    Returns
+    -------
+    accepted : bool
+        Whether to accept the optimum.
+    reason : str
+        The reason.
+    """
+    if cost > LARGEST_COST:
+        return False, (
+            f"no brightness map of the scene explains the events ({min(100 * cost, 100):.0f} % of the residual "
+            "remains): the scene or the camera moved, light flickered, or the encoder or the lens is wrong"
+        )
+    if moved > 0.95 * LARGEST_MOVE_PX:
+        return False, (
+            f"the optimum is over {LARGEST_MOVE_PX:g} px away from that of sharpness: the lens or the encoder is "
+            "wrong, or the scene or the camera moved"
+        )
+    if next_step > LARGEST_NEXT_STEP_PX:
+        size = f"{next_step:.2f} px" if next_step <= LARGEST_MOVE_PX else f"over {LARGEST_MOVE_PX:g} px"
+        return False, (
+            f"the search did not converge: its next step would be {size}, but no step lowers the cost: too few events, "
+            "or many lost"
+        )
+    if rise < min(LEAST_COST_RISE, max(SMALLEST_RISE, RISE_SHARE * cost)):
+        well = f"as well ({100 * rise:.1f} % of the residual more)" if rise > 0.0 else "better"
+        return False, (
+            f"an orbit that is {PERTURBATION_PX:g} px larger, smaller or rotated explains the events {well}: "
+            "too few events, too little contrast, or the scene or the camera moved"
+        )
+    return True, f"one brightness map explains the events ({100 * cost:.0f} % of the residual remains)"
+
+
+# Check that the photometric stage's result is a minimum: slightly larger, smaller or rotated orbits must cost more.
+
+FEW_PAIRS = 50_000
+"""Number of pairs of events below which a new brightness map is solved for each tested point."""
+
+
+def start_costs_around(
+    cost: Cost, best: Vector, final: Callable[[], float]
+) -> Callable[[], list[tuple[Vector, float]]]:
+    """Start to compute the costs at points :data:`PERTURBATION_PX` from ``best`` in size and phase.
+
+    Return a function that waits, and returns the points with their rise in cost, lowest first. ``final`` waits for the
+    cost at ``best`` with the present map. A map of few pairs is biased to the point where it was fitted, and all other
+    points would cost more. Then a new map is solved for each point, ``best`` included.
+    """
+    few = cost.brightness.count < FEW_PAIRS
+    points = [
+        best + side * along
+        for along in size_and_phase_directions(cost.space, best)
+        for side in (PERTURBATION_PX, -PERTURBATION_PX)
+    ]
+    costs = []
+    for point in [best, *points] if few else points:
+        if few:
+            cost.renew(point)
+            cost.residuals(point, rounds=2)
+        else:
+            cost.predict(point)
+            cost.residuals(point, rounds=2, steps=cost.steps // 2)
+        costs.append(cost.start_mean())
+    reference = costs.pop(0) if few else final
+
+    def result() -> list[tuple[Vector, float]]:
+        here = reference()
+        rises = [there() - here for there in costs]
+        return sorted(zip(points, rises, strict=True), key=lambda found: found[1])
+
+    return result
+
+
+# Timing of the sensor that was not given: its refractory period, and the time constant of slow photoreceptors.
+#
+# Both shift the angles of the prism at which events tell the brightness. A linearised fit tells whether one of them
+# explains much of the residual; then it is searched for. All angles are those by which the prism turns within a time.
+
+LEAST_TIMING_GAIN = 0.03
+"""Smallest share of the squared residuals that a time must explain. Right ones explain 0.01 at most."""
+SIGNIFICANT_TIMING = 10.0
+"""Smallest number of standard deviations of a time from 0."""
+STEP_RAD = 0.004
+"""Step of the finite differences that give the derivatives of the residuals by an angle [rad]."""
+LARGEST_RAD = 0.5
+"""Largest angle that is searched [rad]."""
+FACTOR, MOST_TRIALS = 1.7, 7
+"""Ratio between angles that are tried, and their largest number."""
+PARABOLAS = 2
+"""Number of parabolas that are laid through the lowest costs."""
+
+
+def timing_can_be_found(answer: Answer, cost: Cost) -> bool:
+    """Return whether the sensor's timing can be examined: for a still camera, if a map explains most of the events."""
+    space = cost.space
+    drifts = cost.brightness.pairs.arrays.slope.shape[0]
+    return space.sized and not space.moving and not drifts and answer.result.cost <= LARGEST_EXAMINED_COST
+
+
+def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]:
+    """Return the angles per refractory period and per time constant at median brightness [rad].
+
+    A linearised fit at the answer ``v`` estimates each of them. An angle that is not significant is 0.
+    """
+    cost.converge(v)
+    relative, _ = darkness(cost.brightness, cost.space.build(cost.space.to_values(v)))
+    # the refractory period sets the reference of a pair, its first event, later
+    reference = wp.zeros_like(relative)
+    reference[0].fill_(1.0)
+    columns = consistency.free_columns(cost, v)
+    columns["refractory"], columns["slow"] = (_shifted(cost, v, shift) for shift in (reference, relative))
+    fit = consistency.linear_fit(cost, columns)
+
+    def angle(name: str, sign: float) -> float:
+        estimate, significance, gain = fit.adding(cost.space.names, (name,))
+        change = sign * float(estimate.change[-1])
+        return change if change > 0.0 and significance >= SIGNIFICANT_TIMING and gain >= LEAST_TIMING_GAIN else 0.0
+
+    return angle("refractory", direction), angle("slow", -direction)
+
+
+def _shifted(cost: Cost, v: Vector, shift: Any) -> Any:
+    """Return the derivative of the residuals by a factor of ``shift``, changes of the angles at the ends of pairs.
+
+    ``shift`` is a Warp array of shape (2, pairs), padded.
+    """
+    pairs, at = cost.brightness.pairs, cost.at(v)
+    none = pairs.arrays.slope
+    pairs.arrays.slope = shift.flatten()
+    ends = {**at, "drift": STEP_RAD}, {**at, "drift": -STEP_RAD}
+    column = cost.brightness.find_slope(*ends, 2.0 * STEP_RAD)
+    pairs.arrays.slope = none
+    return column
+
+
+def find_refractory(search: AnswerSearch, v: Vector, first: float, direction: float) -> float:
+    """Return the angle by which the prism turns in the refractory period, for which the cost is lowest [rad].
+
+    The parameters are those of :func:`find_time_constant`; the pairs remain unchanged.
+    """
+    cost = search.cost
+    azimuth = cost.brightness.pairs.arrays.azimuth
+    given = azimuth.numpy().copy()
+
+    def cost_at(angle: float) -> float:
+        """Return the cost if the references are ``angle`` later."""
+        turned = given.reshape(4, -1).copy()
+        z = (turned[0] + 1j * turned[1]) * np.exp(1j * direction * angle)
+        turned[0], turned[1] = z.real, z.imag
+        azimuth.assign(turned.ravel())
+        cost.renew(v)
+        at = search.descend(v).x
+        cost.residuals(at, rounds=2, steps=2 * cost.steps)
+        return cost.mean()
+
+    best = _lowest(cost_at, first)
+    azimuth.assign(given)
+    return best
+
+
+def find_time_constant(search: AnswerSearch, v: Vector, first: float, direction: float) -> float:
+    """Return the angle per time constant at median brightness, for which the cost is lowest [rad].
+
+    Parameters
+    ----------
+    search : AnswerSearch
+        Search on a map with one node per pixel, on which costs depend smoothly on the angle. The lags of its pairs are
+        set to those of the result.
+    v : numpy.ndarray
+        Search vector of the answer without lags, shape (n,).
+    first : float
+        Angle from which the search starts [rad].
+    direction : float
+        Direction of rotation of the prism: 1 or -1.
+
+    Returns
+    -------
+    float
+        The angle; 0 if no lag lowers the cost.
+    """
+    cost, space = search.cost, search.cost.space
+
+    def cost_at(turn: float) -> float:
+        """Return the cost with the lags of an angle."""
+        cost.brightness.pairs.clear_lags()
+        cost.renew(v)
+        cost.residuals(v, rounds=2)
+        at = v
+        for with_offsets in (False, True) if turn else ():
+            set_lags(cost.brightness, space.build(space.to_values(at)), direction * turn, with_offsets=with_offsets)
+            at = search.descend(at).x
+        cost.residuals(at, rounds=2, steps=2 * cost.steps)
+        return cost.mean()
+
+    return _lowest(cost_at, first)
+
+
+def _lowest(cost_at: Callable[[float], float], first: float) -> float:
+    """Return the angle of the lowest cost, evaluated last; 0 if no angle costs less than 0.
+
+    Angles in geometric progression from a little above ``first`` on bracket the lowest one; parabolas then find it.
+    """
+    angles = [FACTOR * first, FACTOR**2 * first]
+    costs = [cost_at(angle) for angle in angles]
+    while len(angles) < MOST_TRIALS and costs[-1] < costs[-2] and FACTOR * angles[-1] <= LARGEST_RAD:
+        angles.append(FACTOR * angles[-1])
+        costs.append(cost_at(angles[-1]))
+    while len(angles) < MOST_TRIALS and costs[0] <= costs[1]:
+        angles.insert(0, angles[0] / FACTOR)
+        costs.insert(0, cost_at(angles[0]))
+    for _ in range(PARABOLAS):
+        k = int(np.argmin(costs))
+        if not 0 < k < len(angles) - 1:
+            break
+        curve = np.polyfit(np.log(angles[k - 1 : k + 2]), costs[k - 1 : k + 2], 2)
+        angle = float(np.exp(-0.5 * curve[1] / curve[0]))
+        at = k if angle < angles[k] else k + 1
+        angles.insert(at, angle)
+        costs.insert(at, cost_at(angle))
+    best = angles[int(np.argmin(costs))]
+    none = cost_at(0.0)
+    return best if cost_at(best) < none else 0.0
+
+
+def timing_notes(refractory_us: float, time_constant_us: float) -> list[str]:
+    """Return a sentence for each time that was found [us]; 0 for none."""
+    notes = []
+    if refractory_us:
+        notes.append(
+            f"the events show that pixels pause after an event (refractory period): {refractory_us:.0f} us of it fit "
+            "best and were corrected; give the true one by --refractory-us"
+        )
+    if time_constant_us:
+        notes.append(
+            f"the pixels are slow: about {time_constant_us:.0f} us at the median brightness, more in the dark. The "
+            "size of the orbit was corrected. The lag is part of the phase, which holds at this speed of the prism only"
+        )
+    return notes
 
 
 # Correction of the given camera and prism where the events contradict them, and the last judgement of the answer.
@@ -82,7 +679,7 @@ LARGEST_LAST_STEP_PX = 0.01
 class _Corrected:
     """Answer after the correction of a cause."""
 
-    cause: Cause
+    cause: consistency.Cause
     answer: Answer
     cost: float
     """Cost with a new map, which compares with that of other answers."""
@@ -103,7 +700,7 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
     first = answer, search.sharpest
     for left in range(MOST_CORRECTIONS, -1, -1):
         cost.converge(answer.stage.x)
-        check = check_consistency(cost, answer.stage.x)
+        check = consistency.check_consistency(cost, answer.stage.x)
         best = _best_correction(search, answer, check) if left else None
         if best is not None:
             cost.space, search.sharpest, answer = best.space, best.sharpest, best.answer
@@ -116,13 +713,13 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
     if unexplained and cost.space is not given:  # another trouble, such as a rotating camera, which is tried later
         cost.space, (answer, search.sharpest) = given, first
         cost.converge(answer.stage.x)
-        check = check_consistency(cost, answer.stage.x)
+        check = consistency.check_consistency(cost, answer.stage.x)
     answer = _final(search, answer, check)
     notes = (*_corrections(given, search.cost.space, answer), *check.warnings())
     return replace(answer, result=replace(answer.result, warnings=notes))
 
 
-def _best_correction(search: AnswerSearch, answer: Answer, check: Consistency) -> _Corrected | None:
+def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Consistency) -> _Corrected | None:
     """Return the best answer with one of the likeliest causes corrected; None if none lowers the cost."""
     rivals = [f for f in check.findings if f.gain >= RIVAL_SHARE * check.findings[0].gain]
     if not rivals:
@@ -137,12 +734,12 @@ def _best_correction(search: AnswerSearch, answer: Answer, check: Consistency) -
     return next((t for t in sorted(tried, key=lambda t: t.cause.rank) if t.cost < here and t.cost <= limit), None)
 
 
-def _corrected(search: AnswerSearch, finding: Finding, v: NDArray[np.float64]) -> _Corrected:
+def _corrected(search: AnswerSearch, finding: consistency.Finding, v: Vector) -> _Corrected:
     """Return the answer with a cause corrected. The search's space stays."""
     cost, space, sharpest, cause = search.cost, search.cost.space, search.sharpest, finding.cause
-    cost.space, _ = with_cause(space, cause, space.to_values(v))
-    if cause.names == (FLAT_SIDE,):
-        search.sharpest = turned(space, sharpest)
+    cost.space, _ = consistency.with_cause(space, cause, space.to_values(v))
+    if cause.names == (consistency.FLAT_SIDE,):
+        search.sharpest = consistency.turned(space, sharpest)
     answer = search.search(finding.start)
     found = _Corrected(cause, answer, _comparable_cost(search, answer.stage.x), cost.space, search.sharpest)
     cost.space, search.sharpest = space, sharpest
@@ -152,11 +749,13 @@ def _corrected(search: AnswerSearch, finding: Finding, v: NDArray[np.float64]) -
 def _significant(found: _Corrected) -> bool:
     """Return whether a corrected parameter differs significantly from the given one. A turned prism always does."""
     result, start = found.answer.result, found.space.start
-    names = [n for n in found.cause.names if n != FLAT_SIDE]
-    return not names or any(abs(result.parameters[n] - start[n]) >= SIGNIFICANT * result.uncertainty[n] for n in names)
+    names = [n for n in found.cause.names if n != consistency.FLAT_SIDE]
+    return not names or any(
+        abs(result.parameters[n] - start[n]) >= consistency.SIGNIFICANT * result.uncertainty[n] for n in names
+    )
 
 
-def _comparable_cost(search: AnswerSearch, v: NDArray[np.float64]) -> float:
+def _comparable_cost(search: AnswerSearch, v: Vector) -> float:
     """Return the cost at ``v`` with a new map: a map that was improved for longer has another cost."""
     cost = search.cost
     present = cost.brightness.copy_unknowns()
@@ -167,7 +766,7 @@ def _comparable_cost(search: AnswerSearch, v: NDArray[np.float64]) -> float:
     return mean
 
 
-def _final(search: AnswerSearch, answer: Answer, check: Consistency) -> Answer:
+def _final(search: AnswerSearch, answer: Answer, check: consistency.Consistency) -> Answer:
     """Return the answer with the last step added, its whole uncertainty and the judgement of its consistency."""
     result, v, space = answer.result, answer.stage.x, search.cost.space
     timing = np.zeros(len(v))
@@ -180,10 +779,7 @@ def _final(search: AnswerSearch, answer: Answer, check: Consistency) -> Answer:
         uncertainty=space.deviations(v, answer.covariance + systematic), rotation_gain=check.rotation_gain,
         center_px=check.center_px,
     )  # fmt: skip
-    accepted, reason = judge_consistency(check.inconsistent_px(), check.likeliest())
-    if result.accepted and not accepted:
-        result = replace(result, accepted=False, verdict=reason)
-    return replace(answer, result=result)
+    return replace(answer, result=result).judged(*judge_consistency(check.inconsistent_px(), check.likeliest()))
 
 
 def _corrections(given: ParameterSpace, space: ParameterSpace, answer: Answer) -> list[str]:
@@ -206,147 +802,3 @@ def _corrections(given: ParameterSpace, space: ParameterSpace, answer: Answer) -
                 f"{remedy}"
             )
     return out
-
-
-LARGEST_FINE_COST = 0.3
-"""Largest cost, relative to that without a map, for which a map has more than one node per pixel along each axis. Where
-half of the events are noise, a finer map follows them, and orbits come out too small."""
-
-
-@dataclass(frozen=True)
-class _Equations:
-    """Equations of the stage: pairs of events, a map, and the search on it."""
-
-    pairs: PairSet
-    cost_on: Callable[[Tiles, ParameterSpace], Cost]
-    """Function that returns a cost with a new map on tiles, solved at the sharpness stage's result."""
-    answers: AnswerSearch
-    start: NDArray[np.float64]
-    """Search vector of the sharpness stage's result."""
-    held: tuple[str, ...]
-    """Free parameters that the events do not determine."""
-
-    def coarse(self) -> AnswerSearch:
-        """Return the search on a new map with one node per pixel."""
-        cost = self.answers.cost
-        return replace(self.answers, cost=self.cost_on(cost.brightness.tiles.at_density(1.0), cost.space))
-
-
-def refine(
-    recording: Recording,
-    search: Search,
-    linear: tuple[str, ...],
-    *,
-    ahead: EventsAhead | None = None,
-    progress: Progress | None = None,
-    meanwhile: Iterator[None] | None = None,
-) -> tuple[PhotometricSummary, StageSummary, ParameterSpace]:
-    """Run the photometric stage, which starts at the result of the sharpness stage.
-
-    ``linear`` names the free ones of ``off_ratio`` and ``leak``. ``ahead``: events already on the device, of
-    :func:`upload_ahead`. Some steps of ``meanwhile`` are taken while a GPU works. Return the result, the summary of the
-    search, and the space of the result, whose camera and prism are corrected. Raises :class:`AmiwarpError` for too few
-    pairs.
-    """
-
-    def report(share: float) -> None:
-        if progress is not None:
-            progress(*stage_share(search.settings, "photometric", share))
-
-    def equations(sensor: SensorTiming) -> _Equations:
-        settings = replace(search.settings.photometric, sensor=sensor)
-        collected = collect_pairs(recording, search, settings, ahead)
-        return _equations(recording, search, linear, settings, collected, report, meanwhile)
-
-    given = search.settings.photometric.sensor
-    found = equations(given)
-    answer = found.answers.search(found.start)
-    rpm, sensor, time_constant = search.calibration_events.encoder.rpm, given, 0.0
-    rad_per_us, direction = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm)
-    if timing_can_be_found(answer, found.answers.cost) and rpm:
-        v = answer.stage.x
-        pause, lag = timing_steps(found.answers.cost, v, direction)
-        if pause and not given.refractory_us:
-            turn = find_refractory(found.coarse(), v, pause, direction)
-            sensor = replace(given, refractory_us=turn / rad_per_us)
-            found = equations(sensor)
-            answer = found.answers.search(found.start)
-            _, lag = timing_steps(found.answers.cost, answer.stage.x, direction)
-        if lag:
-            answer, turn = _with_slow_pixels(found, answer, lag, direction)
-            time_constant = turn / rad_per_us
-        if len(v) == len(answer.stage.x):
-            found.answers.timing = answer.stage.x - v
-    answers = found.answers
-    answer = checked(answers, answer)
-    accepted, reason = judge_lag(time_constant * rad_per_us)
-    if answer.result.accepted and not accepted:
-        answer = replace(answer, result=replace(answer.result, accepted=False, verdict=reason))
-    notes = (*timing_notes(sensor.refractory_us - given.refractory_us, time_constant), *answer.result.warnings)
-    result = replace(
-        answer.result, sharpness_parameters=answers.sharpest, pairs=len(found.pairs), held=found.held, warnings=notes,
-        refractory_us=sensor.refractory_us, time_constant_us=time_constant,
-    )  # fmt: skip
-    space = answers.cost.space
-    values = map(space.to_values, answer.stage.points)
-    return result, StageSummary.of("photometric", answer.stage, space.names, values), space
-
-
-def _with_slow_pixels(found: _Equations, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:
-    """Return the answer for pixels with slow photoreceptors, and the angle per time constant [rad]; 0 if it fails.
-
-    ``first`` is a first estimate of that angle. The search of ``found`` has a new map then.
-    """
-    answers, v = found.answers, answer.stage.x
-    found.pairs.clear_lags()
-    turn = find_time_constant(found.coarse(), v, first, direction)
-    answers.cost = found.cost_on(answers.cost.brightness.tiles, answers.cost.space)
-    again = answers.search(v)
-    return replace(again, stage=join_runs(answer.stage, again.stage)), turn
-
-
-def _equations(
-    recording: Recording,
-    search: Search,
-    linear: tuple[str, ...],
-    settings: PhotometricSettings,
-    collected: tuple[PairSet, Tiles],
-    report: Callable[[float], None],
-    meanwhile: Iterator[None] | None,
-) -> _Equations:
-    """Return the equations of ``collected`` pairs. Raises :class:`AmiwarpError` for too few pairs."""
-    pairs, tiles = collected
-    full = search.full_space
-    space = full.holding({n: x for n, x in search.best.items() if n not in full.names})
-    # the count of OFF and ON events gives the ratio of thresholds only if brightness returns after a whole turn
-    duration_us = recording.events.t_last - recording.events.t_first
-    whole_turn = abs(search.calibration_events.encoder.rpm) * duration_us >= 60e6
-    excess = off_excess(pairs, with_leak="leak" in linear) if whole_turn else 0.0
-
-    def cost_on(tiles: Tiles, space: ParameterSpace = space) -> Cost:
-        brightness = BrightnessMap(
-            pairs, tiles, off_excess=None if "off_ratio" in linear else excess, with_leak="leak" in linear,
-            middle_us=space.middle_us,
-        )  # fmt: skip
-        cost = Cost(space, brightness, settings.steps, meanwhile)
-        cost.warm_up(space.to_vector({**space.start, **search.best}))
-        return cost
-
-    v = space.to_vector({**space.start, **search.best})
-    cost = cost_on(tiles)
-    mean, coverage = cost.start_mean(), cost.brightness.coverage(cost.scale)
-    few = not fine_map_is_determined(coverage, len(pairs))
-    noisy = mean() > LARGEST_FINE_COST
-    # a fine map converges too slowly for parameters that make nearly the same motion
-    if tiles.density > 1.0 and (few or noisy or any(n in DEGENERATE_WITH_APEX for n in space.names)):
-        cost = cost_on(tiles.at_density(1.0))
-        coverage = cost.brightness.coverage(cost.scale)
-    left = check_pairs(recording.name, coverage, len(pairs))
-    keep = determined(cost.slopes(v, with_parts=True), space, left)
-    held = tuple(n for n in space.names if n not in keep)
-    # undetermined parameters stay at the answer of sharpness, because the others were found together with them
-    cost.space = space = space.without(held).holding({n: x for n, x in search.best.items() if n in held})
-    v = space.to_vector({**space.start, **search.best})
-    if held:
-        cost.warm_up(v)
-    return _Equations(pairs, cost_on, AnswerSearch(cost, dict(search.best), left, settings, report), v, held)

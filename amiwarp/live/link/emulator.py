@@ -20,28 +20,11 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.live.link import protocol
 from amiwarp.live.link.clocks import WRAP, monotonic_us
-from amiwarp.live.link.protocol import (
-    FAULTS,
-    MOST_SAMPLES,
-    Answer,
-    ControllerStatus,
-    FrameDecoder,
-    Index,
-    Message,
-    Ping,
-    Pong,
-    Samples,
-    SetCounts,
-    SetSpeed,
-    Stop,
-    Sync,
-    encode,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
 
     from numpy.typing import ArrayLike, NDArray
 
@@ -260,12 +243,12 @@ class Controller:
         """Latest sync pulses, each with its number and emulation time [us]."""
         self._rate = 1.0 + drift_ppm * 1e-6
         self._sample_us, self._sync_us = 1e6 / sample_hz, 1e6 / sync_hz
-        self._batch_size = min(max(int(BATCH_US / self._sample_us), 1), MOST_SAMPLES)
+        self._batch_size = min(max(int(BATCH_US / self._sample_us), 1), protocol.MOST_SAMPLES)
         self._rng = random.Random(seed)
         due = [(edge, fault, on) for fault in faults for edge, on in _edges_of(fault, start_us)]
         self._fault_edges = sorted(due, key=itemgetter(0))
         self._active_faults: list[str] = []
-        self._decoder = FrameDecoder()
+        self._decoder = protocol.FrameDecoder()
         self._heard_us = self._now = start_us
         self._out = bytearray()
         self._boot(clock_start)
@@ -330,14 +313,14 @@ class Controller:
         time_us = self._boot_us + elapsed / self._rate
         angle = self.rotor.angle(time_us)
         whole = np.floor(angle * (self.counts_per_turn / math.tau)).astype(np.int64)
-        due: list[tuple[float, Message | int]] = list(zip(elapsed.tolist(), whole.tolist(), strict=True))
+        due: list[tuple[float, protocol.Message | int]] = list(zip(elapsed.tolist(), whole.tolist(), strict=True))
         due += self._index_pulses(np.append(self._before[0], time_us), np.append(self._before[1], angle))
         if len(time_us):
             self._before = time_us[-1], angle[-1]
         for k in range(math.floor(first / self._sync_us) + 1, math.floor(last / self._sync_us) + 1):
             at = k * self._sync_us
             self.pulses.append((k - 1, round(self._boot_us + at / self._rate)))
-            due.append((at, Sync(self._t(at), (k - 1) % WRAP)))
+            due.append((at, protocol.Sync(self._t(at), (k - 1) % WRAP)))
         for at, what in sorted(due, key=itemgetter(0)):
             if isinstance(what, int):
                 self._batch.append((self._t(at), _int32(self._count(what))))
@@ -350,15 +333,15 @@ class Controller:
 
     def _index_pulses(
         self, time_us: NDArray[np.float64], angle: NDArray[np.float64]
-    ) -> list[tuple[float, Message | int]]:
+    ) -> list[tuple[float, protocol.Message | int]]:
         """Return the index pulses between samples, each with its clock reading."""
         turns = np.floor(angle / math.tau).astype(np.int64)
-        found: list[tuple[float, Message | int]] = []
+        found: list[tuple[float, protocol.Message | int]] = []
         for k in np.flatnonzero(np.diff(turns)) if "missed-index" not in self._active_faults else ():
             turn = int(max(turns[k : k + 2]))
             share = (turn * math.tau - angle[k]) / (angle[k + 1] - angle[k])
             at = (time_us[k] + share * (time_us[k + 1] - time_us[k]) - self._boot_us) * self._rate
-            found.append((at, Index(self._t(at), _int32(self._count(turn * self.counts_per_turn)))))
+            found.append((at, protocol.Index(self._t(at), _int32(self._count(turn * self.counts_per_turn)))))
         return found
 
     def _t(self, elapsed: float) -> int:
@@ -395,25 +378,25 @@ class Controller:
         rpm = turned / math.tau * 60e6 / max(self._now - early, 1)
         target = self.rotor.target_rpm(self._now)
         state = 0 if target == 0 and abs(rpm) < 1 else 1 if abs(rpm - target) <= 0.03 * abs(target) + 1 else 2
-        fault_bits = (1 << FAULTS.index("host lost")) * (self._now - self._heard_us > HOST_TIMEOUT_US)
+        fault_bits = (1 << protocol.FAULTS.index("host lost")) * (self._now - self._heard_us > HOST_TIMEOUT_US)
         sent = state, fault_bits, target, self.counts_per_turn
         if sent != self._sent_status:
             self._sent_status = sent
             t = self.clock(self._now) % WRAP
-            self._send(ControllerStatus(t, state, fault_bits, rpm, target, self.counts_per_turn))
+            self._send(protocol.ControllerStatus(t, state, fault_bits, rpm, target, self.counts_per_turn))
 
-    def _execute(self, sequence: int, message: Message) -> None:
+    def _execute(self, sequence: int, message: protocol.Message) -> None:
         refused = 0
-        if isinstance(message, Ping):
+        if isinstance(message, protocol.Ping):
             self._send_status()
-            self._send(Pong(message.number, self.clock(self._now) % WRAP))
+            self._send(protocol.Pong(message.number, self.clock(self._now) % WRAP))
             return
-        if isinstance(message, SetSpeed):
+        if isinstance(message, protocol.SetSpeed):
             fits = abs(message.rpm) <= MOST_RPM and 0 < message.ramp < math.inf
             refused = 2 if not fits else 0 if self.rotor.set_speed(message.rpm, message.ramp, self._now) else 3
-        elif isinstance(message, Stop):
+        elif isinstance(message, protocol.Stop):
             refused = 0 if self.rotor.set_speed(0.0, STOP_RAMP, self._now) else 3
-        elif isinstance(message, SetCounts):
+        elif isinstance(message, protocol.SetCounts):
             refused = 0 if 0 < message.per_turn < 1 << 24 else 2
             if not refused:
                 self._flush()
@@ -421,18 +404,18 @@ class Controller:
                 self._count_offset = math.floor(self._position())
         else:
             refused = 1
-        self._send(Answer(sequence, refused))
+        self._send(protocol.Answer(sequence, refused))
         self._send_status()
 
     def _flush(self) -> None:
         batch, self._batch = self._batch, []
         if batch:
-            self._send(Samples(tuple(t for t, _ in batch), tuple(count for _, count in batch)))
+            self._send(protocol.Samples(tuple(t for t, _ in batch), tuple(count for _, count in batch)))
 
-    def _send(self, message: Message) -> None:
-        if not isinstance(message, Samples):
+    def _send(self, message: protocol.Message) -> None:
+        if not isinstance(message, protocol.Samples):
             self._flush()
-        frame = encode(message, self._sequence)
+        frame = protocol.encode(message, self._sequence)
         self._sequence = (self._sequence + 1) % (1 << 16)
         if self.plugged and len(self._out) < MOST_OUT_BYTES:
             self._out += self._corrupt(bytearray(frame))
@@ -510,9 +493,7 @@ class PseudoTerminal:
     def __enter__(self) -> PseudoTerminal:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

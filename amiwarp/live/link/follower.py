@@ -12,19 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.live.link import protocol
 from amiwarp.live.link.clocks import FEWEST_PAIRS, WRAP, ClockMap, UnwrappedClock, fit_to_round_trips
-from amiwarp.live.link.protocol import (
-    FAULTS,
-    Answer,
-    ControllerStatus,
-    FrameCounters,
-    FrameDecoder,
-    Index,
-    Message,
-    Pong,
-    Samples,
-    Sync,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -276,11 +265,11 @@ class LossReporter:
     _noise_us: int = -REPORT_US
     _lost_us: int = -REPORT_US
 
-    def forget_lost(self, received: FrameCounters) -> None:
+    def forget_lost(self, received: protocol.FrameCounters) -> None:
         """Mark the frames lost so far as reported."""
         self._lost = received.lost
 
-    def check(self, received: FrameCounters, host_us: int) -> Iterator[str]:
+    def check(self, received: protocol.FrameCounters, host_us: int) -> Iterator[str]:
         """Yield the messages about losses and noise that are due."""
         if self._damaged is not None and received.damaged > self._damaged:
             if host_us - self._noise_us > REPORT_US:
@@ -301,7 +290,7 @@ class Connection:
 
     opened_us: int
     """Host time at which the port was opened [us]."""
-    decoder: FrameDecoder = field(default_factory=FrameDecoder)
+    decoder: protocol.FrameDecoder = field(default_factory=protocol.FrameDecoder)
     losses: LossReporter = field(default_factory=LossReporter)
     received_bytes: int = 0
     unusable: bool = False
@@ -329,7 +318,7 @@ class StallDetector:
     _count: int = 0
     _reported: bool = False
 
-    def check(self, t: int, count: int, status: ControllerStatus | None, counts_per_turn: int) -> str | None:
+    def check(self, t: int, count: int, status: protocol.ControllerStatus | None, counts_per_turn: int) -> str | None:
         """Process a sample; return a message when a stall begins."""
         if self._since_us == 0 or count != self._count:
             self._since_us, self._count, self._reported = t, count, False
@@ -411,7 +400,7 @@ STATUS_US = 2_000_000
 """Longest time for which samples wait until the controller's status gives the counts per turn [us]. The status is sent
 once per second."""
 FROM_FIRST = "angles are relative to the first encoder count"
-HOST_LOST = 1 << FAULTS.index("host lost")
+HOST_LOST = 1 << protocol.FAULTS.index("host lost")
 
 
 class Follower:
@@ -424,7 +413,7 @@ class Follower:
 
     def __init__(self, name: str, counts_per_turn: int | None = None) -> None:
         self.name = name
-        self.status: ControllerStatus | None = None
+        self.status: protocol.ControllerStatus | None = None
         """Latest status that the controller sent; None before the first."""
         self.trips: deque[tuple[int, int, int]] = deque(maxlen=TRIPS)
         """Round trips of pings: time sent (host), answered (controller), received (host) [us]."""
@@ -474,7 +463,7 @@ class Follower:
         """Return the oldest update. After a restart of the controller, data from before the restart come first."""
         return self.updates.take()
 
-    def feed(self, data: bytes, host_us: int) -> list[Answer]:
+    def feed(self, data: bytes, host_us: int) -> list[protocol.Answer]:
         """Process bytes that were read at a host time [us]; return the answers to commands among them."""
         connection = self._connection
         connection.received_bytes += len(data)
@@ -482,28 +471,28 @@ class Follower:
         for sequence, message in connection.decoder.feed(data):
             if sequence is not None and connection.runs_back(sequence):
                 self._restart("the controller was reset")
-            if isinstance(message, Answer):
+            if isinstance(message, protocol.Answer):
                 answers.append(message)
             else:
                 self._process(message, host_us, text=sequence is None)
         self._report_losses(host_us)
         return answers
 
-    def _process(self, message: Message, host_us: int, *, text: bool) -> None:
-        if isinstance(message, Samples):
+    def _process(self, message: protocol.Message, host_us: int, *, text: bool) -> None:
+        if isinstance(message, protocol.Samples):
             for raw_t, raw_count in zip(message.t_us, message.count, strict=True):
                 self._sample(raw_t, raw_count, host_us, text=text)
-        elif isinstance(message, Index):
+        elif isinstance(message, protocol.Index):
             t, count = self._unwrap(message.t_us, message.count, host_us)
             self._convert(t, count, pulse=True)
-        elif isinstance(message, Sync):
+        elif isinstance(message, protocol.Sync):
             self.updates.add_sync(message.number, self._unwrap_time(message.t_us, host_us), host_us)
-        elif isinstance(message, Pong):
+        elif isinstance(message, protocol.Pong):
             t = self._unwrap_time(message.t_us, host_us)
             self._connection.ping_answered = True
             if message.number in self._epoch.pings:
                 self.trips.append((self._epoch.pings.pop(message.number), t, host_us))
-        elif isinstance(message, ControllerStatus):
+        elif isinstance(message, protocol.ControllerStatus):
             self._take_status(message, self._unwrap_time(message.t_us, host_us))
 
     def _sample(self, raw_t: int, raw_count: int, host_us: int, *, text: bool) -> None:
@@ -658,12 +647,12 @@ class Follower:
             else:
                 self.say("the prism turns the other way")
 
-    def _take_status(self, status: ControllerStatus, t: int) -> None:
+    def _take_status(self, status: protocol.ControllerStatus, t: int) -> None:
         self.status, self._epoch.stall.status_us = status, t
         self._decide_counts(status.counts_per_turn or self._per_turn or self._given_per_turn)
         # Before the first ping the controller cannot know the host: this is not a fault.
         faults = status.faults if self._connection.ping_answered else status.faults & ~HOST_LOST
-        for bit, name in enumerate(FAULTS):
+        for bit, name in enumerate(protocol.FAULTS):
             if faults & ~self._epoch.faults & 1 << bit:
                 self.say(f"the controller reports a fault: {name}")
         self._epoch.faults = faults

@@ -16,7 +16,6 @@ from amiwarp.live.link.protocol import REFUSALS, FrameDecoder, Message, Ping, Se
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from types import TracebackType
 
     from amiwarp.live.link.clocks import ClockMap
     from amiwarp.live.link.follower import LinkUpdate
@@ -160,9 +159,7 @@ class Link:
     def __enter__(self) -> Link:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

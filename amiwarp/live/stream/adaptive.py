@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.compensation.streams import held_bytes
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
+from amiwarp.events.events import Events, held_bytes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

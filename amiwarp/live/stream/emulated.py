@@ -13,8 +13,6 @@ from amiwarp.live.stream.packets import encode_events, encode_hello, encode_trig
 from amiwarp.live.stream.sockets import SocketSink
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from amiwarp.events.recording import Recording
     from amiwarp.live.link.emulator import Controller, Played
 
@@ -61,9 +59,7 @@ class EmulatedCamera:
     def __enter__(self) -> EmulatedCamera:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from amiwarp.calib import calibrate
-from amiwarp.compensation.streams import held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI
-from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.events import Events, MemoryEvents, held_bytes
 from amiwarp.events.recording import Recording
 
 if TYPE_CHECKING:

@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from amiwarp.compensation.streams import OVERHEAD, held_bytes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.encoder_stream import start_of_last_run
-from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.events import OVERHEAD, Events, MemoryEvents, held_bytes
 from amiwarp.events.recording import Recording
 from amiwarp.live.stream.queues import Policy
 from amiwarp.live.stream.session import Session, SessionStatus

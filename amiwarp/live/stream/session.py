@@ -5,20 +5,23 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from amiwarp.choices import Sharpness
-from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator, held_bytes
+from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
 from amiwarp.events.encoder_stream import EncoderStream
+from amiwarp.events.events import held_bytes
 from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape
-from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream.camera_clock import EncoderFeed, clock_offset
+from amiwarp.live.link.clocks import ClockMap, monotonic_us
+from amiwarp.live.stream.camera_clock import CameraClock, clock_offset
+from amiwarp.live.stream.packets import NO_TIMES
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.queues import BackgroundWorker, EventSorter, PacketQueue, Policy
 
@@ -26,9 +29,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.calib.result import Calibration
+    from amiwarp.events.encoder_stream import EncoderStream
     from amiwarp.events.events import Events
     from amiwarp.io.live_writer import LiveWriter
     from amiwarp.live.link.clocks import ClockMap
+    from amiwarp.live.link.follower import LinkUpdate
     from amiwarp.live.link.link import Link
     from amiwarp.live.stream.adaptive import SpeedKeeper
     from amiwarp.live.stream.packets import Packet, Source
@@ -49,17 +54,6 @@ class RawConsumer(Protocol):
     def tick(self) -> None: ...
 
 
-Consumer = TypeVar("Consumer", bound="RawConsumer | LiveWriter", covariant=True)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Served(Generic[Consumer]):
-    """Consumer together with the background thread that calls it."""
-
-    consumer: Consumer
-    worker: BackgroundWorker
-
-
 class Consumers:
     """Consumers of a session's data. A consumer that fails is removed; the others continue.
 
@@ -68,19 +62,21 @@ class Consumers:
     """
 
     def __init__(self, raw: Iterable[RawConsumer], out: LiveWriter | None, fail: Callable[[Exception], None]) -> None:
-        self.raw = [Served(consumer, BackgroundWorker()) for consumer in raw]
-        self.out = None if out is None else Served(out, BackgroundWorker())
+        self.raw = [(consumer, BackgroundWorker()) for consumer in raw]
+        """Consumers of the sensor's events, each with the thread that calls it."""
+        self.out = None if out is None else (out, BackgroundWorker())
+        """The same for the consumer of compensated events."""
         self._fail = fail
 
     def append(self, events: Events) -> None:
         """Pass the sensor's events to the consumers of raw events."""
         for served in list(self.raw):
-            self._put(served, partial(served.consumer.append, events), held_bytes(events))
+            self._put(served, partial(served[0].append, events), held_bytes(events))
 
     def append_encoder(self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64]) -> None:
         """Pass encoder samples and index pulses to all consumers."""
         for served in self._all():
-            append = partial(served.consumer.append_encoder, t, angle, index_t)
+            append = partial(served[0].append_encoder, t, angle, index_t)
             self._put(served, append, t.nbytes + angle.nbytes + index_t.nbytes)
 
     def append_compensated(self, packet: Compensated) -> None:
@@ -89,42 +85,44 @@ class Consumers:
             return
         flags = packet.flags
         inside, extrapolated = (flags & OUTSIDE) == 0, (flags & (EXTRAPOLATED | NO_ANGLE)) != 0
-        append = partial(self.out.consumer.append, packet.events, inside=inside, extrapolated=extrapolated)
+        append = partial(self.out[0].append, packet.events, inside=inside, extrapolated=extrapolated)
         self._put(self.out, append, held_bytes(packet.events) + flags.nbytes)
 
     def tick(self) -> None:
         """Let all consumers continue pending work, even without new data."""
         for served in self._all():
-            self._put(served, served.consumer.tick)
+            self._put(served, served[0].tick)
 
     def finish(self) -> None:
         """Wait until the consumers have processed all data, and collect their errors."""
-        for served in self._all():
+        for _, worker in self._all():
             try:
-                served.worker.close()
+                worker.close()
             except Exception as error:
                 self._fail(error)
 
     def end(self) -> None:
         """Wait for the end of all background threads."""
-        for served in self._all():
-            served.worker.end()
+        for _, worker in self._all():
+            worker.end()
 
     def abandon(self) -> None:
         """Drop the waiting data, so that the caller can close the consumers at once."""
-        for served in self._all():
-            served.worker.abandon()
+        for _, worker in self._all():
+            worker.abandon()
 
-    def _all(self) -> list[Served[RawConsumer | LiveWriter]]:
+    def _all(self) -> list[tuple[RawConsumer | LiveWriter, BackgroundWorker]]:
         return [*self.raw, *([] if self.out is None else [self.out])]
 
-    def _put(self, served: Served[RawConsumer | LiveWriter], job: Callable[[], object], held: int = 0) -> None:
+    def _put(
+        self, served: tuple[RawConsumer | LiveWriter, BackgroundWorker], job: Callable[[], object], held: int = 0
+    ) -> None:
         """Pass a job to a consumer's thread; remove the consumer if it has failed."""
         try:
-            served.worker.put(job, held)
+            served[1].put(job, held)
         except Exception as error:
             self._fail(error)
-            served.worker.end()
+            served[1].end()
             if served is self.out:
                 self.out = None
             else:
@@ -451,3 +449,90 @@ class Session:
         if self._compensator is not None:
             self._give(self._compensator.flush())
         self._consumers.finish()
+
+
+MOST_WAITING = 1 << 20
+"""Largest number of samples and index pulses that wait until the camera's clock is known. Beyond it, the oldest are
+dropped."""
+
+
+class EncoderFeed:
+    """Appends encoder samples to an encoder, and gives them to the session's consumers.
+
+    With a link, the controller's samples are used, on the camera's clock; else the source's own samples.
+    """
+
+    def __init__(
+        self,
+        link: Link | None,
+        encoder: EncoderStream,
+        give: Callable[[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]], None],
+        say: Callable[[str], None],
+    ) -> None:
+        """Set up the feed.
+
+        ``give`` is called with samples and index pulses on the events' clock, ``say`` with messages.
+        """
+        self.clock: ClockMap | None = None
+        """Map from the controller's clock to the camera's; None while it is unknown."""
+        self._link, self._encoder, self._give, self._say = link, encoder, give, say
+        self._camera_clock = CameraClock()
+        self._waiting: deque[LinkUpdate] = deque()
+        self._waiting_samples = 0
+        self._warned = False
+
+    def poll(self) -> None:
+        """Process the data that the controller has sent since the last call."""
+        if self._link is None:
+            return
+        update = self._link.poll()
+        for message in update.messages:
+            self._say(message)
+        if update.restarted:
+            self._camera_clock.restart()
+            self._encoder.restart()
+            self._clear()
+        for _number, t_us, host_us in update.sync:
+            self._camera_clock.sync(t_us, host_us)
+        if _size(update):
+            self._waiting.append(update)
+            self._waiting_samples += _size(update)
+        clock = self.clock = self._camera_clock.clock(self._link.clock())
+        if clock is None:
+            self._drop_oldest()
+            return
+        for waiting in self._waiting:
+            self._append(clock(waiting.t_us), waiting.angle, clock(waiting.index_t_us))
+        self._clear()
+
+    def take(self, packet: Packet) -> None:
+        """Process a source's packet: its arrival time and triggers with a link, else its own encoder samples."""
+        if packet.returned:
+            self._camera_clock.returned()
+            self._encoder.restart()
+        if len(packet.events):
+            self._camera_clock.packet(int(packet.events.t[-1]), packet.arrived_us)
+        if self._link is not None:
+            self._camera_clock.triggers(packet.triggers, packet.arrived_us)
+        elif len(packet.encoder_t):
+            self._append(packet.encoder_t, packet.encoder_angle, NO_TIMES)
+
+    def _append(self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64]) -> None:
+        t, angle = self._encoder.append(t, angle)
+        self._give(t, angle, index_t)
+
+    def _drop_oldest(self) -> None:
+        """Drop the oldest waiting samples if there are too many; warn the user once."""
+        if self._waiting_samples > MOST_WAITING and not self._warned:
+            self._warned = True
+            self._say("the camera's clock is not known yet: dropping the oldest encoder samples that wait for it")
+        while self._waiting_samples > MOST_WAITING:
+            self._waiting_samples -= _size(self._waiting.popleft())
+
+    def _clear(self) -> None:
+        self._waiting.clear()
+        self._waiting_samples = 0
+
+
+def _size(update: LinkUpdate) -> int:
+    return len(update.t_us) + len(update.index_t_us)

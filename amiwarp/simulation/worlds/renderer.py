@@ -24,7 +24,7 @@ from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.simulation.worlds.world import Body
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.simulator import Simulation
+    from amiwarp.simulation.description import SimulationValues
     from amiwarp.simulation.worlds.world import WorldScene
 
 
@@ -310,7 +310,7 @@ class WorldMapRing:
     """
 
     def __init__(
-        self, simulation: Simulation, scene: WorldScene, world: DeviceWorld, bearings: NDArray[np.float64]
+        self, simulation: SimulationValues, scene: WorldScene, world: DeviceWorld, bearings: NDArray[np.float64]
     ) -> None:
         """Place the maps. ``bearings``: directions that the camera sees over a turn of the prism, shape (n, 3)."""
         self._scene, self._camera, self._bearings, self._world = scene, simulation.camera, bearings, world

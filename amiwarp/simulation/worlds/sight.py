@@ -26,7 +26,7 @@ from amiwarp.simulation.worlds.renderer import (
 )
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.simulator import Simulation
+    from amiwarp.simulation.description import SimulationValues
     from amiwarp.simulation.worlds.world import WorldScene
 
 RAYS_PER_PIXEL = 4
@@ -61,7 +61,7 @@ class ImageSpeed:
     """Speed due to moving bodies and the camera's translation [px/s], which require new maps."""
 
 
-def image_speed(world: DeviceWorld, simulation: Simulation, scene: WorldScene) -> ImageSpeed:
+def image_speed(world: DeviceWorld, simulation: SimulationValues, scene: WorldScene) -> ImageSpeed:
     """Return the largest speeds of a world's image over the duration of a simulation."""
     t = np.linspace(0.0, simulation.duration_s, MOMENTS)
     camera, trajectory = simulation.camera, scene.trajectory
@@ -76,7 +76,7 @@ def image_speed(world: DeviceWorld, simulation: Simulation, scene: WorldScene) -
 class WorldSight:
     """Light that pixels receive from a world through the prism, at the instants of a chunk of simulated time."""
 
-    def __init__(self, simulation: Simulation, scene: WorldScene, world: DeviceWorld) -> None:
+    def __init__(self, simulation: SimulationValues, scene: WorldScene, world: DeviceWorld) -> None:
         self._scene, self._world, device = scene, world, world.device
         camera, samples = simulation.camera, scene.samples or RAYS_PER_PIXEL
         rays = aperture(samples, scene.blur)

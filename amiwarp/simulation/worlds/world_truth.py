@@ -27,7 +27,7 @@ from amiwarp.validation import array, guarded, real, shown
 
 if TYPE_CHECKING:
     from amiwarp.events.truth import EventValues
-    from amiwarp.simulation.simulator import Simulation
+    from amiwarp.simulation.description import SimulationValues
 
 
 # Ground truth of a simulated world at an instant: depth, normals, instances, optical flow and luminance.
@@ -63,7 +63,7 @@ class TruthRenderer:
     2.0
     """
 
-    def __init__(self, simulation: Simulation) -> None:
+    def __init__(self, simulation: SimulationValues) -> None:
         if not isinstance(simulation.scene, WorldScene):
             raise AmiwarpError("the scene is a picture at infinity, which has no depth; give a WorldScene as the scene")
         self._simulation, self._scene = simulation, simulation.scene
@@ -221,7 +221,7 @@ class RecordedTruth:
     A world gives labels, maps of the chosen instants, and poses. A picture scene gives nothing.
     """
 
-    def __init__(self, simulation: Simulation, instants: NDArray[np.int64]) -> None:
+    def __init__(self, simulation: SimulationValues, instants: NDArray[np.int64]) -> None:
         scene = simulation.scene
         self._scene = scene if isinstance(scene, WorldScene) else None
         self._renderer = TruthRenderer(simulation) if len(instants) else None

@@ -18,7 +18,7 @@ from amiwarp.calib.presets import settings_to
 from amiwarp.calib.settings import STAGES, PhotometricSettings
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import model_error
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import rungs
 from amiwarp.progress import Progress
 from amiwarp.studies.chart.rows import KnownRecording, Row, Task, Timed, measure, near_front
 
@@ -88,7 +88,7 @@ def _both(label: str, family: str, s: Settings) -> Iterator[CalibrationSetting]:
 def _stages(known: KnownRecording) -> Iterator[CalibrationSetting]:
     """Yield the default setting, every model, and the local search that starts from a guess."""
     yield from _both("default", "default", Settings())
-    for model in MODELS:
+    for model in rungs():
         yield from _both(model, "model", Settings(model=model))
     guess = Settings(global_algorithm=None, start={"phase": known.model.phase + GUESS})
     for way in _both("local search from a guess", "algorithms", guess):

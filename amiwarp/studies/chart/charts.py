@@ -17,10 +17,11 @@ import numpy as np
 
 from amiwarp.calib.presets import Preset
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.palette import BLACK, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, VERMILION
+from amiwarp.imaging.palette import BLACK, BLUE, GREEN, MODEL_COLOURS, ORANGE, PINK, SKY_BLUE, VERMILION
 from amiwarp.imaging.votes import TURNS
 from amiwarp.io.atomic_output import check_output, make_folder, write_text
 from amiwarp.io.input_files import read_text
+from amiwarp.optics.models import MODELS, rungs
 from amiwarp.plotting import figures
 from amiwarp.progress import Progress, part, silent
 from amiwarp.simulation.sensor import SensorModel
@@ -57,12 +58,13 @@ LETTERS, SMALL, TINY = 12.5, 10.5, 9.5
 QUANTISATION, PAPER = 0.29, (1.5, 2.0)
 """Rounding error of a pixel along one axis, and range of the error that the paper reports [px]."""
 COLOURS = {
-    "circle": ORANGE, "radial": GREEN, "ellipse": BLUE, "exact": VERMILION, "other libraries": "#6b6b6b",
+    **dict(zip(sorted(rungs(), key=lambda name: not MODELS[name].SIMPLIFIES), MODEL_COLOURS, strict=False)),
+    "other libraries": "#6b6b6b",
     "default": BLACK, "model": ORANGE, "algorithms": BLUE, "events": GREEN, "folding": PINK, "pairs": SKY_BLUE,
     "events and pairs": VERMILION,
 }  # fmt: skip
 """Colour of each family of settings in the charts."""
-WORDS = {"ellipse": "ellipse (table)", "exact": "exact (closed form)", "default": "all settings default",
+WORDS = {**{name: model.TEXT for name, model in rungs().items()}, "default": "all settings default",
          "other libraries": "other libraries (circle)"}  # fmt: skip
 """Legend text of the families whose text differs from the name."""
 MARKS = {

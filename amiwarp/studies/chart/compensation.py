@@ -26,7 +26,7 @@ from amiwarp.imaging.votes import TURNS, CanvasShape, Image, upload_events
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.optics.displacement import wrap_angle
-from amiwarp.optics.models import MODELS, Model
+from amiwarp.optics.models import Model, rungs
 from amiwarp.progress import Progress
 from amiwarp.studies.chart.rows import KnownRecording, Row, Task, exact_image, exact_places, measure, raw_places, rms
 
@@ -171,7 +171,7 @@ class ImageSetting:
 
 def settings(*, quick: bool) -> list[ImageSetting]:
     """Return the image settings that the chart measures."""
-    angles, models = (ANGLES[::2], ("circle", "exact")) if quick else (ANGLES, tuple(MODELS))
+    angles, models = (ANGLES[::2], ("circle", "exact")) if quick else (ANGLES, tuple(rungs()))
     # a nearest vote hides the error of coarse angles
     whole = [
         ImageSetting(m, v, a) for m in models for v in Vote for a in (angles if v is Vote.BILINEAR else angles[:1])
@@ -224,7 +224,7 @@ def _image_rows(
     The uploaded events are freed when this function returns, before files are measured.
     """
     known, truth = sample.known, exact_image(sample.known)
-    models = {name: simplified(known.calibration(), name).model for name in MODELS}
+    models = {name: simplified(known.calibration(), name).model for name in rungs()}
     uploads, ways = Uploads(known, device), settings(quick=quick)
     others, notes = libraries(sample, uploads, device) if libraries is not None else ([], [])
     tasks = [*_image_tasks(ways, models, uploads, device), *(other.task for other in others)]
@@ -315,7 +315,7 @@ def _file_rows(
         save_recording(place / "in.h5", replace(known.recording, truth=None))
         source = open_recording(place / "in.h5")
         tasks = []
-        for model in ("circle", "exact") if quick else MODELS:
+        for model in ("circle", "exact") if quick else rungs():
             calibration = simplified(known.calibration(), model)
             fields = {"chart": "compensation", "job": FILE, "label": f"{model}, file to file", "family": model,
                       "mark": FILE, "settings": {"model": model, "device": device},

@@ -35,8 +35,8 @@ from amiwarp.io.sealed_json import append_line, create_journal, read_journal
 from amiwarp.kernels import launch
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.progress import Progress, silent
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.world import WorldScene

@@ -12,14 +12,14 @@ import numpy as np
 
 from amiwarp.calib.model_choice import QUANTISATION_PX, SHARE
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
 from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import MODELS, predicted_error
+from amiwarp.optics.models import Model, predicted_error, rungs
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, part, silent
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scenery import Scene, place_scene, seen_bearings
+from amiwarp.simulation.scenery import place_scene, seen_bearings
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 
@@ -89,26 +89,30 @@ def orbit_radii(camera: Camera, prism: Prism) -> tuple[float, float]:
 
 
 def _model_errors(exact: ExactModel, device: str) -> dict[str, float]:
-    """Return the error of each refraction model's best fit [px rms]; circle models get the best deflection."""
-    fitted = {
-        "circle": _fitted(CircleModel, exact),
-        "radial": _fitted(RadialCircleModel, exact),
-        "ellipse": EllipseModel.from_model(exact, device),
-    }
-    return {n: predicted_error(fitted[n], exact, remove_lag=True).rms if n in fitted else 0.0 for n in MODELS}
+    """Return the error of each refraction model's best fit [px rms]; those without tables get the best size."""
+
+    def error(kind: type[Model]) -> float:
+        if kind is ExactModel:
+            return 0.0
+        fitted = _fitted(kind, exact) if kind.closed_form() is kind else EllipseModel.from_model(exact, device)
+        return predicted_error(fitted, exact, remove_lag=True).rms
+
+    return {name: error(kind) for name, kind in rungs().items()}
 
 
-def _fitted(kind: type[CircleModel | RadialCircleModel], exact: ExactModel) -> CircleModel | RadialCircleModel:
-    """Return the circle model whose deflection fits the exact model best."""
+def _fitted(kind: type[Model], exact: ExactModel) -> Model:
+    """Return the model whose size fits the exact model best."""
     from scipy.optimize import minimize_scalar
 
-    def sized(deflection: float) -> CircleModel | RadialCircleModel:
-        return replace(kind.from_prism(exact.camera, exact.prism), deflection=deflection)
+    start = kind.start_values(exact.prism)
 
-    def error(deflection: float) -> float:
-        return predicted_error(sized(deflection), exact, grid=GRID).rms
+    def sized(size: float) -> Model:
+        return kind.from_values(exact.camera, exact.prism, {**start, kind.SIZE: size})
 
-    size = exact.prism.deflection
+    def error(size: float) -> float:
+        return predicted_error(sized(size), exact, grid=GRID).rms
+
+    size = start[kind.SIZE]
     found = minimize_scalar(error, bounds=(0.5 * size, 4.0 * size), method="bounded", options={"xatol": 1e-3 * size})
     return sized(float(found.x))
 
@@ -376,7 +380,7 @@ class Design:
         """Return the properties of a prism, given by its orbit, at a speed [turns/min]."""
         limits, blurs = self.limits, self.timing.blur(orbit.radius, rpm)
         budget = limits.budget_px or SHARE * math.hypot(QUANTISATION_PX, *blurs)
-        model = next(name for name in MODELS if orbit.errors[name] <= budget)
+        model = next(name for name in rungs() if orbit.errors[name] <= budget)
         made = Choice(orbit, rpm, self.volume.events_per_s(orbit, rpm), *blurs, model, budget, ())
         kept = {
             "edges": orbit.swing >= LEAST_SWING,

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.imaging.palette import BLUE, GREEN, ORANGE, VERMILION
+from amiwarp.imaging.palette import MODEL_COLOURS, VERMILION
+from amiwarp.optics.models import rungs
 from amiwarp.plotting import figures
 from amiwarp.studies.design.choice import LEAST_SWING, degrees, headline
 
@@ -26,9 +27,10 @@ EDGE, TABLE, FIRST = 0.3, 11.4, 1.05
 """Margin of text and table, width of the table, and width of its first column [inch]."""
 LETTERS, SMALL, TINY = 12.0, 10.5, 9.5
 """Font sizes of the chart [point]."""
-COLOURS = {"circle": ORANGE, "radial": GREEN, "ellipse": BLUE}
+_APPROXIMATIONS = [name for name, model in rungs().items() if model.SIMPLIFIES]
+COLOURS = dict(zip(_APPROXIMATIONS, MODEL_COLOURS, strict=False))
 """Colour of each refraction model. The exact model has no error, so it is not drawn."""
-MARKS = {"circle": "o", "radial": "s", "ellipse": "^"}
+MARKS = dict(zip(_APPROXIMATIONS, "os^vPX", strict=False))
 """Marker of each refraction model."""
 SHORT, GOOD, BAD, CHOSEN = "#e3e3e3", "#d3e8f4", "#f3f3f3", VERMILION
 """Colours of apex angles that are too small, of table cells that keep the limits, of cells that violate them, and of

@@ -27,8 +27,8 @@ from amiwarp.events.truth import EventTruth
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.optics.prism import Prism
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.scenery import Scene
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.named.catalogue import named_world

@@ -17,8 +17,8 @@ from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.simulation.description import Scene, Still
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.simulation.scenery import Scene, Still
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 

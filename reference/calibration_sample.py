@@ -2,9 +2,7 @@
 
 from collections.abc import Mapping
 
-from amiwarp.calib import Calibration
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
+from amiwarp import Calibration, Camera, Prism
 
 
 def exact_calibration(camera: Camera, prism: Prism, parameters: Mapping[str, float]) -> Calibration:

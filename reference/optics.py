@@ -12,8 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
-from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp import Camera, Fisheye, FlatSide, Prism, RadialTangential
 
 Array = NDArray[np.float64]
 

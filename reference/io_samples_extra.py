@@ -1,4 +1,5 @@
-"""Small valid files of data sets and of ROS, written by h5py, NumPy and rosbags, or by their specification."""
+"""Small valid files of data sets and of ROS, written by h5py, NumPy and rosbags, or by their specification; and
+programs that are not amiwarp, which read the files that it writes."""
 
 import struct
 from collections.abc import Callable
@@ -6,14 +7,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import eventcv
 import h5py
+import hdf5plugin  # noqa: F401 - its import registers the compression
 import numpy as np
+import pytest
+from faery.extension import evt
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from amiwarp.events.events import Events
+from amiwarp import Events
 
 SIZE = (320, 240)
 EVENT = "uint16 x\nuint16 y\ntime ts\nbool polarity\n"
@@ -303,3 +309,100 @@ MORE_WRITERS: dict[str, tuple[str, str, tuple[int, int], Callable[[Path, Events]
     "ros2_mcap": ("rosbag2", "mcap", SIZE, partial(write_bag2, "MCAP")),
 }
 """Formats that store columns up to 319, rows up to 239 and times from 1 s on."""
+
+
+# Programs that are not amiwarp, which read what it writes.
+
+Columns = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""x, y, t and p, as a client gives them."""
+
+HOURS_28 = 100_000_000_000
+"""Longest recording of the formats with EVT 3.0 [us]."""
+
+
+def by_dsec(path: Path) -> Columns:
+    """Read as DSEC's own programs do, and check its index."""
+    with h5py.File(path) as file:
+        assert sorted(file) == ["events", "ms_to_idx", "t_offset"]
+        assert [file[f"events/{name}"].dtype.str for name in "xytp"] == ["<u2", "<u2", "<u4", "|u1"]
+        assert (file["ms_to_idx"].dtype.str, file["t_offset"].shape) == ("<u8", ())
+        t, index = file["events/t"][:], file["ms_to_idx"][:]
+        ms = np.arange(t[-1] // 1000 + 1 if t.size else 0)
+        np.testing.assert_array_equal(index, np.searchsorted(t, 1000 * ms))
+        return file["events/x"][:], file["events/y"][:], t + file["t_offset"][()], file["events/p"][:]
+
+
+def by_faery(path: Path) -> Columns:
+    with evt.Decoder(path, None, None) as decoder:
+        assert (decoder.version, decoder.dimensions) == ("evt3", SIZE)
+        packets = [packet["events"] for packet in decoder if "events" in packet]
+    events = np.concatenate(packets) if packets else np.zeros(0, [(name, "<u8") for name in "txyp"])
+    return events["x"], events["y"], events["t"], events["p"]
+
+
+def by_eventcv(path: Path) -> Columns:
+    options = {"time_unit": "microseconds"} if path.suffix == ".h5" else {}
+    return tuple(eventcv.load(str(path), **options).numpy().T)
+
+
+def by_dv_processing(path: Path) -> Columns:
+    recording = pytest.importorskip("dv_processing").io.MonoCameraRecording(str(path))
+    assert recording.getEventResolution() == SIZE
+    x, y, t, p = [[np.zeros(0, np.int64)] for _ in range(4)]
+    while (batch := recording.getNextEventBatch()) is not None:
+        x.append(batch.coordinates()[:, 0])
+        y.append(batch.coordinates()[:, 1])
+        t.append(batch.timestamps())
+        p.append(batch.polarities())
+    return np.concatenate(x), np.concatenate(y), np.concatenate(t), np.concatenate(p)
+
+
+def by_numpy(path: Path) -> Columns:
+    with np.load(path) as archive:
+        assert (int(archive["width"]), int(archive["height"])) == SIZE
+        assert [archive[name].dtype.str for name in "xytp"] == ["<u2", "<u2", "<i8", "|u1"]
+        return archive["x"], archive["y"], archive["t"], archive["p"]
+
+
+def by_decimals(path: Path) -> Columns:
+    """Read text without rounding: the point is taken out of the seconds."""
+    rows = [line.split() for line in path.read_text().splitlines()]
+    assert all(len(row) == 4 and len(row[0].partition(".")[2]) == 6 for row in rows)
+    table = np.array([[int(word.replace(".", "")) for word in row] for row in rows], np.int64).reshape(-1, 4)
+    return table[:, 1], table[:, 2], table[:, 0], table[:, 3]
+
+
+def by_rosbags(path: Path) -> Columns:
+    """Read a bag with the definitions that it holds. Its packets, one after the other, are the words of a RAW file."""
+    words, stamps, counts = [], [], []
+    with AnyReader([path]) as reader:
+        for connection, recorded, data in reader.messages():
+            assert (connection.topic, connection.msgtype) == (
+                "/event_camera/events",
+                "event_camera_msgs/msg/EventPacket",
+            )
+            packet = reader.deserialize(data, connection.msgtype)
+            assert (packet.width, packet.height, packet.encoding, packet.is_bigendian) == (*SIZE, "evt3", False)
+            assert packet.seq == len(words)
+            stamps.append(packet.header.stamp.sec * 1_000_000 + packet.header.stamp.nanosec // 1000)
+            assert recorded == stamps[-1] * 1000
+            words.append(packet.events.tobytes())
+            counts.append(int(np.count_nonzero(packet.events.view("<u2") >> 12 == 2)))
+    origin = 0 if not stamps or stamps[0] < HOURS_28 else stamps[0]
+    raw = path.with_suffix(".packets")
+    raw.write_bytes(f"% evt 3.0\n% geometry {SIZE[0]}x{SIZE[1]}\n% t0 {origin}\n% end\n".encode() + b"".join(words))
+    columns = by_faery(raw)
+    np.testing.assert_array_equal(columns[2][np.cumsum([0, *counts])[:-1]], stamps)
+    return columns
+
+
+CLIENTS: dict[str, tuple[str, Callable[[Path], Columns]]] = {
+    # format: (extension, client)
+    "dsec": (".h5", by_dsec),
+    "evt3": (".raw", by_faery),
+    "aedat4": (".aedat4", by_eventcv),
+    "npz": (".npz", by_numpy),
+    "text": (".txt", by_decimals),
+    "ros2 mcap": (".mcap", by_rosbags),
+    "ros2 db3": (".db3", by_rosbags),
+}

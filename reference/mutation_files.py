@@ -1,7 +1,7 @@
 """Damaged files for tests and long fuzzing runs: small samples of every input, a mutator, and a supervised check.
 
 The rule: a damaged file is read, or refused with one :class:`AmiwarpError`. Nothing else is raised, nothing crashes or
-hangs, and memory stays below :data:`MEMORY_KIB`. ``python tests/mutation_files.py COUNT [NAME ...]`` checks COUNT
+hangs, and memory stays below :data:`MEMORY_KIB`. ``python -m reference.mutation_files COUNT [NAME ...]`` checks COUNT
 mutants of each named input, or of all inputs.
 """
 
@@ -11,6 +11,7 @@ import contextlib
 import io
 import json
 import math
+import os
 import random
 import re
 import subprocess
@@ -28,28 +29,36 @@ from typing import Any
 import h5py
 import hdf5plugin
 import numpy as np
-from calibration_sample import exact_calibration
-from io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
-from io_samples_extra import MORE_WRITERS, packets, small, write_bin, write_ros2
 from PIL import Image
 
-from amiwarp.calib import Calibration
+from amiwarp import (
+    AmiwarpError,
+    Calibration,
+    Camera,
+    Events,
+    EventTruth,
+    Fisheye,
+    FrameTruth,
+    ImuSamples,
+    Poses,
+    Prism,
+    Recording,
+    RecordingWriter,
+    Trajectory,
+    WorldLabels,
+    load_world,
+    open_recording,
+)
 from amiwarp.cli.info import describe
 from amiwarp.cli.options import _read_speed, read_camera
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, check_events
-from amiwarp.events.recording import Recording
-from amiwarp.events.sensors import ImuSamples
-from amiwarp.events.truth import MAPS, EventTruth, FrameTruth, Poses, WorldLabels
-from amiwarp.io import RecordingWriter, open_recording, read_encoder_csv
+from amiwarp.events.events import check_events
+from amiwarp.events.truth import MAPS
+from amiwarp.io import read_encoder_csv
 from amiwarp.io.sealed_json import append_line, sealed
 from amiwarp.io.text import read_calib
-from amiwarp.optics.camera import Camera, Fisheye
-from amiwarp.optics.prism import Prism
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.sequences import _read_times, open_pictures
-from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.simulation.worlds.world_files import load_mesh, load_world
+from amiwarp.simulation.worlds.world_files import load_mesh
 from amiwarp.studies import stability
 from amiwarp.studies.dataset.making import JOURNAL, Journal, Made, list_items
 from amiwarp.studies.dataset.specification import load_specification
@@ -57,6 +66,9 @@ from amiwarp.studies.evaluate.edges import THRESHOLDS
 from amiwarp.studies.evaluate.report import CHANCE, section
 from amiwarp.studies.evaluate.run import Store
 from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, encode_picture
+from reference.calibration_sample import exact_calibration
+from reference.io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
+from reference.io_samples_extra import MORE_WRITERS, packets, small, write_bin, write_ros2
 
 MEMORY_KIB = 3 << 19
 """Largest memory that a check may take, 1.5 GiB [KiB]."""
@@ -714,9 +726,9 @@ class Checker:
         self._start()
 
     def _start(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, __file__, "--serve"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        )
+        command = [sys.executable, "-P", "-m", "reference.mutation_files", "--serve"]
+        modules = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}  # the amiwarp of this process
+        self._process = subprocess.Popen(command, env=modules, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def check(self, path: Path, name: str) -> str | None:
         """Run :func:`check`. Raise :class:`AssertionError` for a crash, a hang or a wrong exception as well."""

@@ -7,8 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.choices import CornerMethod
-from amiwarp.events.events import Events
+from amiwarp import CornerMethod, Events
 
 QUARTERS = {3: [(0, 3), (1, 3), (2, 2), (3, 1)], 4: [(0, 4), (1, 4), (2, 3), (3, 2), (4, 1)]}
 TURNS = [np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), k) for k in range(4)]

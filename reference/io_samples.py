@@ -9,11 +9,7 @@ import hdf5plugin
 import numpy as np
 from faery.extension import aedat, dat, es, evt
 
-from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.io import RecordingWriter
-from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp import AmiwarpError, Camera, Encoder, Events, RadialTangential, RecordingWriter
 
 SIZE = (320, 240)
 CALIB = "200 201 150 110 -0.3 0.1 1e-4 -2e-4 0.01"

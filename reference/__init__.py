@@ -1,0 +1,1 @@
+"""What tests and benchmarks compare with and feed in: independent formulas, sample files and damaged inputs."""
