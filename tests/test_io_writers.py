@@ -15,7 +15,6 @@ import pytest
 from faery.extension import aedat
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from io_samples_extra import CLIENTS, HOURS_28, Columns, by_dv_processing, by_eventcv
 
 from amiwarp import (
     AmiwarpError,
@@ -38,6 +37,7 @@ from amiwarp.io.chunks import CHUNK
 from amiwarp.io.export import export
 from amiwarp.io.prophesee import Evt3Encoder
 from reference.io_samples import SIZE, make_events
+from reference.io_samples_extra import CLIENTS, HOURS_28, Columns, by_dv_processing, by_eventcv
 
 
 def save(path: Path, events: Events, **options: object) -> Path:

@@ -26,8 +26,7 @@ from amiwarp.optics.exact_model import ExactModel, axis_rotation
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step_us
 from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.renderer import WorldMapRing, flicker_interval_s
-from amiwarp.simulation.worlds.sight import WorldSight, image_speed
+from amiwarp.simulation.worlds.renderer import WorldMapRing, WorldSight, flicker_interval_s, image_speed
 from amiwarp.simulation.worlds.world import WorldScene
 
 if TYPE_CHECKING:

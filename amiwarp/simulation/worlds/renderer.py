@@ -1,10 +1,10 @@
-"""Rendering of a simulated world without the prism: surfaces that rays hit, and maps of log intensity."""
+"""What is seen of a simulated world: surfaces that rays hit, maps of log intensity, and the light of each pixel."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import warp as wp
@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.sharpness import gaussian
 from amiwarp.kernels import world as kernels
-from amiwarp.kernels import world as world_maps
 from amiwarp.kernels import world_rays
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import Camera, camera_params
 from amiwarp.simulation.pictures import DARK, Placement
 from amiwarp.simulation.scenery import SMALLEST_COSINE, TEXELS_PER_PIXEL, MapSlots
 from amiwarp.simulation.worlds.device_world import DeviceWorld
@@ -35,7 +34,7 @@ ROTATED_GRID = [(-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.37
 
 The positions are fixed, because random positions would differ between maps and cause events.
 """
-TILE = int(world_maps.TILE)
+TILE = int(kernels.TILE)
 """Side of a tile of a map [texels]."""
 
 
@@ -100,7 +99,7 @@ def sample_grid(samples: int, device: Any) -> wp.array:
 
 def first_hits(n: int, device: Any) -> Any:
     """Return the :class:`amiwarp.kernels.world.FirstHits` of ``n`` rays, without an array for the luminance."""
-    hits = world_maps.FirstHits()
+    hits = kernels.FirstHits()
     hits.face = wp.empty(n, dtype=int, device=device)
     hits.white = wp.empty(n, dtype=float, device=device)
     hits.normal = wp.empty(n, dtype=wp.vec3, device=device)
@@ -150,11 +149,11 @@ class MapRenderer:
 
         frame, world = self._frame, self._world
         n = frame.width * frame.height
-        launch(world_maps.interpolate_maps, n, [maps, faces, *ends, weight, first], [], device=world.device)
+        launch(kernels.interpolate_maps, n, [maps, faces, *ends, weight, first], [], device=world.device)
         frame.pose, frame.instant, frame.first = pose, 0, ends[0]
         marks = wp.empty(self._grid[0] * self._grid[1], dtype=wp.uint8, device=world.device)
         inputs = [world.params, frame, faces, 3]
-        launch(world_maps.mark_tiles, len(marks), inputs, [marks], device=world.device, smallest=SMALLEST_LAUNCH)
+        launch(kernels.mark_tiles, len(marks), inputs, [marks], device=world.device, smallest=SMALLEST_LAUNCH)
         neighbours = np.ones((3, 3), bool)
         changed = binary_dilation(marks.numpy().reshape(self._grid), neighbours)
         if not changed.any():
@@ -174,22 +173,22 @@ class MapRenderer:
         f, device = self._frame, self._world.device
         f.tiles = tiles
         inputs, n = [self._world.params, f], len(tiles) * TILE * TILE
-        launch(world_maps.render_map, n, inputs, [faces, self._hits], device=device, smallest=SMALLEST_LAUNCH)
+        launch(kernels.render_map, n, inputs, [faces, self._hits], device=device, smallest=SMALLEST_LAUNCH)
         if len(f.offsets) == 1:
             wp.copy(self._smooth, self._hits.light)
             return
         inputs += [self._hits]
-        launch(world_maps.smooth_edges, n, inputs, [self._smooth], device=device, smallest=SMALLEST_LAUNCH)
+        launch(kernels.smooth_edges, n, inputs, [self._smooth], device=device, smallest=SMALLEST_LAUNCH)
 
     def _blur(self, tiles: wp.array, written: wp.array, maps: wp.array) -> None:
         """Blur the luminance of ``tiles``, and write the log intensities of the tiles ``written`` to ``maps``."""
         f, device = self._frame, self._world.device
         for across, source, target in ((0, self._smooth, self._half), (1, self._half, self._smooth)):
             inputs = [f, source, self._weights, across]
-            launch(world_maps.blur_lines, len(tiles) * TILE * TILE, inputs, [target], device=device)
+            launch(kernels.blur_lines, len(tiles) * TILE * TILE, inputs, [target], device=device)
         f.tiles = written
         inputs = [f, self._smooth, self._dark]
-        launch(world_maps.log_pieces, len(written) * TILE * TILE, inputs, [maps], device=device)
+        launch(kernels.log_pieces, len(written) * TILE * TILE, inputs, [maps], device=device)
 
 
 # Speed at which the image of a simulated world moves.
@@ -316,7 +315,7 @@ class WorldMapRing:
         self._scene, self._camera, self._bearings, self._world = scene, simulation.camera, bearings, world
         focal = max(self._camera.fx, self._camera.fy)
         self.placement = _placement(bearings, focal, MARGIN_PX / focal if scene.trajectory.moves else 2.0 / focal)
-        p, frame = self.placement, world_maps.MapFrame()
+        p, frame = self.placement, kernels.MapFrame()
         frame.left, frame.top, (frame.pitch_x, frame.pitch_y) = p.left, p.top, p.pitch
         frame.width, frame.height, frame.cone = p.width, p.height, 1.0 / (TEXELS_PER_PIXEL * focal)
         self._renderer = MapRenderer(self._world, frame, blur=map_blur(scene.blur), dark=DARK,
@@ -487,3 +486,139 @@ def _placement(bearings: NDArray[np.float64], focal: float, margin: float) -> Pl
     pitch = TEXELS_PER_PIXEL * focal
     width, height = math.ceil((high_x - low_x) * pitch), math.ceil((high_y - low_y) * pitch)
     return Placement(width, height, (0.0, 0.0, 1.0, 1.0), low_x, low_y, (pitch, pitch))
+
+
+# Connection of the event simulator to a world: rays of pixels, image speeds, and surfaces that events saw.
+
+RAYS_PER_PIXEL = 4
+"""Default number of rays per pixel if pixels see the world by rays."""
+LEAST_CONE_PX = 0.25
+"""Smallest width of the cone of a ray [px]. Textures are averaged over the cone."""
+MOMENTS = 64
+"""Number of times in a simulation at which the speed of the world's image is computed."""
+INSTANTS_TOGETHER = 16
+"""Number of instants at which all pixels cast their rays together."""
+
+
+def aperture(samples: int, blur: float) -> NDArray[np.float32]:
+    """Return the rays of a pixel, shape (n, 3): x and y relative to the centre [px], and weights that sum to 1.
+
+    The rays are the nodes of a Gauss-Hermite quadrature with the standard deviation ``blur`` of the optical blur [px].
+    """
+    nodes, weights = np.polynomial.hermite_e.hermegauss(math.isqrt(samples))
+    x, y = np.meshgrid(nodes * blur, nodes * blur)
+    return np.stack([x.ravel(), y.ravel(), np.outer(weights, weights).ravel() / weights.sum() ** 2], 1).astype(
+        np.float32
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ImageSpeed:
+    """Upper bounds of the speed at which a world's image without the prism moves [px/s]."""
+
+    total: float
+    """Speed due to all motion of the camera and the bodies [px/s]."""
+    in_maps: float
+    """Speed due to moving bodies and the camera's translation [px/s], which require new maps."""
+
+
+def image_speed(world: DeviceWorld, simulation: SimulationValues, scene: WorldScene) -> ImageSpeed:
+    """Return the largest speeds of a world's image over the duration of a simulation."""
+    t = np.linspace(0.0, simulation.duration_s, MOMENTS)
+    camera, trajectory = simulation.camera, scene.trajectory
+    world.set_instants(t)
+    speed = movers_speed(world, camera, trajectory, t)
+    if trajectory.moves:
+        speed = speed + [parallax_speed(world, camera, trajectory, float(at), k) for k, at in enumerate(t)]
+    total = speed + rotation_speed(camera, trajectory, t)
+    return ImageSpeed(float(total.max()), float(speed.max()))
+
+
+class WorldSight:
+    """Light that pixels receive from a world through the prism, at the instants of a chunk of simulated time."""
+
+    def __init__(self, simulation: SimulationValues, scene: WorldScene, world: DeviceWorld) -> None:
+        self._scene, self._world, device = scene, world, world.device
+        camera, samples = simulation.camera, scene.samples or RAYS_PER_PIXEL
+        rays = aperture(samples, scene.blur)
+        view = self._view = world_rays.RayView()
+        view.camera = camera_params(camera, str(device))
+        view.aperture = wp.array(rays, dtype=wp.vec3, device=device)
+        view.reach = max(1, math.ceil(float(np.abs(rays[:, :2]).max())))
+        side = math.isqrt(samples)
+        width = 1.0 if side == 1 else max(2.0 * scene.blur * math.sqrt(2.0 / side), LEAST_CONE_PX)
+        view.cone = width / max(camera.fx, camera.fy)
+        self._pixels = camera.width * camera.height
+        self._tiled = math.prod(-(-size // TILE) * TILE for size in (camera.width, camera.height))
+        self._light: wp.array = wp.empty(0, dtype=float, device=device)
+        self._cast: wp.array = wp.empty(0, dtype=float, device=device)
+        self._batch = world_rays.Batch()
+        self._marks: wp.array = wp.empty(0, dtype=int, device=device)
+        self._listed: wp.array = wp.empty(0, dtype=int, device=device)
+
+    def set_instants(self, t_us: NDArray[np.float64], view: Any) -> None:
+        """Set the poses of the camera and the bodies at the instants of a chunk.
+
+        ``t_us``: times [us]; ``view``: a :class:`amiwarp.kernels.prism_view.View` with the prism.
+        """
+        t = np.maximum(t_us, 0.0) * 1e-6
+        self._world.set_instants(t)
+        poses: NDArray[Any] = np.zeros(len(t), cast("Any", kernels.Pose).numpy_dtype())
+        poses["rotation"], poses["position"] = self._scene.trajectory.poses(t)
+        self._view.poses = wp.array(poses, dtype=kernels.Pose, device=self._world.device)
+        self._view.prism = view.prism
+
+    def light(self, steps: Any, first: int, count: int) -> wp.array:
+        """Return the luminance that each pixel sees at ``count`` instants, the first of which has the index ``first``.
+
+        The shape of the array is (count, pixels). The array is valid until the next call.
+        """
+        n = self._pixels
+        if len(self._light) < count * n:
+            self._light = wp.empty(count * n, dtype=float, device=self._world.device)
+        self._reserve(min(count, INSTANTS_TOGETHER))
+        for k in range(0, count, INSTANTS_TOGETHER):
+            self._batch.first, self._batch.count = first + k, min(INSTANTS_TOGETHER, count - k)
+            self._batch.hits.light = self._light[k * n : (k + self._batch.count) * n]
+            self._cast_batch(steps)
+        return self._light[: count * n].reshape((count, n))
+
+    def _reserve(self, count: int) -> None:
+        """Allocate the arrays of a batch of ``count`` instants."""
+        if len(self._listed) < count * self._tiled:
+            device = self._world.device
+            self._batch.hits = first_hits(count * self._pixels, device)
+            self._marks, self._listed = (wp.empty(count * self._tiled, dtype=int, device=device) for _ in range(2))
+
+    def _cast_batch(self, steps: Any) -> None:
+        """Write the luminance of all pixels at the instants of the batch to ``light`` of its hits."""
+        device, batch, view, rays = self._world.device, self._batch, self._view, len(self._view.aperture)
+        seen = [self._world.params, view, steps]
+        launch(world_rays.cast_centres, self._tiled, seen, [batch], device=device, smallest=SMALLEST_LAUNCH)
+        if rays == 1:
+            return
+        n = self._tiled * batch.count
+        marks = self._marks[:n]
+        launch(world_rays.smooth_insides, n, [*seen, batch], [marks], device=device)
+        wp.utils.array_scan(marks, marks, inclusive=True)
+        launch(world_rays.list_marked, n, [marks], [self._listed], device=device)
+        listed = int(marks[n - 1 :].numpy()[0])
+        if len(self._cast) < listed * rays:
+            self._cast = wp.empty(listed * rays * 5 // 4, dtype=float, device=device)
+        launch(world_rays.cast_edges, listed * rays, [*seen, batch, self._listed], [self._cast], device=device,
+               smallest=SMALLEST_LAUNCH)  # fmt: skip
+        launch(world_rays.add_edges, listed, [view, batch, self._listed, self._cast], [], device=device)
+
+    def look(self, view: Any, steps: Any, block: Any, n: int, faces: Any) -> Any:
+        """Return the surfaces that ``n`` events saw, as a :class:`amiwarp.kernels.world_rays.SeenSurfaces`.
+
+        ``view``, ``steps``: camera and instants of the chunk; ``block``: events; ``faces``: face of each texel of the
+        maps, or an empty array without maps.
+        """
+        out = world_rays.SeenSurfaces()
+        device = self._world.device
+        for name, dtype in (("instance", wp.uint16), ("depth", float), ("place", wp.vec3)):
+            setattr(out, name, wp.empty(n, dtype=dtype, device=device))
+        inputs = [self._world.params, view, steps, self._view.poses, faces, block.points, block.ticks]
+        launch(world_rays.find_seen_surfaces, n, inputs, [out], device=device, smallest=SMALLEST_LAUNCH)
+        return out

@@ -20,8 +20,7 @@ from amiwarp.optics.displacement import wrap_angle
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.simulation.scenery import KnownPixels
 from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.renderer import SurfaceView, pixel_rays, surfaces_at
-from amiwarp.simulation.worlds.sight import WorldSight
+from amiwarp.simulation.worlds.renderer import SurfaceView, WorldSight, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.validation import array, guarded, real, shown
 
