@@ -33,12 +33,12 @@ from .events.encoder_stream import EncoderStream as EncoderStream
 from .events.events import Events as Events
 from .events.events import EventSource as EventSource
 from .events.events import MemoryEvents as MemoryEvents
+from .events.recording import ImageStore as ImageStore
+from .events.recording import ImuSamples as ImuSamples
+from .events.recording import MemoryImages as MemoryImages
 from .events.recording import MetadataValue as MetadataValue
 from .events.recording import Recording as Recording
 from .events.recording import Truth as Truth
-from .events.sensors import ImageStore as ImageStore
-from .events.sensors import ImuSamples as ImuSamples
-from .events.sensors import MemoryImages as MemoryImages
 from .events.truth import Cause as Cause
 from .events.truth import EventTruth as EventTruth
 from .events.truth import EventValues as EventValues

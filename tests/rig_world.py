@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from amiwarp.live.link.emulator import PseudoTerminal
 from amiwarp.live.link.link import Link
 from amiwarp.live.link.protocol import Answer
-from amiwarp.live.stream.emulated import EmulatedCamera
+from amiwarp.live.stream.cameras import EmulatedCamera
 from amiwarp.live.stream.packets import Packet, Source
 from amiwarp.live.stream.session import Session
 

@@ -10,9 +10,8 @@ import warp as wp
 
 from amiwarp import CameraRotation, ExactModel, RadialTangential, Recording
 from amiwarp.brightness.event_pairs import EventTable
-from amiwarp.brightness.multigrid import GridHierarchy, Tiles
 from amiwarp.brightness.pair_positions import PairEnds
-from amiwarp.brightness.solver import BrightnessMap, Smoothness
+from amiwarp.brightness.solver import BrightnessMap, GridHierarchy, Smoothness, Tiles
 from amiwarp.kernels import conjugate_gradients as cg
 from amiwarp.kernels import equations_cuda, multilevel
 from amiwarp.kernels.conjugate_gradients import Prior

@@ -36,8 +36,7 @@ from amiwarp import (
     truth_model,
 )
 from amiwarp.brightness.event_pairs import EventTable, PairSet
-from amiwarp.brightness.multigrid import Tiles
-from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap, Residuals
+from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap, Residuals, Tiles
 from amiwarp.calib.calibration_events import EventsAhead
 from amiwarp.calib.photometric.cost import TILE, Slopes, choose_tiles, iterate, near_tiles, one_tile, van_der_corput
 from amiwarp.imaging.votes import CanvasShape, Image

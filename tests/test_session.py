@@ -36,7 +36,7 @@ from amiwarp.io.live_writer import LiveWriter
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream import session as session_module
 from amiwarp.live.stream import sources
-from amiwarp.live.stream.emulated import LEAD_US, EmulatedCamera
+from amiwarp.live.stream.cameras import LEAD_US, EmulatedCamera
 from amiwarp.live.stream.packets import Packet, make_packet
 from amiwarp.live.stream.queues import BackgroundWorker, Policy
 from amiwarp.live.stream.session import Session, SessionStatus

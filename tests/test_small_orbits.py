@@ -17,7 +17,7 @@ from amiwarp import (
     simulate,
     truth_model,
 )
-from amiwarp.brightness.multigrid import Tiles
+from amiwarp.brightness.solver import Tiles
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))
 

@@ -33,7 +33,7 @@ from amiwarp.live.stream import adaptive as speed_module
 from amiwarp.live.stream import phase_check as watch_module
 from amiwarp.live.stream import recent_events as ring_module
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orbit
-from amiwarp.live.stream.emulated import EmulatedCamera
+from amiwarp.live.stream.cameras import EmulatedCamera
 from amiwarp.live.stream.packets import Packet, encode_hello, make_packet
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.queues import BackgroundWorker, PacketQueue, Policy

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from amiwarp.events.recording import Recording
     from amiwarp.live.link.emulator import Rotor
-    from amiwarp.live.stream.emulated import EmulatedCamera
+    from amiwarp.live.stream.cameras import EmulatedCamera
 
 EXAMPLE = "amiwarp emulate --link ./prism --rpm 720 --fault slip@5 --fault unplug@10+2"
 
@@ -114,7 +114,7 @@ class _Playback:
     address: str
 
     def camera(self, controller: Controller, now_us: Callable[[], int]) -> EmulatedCamera:
-        from amiwarp.live.stream.emulated import EmulatedCamera
+        from amiwarp.live.stream.cameras import EmulatedCamera
 
         return EmulatedCamera(self.recording, self.rotor, controller, self.address, now_us)
 

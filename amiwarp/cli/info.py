@@ -14,7 +14,7 @@ from amiwarp.cli.console import progress, report, table
 from amiwarp.cli.options import Common, Topic
 from amiwarp.events.encoder import rpm_between
 from amiwarp.events.events import DEFAULT_BLOCK
-from amiwarp.events.sensors import mean_rate
+from amiwarp.events.recording import mean_rate
 from amiwarp.events.truth import Cause
 from amiwarp.io import open_recording
 from amiwarp.io.camera_files import camera_to_json
@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.events import EventSource
-    from amiwarp.events.recording import Recording, Truth
-    from amiwarp.events.sensors import ImageStore, ImuSamples
+    from amiwarp.events.recording import ImageStore, ImuSamples, Recording, Truth
 
 EXAMPLE = "amiwarp info recording.h5"
 MOST_NAMES = 16

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK
-from amiwarp.events.recording import MetadataValue, Recording
-from amiwarp.events.sensors import ImuSamples
+from amiwarp.events.recording import ImuSamples, MetadataValue, Recording
 from amiwarp.io import file_scan
 from amiwarp.io.file_scan import FileEvents, Packet
 from amiwarp.io.input_files import errors_name, open_input

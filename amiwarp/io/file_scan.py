@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import DEFAULT_BLOCK, Events, as_coordinate, regroup, rounded_times
-from amiwarp.events.recording import MetadataValue
-from amiwarp.events.sensors import ImuSamples
+from amiwarp.events.recording import ImuSamples, MetadataValue
 from amiwarp.io.input_files import errors_name, open_input, register_reader
 from amiwarp.io.reading_process import packets
 from amiwarp.optics.camera import LARGEST_SIZE, check_size

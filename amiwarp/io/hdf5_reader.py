@@ -29,8 +29,7 @@ from amiwarp.events.events import (
     regroup,
     rounded_times,
 )
-from amiwarp.events.recording import MetadataValue, Recording, Truth
-from amiwarp.events.sensors import ImuSamples
+from amiwarp.events.recording import ImuSamples, MetadataValue, Recording, Truth
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS, FrameTruth, Poses, WorldLabels, check_truth, rotation_of
 from amiwarp.io.camera_files import attribute, read_camera, read_prism
 from amiwarp.io.chunks import CHUNK, StoredColumn, in_order

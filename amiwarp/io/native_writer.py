@@ -21,8 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, check_coordinates, check_events, inside_image, regroup
-from amiwarp.events.recording import MetadataValue
-from amiwarp.events.sensors import ImuSamples, check_image
+from amiwarp.events.recording import ImuSamples, MetadataValue, check_image
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS, EventTruth, FrameTruth, Poses, WorldLabels, as_poses, check_truth
 from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.camera_files import camera_attributes, prism_attributes

@@ -18,8 +18,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet
-from amiwarp.brightness.multigrid import Tiles
-from amiwarp.brightness.solver import BrightnessMap, Smoothness
+from amiwarp.brightness.solver import BrightnessMap, Smoothness, Tiles
 from amiwarp.choices import Fill
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
-from amiwarp.brightness.multigrid import Tiles
+from amiwarp.brightness.solver import Tiles
 from amiwarp.calib.calibration_events import EventsAhead
 from amiwarp.calib.nlopt_solver import SearchStage, best_of
 from amiwarp.calib.parameters import RATES

@@ -1,13 +1,11 @@
-"""Cameras: iniVation's through dv-processing, Prophesee's through Metavision or OpenEB. Both libraries are optional.
-
-Tested with substitutes for these libraries, not yet with cameras.
-"""
+"""Cameras: iniVation's through dv-processing, Prophesee's through Metavision or OpenEB, and the emulated one."""
 
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from datetime import timedelta
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -17,13 +15,21 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream.packets import Packet, make_packet
+from amiwarp.live.stream.packets import Packet, encode_events, encode_hello, encode_triggers, make_packet
+from amiwarp.live.stream.sockets import SocketSink
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from amiwarp.events.recording import Recording
+    from amiwarp.live.link.emulator import Controller, Played
     from amiwarp.optics.camera import Camera
     from amiwarp.optics.prism import NominalPrism
+
+
+# Cameras: iniVation's through dv-processing, Prophesee's through Metavision or OpenEB. Both libraries are optional.
+#
+# Tested with substitutes for these libraries, not yet with cameras.
 
 POLL_S = 0.0005
 """Pause between two requests to the camera's library for events [s]."""
@@ -168,3 +174,101 @@ class PropheseeSource(_CameraSource):
         rising = np.array(edges["t"][edges["p"] == 1], np.int64) if len(edges) else np.zeros(0, np.int64)
         reader.clear_ext_trigger_events()
         return rising
+
+
+# Emulated camera for the emulated controller: serves a recording's events, and a trigger for each sync pulse.
+
+STEP_US, RETRY_S = 2000, 2e-4
+"""Duration of an event packet [us], and interval between attempts to send while a client is slow [s]."""
+LEAD_US = 1_000_000
+"""Time from the first client's connection to the first event [us], in which sync pulses relate the clocks."""
+NEVER_US = 1 << 60
+"""Start time of an emulation that has not begun [us]."""
+
+
+class EmulatedCamera:
+    """Serves a recording's events at their recorded pace, and one trigger for each of the controller's sync pulses.
+
+    Camera and ``rotor`` begin once the first client connects. If reading, sending or a client is slower than the
+    recording, events are sent late, but none is lost. ``now_us``: emulation time [us], shared with the controller.
+    Raises :class:`AmiwarpError` for a recording without encoder or events, or an address in use.
+    """
+
+    def __init__(
+        self, recording: Recording, rotor: Played, controller: Controller, address: str, now_us: Callable[[], int]
+    ) -> None:
+        encoder, events = recording.encoder, recording.events
+        if encoder is None or not len(events):
+            raise AmiwarpError(
+                f"{recording.name}: has no {'events' if encoder else 'encoder'}; give a recording with both"
+            )
+        self._events, self._rotor, self._controller, self._now_us = events, rotor, controller, now_us
+        self._origin = round(int(encoder.t[0]) - encoder.clock_offset_us)
+        """Time on the events' clock at which the rotor begins [us]."""
+        rotor.begin(NEVER_US)
+        self._start, self._pulses_until_us = NEVER_US, -1
+        self.late_us = 0
+        """Largest delay of sent events so far [us]."""
+        self._sink = SocketSink(address, encode_hello(*events.size, recording.camera, recording.prism))
+        self.address = self._sink.address
+        self._ended = threading.Event()
+        self.done = threading.Event()
+        """Event that is set when all events were sent, or the recording cannot be read further."""
+        self._failure: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="amiwarp-camera", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> EmulatedCamera:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the emulation and end its stream. Raises the error of a failed recording."""
+        self._ended.set()
+        self._thread.join()
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+
+    def _run(self) -> None:
+        try:
+            self._play()
+        except Exception as error:
+            self._failure = error
+            self.done.set()
+
+    def _play(self) -> None:
+        with self._sink:
+            while not self._sink.clients:
+                if self._ended.wait(STEP_US * 1e-6):
+                    return
+                self._sink.tick()
+            self._start = self._now_us() + LEAD_US
+            self._rotor.begin(self._start)
+            for block in self._events.blocks(duration_us=STEP_US):
+                while (ahead_us := int(block.t[-1]) - self._time(self._now_us())) >= 0 or self._sink.waiting:
+                    if self._pause(min(ahead_us, STEP_US) * 1e-6 if ahead_us > 0 else RETRY_S):
+                        return
+                self.late_us = max(self.late_us, -ahead_us)
+                self._sink.send(encode_events(block))
+            while self._sink.waiting:
+                if self._pause(RETRY_S):
+                    return
+        self.done.set()
+
+    def _pause(self, seconds: float) -> bool:
+        """Wait, then send the new triggers and the waiting packets; return True if the camera was closed meanwhile."""
+        if self._ended.wait(seconds):
+            return True
+        # Select pulses by time, not by number: after a reset the controller numbers them from 0 again.
+        pulses = [world for _, world in list(self._controller.pulses) if world > self._pulses_until_us]
+        if pulses:
+            self._pulses_until_us = pulses[-1]
+        self._sink.send(encode_triggers(np.array([self._time(world) for world in pulses], np.int64)))
+        return False
+
+    def _time(self, world_us: int) -> int:
+        """Return the time on the camera's clock [us] for an emulation time [us]."""
+        return world_us - self._start + self._origin
