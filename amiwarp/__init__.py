@@ -6,6 +6,6 @@ milliseconds only.
 
 import lazy_loader
 
-from amiwarp._version import __version__
+from amiwarp._version import __version__ as __version__
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -20,7 +20,7 @@ from amiwarp.brightness.pair_positions import FEW_BLOCKS, PairPositions
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import conjugate_gradients as cg
 from amiwarp.kernels import equations as eqs
-from amiwarp.kernels import multilevel as k
+from amiwarp.kernels import multilevel
 from amiwarp.kernels import slow_pixels as slow_kernels
 from amiwarp.kernels.conjugate_gradients import gather
 from amiwarp.kernels.launch import BLOCK_DIM, SMALLEST_SLICE, Program, RepeatedLaunches, launch, slice_count
@@ -72,13 +72,13 @@ class GridHierarchy:
         for level, diagonal in enumerate(self._diagonal, start=1):
             stride = STRIDES[min(level, len(STRIDES)) - 1]
             inputs = [*equations, float(2**level), self.shapes[level][1], stride]
-            program.add_slices(k.add_coarse_diagonal, count // stride, inputs, slices)
+            program.add_slices(multilevel.add_coarse_diagonal, count // stride, inputs, slices)
             program.add(gather, len(diagonal), [sums], [diagonal])
 
     def correct(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
         """Add to ``program`` the step ``out`` = sum of the grids' corrections for the finest grid's ``residual``."""
         if not self._correction:
-            program.add(k.divide, len(out), [diagonal, residual], [out])
+            program.add(multilevel.divide, len(out), [diagonal, residual], [out])
         elif program.device.is_cpu:
             self._correct_by_rows(program, diagonal, prior, residual, out)
         else:
@@ -94,34 +94,37 @@ class GridHierarchy:
         """Correct with a row of nodes per thread."""
         grids = zip(self.shapes[1:], self._restrictions(residual, prior), strict=True)
         for (rows, columns), (inputs, outputs) in grids:
-            program.add(k.restrict_rows, rows, inputs, outputs, smallest=SMALLEST_SLICE // (4 * columns) + 1)
+            program.add(multilevel.restrict_rows, rows, inputs, outputs, smallest=SMALLEST_SLICE // (4 * columns) + 1)
         for level in range(len(self._correction) - 1, -1, -1):
             rows, columns = self.shapes[level]
             inputs, smallest = [self._correction[level], self.shapes[level + 1][1]], SMALLEST_SLICE // columns + 1
             if level:
                 outputs = [self._correction[level - 1]]
-                program.add(k.prolong_rows, rows, [*inputs, columns], outputs, smallest=smallest)
+                program.add(multilevel.prolong_rows, rows, [*inputs, columns], outputs, smallest=smallest)
             else:
                 inputs += [rows, columns, diagonal, residual]
-                program.add(k.prolong_rows_to_finest, rows, inputs, [out], smallest=smallest)
+                program.add(multilevel.prolong_rows_to_finest, rows, inputs, [out], smallest=smallest)
 
     def _correct_by_nodes(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
         """Correct with a node per thread, and the small grids in one block of threads."""
         small = sum(rows * columns <= SMALL for rows, columns in self.shapes[2:])
         large = len(self._correction) - small
         for inputs, outputs in islice(self._restrictions(residual, prior), large):
-            program.add(k.restrict, len(outputs[0]), inputs, outputs)
+            program.add(multilevel.restrict, len(outputs[0]), inputs, outputs)
         if small:
             all_diagonals, *outputs = self._all
             inputs = [*self.shapes[large], self._first[large - 1], small, all_diagonals, prior, 4.0**large]
-            program.add(k.correct_small, BLOCK_DIM, inputs, outputs)
+            program.add(multilevel.correct_small, BLOCK_DIM, inputs, outputs)
         for level in range(large if small else large - 1, 0, -1):
             rows, columns = self.shapes[level]
             program.add(
-                k.prolong, rows * columns, [self._correction[level], rows, columns], [self._correction[level - 1]]
+                multilevel.prolong,
+                rows * columns,
+                [self._correction[level], rows, columns],
+                [self._correction[level - 1]],
             )
         inputs = [self._correction[0], *self.shapes[0], diagonal, residual]
-        program.add(k.prolong_to_finest, len(out), inputs, [out])
+        program.add(multilevel.prolong_to_finest, len(out), inputs, [out])
 
 
 # Tiles of the brightness map.

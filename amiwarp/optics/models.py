@@ -12,7 +12,7 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
-from amiwarp.optics.displacement import Model
+from amiwarp.optics.displacement import Model as Model
 from amiwarp.optics.ellipse_model import EllipseModel
 from amiwarp.optics.exact_model import ExactModel
 from amiwarp.validation import guarded, whole
