@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import TRUE_PHASE, TRUE_PRISM
 from typer.testing import CliRunner
 
 import amiwarp
-import reference
 from amiwarp.calib.parameters import units
 from amiwarp.choices import OPTICAL_MODELS
 from amiwarp.cli.app import app
 from amiwarp.kernels.refraction import compensate_direction, deflect
 from amiwarp.optics.models import MODELS, rungs
+from reference import optics as reference
+from tests.conftest import TRUE_PHASE, TRUE_PRISM
 
 CYLINDER = 0.03
 """True cylinder power: 3 px at the image's border."""
@@ -28,9 +28,7 @@ VALUES = {"apex": TRUE_PRISM.apex, "phase": TRUE_PHASE, "cylinder": CYLINDER}
 MOST_FILES = 6
 """Largest number of files of the package that know a model by name."""
 LOADED = """
-import sys
-sys.path.insert(0, {tests!r})
-import cylinder_model
+import tests.cylinder_model
 from amiwarp.viewer import layout
 print(layout.SLIDERS["cylinder"], 'name="cylinder"' in layout.template())
 """
@@ -41,9 +39,9 @@ def cylinder() -> Iterator[Any]:
     """The module of the new model, which registers the model; afterwards it is removed."""
     overloads = [function.user_overloads for function in (compensate_direction, deflect)]
     before = [set(each) for each in overloads]
-    module = importlib.import_module("cylinder_model")
+    module = importlib.import_module("tests.cylinder_model")
     yield module
-    del MODELS["cylinder"], sys.modules["cylinder_model"]
+    del MODELS["cylinder"], sys.modules["tests.cylinder_model"]
     for each, known in zip(overloads, before, strict=True):
         added = set(each) - known
         assert len(added) == 1
@@ -121,7 +119,7 @@ def test_programs_list_its_parameter(cylinder: Any, tmp_path: Path) -> None:
     said = CliRunner().invoke(app, ["calibrate", str(tmp_path / "no.h5"), "--start", "nothing=1"]).stderr
     assert ", cylinder, " in said
     printed = subprocess.run(
-        [sys.executable, "-c", LOADED.format(tests=str(Path(__file__).parent))],
+        [sys.executable, "-c", LOADED],
         cwd=Path(amiwarp.__file__).parents[1], capture_output=True, text=True, check=True,
     ).stdout  # fmt: skip
     assert "('cylinder power', '', ('-0.1', '0.1', '0.001'), \"model === 'cylinder'\") True" in printed
