@@ -45,7 +45,7 @@ from amiwarp.calib.model_choice import (
     trial_for,
 )
 from amiwarp.calib.sharpness import split_turns
-from amiwarp.optics.displacement import rms
+from amiwarp.optics.displacement import compensate_by_each, rms
 from amiwarp.optics.models import MODELS
 from tests.conftest import COARSE
 
@@ -160,7 +160,7 @@ def test_the_motion_by_a_clock_offset_follows_the_orbits(found: Calibration, wid
     space = candidate_space("exact", found.exact, ("clock_offset",), rad_per_us=7.5e-5, duration_us=3e5)
     (motion,) = linear_motions([space], places)
     model, h = space.build(space.start), 0.03
-    later, earlier = places.by_each([model, model], np.array([[h], [-h]]))
+    later, earlier = compensate_by_each([model, model], places.xy, places.theta + np.array([[h], [-h]]))
     expected = (later - earlier) / (2.0 * h) * places.speed[:, None] / space.pixels["clock_offset"]
     assert rms(motion.slopes[2] - expected) < 2e-3 * rms(expected)
 

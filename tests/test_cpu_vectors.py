@@ -83,7 +83,7 @@ def test_slopes_over_blocks_of_pairs(placed: BrightnessMap, recording: Recording
     plus, minus = at._sides
     inputs = [placed.pairs.arrays, placed._atlas, plus, minus, placed._image, 0.02, 0]
     for side, values in zip((plus, minus), sides, strict=True):
-        at._place(**values, out=side)
+        at.place(**values, out=side)
     other = wp.zeros(placed.pairs.arrays.stride, dtype=float, device="cpu")
     wp.launch(slope_between, n, inputs, [other], device="cpu")
     assert 1000 < np.count_nonzero(slope) < n  # some pairs are off the map
@@ -159,7 +159,7 @@ class OneThread:
 
     device = SimpleNamespace(is_cpu=False)
 
-    def add(self, kernel: Any, n: int, inputs: list[Any], outputs: list[Any]) -> None:
+    def add(self, kernel: Any, n: int, inputs: list[Any], outputs: list[Any], *, smallest: int = 0) -> None:
         wp.launch(kernel, 1 if kernel is multilevel.correct_small else n, [*inputs, 0], outputs, device="cpu")
 
 

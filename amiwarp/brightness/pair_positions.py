@@ -63,20 +63,19 @@ class PairChains:
 
     def add_product(self, program: Any, weight: Any, vector: Any, slices: list[Any]) -> None:
         """Add to ``program``: slices += Aᵀ W A vector, for equations A with weights W."""
-        self._add(program, equations_cpu.apply_normal, [weight, vector], slices)
+        inputs = [self._pairs, self._atlas, self.arrays, weight, vector]
+        program.add_slices(equations_cpu.apply_normal, self.threads, inputs, slices, smallest=FEW_BLOCKS)
 
     def add_transpose(self, program: Any, weight: Any, residual: Any, slices: list[Any]) -> None:
         """Add to ``program``: slices += Aᵀ W residual."""
-        self._add(program, equations_cpu.apply_transpose, [weight, residual], slices)
+        inputs = [self._pairs, self._atlas, self.arrays, weight, residual]
+        program.add_slices(equations_cpu.apply_transpose, self.threads, inputs, slices, smallest=FEW_BLOCKS)
 
     def add_diagonal(self, program: Any, weight: Any, slices: list[Any]) -> None:
         """Add to ``program``: slices += diag(Aᵀ W A). Later products must have the same weights."""
         program.add(weigh_chains, self.threads, [weight], [self.arrays], smallest=FEW_BLOCKS)
-        self._add(program, equations_cpu.add_diagonal, [weight], slices)
-
-    def _add(self, program: Any, kernel: Any, vectors: list[Any], slices: list[Any]) -> None:
-        inputs = [self._pairs, self._atlas, self.arrays, *vectors]
-        program.add_slices(kernel, self.threads, inputs, slices, smallest=FEW_BLOCKS)
+        inputs = [self._pairs, self._atlas, self.arrays, weight]
+        program.add_slices(equations_cpu.add_diagonal, self.threads, inputs, slices, smallest=FEW_BLOCKS)
 
 
 # Ends of event pairs on CUDA in the order of the map, so that neighbouring threads add to the same nodes.
@@ -103,10 +102,11 @@ class PairEnds:
         self.arrays.part = wp.empty(2 * stride, dtype=wp.vec2, device=self._device)
         self.arrays.order, self.arrays.cell = (wp.empty(4 * stride, dtype=int, device=self._device) for _ in "oc")
         self._flow = wp.empty(stride, dtype=float, device=self._device)
+        self._ends, self._end_inputs = 2 * stride, [self.arrays, stride, atlas.columns]
 
     def take_positions(self) -> None:
         """Take the present positions, and sort them."""
-        ends, nodes = 2 * self._geometry.stride, self._nodes
+        ends, nodes = self._ends, self._nodes
         inputs, outputs = [self._geometry, self.threads, nodes], [self.arrays.cell, self.arrays.order]
         self._launch(list_ends, ends, inputs, outputs)
         wp.utils.radix_sort_pairs(*outputs, ends, end_bit=nodes.bit_length())
@@ -120,25 +120,20 @@ class PairEnds:
     def add_product(self, program: Any, weight: Any, vector: Any, slices: list[Any]) -> None:
         """Add to ``program``: slices += Aᵀ W A vector, for equations A with weights W."""
         program.add(equations_cuda.find_flows, self.threads, [*self.inputs, weight, vector], [self._flow, *slices])
-        self._add(program, self._flow, slices)
+        program.add(add_ends, self._ends, [*self._end_inputs, self._flow, 0], slices)
 
     def add_transpose(self, program: Any, weight: Any, residual: Any, slices: list[Any]) -> None:
         """Add to ``program``: slices += Aᵀ W residual."""
         inputs = [self._pairs, self._atlas, weight, residual]
         program.add(equations_cuda.weigh_residuals, self.threads, inputs, [self._flow, *slices])
-        self._add(program, self._flow, slices)
+        program.add(add_ends, self._ends, [*self._end_inputs, self._flow, 0], slices)
 
     def add_diagonal(self, program: Any, weight: Any, slices: list[Any]) -> None:
         """Add to ``program``: slices += diag(Aᵀ W A)."""
         if self._atlas.with_leak or self._atlas.with_off:
             inputs = [self._pairs, self._atlas, weight]
             program.add(equations_cuda.add_sensor_diagonal, self.threads, inputs, slices)
-        self._add(program, weight, slices, squared=1)
-
-    def _add(self, program: Any, values: Any, slices: list[Any], squared: int = 0) -> None:
-        stride = self._geometry.stride
-        inputs = [self.arrays, stride, self._atlas.columns, values, squared]
-        program.add(add_ends, 2 * stride, inputs, slices)
+        program.add(add_ends, self._ends, [*self._end_inputs, weight, 1], slices)
 
 
 class PairPositions:
@@ -161,12 +156,7 @@ class PairPositions:
         g.part = wp.empty(4 * g.stride, dtype=float, device=self.device)
         return g
 
-    def place(self, model: Model, drift: float, camera_rotation: CameraRotation | None) -> None:
-        """Compute the positions."""
-        self._place(model, drift, camera_rotation, self.geometry)
-        self.equations.take_positions()
-
-    def _place(
+    def place(
         self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any, image: Any = None
     ) -> None:
         """Compute the positions into ``out``.
@@ -213,11 +203,11 @@ class PairPositions:
         out = wp.empty(self.pairs.arrays.stride, dtype=float, device=self.device)
         if self.device.is_cpu and all(self._in_blocks(at["model"], self._turn(at["camera_rotation"])) for at in both):
             for change, at in zip(self._changes, both, strict=True):
-                self._place(**at, out=change, image=image)
+                self.place(**at, out=change, image=image)
             self._launch(slope_of_changes, len(self.pairs), [*self._changes, width], [out])
             return out
         for side, at in zip(self._sides, both, strict=True):
-            self._place(**at, out=side)
+            self.place(**at, out=side)
         inputs = [self.pairs.arrays, self._atlas, *self._sides, image, width]
         self._launch(slope_between, len(self.pairs), inputs, [out])
         return out

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from amiwarp.brightness.event_pairs import PairSet
     from amiwarp.optics.models import Model
 
+    _Step = tuple[Any, int, list[Any], list[Any], int]  # kernel, number of threads, inputs, outputs, smallest slice
+
 
 # Multigrid preconditioner for large maps.
 #
@@ -79,10 +81,10 @@ class GridHierarchy:
         """Add to ``program`` the step ``out`` = sum of the grids' corrections for the finest grid's ``residual``."""
         if not self._correction:
             program.add(multilevel.divide, len(out), [diagonal, residual], [out])
-        elif program.device.is_cpu:
-            self._correct_by_rows(program, diagonal, prior, residual, out)
-        else:
-            self._correct_by_nodes(program, diagonal, prior, residual, out)
+            return
+        steps = self._steps_by_rows if program.device.is_cpu else self._steps_by_nodes
+        for kernel, n, inputs, outputs, smallest in steps(diagonal, prior, residual, out):
+            program.add(kernel, n, inputs, outputs, smallest=smallest)
 
     def _restrictions(self, residual: Any, prior: Any) -> Iterator[tuple[list[Any], list[Any]]]:
         """Yield inputs and outputs of the restriction to each grid but the finest."""
@@ -90,41 +92,37 @@ class GridHierarchy:
         for level, (fine, *outputs) in enumerate(zip(fines, self._residual, self._correction, strict=False)):
             yield [fine, *self.shapes[level], self._diagonal[level], prior, 4.0 ** (level + 1)], outputs
 
-    def _correct_by_rows(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
-        """Correct with a row of nodes per thread."""
+    def _steps_by_rows(self, diagonal: Any, prior: Any, residual: Any, out: Any) -> Iterator[_Step]:
+        """Yield the launches of :meth:`correct` with a row of nodes per thread."""
         grids = zip(self.shapes[1:], self._restrictions(residual, prior), strict=True)
         for (rows, columns), (inputs, outputs) in grids:
-            program.add(multilevel.restrict_rows, rows, inputs, outputs, smallest=SMALLEST_SLICE // (4 * columns) + 1)
+            yield multilevel.restrict_rows, rows, inputs, outputs, SMALLEST_SLICE // (4 * columns) + 1
         for level in range(len(self._correction) - 1, -1, -1):
             rows, columns = self.shapes[level]
             inputs, smallest = [self._correction[level], self.shapes[level + 1][1]], SMALLEST_SLICE // columns + 1
             if level:
                 outputs = [self._correction[level - 1]]
-                program.add(multilevel.prolong_rows, rows, [*inputs, columns], outputs, smallest=smallest)
+                yield multilevel.prolong_rows, rows, [*inputs, columns], outputs, smallest
             else:
                 inputs += [rows, columns, diagonal, residual]
-                program.add(multilevel.prolong_rows_to_finest, rows, inputs, [out], smallest=smallest)
+                yield multilevel.prolong_rows_to_finest, rows, inputs, [out], smallest
 
-    def _correct_by_nodes(self, program: Any, diagonal: Any, prior: Any, residual: Any, out: Any) -> None:
-        """Correct with a node per thread, and the small grids in one block of threads."""
+    def _steps_by_nodes(self, diagonal: Any, prior: Any, residual: Any, out: Any) -> Iterator[_Step]:
+        """Yield the launches of :meth:`correct` with a node per thread, and the small grids in one block of threads."""
         small = sum(rows * columns <= SMALL for rows, columns in self.shapes[2:])
         large = len(self._correction) - small
         for inputs, outputs in islice(self._restrictions(residual, prior), large):
-            program.add(multilevel.restrict, len(outputs[0]), inputs, outputs)
+            yield multilevel.restrict, len(outputs[0]), inputs, outputs, SMALLEST_SLICE
         if small:
             all_diagonals, *outputs = self._all
             inputs = [*self.shapes[large], self._first[large - 1], small, all_diagonals, prior, 4.0**large]
-            program.add(multilevel.correct_small, BLOCK_DIM, inputs, outputs)
+            yield multilevel.correct_small, BLOCK_DIM, inputs, outputs, SMALLEST_SLICE
         for level in range(large if small else large - 1, 0, -1):
             rows, columns = self.shapes[level]
-            program.add(
-                multilevel.prolong,
-                rows * columns,
-                [self._correction[level], rows, columns],
-                [self._correction[level - 1]],
-            )
+            inputs, outputs = [self._correction[level], rows, columns], [self._correction[level - 1]]
+            yield multilevel.prolong, rows * columns, inputs, outputs, SMALLEST_SLICE
         inputs = [self._correction[0], *self.shapes[0], diagonal, residual]
-        program.add(multilevel.prolong_to_finest, len(out), inputs, [out])
+        yield multilevel.prolong_to_finest, len(out), inputs, [out], SMALLEST_SLICE
 
 
 # Tiles of the brightness map.
@@ -403,7 +401,8 @@ class BrightnessMap:
 
     def place(self, model: Model, *, drift: float = 0.0, camera_rotation: CameraRotation | None = None) -> None:
         """Compute the positions of the pairs on the map, for a model and a camera rotation about ``middle_us``."""
-        self._at.place(model, drift, camera_rotation)
+        self._at.place(model, drift, camera_rotation, self._at.geometry)
+        self._equations.take_positions()
 
     def path_arguments(self, model: Model) -> list[Any]:
         """Return the kernel arguments that describe the map and the paths of the pairs' pixels over it."""
@@ -600,37 +599,24 @@ class _ConjugateGradients:
     def __init__(self, of: BrightnessMap, image: Any, residual: Any) -> None:
         self.image, self.residual = image, residual
         self._map, self._start, self._step = of, Program(of.device), Program(of.device)
-        self._add_start(self._start)
-        self._add_step(self._step)
+        of._equations.add_transpose(self._start, of.residuals.weight, residual, of._slices)
+        self._add(self._start, cg.start_descent, [of._sums, of._prior, image], [of._u, of._dots])
+        if of._grids is None:
+            self._add(self._step, cg.update_search_direction, [], [of._u, of._dots])
+        else:
+            self._add(self._step, cg.update_search_direction_with, [of._z], [of._u, of._dots])
+        of._equations.add_product(self._step, of.residuals.weight, of._u.direction, of._slices)
+        self._add(self._step, cg.finish_product, [of._sums, of._prior], [of._u, of._dots])
+        self._add(self._step, cg.descend, [], [image, of._u, of._dots])
+        if of._grids is not None:
+            for program in (self._start, self._step):  # preconditioned residual, and its product with the residual
+                of._grids.correct(program, of._u.diagonal, of._prior, of._u.residual, of._z)
+                self._add(program, cg.dot, [of._u.residual, of._z], [of._dots.rz])
 
     def run(self, steps: int) -> None:
         """Start from the current ``image`` and run ``steps`` iterations."""
         self._start.run()
         self._step.run(steps)
-
-    def _add_start(self, program: Any) -> None:
-        of = self._map
-        of._equations.add_transpose(program, of.residuals.weight, self.residual, of._slices)
-        self._add(program, cg.start_descent, [of._sums, of._prior, self.image], [of._u, of._dots])
-        self._correct(program)
-
-    def _add_step(self, program: Any) -> None:
-        of = self._map
-        if of._grids is None:
-            self._add(program, cg.update_search_direction, [], [of._u, of._dots])
-        else:
-            self._add(program, cg.update_search_direction_with, [of._z], [of._u, of._dots])
-        of._equations.add_product(program, of.residuals.weight, of._u.direction, of._slices)
-        self._add(program, cg.finish_product, [of._sums, of._prior], [of._u, of._dots])
-        self._add(program, cg.descend, [], [self.image, of._u, of._dots])
-        self._correct(program)
-
-    def _correct(self, program: Any) -> None:
-        """Compute the preconditioned residual and its product with the residual."""
-        of = self._map
-        if of._grids is not None:
-            of._grids.correct(program, of._u.diagonal, of._prior, of._u.residual, of._z)
-            self._add(program, cg.dot, [of._u.residual, of._z], [of._dots.rz])
 
     def _add(self, program: Any, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
         program.add(kernel, self._map._threads, [*inputs, self._map._width], outputs, smallest=FEW_CHUNKS)

@@ -734,18 +734,11 @@ class Places:
 
     def compensated(self, model: Model) -> NDArray[np.float64]:
         """Return the events' compensated coordinates [px], shape (n, 2)."""
-        return self.by_each([model])[0]
-
-    def by_each(self, models: Sequence[Model], ahead: NDArray[np.float64] | float = 0.0) -> NDArray[np.float64]:
-        """Return the events' coordinates compensated by each model [px], shape (models, n, 2).
-
-        ``ahead`` are angles to add to those of the events [rad], shape (models, 1) or (models, n).
-        """
-        return compensate_by_each(models, self.xy, self.theta + ahead)
+        return compensate_by_each([model], self.xy, self.theta)[0]
 
     def path(self, model: Model) -> NDArray[np.float64]:
         """Return the events' compensated coordinates at :data:`TURN` [px], shape (TURN_ANGLES, n, 2)."""
-        return self.by_each([model] * len(TURN), TURN)
+        return compensate_by_each([model] * len(TURN), self.xy, self.theta + TURN)
 
     def distance(self, model: Model, other: Model, *, remove_lag: bool = False) -> float:
         """Return the rms distance of two models at the events [px].
@@ -754,7 +747,8 @@ class Places:
         """
         away = self.compensated(model) - self.compensated(other)
         if remove_lag:
-            later, earlier = self.by_each([model, model], np.array([[0.01], [-0.01]]))
+            angles = self.theta + np.array([[0.01], [-0.01]])
+            later, earlier = compensate_by_each([model, model], self.xy, angles)
             per_angle = later - earlier
             away = away - per_angle * (np.nansum(away * per_angle) / np.nansum(per_angle**2))
         return rms(away)
@@ -863,7 +857,8 @@ def linear_motions(spaces: Sequence[ParameterSpace], sample: Places) -> list[Lin
     ]
     each = [(space, values) for space, several in zip(spaces, near, strict=True) for values in several]
     drifts = np.array([[space.drift(values)] for space, values in each])
-    moved = sample.by_each([space.build(values) for space, values in each], drifts * sample.speed)
+    models = [space.build(values) for space, values in each]
+    moved = compensate_by_each(models, sample.xy, sample.theta + drifts * sample.speed)
     found = []
     for space, v, part in zip(spaces, starts, np.split(moved, np.cumsum([len(n) for n in near])[:-1]), strict=True):
         at, ahead, back = part[0], part[1 : 1 + len(v)], part[1 + len(v) :]
@@ -886,7 +881,8 @@ def fit(
         fields = _finite(np.stack([m.at - target, *m.slopes]))
         left, design = fields[0], fields[1:]
         best.append(m.space.to_values(m.v - np.linalg.solve(design @ design.T, design @ left)))
-    found = sample.by_each([m.space.build(values) for m, values in zip(motions, best, strict=True)])
+    models = [m.space.build(values) for m, values in zip(motions, best, strict=True)]
+    found = compensate_by_each(models, sample.xy, sample.theta)
     return [(values, rms(at - target)) for values, at in zip(best, found, strict=True)]
 
 

@@ -121,23 +121,16 @@ class Objective:
                     if self._meter.takes_votes:
                         self._meter.launch(votes.votes[0])
                     else:
-                        self._read()
+                        votes.read(0, self._meter.image)
                         self._meter.launch()
                 self._graph = capture.graph
             wp.capture_launch(self._graph)
         else:
             votes.clear()
             votes.add_events(model, self._events, drift=drift, camera_rotation=rotation)
-            self._read()
+            votes.read(self._meter.image)
             self._meter.launch()
         return self._meter.results()
-
-    def _read(self) -> None:
-        """Write the votes to the meter's image."""
-        if isinstance(self._votes, TileVotes):
-            self._votes.read(0, self._meter.image)
-        else:
-            self._votes.read(self._meter.image)
 
     def values(self, values: Mapping[str, float]) -> float:
         """Return the sharpness of the image of warped events at parameter values, in their units."""
@@ -154,8 +147,8 @@ class Objective:
     def image(self, values: Mapping[str, float]) -> Image:
         """Return the IWE at parameter values, with the border outside the sensor, until the next evaluation."""
         self.measure(values)
-        if self._meter.takes_votes:
-            self._read()
+        if isinstance(self._votes, TileVotes) and self._meter.takes_votes:
+            self._votes.read(0, self._meter.image)
         return self._meter.image
 
 

@@ -59,12 +59,11 @@ class Votes:
         """
         if events.slope is not None:
             events.drift(drift)
-        params, rotation = model.params(self.device), None
-        camera = pinhole_params(model.camera)
+        kernel, rotation, camera = self._buffers.EVENTS, [], pinhole_params(model.camera)
         if camera_rotation is not None and events.arrays.time.shape[0]:
-            camera, rotation = None, camera_rotation.params()
-        inputs = [params, camera or model_camera(model, self.device), events.arrays, self._params]
-        self._buffers.add_events(inputs, events, rotation)
+            kernel, rotation, camera = self._buffers.EVENTS_OF_ROTATING_CAMERA, [camera_rotation.params()], None
+        inputs = [model.params(self.device), camera or model_camera(model, self.device), events.arrays, self._params]
+        self._buffers.vote(kernel, [*inputs, *rotation], events.count, events.total)
 
     def add_points(self, x: Any, y: Any, layer: Any, count: int | None = None) -> None:
         """Vote points at their coordinates, without compensation.
@@ -72,7 +71,8 @@ class Votes:
         ``x``, ``y``: Warp arrays of float [px]. ``layer``: Warp array of uint8, the index of each point's layer.
         ``count``: number of points to vote; None for all.
         """
-        self._buffers.add_points(x, y, layer, len(x) if count is None else count)
+        count = len(x) if count is None else count
+        self._buffers.vote(self._buffers.POINTS, [x, y, layer, self._params], count, count)
 
     def range_voter(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
         """Return a function that votes ``count`` of the points from index ``first`` on, for arrays that stay allocated.

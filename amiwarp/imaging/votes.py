@@ -393,6 +393,9 @@ SMALLEST = 512
 class PixelVotes:
     """Sums of the votes of each pixel on a CPU, allocated once. Before they overflow, they move to 64-bit totals."""
 
+    EVENTS, EVENTS_OF_ROTATING_CAMERA, POINTS = vote_event_blocks, vote_rotating_camera_blocks, vote_point_blocks
+    """Kernels for :meth:`vote`."""
+
     def __init__(self, canvas: Any, layers: int) -> None:
         """Allocate the sums. ``canvas``: Warp struct ``amiwarp.kernels.votes.Canvas``."""
         self._canvas, self._cells = canvas, layers * canvas.rows * canvas.columns
@@ -418,17 +421,6 @@ class PixelVotes:
             run_together([one.zero_ for one in self._slices])
             self._stale = False
 
-    def add_events(self, inputs: list[Any], events: UploadedEvents, camera_rotation: Any | None) -> None:
-        """Vote events. ``inputs``: model, camera, columns of the events and canvas, as the kernels take them."""
-        kernel = vote_event_blocks
-        if camera_rotation is not None:
-            kernel, inputs = vote_rotating_camera_blocks, [*inputs, camera_rotation]
-        self._vote(kernel, inputs, events.count, events.total)
-
-    def add_points(self, x: Any, y: Any, layer: Any, count: int) -> None:
-        """Vote the first ``count`` points."""
-        self._vote(vote_point_blocks, [x, y, layer, self._canvas], count, count)
-
     def range_voter(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
         """Return a function that votes a range of blocks of points in the calling thread."""
         inputs = [x, y, layer, self._canvas, len(x), 0]
@@ -441,7 +433,7 @@ class PixelVotes:
 
         return vote_range
 
-    def _vote(self, kernel: Any, inputs: list[Any], count: int, total: int) -> None:
+    def vote(self, kernel: Any, inputs: list[Any], count: int, total: int) -> None:
         """Vote ``count`` entries that stand for ``total`` events, in pieces that fit into the sums."""
         blocks, piece = -(-count // int(BLOCK)), CAPACITY // (int(BLOCK) * (1 if total == count else LARGEST_WEIGHT))
         if total <= CAPACITY:
@@ -495,6 +487,9 @@ up to 1,023."""
 class WordVotes:
     """Words of the cells of an image on CUDA, and 64-bit totals, allocated once."""
 
+    EVENTS, EVENTS_OF_ROTATING_CAMERA, POINTS = vote_events, vote_rotating_camera, vote_points
+    """Kernels for :meth:`vote`."""
+
     def __init__(self, canvas: Any, layers: int, device: Any) -> None:
         """Allocate the words. ``canvas``: Warp struct ``amiwarp.kernels.votes.Canvas``."""
         self._params, self.device = canvas, device
@@ -527,35 +522,19 @@ class WordVotes:
         self._cells.words.zero_()
         self._cells.totals.zero_()
 
-    def add_events(self, inputs: list[Any], events: UploadedEvents, camera_rotation: Any | None) -> None:
-        """Vote events. ``inputs``: model, camera, columns of the events and canvas, as the kernels take them."""
-        if camera_rotation is not None:
-            self._vote_exactly(vote_rotating_camera, [*inputs, camera_rotation], events.count)
-        elif len(events.arrays.weight):
-            self._vote_exactly(vote_events, inputs, events.count)
-        else:
-            self._vote_in_batches(inputs, events.count)
-
-    def add_points(self, x: Any, y: Any, layer: Any, count: int) -> None:
-        """Vote the first ``count`` points."""
-        self._vote_exactly(vote_points, [x, y, layer, self._params], count)
-
     def range_voter(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
         """Return a function that votes a range of points."""
         return RecordedLaunch(vote_points, [x, y, layer, self._params, 0], [self._cells], device=self.device)
 
-    def _vote_exactly(self, kernel: Any, inputs: list[Any], count: int, first: int = 0) -> None:
-        """Vote by the exact kernel, which checks for overflow at every addition."""
-        launch(kernel, count, inputs, [self._cells], device=self.device, first=first)
+    def vote(self, kernel: Any, inputs: list[Any], count: int, total: int) -> None:
+        """Vote ``count`` entries that stand for ``total`` events.
 
-    def _vote_in_batches(self, inputs: list[Any], count: int) -> None:
-        """Vote on CUDA by the fast kernel, whose result is verified later; few events are voted exactly at once."""
-        start, vote = 0, None
-        while start < count:
+        Many events are voted by the fast kernel, whose result is verified later. ``kernel`` votes all others exactly:
+        it checks for overflow at every addition.
+        """
+        start, vote, fast = 0, None, kernel is self.EVENTS and total == count
+        while fast and self._batches_fit is not False and count - start >= FIRST_BATCH:
             batch = min(count - start, self._batch)
-            if self._batches_fit is False or batch < FIRST_BATCH:
-                self._vote_exactly(vote_events, inputs, count - start, start)
-                return
             vote = vote or self._recorded_vote(inputs)
             vote(start, batch)
             self._clear_words.set(2, len(self._batches))
@@ -565,6 +544,7 @@ class WordVotes:
             if self._batches_fit is None or len(self._batches) == len(self._counts):
                 self._verify_batches()
             start += batch
+        launch(kernel, count - start, inputs, [self._cells], device=self.device, first=start)
 
     def _recorded_vote(self, inputs: list[Any]) -> RecordedLaunch:
         """Return the recorded launch of the fast kernel, which takes a tenth of the time of a new launch."""
@@ -593,7 +573,7 @@ class WordVotes:
             self._batches.clear()
             return
         for inputs, count, first in self._batches:
-            self._vote_exactly(vote_events, inputs, count, first)
+            launch(vote_events, count, inputs, [self._cells], device=self.device, first=first)
         self._discard_batches()
 
     def _discard_batches(self) -> None:

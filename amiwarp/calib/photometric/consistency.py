@@ -28,7 +28,7 @@ from amiwarp.optics.models import predicted_error
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from numpy.typing import NDArray
 
@@ -384,7 +384,7 @@ def _columns(cost: Cost, best: Vector) -> dict[str, Any]:
     ``long …`` are the derivatives of pairs with long gaps only; ``late …`` grow with the time of the pair.
     """
     space, pairs = cost.space, cost.brightness.pairs
-    columns = free_columns(cost, best)
+    columns = slopes(cost, space, best, space.names)
     late, long = pairs.split_by_time()
     for name in _orbit(space):
         columns[f"long {name}"] = masked(columns[name], long)
@@ -456,22 +456,21 @@ def _distance(model: Model, other: Model) -> float:
     return predicted_error(model, other, remove_lag=True, grid=8).rms
 
 
-def slope(cost: Cost, space: ParameterSpace, v: Vector, k: int) -> Any:
-    """Return the derivative of the residuals by entry ``k`` of the search vector of ``space``, on the device."""
-    step = np.zeros(len(v))
-    step[k] = SLOPE_PX
-    up, down = (place_arguments(space, space.to_values(at)) for at in (v + step, v - step))
-    return cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
+def slopes(cost: Cost, space: ParameterSpace, v: Vector, names: Iterable[str]) -> dict[str, Any]:
+    """Return the derivatives of the residuals by parameters of ``space`` at its search vector ``v``, by name.
 
-
-def free_columns(cost: Cost, v: Vector) -> dict[str, Any]:
-    """Return the derivatives of the residuals by each free parameter, on the device, by name.
-
-    The map must be solved at ``v``.
+    They are on the device. The map must be solved at ``v``.
     """
-    known = cost.columns
-    names = cost.space.names
-    return {n: known[n][0] if n in known else slope(cost, cost.space, v, k) for k, n in enumerate(names)}
+    columns, known = {}, cost.columns if space is cost.space else {}
+    for name in names:
+        if name in known:
+            columns[name] = known[name][0]
+            continue
+        step = np.zeros(len(v))
+        step[space.names.index(name)] = SLOPE_PX
+        up, down = (place_arguments(space, space.to_values(at)) for at in (v + step, v - step))
+        columns[name] = cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
+    return columns
 
 
 def _rotation_columns(cost: Cost, best: Vector) -> dict[str, Any]:
@@ -523,7 +522,7 @@ def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
         wide, v = with_cause(space, cause, values)
     except AmiwarpError:
         return {}  # it moves no event
-    return {n: slope(cost, wide, v, wide.names.index(n)) for n in cause.names}
+    return slopes(cost, wide, v, cause.names)
 
 
 def _findings(cost: Cost, best: Vector, fit: LinearFit, causes: list[Cause], least_gain: float) -> list[Finding]:

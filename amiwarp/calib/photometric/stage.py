@@ -528,7 +528,7 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
     # the refractory period sets the reference of a pair, its first event, later
     reference = wp.zeros_like(relative)
     reference[0].fill_(1.0)
-    columns = consistency.free_columns(cost, v)
+    columns = consistency.slopes(cost, cost.space, v, cost.space.names)
     columns["refractory"], columns["slow"] = (_shifted(cost, v, shift) for shift in (reference, relative))
     fit = consistency.linear_fit(cost, columns)
 
