@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from amiwarp.kernels import equations_cpu, equations_cuda
-from amiwarp.kernels import map_positions as kernels
 from amiwarp.kernels.equations import Geometry, slope_between, slope_of_changes
 from amiwarp.kernels.equations_cpu import BLOCK, Chains, make_chains, weigh_chains
 from amiwarp.kernels.equations_cuda import Ends, add_ends, list_ends, take_fractions
 from amiwarp.kernels.launch import RepeatedLaunches, launch
+from amiwarp.kernels.map_positions import place_blocks, place_pairs, place_still
 from amiwarp.kernels.pairs import keep_nodes
 from amiwarp.optics.camera import pinhole_params
 from amiwarp.optics.camera_rotation import CameraRotation
@@ -167,15 +167,15 @@ class PairPositions:
         n = arrays.stride if self.device.is_cpu else arrays.count  # CPU kernels also read the padding
         if not self._in_blocks(model, turn):
             inputs = [model.params(self.device), model_camera(model, self.device), arrays, self._atlas]
-            self._launch(kernels.place_pairs, n, [*inputs, drift, turn.params()], [out])
+            self._launch(place_pairs, n, [*inputs, drift, turn.params()], [out])
             return
         inputs = [model.params(self.device), pinhole_params(model.camera), arrays, self._atlas]
         if not self.device.is_cpu:
-            self._launch(kernels.place_still, n, inputs, [out])
+            self._launch(place_still, n, inputs, [out])
             return
         inputs += [drift, turn.params(), self._nothing if image is None else image]
         outputs = [out, self._nothing] if image is None else [self.geometry, out]
-        self._launch(kernels.place_blocks, self.equations.threads, inputs, outputs, smallest=FEW_BLOCKS)
+        self._launch(place_blocks, self.equations.threads, inputs, outputs, smallest=FEW_BLOCKS)
 
     def _turn(self, camera_rotation: CameraRotation | None) -> CameraRotation:
         return (camera_rotation or CameraRotation()).about(self._middle_us)
