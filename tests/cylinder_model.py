@@ -9,8 +9,7 @@ import warp as wp
 from amiwarp import Camera, ExactModel, Model, Parameter, Prism
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.refraction import ExactParams, compensate_direction, deflect, refract_through_prism, trace
-from amiwarp.optics.displacement import PHASE, phase_values, struct_of
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, PHASE, phase_values, struct_of
 from amiwarp.validation import guarded
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})

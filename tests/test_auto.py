@@ -45,8 +45,7 @@ from amiwarp.calib.model_choice import (
     trial_for,
 )
 from amiwarp.calib.sharpness import split_turns
-from amiwarp.optics.displacement import compensate_by_each, rms
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, compensate_by_each, rms
 from tests.conftest import COARSE
 
 BOTH = Settings(events=120_000, photometric=COARSE)

@@ -35,8 +35,7 @@ from amiwarp.calib.calibration_events import RUN, thin
 from amiwarp.calib.first_guess import estimate_rpm
 from amiwarp.calib.parameters import make_space
 from amiwarp.calib.sharpness import PARTS
-from amiwarp.optics.displacement import wrap_angle
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, wrap_angle
 from tests.conftest import NOMINAL_PRISM, TRUE_PRISM
 
 calibrate = functools.partial(calib.calibrate, stages=("sharpness",))

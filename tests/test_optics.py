@@ -28,8 +28,7 @@ from amiwarp import (
 )
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, PinholeParams, undo_camera_rotation
 from amiwarp.optics.camera import camera_params, pinhole_params
-from amiwarp.optics.displacement import compensate_by_each, wrap_angle
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, compensate_by_each, wrap_angle
 from reference import optics as oracle
 
 ATOL = 1e-3  # px, the documented limit; docs/explanation/optics.md has the measured values

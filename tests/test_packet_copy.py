@@ -11,7 +11,7 @@ import warp as wp
 
 from amiwarp import Events
 from amiwarp.compensation.streams import MOST_HELD, PIECE, ColumnCheck, PacketCopier, join_packets
-from amiwarp.kernels.page_locked import PageLockedPool
+from amiwarp.kernels.launch import PageLockedPool
 
 Copy = Callable[[list[Events], list[np.ndarray]], ColumnCheck]
 

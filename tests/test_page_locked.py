@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp.kernels.page_locked import page_locked, start_read
+from amiwarp.kernels.launch import page_locked, start_read
 
 
 def test_page_locked_memory_is_used_again() -> None:

@@ -16,17 +16,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from amiwarp.brightness.pair_positions import FEW_BLOCKS, PairPositions
+from amiwarp.brightness.event_pairs import FEW_BLOCKS, PairPositions
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import conjugate_gradients as cg
 from amiwarp.kernels import equations as eqs
 from amiwarp.kernels import multilevel
 from amiwarp.kernels import slow_pixels as slow_kernels
 from amiwarp.kernels.conjugate_gradients import gather
-from amiwarp.kernels.launch import BLOCK_DIM, SMALLEST_SLICE, Program, RepeatedLaunches, launch, slice_count
-from amiwarp.kernels.page_locked import start_read
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.displacement import model_camera
+from amiwarp.kernels.launch import BLOCK_DIM, SMALLEST_SLICE, Program, RepeatedLaunches, launch, slice_count, start_read
+from amiwarp.optics.camera import CameraRotation
+from amiwarp.optics.models import model_camera
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -30,9 +30,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape
-from amiwarp.optics.displacement import compensate_by_each, rms, wrap_angle
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import MODELS, predicted_error, rungs
+from amiwarp.optics.models import MODELS, ExactModel, compensate_by_each, predicted_error, rms, rungs, wrap_angle
 from amiwarp.optics.prism import UnsizedPrism
 from amiwarp.validation import real
 

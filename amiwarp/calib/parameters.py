@@ -16,10 +16,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera import RadialTangential
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.displacement import PHASE, Parameter, check_given, compensate_by_each, model_of, rms, wrap_angle
-from amiwarp.optics.models import MODELS, size_names
+from amiwarp.optics.camera import CameraRotation, RadialTangential
+from amiwarp.optics.models import (
+    MODELS,
+    PHASE,
+    Parameter,
+    check_given,
+    compensate_by_each,
+    model_of,
+    rms,
+    size_names,
+    wrap_angle,
+)
 from amiwarp.optics.prism import Prism, UnsizedPrism
 from amiwarp.validation import guarded, instance, one_of, real, shown, vector
 

@@ -21,10 +21,8 @@ from amiwarp.io.camera_files import camera_from_json, camera_to_json
 from amiwarp.io.formats import check_ending
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import build, fields_of, read_json
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.camera import Camera, CameraRotation
+from amiwarp.optics.models import MODELS, ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.validation import guarded, one_of, real, shown
 

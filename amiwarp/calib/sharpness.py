@@ -21,9 +21,8 @@ from amiwarp.choices import Sharpness
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape, TileVotes, upload_events
-from amiwarp.optics.camera_rotation import border
-from amiwarp.optics.displacement import points_on_host
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.camera import border
+from amiwarp.optics.models import MODELS, points_on_host
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:

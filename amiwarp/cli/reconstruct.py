@@ -16,7 +16,7 @@ from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.options import OUTPUT, Common, numbers
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.camera import CameraRotation
 from amiwarp.progress import Progress
 
 if TYPE_CHECKING:

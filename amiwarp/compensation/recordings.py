@@ -36,8 +36,7 @@ from amiwarp.io.hdf5_reader import NativeEvents
 from amiwarp.io.native_writer import FlaggedEvents
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import join_columns
-from amiwarp.kernels.launch import RecordedLaunch, launch
-from amiwarp.kernels.page_locked import page_locked
+from amiwarp.kernels.launch import RecordedLaunch, launch, page_locked
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded
 

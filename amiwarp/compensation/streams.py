@@ -21,9 +21,8 @@ from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.votes import CanvasShape
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import EncoderParams, flag_events
-from amiwarp.kernels.launch import RecordedLaunch, background_worker, launch, pool
+from amiwarp.kernels.launch import PageLockedPool, RecordedLaunch, background_worker, launch, pool
 from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
-from amiwarp.kernels.page_locked import PageLockedPool
 from amiwarp.validation import guarded, whole
 
 if TYPE_CHECKING:

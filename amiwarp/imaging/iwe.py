@@ -12,9 +12,8 @@ from amiwarp.choices import Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, cast, check_order, device_for, wait
 from amiwarp.imaging.votes import CanvasShape, Image, PixelVotes, UploadedEvents, WordVotes, upload_events
-from amiwarp.optics.camera import pinhole_params
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.displacement import model_camera
+from amiwarp.optics.camera import CameraRotation, pinhole_params
+from amiwarp.optics.models import model_camera
 from amiwarp.validation import guarded
 
 if TYPE_CHECKING:

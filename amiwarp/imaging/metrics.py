@@ -14,8 +14,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.sharpness import sharpness
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import ModelError, predicted_error
+from amiwarp.optics.models import ExactModel, ModelError, predicted_error
 from amiwarp.optics.prism import Prism
 from amiwarp.validation import guarded
 

@@ -15,8 +15,7 @@ from amiwarp.events.device_events import cast, import_array
 from amiwarp.imaging.votes import CanvasShape, Image
 from amiwarp.kernels import iwe as kernels
 from amiwarp.kernels.iwe import SEGMENT, STRIP, find_largest, gather_sums, smooth_and_add, smooth_votes, sum_directions
-from amiwarp.kernels.launch import BLOCK_DIM, Program, launch
-from amiwarp.kernels.page_locked import page_locked
+from amiwarp.kernels.launch import BLOCK_DIM, Program, launch, page_locked
 from amiwarp.validation import array, choice, guarded, on_gpu, real
 
 if TYPE_CHECKING:

@@ -18,8 +18,15 @@ from amiwarp.events.device_events import DeviceEvents, azimuths, check_sensor, e
 from amiwarp.kernels import tiles as kernels
 from amiwarp.kernels.camera import CameraRotationParams
 from amiwarp.kernels.iwe import CPU_WIDTH, Frame, add_sums, add_totals, empty_words, read_sums, read_votes
-from amiwarp.kernels.launch import Program, RecordedLaunch, launch, launch_slices, run_together, specialised
-from amiwarp.kernels.page_locked import page_locked
+from amiwarp.kernels.launch import (
+    Program,
+    RecordedLaunch,
+    launch,
+    launch_slices,
+    page_locked,
+    run_together,
+    specialised,
+)
 from amiwarp.kernels.pixel_votes import (
     BLOCK,
     CAPACITY,
@@ -39,9 +46,8 @@ from amiwarp.kernels.votes import (
     unfold_keys,
 )
 from amiwarp.kernels.word_votes import TRASH, Cells, vote_events, vote_points, vote_quickly, vote_rotating_camera
-from amiwarp.optics.camera import LARGEST_SIZE, pinhole_params
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.displacement import model_camera
+from amiwarp.optics.camera import LARGEST_SIZE, CameraRotation, pinhole_params
+from amiwarp.optics.models import model_camera
 from amiwarp.validation import choice, whole
 
 if TYPE_CHECKING:

@@ -5,21 +5,792 @@ The formulas are derived in ``docs/explanation/optics.md``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import groupby
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
+import warp as wp
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.circle_models import CircleModel, RadialCircleModel
-from amiwarp.optics.displacement import Model as Model
-from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.validation import guarded, whole
+from amiwarp.kernels import refraction as kernels
+from amiwarp.kernels.launch import RecordedLaunch, launch
+from amiwarp.optics.camera import Camera, camera_params
+from amiwarp.optics.prism import (
+    FlatSide,
+    NominalPrism,
+    Prism,
+    apex_from_deflection,
+    check_index,
+    check_phase,
+    check_tilt,
+    deflection_from_apex,
+)
+from amiwarp.validation import array, choice, guarded, instance, real, whole
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from numpy.typing import NDArray
 
+
+# Base class of the optical models: what a model knows of itself, and the displacement of points on any device.
+
+Points = TypeVar("Points")
+"""Type of points given to a model: NumPy array (n, 2), or Warp array of vec2 of shape (n,). Results have the same type.
+"""
+
+
+@guarded
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """Parameter of an optical model that a calibration can find.
+
+    Examples
+    --------
+    >>> amiwarp.ExactModel.PARAMETERS[-1].name
+    'index'
+    """
+
+    name: str
+    """Name in settings, files and results."""
+    unit: str
+    """Unit of its values: ``rad``, or ``1`` for a number."""
+    half_range: float = math.pi
+    """Half width of its default bounds about its start value, in its unit. The size has bounds from its nominal value.
+    """
+    like_size: bool = False
+    """Whether its effect on the sharpness is nearly that of the size, so that sharpness alone hardly finds it."""
+    limits: tuple[float, float] = (-math.inf, math.inf)
+    """Smallest and largest value in an address of ``amiwarp view``, angles in degrees."""
+    label: str = ""
+    """Text of its slider in ``amiwarp view``; empty without a slider."""
+    slider: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Minimum, maximum and step of its slider, angles in degrees; the slider starts at 0."""
+
+
+PHASE = Parameter("phase", "rad")
+"""Phase θ_b, which is added to the encoder's angle."""
+
+
+class Model:
+    """Optical model: displaces the pixels of a camera by the angle of its prism, and knows its parameters.
+
+    Base class of all models. ``docs/explanation/optics.md`` derives their formulas.
+
+    Examples
+    --------
+    >>> amiwarp.ExactModel.SIZE, amiwarp.ExactModel.FREE
+    ('apex', ('apex', 'phase', 'tilt_x', 'tilt_y', 'index'))
+    """
+
+    NAME: ClassVar[str]
+    """Name in settings and files."""
+    TEXT: ClassVar[str]
+    """Name in the legends of figures, which may say how the model computes."""
+    NUMBERS: ClassVar[str]
+    """Number of its parameters, as shown in the table of an automatic choice."""
+    PARAMETERS: ClassVar[tuple[Parameter, ...]]
+    """Parameters that a calibration can find: the size of the prism, the phase, then others."""
+    SIMPLIFIES: ClassVar[str | None] = None
+    """Name of the next better model of the same optic, which it approximates; None for the best one."""
+    STRUCT: ClassVar[Any]
+    """Warp struct of its parameters, for which ``compensate`` and ``deflect`` of
+    :mod:`amiwarp.kernels.refraction` have overloads."""
+    FREE: ClassVar[tuple[str, ...]]
+    """Names of the parameters that a calibration can find."""
+    SIZE: ClassVar[str]
+    """Name of the parameter that sets the size of the orbit."""
+
+    camera: Camera
+    """Camera intrinsics."""
+    phase: float
+    """Phase θ_b, added to the encoder's angle [rad]."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.FREE = tuple(parameter.name for parameter in cls.PARAMETERS)
+        cls.SIZE = cls.FREE[0]
+
+    @classmethod
+    def closed_form(cls) -> type[Model]:
+        """Return the model that a search uses in place of this one: itself, unless its tables come from another model.
+
+        Returns
+        -------
+        type of Model
+            A model that computes each pixel from its parameters.
+        """
+        return cls
+
+    @classmethod
+    def size_from_apex(cls, apex: float, prism: NominalPrism) -> float:
+        """Return the model's size for a prism of a given apex angle.
+
+        Parameters
+        ----------
+        apex : float
+            Apex angle [rad].
+        prism : Prism or UnsizedPrism
+            Prism with the refractive index and the flat side.
+
+        Returns
+        -------
+        float
+            Value of the parameter :attr:`SIZE`: here the apex angle itself.
+        """
+        return apex
+
+    @classmethod
+    def apex_from_size(cls, size: float, prism: NominalPrism) -> float:
+        """Return the apex angle for the model's size. Inverse of :meth:`size_from_apex`.
+
+        Parameters
+        ----------
+        size : float
+            Value of the parameter :attr:`SIZE`.
+        prism : Prism or UnsizedPrism
+            Prism with the refractive index and the flat side.
+
+        Returns
+        -------
+        float
+            Apex angle [rad].
+        """
+        return size
+
+    @classmethod
+    def start_values(cls, prism: Prism) -> dict[str, float]:
+        """Return the values with which a search starts if nothing but the nominal prism is known.
+
+        Parameters
+        ----------
+        prism : Prism
+            The nominal prism.
+
+        Returns
+        -------
+        dict
+            Value of each parameter by name, in its unit.
+        """
+        given = {cls.SIZE: cls.size_from_apex(prism.apex, prism), "index": prism.index}
+        return {name: given.get(name, 0.0) for name in cls.FREE}
+
+    @classmethod
+    def from_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        """Create the model from the values of its parameters.
+
+        Parameters
+        ----------
+        camera : Camera
+            The camera.
+        prism : Prism
+            Prism that gives what ``values`` do not contain, such as the flat side.
+        values : mapping of str to float
+            Values by name, in their units: size and phase at least. Names of other parameters are ignored.
+
+        Returns
+        -------
+        Model
+            The model.
+
+        Raises
+        ------
+        AmiwarpError
+            If size or phase is missing, or a value is unusable.
+        """
+        return model_of(cls, camera, prism, values)
+
+    @classmethod
+    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        """Create the model of :meth:`from_values` from values that contain size and phase."""
+        raise NotImplementedError
+
+    @classmethod
+    def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> Self:
+        """Create the model of a prism.
+
+        Parameters
+        ----------
+        camera : Camera
+            The camera.
+        prism : Prism
+            The prism.
+        phase : float, default 0.0
+            Added to the encoder's angle [rad].
+
+        Returns
+        -------
+        Model
+            The model.
+        """
+        return cls.from_values(camera, prism, {**cls.start_values(prism), PHASE.name: phase})
+
+    def kernel_values(self) -> tuple[Any, ...]:
+        """Return the values of the parameters for kernels, in the order of the fields of :attr:`STRUCT`.
+
+        Returns
+        -------
+        tuple
+            Value of each field. A matrix is an array.
+        """
+        raise NotImplementedError
+
+    def params(self, device: Any) -> Any:
+        """Return the parameters for kernels.
+
+        Parameters
+        ----------
+        device : str or warp.Device
+            The device that runs the kernels.
+
+        Returns
+        -------
+        warp struct
+            Instance of :attr:`STRUCT`.
+        """
+        return struct_of(self.STRUCT, self.kernel_values())
+
+    def compensate_points(self, xy: Points, theta: Points) -> Points:
+        """Return the pixel that the same scene ray would hit without the prism.
+
+        Parameters
+        ----------
+        xy : numpy.ndarray or warp.array
+            Observed pixels [px], shape (n, 2), or a Warp array of vec2 of shape (n,).
+        theta : numpy.ndarray or warp.array
+            Prism angle of the encoder [rad], shape (n,). A float32 Warp array on the same device if ``xy`` is one.
+
+        Returns
+        -------
+        numpy.ndarray or warp.array
+            Compensated pixels [px], of the same shape as ``xy``. A row is NaN if it has no ray: total internal
+            reflection, or a ray behind the image plane.
+
+        Raises
+        ------
+        AmiwarpError
+            If the arrays have other shapes, types or devices.
+        """
+        return _run("compensate_points", self, xy, theta)
+
+    def deflect_points(self, xy: Points, theta: Points) -> Points:
+        """Return the observed pixel of a scene ray, given its pixel without the prism.
+
+        Inverse of :meth:`compensate_points`.
+
+        Parameters
+        ----------
+        xy : numpy.ndarray or warp.array
+            Pixels without the prism [px], shape (n, 2), or a Warp array of vec2 of shape (n,).
+        theta : numpy.ndarray or warp.array
+            Prism angle of the encoder [rad], shape (n,). A float32 Warp array on the same device if ``xy`` is one.
+
+        Returns
+        -------
+        numpy.ndarray or warp.array
+            Observed pixels [px], of the same shape as ``xy``. A row is NaN if it has no ray.
+
+        Raises
+        ------
+        AmiwarpError
+            If the arrays have other shapes, types or devices.
+        """
+        return _run("deflect_points", self, xy, theta)
+
+
+def _run(kernel_name: str, model: Model, xy: Any, theta: Any) -> Any:
+    kernel = getattr(kernels, kernel_name)
+    if isinstance(xy, wp.array):
+        if not isinstance(theta, wp.array) or theta.device != xy.device or theta.dtype is not wp.float32:
+            raise AmiwarpError(
+                f"xy is a Warp array on {xy.device}; give theta as a float32 Warp array on the same device"
+            )
+        if xy.dtype is not wp.vec2 or xy.ndim != 1 or xy.shape != theta.shape:
+            given = f"xy has type {xy.dtype} and shape {xy.shape}, theta has shape {theta.shape}"
+            raise AmiwarpError(f"{given}; give vec2 for xy, and shape (n,) for both")
+        out = wp.empty_like(xy)
+        launch(kernel, len(xy), [model.params(xy.device), model_camera(model, xy.device), xy, theta], [out],
+               device=xy.device)  # fmt: skip
+        return out
+    xy, theta = array(xy, "xy"), array(theta, "theta")
+    if xy.ndim != 2 or xy.shape[1] != 2 or theta.shape != xy.shape[:1]:
+        raise AmiwarpError(f"xy has shape {xy.shape} and theta {theta.shape}; give (n, 2) and (n,)")
+    result = _run(kernel_name, model, *points_on_host(xy, theta))
+    return result.numpy().astype(xy.dtype if np.issubdtype(xy.dtype, np.floating) else np.float32, copy=False)
+
+
+Made = TypeVar("Made", bound=Model)
+
+
+def model_of(kind: type[Made], camera: Camera, prism: Prism, values: Mapping[str, float]) -> Made:
+    """Create a model as :meth:`Model.from_values` does, but without its checks of types: a search calls it often."""
+    check_given(values, kind.FREE[:2])
+    return kind._of_values(camera, prism, values)
+
+
+def check_given(values: Mapping[str, float], names: Iterable[str]) -> None:
+    """Raise :class:`AmiwarpError` if a parameter has no value."""
+    missing = [name for name in names if name not in values]
+    if missing:
+        raise AmiwarpError(f"values have no {', '.join(missing)}; give the value of each parameter")
+
+
+def compensate_by_each(models: Sequence[Model], xy: NDArray[Any], theta: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the same pixels compensated by each of several models, on the CPU [px], shape (models, n, 2).
+
+    ``xy`` holds the pixels, shape (n, 2). ``theta`` holds the prism angles, wrapped to a turn [rad], shape (n,), or
+    (models, n) if each model has its own. One call takes a fraction of the time of a call for each model. Successive
+    places of one model share a launch.
+    """
+    n = len(xy)
+    pixels = wp.array(np.tile(xy.astype(np.float32), (len(models), 1)), dtype=wp.vec2, device="cpu", copy=False)
+    angles = np.empty((len(models), n), np.float32)
+    angles[:] = theta
+    points = [pixels, wp.array(angles.ravel(), dtype=float, device="cpu", copy=False)]
+    out = wp.empty_like(pixels)
+    launches: dict[type, RecordedLaunch] = {}
+    for _, group in groupby(range(len(models)), key=lambda k: id(models[k])):
+        same = list(group)  # successive places of one model
+        model = models[same[0]]
+        arguments = [model.params("cpu"), model_camera(model, "cpu")]
+        compensate = launches.get(type(model))
+        if compensate is None:
+            compensate = RecordedLaunch(kernels.compensate_points, [*arguments, *points, 0], [out], device="cpu")
+            launches[type(model)] = compensate
+        for index, value in enumerate(arguments):
+            compensate.set(index, value)
+        compensate(same[0] * n, len(same) * n)
+    return out.numpy().reshape(len(models), n, 2).astype(np.float64)
+
+
+def rms(moved: NDArray[np.float64]) -> float:
+    """Return the root mean square length of displacements [px], shape (n, 2), without those that are not finite."""
+    squares = np.sum(moved**2, axis=1)
+    return float(np.sqrt(np.mean(squares[np.isfinite(squares)])))
+
+
+def points_on_host(xy: NDArray[Any], theta: NDArray[Any]) -> tuple[Any, Any]:
+    """Return pixels, shape (n, 2), and prism angles [rad], shape (n,), as Warp arrays on the CPU."""
+    wrapped = wrap_angle(theta).astype(np.float32)
+    return wp.array(xy.astype(np.float32), dtype=wp.vec2, device="cpu"), wp.array(wrapped, dtype=float, device="cpu")
+
+
+def wrap_angle(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Wrap an angle [rad] to [-pi, pi) in float64. Wrap angles before they are rounded to float32."""
+    return (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def model_camera(model: Model, device: Any) -> Any:
+    """Return the parameters of the model's camera on ``device``, cached per camera."""
+    return camera_params(model.camera, str(device))
+
+
+def phase_values(phase: float) -> tuple[float, float, float]:
+    """Return a phase [rad] with its cosine and sine: three fields of a model's parameters for kernels."""
+    return phase, math.cos(phase), math.sin(phase)
+
+
+def struct_of(kind: Any, values: Sequence[Any]) -> Any:
+    """Return a Warp struct with the given values of its fields, in their order."""
+    struct = kind()
+    for name, value in zip(kind.vars, values, strict=True):
+        setattr(struct, name, value)
+    return struct
+
+
+# Circle and radial circle models: rotations of the bearing vector, described by a few numbers.
+
+
+class _DeflectionModel(Model):
+    """Model that is sized by the deflection on the optical axis."""
+
+    PARAMETERS = (Parameter("deflection", "rad"), PHASE)
+
+    deflection: float
+    flat_side: FlatSide
+
+    def __post_init__(self) -> None:
+        instance(self.camera, Camera, "camera")
+        below = math.nextafter(math.pi / 2.0, 0.0)
+        hint = " rad; for a negative deflection, add pi to the phase"
+        object.__setattr__(self, "deflection", real(self.deflection, "deflection", 0.0, below, hint))
+        object.__setattr__(self, "phase", check_phase(self.phase))
+        object.__setattr__(self, "flat_side", choice(FlatSide, self.flat_side, "flat_side"))
+
+    @classmethod
+    def size_from_apex(cls, apex: float, prism: NominalPrism) -> float:
+        return deflection_from_apex(apex, prism.index, prism.flat_side)
+
+    @classmethod
+    def apex_from_size(cls, size: float, prism: NominalPrism) -> float:
+        return apex_from_deflection(size, prism.index, prism.flat_side)
+
+
+@guarded
+@dataclass(frozen=True)
+class CircleModel(_DeflectionModel):
+    """Circle model: rotates every bearing vector by one constant angle.
+
+    Raises
+    ------
+    AmiwarpError
+        If the deflection is not at least 0 and below pi/2, or another field has an unusable value.
+
+    Notes
+    -----
+    The rotation axis is z × w, with z the optical axis and w = (cos φ, sin φ) the direction of the prism's tilt at
+    φ = θ + θ_b. See ``docs/explanation/optics.md``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> camera = amiwarp.Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    >>> model = amiwarp.CircleModel(camera, deflection=0.02)
+    >>> model.compensate_points(np.array([[320.0, 240.0]]), np.array([0.0])).round(2)
+    array([[330., 240.]])
+    """
+
+    NAME, TEXT, NUMBERS, STRUCT = "circle", "circle", "2", kernels.CircleParams
+    SIMPLIFIES = "radial"
+
+    camera: Camera
+    """Camera intrinsics."""
+    deflection: float
+    """Angle of the rotation [rad], not negative."""
+    phase: float = 0.0
+    """Phase θ_b, added to the encoder's angle [rad]."""
+    flat_side: FlatSide = FlatSide.SCENE
+    """Side that the prism's flat face points to: scene or camera."""
+
+    @classmethod
+    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        return cls(camera, values["deflection"], values["phase"], prism.flat_side)
+
+    def kernel_values(self) -> tuple[Any, ...]:
+        sine = math.sin(self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection)
+        return sine, 2.0 * math.sin(self.deflection / 2.0) ** 2, *phase_values(self.phase)
+
+
+@guarded
+@dataclass(frozen=True)
+class RadialCircleModel(_DeflectionModel):
+    """Radial circle model: rotates each bearing vector by an angle that grows away from the optical axis.
+
+    Raises
+    ------
+    AmiwarpError
+        If the deflection is not at least 0 and below pi/2, or another field has an unusable value.
+
+    Notes
+    -----
+    The angle is δ(φ) = δ₀ (√(n² − sin²φ)/cos φ − 1)/(n − 1), derived in ``docs/explanation/optics.md``. φ is the angle
+    between the optical axis and the bearing on the side of the tilted face. This is the observed bearing if the flat
+    face points to the scene, and the scene's bearing if it points to the camera. With the other bearing the model would
+    lose its accuracy, which is almost second order in the apex angle.
+
+    Examples
+    --------
+    >>> camera = amiwarp.Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    >>> model = amiwarp.RadialCircleModel.from_prism(camera, amiwarp.Prism(apex=0.03), phase=0.5)
+    >>> round(model.deflection, 4)
+    0.0155
+    """
+
+    NAME, TEXT, NUMBERS, STRUCT = "radial", "radial", "2, index given", kernels.RadialCircleParams
+    SIMPLIFIES = "exact"
+
+    camera: Camera
+    """Camera intrinsics."""
+    deflection: float
+    """Angle of the rotation on the optical axis, δ₀ [rad], not negative."""
+    phase: float = 0.0
+    """Phase θ_b, added to the encoder's angle [rad]."""
+    index: float = 1.5168
+    """Refractive index n of the prism."""
+    flat_side: FlatSide = FlatSide.SCENE
+    """Side that the prism's flat face points to: scene or camera."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "index", check_index(self.index, "index"))
+
+    @classmethod
+    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        return cls(camera, values["deflection"], values["phase"], prism.index, prism.flat_side)
+
+    def kernel_values(self) -> tuple[Any, ...]:
+        deflection = self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection
+        return deflection, *phase_values(self.phase), self.index
+
+
+# Exact model: refraction at both faces of the prism.
+
+UPRIGHT = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+UPRIGHT_ROWS = np.eye(3)
+"""Rotation of a prism axis without tilt: the identity matrix."""
+
+
+@guarded
+@dataclass(frozen=True)
+class ExactModel(Model):
+    """Exact model: refracts each ray at both faces of the prism, in closed form.
+
+    Raises
+    ------
+    AmiwarpError
+        If a field has an unusable value.
+
+    Notes
+    -----
+    The formulas are in ``docs/explanation/optics.md``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> camera = amiwarp.Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    >>> model = amiwarp.ExactModel(camera, amiwarp.Prism(apex=0.03), phase=0.1)
+    >>> observed = model.deflect_points(np.array([[100.0, 200.0]]), np.array([0.5]))
+    >>> model.compensate_points(observed, np.array([0.5])).round(2)
+    array([[100., 200.]])
+    """
+
+    NAME, TEXT, NUMBERS, STRUCT = "exact", "exact (closed form)", "2, index given", kernels.ExactParams
+    PARAMETERS = (
+        Parameter("apex", "rad"),
+        PHASE,
+        *(
+            Parameter(
+                f"tilt_{axis}", "rad", math.radians(5.0), limits=(-45.0, 45.0), label=f"tilt in {axis}",
+                slider=(-5.0, 5.0, 0.05),
+            )
+            for axis in "xy"
+        ),
+        Parameter("index", "1", 0.2, like_size=True, limits=(1.0, 5.0)),
+    )  # fmt: skip
+
+    camera: Camera
+    """Camera intrinsics."""
+    prism: Prism
+    """Prism whose faces refract the rays."""
+    phase: float = 0.0
+    """Phase θ_b, added to the encoder's angle [rad]."""
+    tilt: tuple[float, float] = (0.0, 0.0)
+    """Rotation of the prism's rotation axis about the camera's x, then about its y [rad]."""
+
+    def __post_init__(self) -> None:
+        instance(self.camera, Camera, "camera")
+        instance(self.prism, Prism, "prism")
+        object.__setattr__(self, "phase", check_phase(self.phase))
+        object.__setattr__(self, "tilt", check_tilt(self.tilt))
+
+    @classmethod
+    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        wedge = Prism(values["apex"], values.get("index", prism.index), prism.flat_side)
+        return cls(camera, wedge, values["phase"], (values.get("tilt_x", 0.0), values.get("tilt_y", 0.0)))
+
+    def params(self, device: Any) -> Any:
+        *numbers, axis = self.kernel_values()
+        matrix = UPRIGHT if axis is UPRIGHT_ROWS else wp.mat33(*axis.ravel().tolist())
+        return struct_of(kernels.ExactParams, [*numbers, matrix])
+
+    def kernel_values(self) -> tuple[Any, ...]:
+        tilted = any(self.tilt)
+        return (
+            math.sin(self.prism.apex), math.cos(self.prism.apex), self.prism.index**2, *phase_values(self.phase),
+            int(self.prism.flat_side is FlatSide.SCENE), int(tilted),
+            axis_rotation(*self.tilt) if tilted else UPRIGHT_ROWS,
+        )  # fmt: skip
+
+
+def axis_rotation(tilt_x: float, tilt_y: float) -> NDArray[np.float64]:
+    """Return the rotation matrix (3, 3) of a tilted axis: about x by ``tilt_x``, then about y by ``tilt_y`` [rad]."""
+    cx, sx, cy, sy = math.cos(tilt_x), math.sin(tilt_x), math.cos(tilt_y), math.sin(tilt_y)
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
+    about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
+    return about_y @ about_x
+
+
+# Ellipse model: tables of the displacement for every pixel, fitted to another model or to measured pairs of pixels.
+
+HARMONIC_ANGLES = 16
+"""Number of angles at which a model is approximated."""
+
+
+@guarded
+@dataclass(frozen=True, eq=False)
+class EllipseModel(Model):
+    """Ellipse model: stores the mean and the first harmonic of the displacement for every observed pixel.
+
+    Raises
+    ------
+    AmiwarpError
+        If a table does not have the camera's size, or another field has an unusable value.
+
+    Notes
+    -----
+    The displacement at φ = θ + θ_b is d(φ) = offset + cosine · cos φ + sine · sin φ [px].
+
+    Examples
+    --------
+    >>> camera = amiwarp.Camera(width=32, height=24, fx=40.0, fy=40.0, cx=15.5, cy=11.5)
+    >>> model = amiwarp.EllipseModel.from_prism(camera, amiwarp.Prism(apex=0.03))
+    >>> model.cosine.shape
+    (24, 32, 2)
+    """
+
+    NAME, TEXT, NUMBERS, STRUCT = "ellipse", "ellipse (table)", "6 a pixel", kernels.EllipseParams
+    PARAMETERS = ExactModel.PARAMETERS
+    SIMPLIFIES = "exact"
+
+    camera: Camera
+    """Camera intrinsics."""
+    offset: NDArray[np.float32] = field(repr=False)
+    """Mean displacement [px], shape ``(height, width, 2)``."""
+    cosine: NDArray[np.float32] = field(repr=False)
+    """Cosine term of the displacement [px], shape ``(height, width, 2)``."""
+    sine: NDArray[np.float32] = field(repr=False)
+    """Sine term of the displacement [px], shape ``(height, width, 2)``."""
+    phase: float = 0.0
+    """Phase θ_b, added to the encoder's angle [rad]."""
+
+    def __post_init__(self) -> None:
+        instance(self.camera, Camera, "camera")
+        object.__setattr__(self, "phase", check_phase(self.phase))
+        for name in ("offset", "cosine", "sine"):
+            table = array(getattr(self, name), name)
+            shape = (self.camera.height, self.camera.width, 2)
+            if table.shape != shape:
+                raise AmiwarpError(f"{name} has shape {table.shape}; expected {shape}, the camera's rows and columns")
+            object.__setattr__(self, name, table.astype(np.float32, copy=False))
+
+    @classmethod
+    def closed_form(cls) -> type[Model]:
+        return ExactModel
+
+    @classmethod
+    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        return cls.from_model(ExactModel.from_values(camera, prism, values))
+
+    @classmethod
+    def from_model(cls, model: Model, device: Any = "cpu") -> Self:
+        """Fit the tables to another model, by least squares over 16 angles for each pixel.
+
+        Parameters
+        ----------
+        model : Model
+            The model to approximate, which is no ellipse model.
+        device : str or warp.Device, default "cpu"
+            The device that does the fit.
+
+        Returns
+        -------
+        EllipseModel
+            The model. Its tables are NaN at pixels without a ray.
+        """
+        height, width = model.camera.height, model.camera.width
+        table = wp.empty((height, width, 6), dtype=float, device=device)
+        phi = math.tau * np.arange(HARMONIC_ANGLES) / HARMONIC_ANGLES
+        angles = wp.array(np.stack([np.cos(phi), np.sin(phi)], axis=1), dtype=wp.vec2, device=device)
+        inputs = [replace(cast("Any", model), phase=0.0).params(device), model_camera(model, device), angles]
+        launch(kernels.fit_harmonics, height * width, inputs, [table], device=device)
+        offset, cosine, sine = np.split(table.numpy(), 3, axis=2)
+        return cls(model.camera, offset, cosine, sine, model.phase)
+
+    @classmethod
+    def fit(
+        cls,
+        camera: Camera,
+        xy: NDArray[np.float64],
+        theta: NDArray[np.float64],
+        compensated: NDArray[np.float64],
+        *,
+        degree: int = 4,
+    ) -> EllipseModel:
+        """Fit the tables to measured pairs of pixels, by least squares.
+
+        Each of the six table components is a polynomial of the pixel's position. The tables include the phase, so the
+        model's ``phase`` is 0.
+
+        Parameters
+        ----------
+        camera : Camera
+            The camera.
+        xy : numpy.ndarray
+            Observed pixels [px], shape (n, 2).
+        theta : numpy.ndarray
+            Prism angle of the encoder [rad], shape (n,).
+        compensated : numpy.ndarray
+            The same points without the prism [px], shape (n, 2). Pairs with NaN are left out.
+        degree : int, default 4
+            Total degree of the polynomials.
+
+        Returns
+        -------
+        EllipseModel
+            The model.
+
+        Raises
+        ------
+        AmiwarpError
+            If the pairs do not determine all coefficients.
+        """
+        xy, theta = np.asarray(xy, dtype=np.float64), np.asarray(theta, dtype=np.float64)
+        compensated, degree = np.asarray(compensated, dtype=np.float64), whole(degree, "degree", 0, 20)
+        if xy.ndim != 2 or xy.shape[1] != 2 or compensated.shape != xy.shape or theta.shape != xy.shape[:1]:
+            given = f"xy has shape {xy.shape}, theta {theta.shape} and compensated {compensated.shape}"
+            raise AmiwarpError(f"{given}; give (n, 2), (n,) and (n, 2)")
+        shift = compensated - xy
+        valid = np.isfinite(shift).all(axis=1)
+        basis = _polynomials(camera, xy[valid], degree)
+        angle = theta[valid][:, None]
+        design = np.hstack([basis, basis * np.cos(angle), basis * np.sin(angle)])
+        solution, _, rank, _ = np.linalg.lstsq(design, shift[valid], rcond=None)
+        if rank < design.shape[1]:
+            raise AmiwarpError(
+                f"{len(design)} pairs determine {rank} of {design.shape[1]} coefficients; "
+                f"spread them over the image and the angles, or lower degree = {degree}"
+            )
+        rows, cols = np.mgrid[: camera.height, : camera.width]
+        pixels = _polynomials(camera, np.stack([cols.ravel(), rows.ravel()], axis=1).astype(np.float64), degree)
+        shape = (3, camera.height, camera.width, 2)
+        tables = np.stack([pixels @ part for part in np.split(solution, 3)]).reshape(shape).astype(np.float32)
+        return cls(camera, tables[0], tables[1], tables[2])
+
+    def kernel_values(self) -> tuple[Any, ...]:
+        return *phase_values(self.phase), np.concatenate([self.offset, self.cosine, self.sine], axis=2)
+
+    @cached_property
+    def _tables(self) -> dict[str, Any]:
+        return {}
+
+    def params(self, device: Any) -> Any:
+        if str(device) not in self._tables:
+            *phase, table = self.kernel_values()
+            on_device = wp.array(table, dtype=float, device=device)
+            self._tables[str(device)] = struct_of(kernels.EllipseParams, [*phase, on_device])
+        return self._tables[str(device)]
+
+
+def _polynomials(camera: Camera, xy: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """Return products of Chebyshev polynomials of total degree ≤ ``degree``, with pixels scaled to [-1, 1].
+
+    The shape is (n, terms).
+    """
+    scaled = 2.0 * xy / np.maximum([camera.width - 1.0, camera.height - 1.0], 1.0) - 1.0
+    full = np.polynomial.chebyshev.chebvander2d(scaled[:, 0], scaled[:, 1], [degree, degree])
+    return cast("NDArray[np.float64]", full.reshape(len(xy), degree + 1, degree + 1)[:, _triangle(degree)])
+
+
+def _triangle(degree: int) -> NDArray[np.bool_]:
+    i = np.arange(degree + 1)
+    return i[:, None] + i[None, :] <= degree
+
+
+# The models by name.
 
 MODELS: dict[str, type[Model]] = {
     model.NAME: model for model in (CircleModel, ExactModel, RadialCircleModel, EllipseModel)

@@ -27,9 +27,8 @@ from amiwarp.events.encoder import TWO_PI, turn_between
 from amiwarp.events.events import TIME_LIMIT
 from amiwarp.kernels import known_nodes as kernels
 from amiwarp.kernels.known_nodes import drop_small_regions, exponentiate, find_large_regions
-from amiwarp.kernels.launch import launch, load
-from amiwarp.kernels.page_locked import start_read
-from amiwarp.optics.camera_rotation import CameraRotation, border
+from amiwarp.kernels.launch import launch, load, start_read
+from amiwarp.optics.camera import CameraRotation, border
 from amiwarp.validation import choice, guarded, real, whole
 
 if TYPE_CHECKING:

@@ -21,8 +21,7 @@ from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.kernels import event_keys as readout
 from amiwarp.kernels import launch as launching
 from amiwarp.optics.camera import camera_params
-from amiwarp.optics.displacement import wrap_angle
-from amiwarp.optics.exact_model import ExactModel, axis_rotation
+from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step_us
 from amiwarp.simulation.worlds.device_world import DeviceWorld

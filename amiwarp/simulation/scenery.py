@@ -15,7 +15,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import prism_view
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import camera_params
-from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.models import ExactModel
 from amiwarp.simulation.description import Scene
 from amiwarp.simulation.pictures import Placement, log_map, place_picture
 

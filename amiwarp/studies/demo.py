@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from amiwarp.events.recording import Recording
-    from amiwarp.optics.exact_model import ExactModel
+    from amiwarp.optics.models import ExactModel
 
 
 # Kernels that the steps after a simulation need on a CPU, to be compiled before they are needed.

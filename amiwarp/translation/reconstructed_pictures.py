@@ -17,9 +17,8 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape, upload_events
-from amiwarp.optics.camera import Camera
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.camera import Camera, CameraRotation
+from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.reconstruction.picture import Reconstruction

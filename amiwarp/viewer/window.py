@@ -18,8 +18,7 @@ from amiwarp.imaging.corners import find_background_activity
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter, relative_variance
 from amiwarp.imaging.votes import CanvasShape, UploadedEvents
-from amiwarp.optics.displacement import PHASE
-from amiwarp.optics.models import size_names
+from amiwarp.optics.models import PHASE, size_names
 from amiwarp.viewer.timeline import Span
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from amiwarp.calib.photometric.cost import (
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.equations import multiply
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.camera import CameraRotation
 from amiwarp.optics.models import predicted_error
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 

@@ -16,8 +16,7 @@ from amiwarp.events.events import TIME_LIMIT
 from amiwarp.events.recording import Truth
 from amiwarp.events.truth import EventTruth, FrameTruth, MemoryFrames, MemoryMasks, Poses, WorldLabels, as_poses
 from amiwarp.kernels import prism_view
-from amiwarp.optics.displacement import wrap_angle
-from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.models import ExactModel, wrap_angle
 from amiwarp.simulation.scenery import KnownPixels
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.renderer import SurfaceView, WorldSight, pixel_rays, surfaces_at

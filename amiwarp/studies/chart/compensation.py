@@ -25,8 +25,7 @@ from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.votes import TURNS, CanvasShape, Image, upload_events
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.atomic_output import scratch_folder
-from amiwarp.optics.displacement import wrap_angle
-from amiwarp.optics.models import Model, rungs
+from amiwarp.optics.models import Model, rungs, wrap_angle
 from amiwarp.progress import Progress
 from amiwarp.studies.chart.rows import KnownRecording, Row, Task, exact_image, exact_places, measure, raw_places, rms
 

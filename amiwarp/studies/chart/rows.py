@@ -18,7 +18,7 @@ from amiwarp.events.events import MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import truth_model
 from amiwarp.memory import only_new_garbage, release_memory
-from amiwarp.optics.exact_model import axis_rotation
+from amiwarp.optics.models import axis_rotation
 from amiwarp.optics.prism import FlatSide
 from amiwarp.progress import Progress
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from amiwarp.events.encoder import Encoder
     from amiwarp.events.events import Events
     from amiwarp.optics.camera import Camera
-    from amiwarp.optics.exact_model import ExactModel
+    from amiwarp.optics.models import ExactModel
 
 
 # Ground truth of the charts: the recording's true parameters, and the exact model in float64.

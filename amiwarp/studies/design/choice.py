@@ -12,9 +12,7 @@ import numpy as np
 
 from amiwarp.calib.model_choice import QUANTISATION_PX, SHARE
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.ellipse_model import EllipseModel
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import Model, predicted_error, rungs
+from amiwarp.optics.models import EllipseModel, ExactModel, Model, predicted_error, rungs
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, part, silent
 from amiwarp.simulation.description import Scene

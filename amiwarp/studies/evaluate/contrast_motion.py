@@ -14,7 +14,7 @@ import numpy as np
 from amiwarp.events.events import Events
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.votes import CanvasShape
-from amiwarp.optics.camera_rotation import CameraRotation
+from amiwarp.optics.camera import CameraRotation
 from amiwarp.studies.evaluate.measures import smoothed
 
 if TYPE_CHECKING:

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
     from amiwarp.events.events import Events
     from amiwarp.events.truth import FrameTruth
-    from amiwarp.optics.camera import Camera
-    from amiwarp.optics.camera_rotation import CameraRotation
+    from amiwarp.optics.camera import Camera, CameraRotation
 
 
 # Optical flow from events: dense inverse search between event images, and contrast maximisation per tile.

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
-from amiwarp.optics.camera_rotation import CameraRotation
-from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.camera import CameraRotation
+from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.simulation.pictures import DARK

@@ -25,7 +25,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.events.truth import EventTruth
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.exact_model import ExactModel
+from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion

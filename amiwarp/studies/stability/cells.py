@@ -28,8 +28,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import model_error
 from amiwarp.io.json_files import build, fields_of, value_of
 from amiwarp.io.sealed_json import CellStore
-from amiwarp.optics.exact_model import ExactModel
-from amiwarp.optics.models import predicted_error
+from amiwarp.optics.models import ExactModel, predicted_error
 from amiwarp.progress import Progress
 from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs
 from amiwarp.studies.stability.conditions import AXES, Axis, Condition, SimulatedSample, make
