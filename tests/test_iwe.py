@@ -8,8 +8,7 @@ import warp as wp
 
 from amiwarp import AmiwarpError, Camera, Encoder, Events, ExactModel, Prism, Vote, iwe
 from amiwarp.imaging import votes as pixel_votes
-from amiwarp.imaging.iwe import Votes
-from amiwarp.imaging.votes import FIRST_BATCH, CanvasShape, Image, upload_events
+from amiwarp.imaging.votes import FIRST_BATCH, CanvasShape, Image, Votes, upload_events
 from amiwarp.optics.models import MODELS
 
 

@@ -32,9 +32,8 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.choices import Axis, Colour, View
-from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import random_variance, relative_variance
-from amiwarp.imaging.votes import CanvasShape
+from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.viewer import exports, timeline
 from amiwarp.viewer import images as log_intensity
 from amiwarp.viewer import images as selected_part

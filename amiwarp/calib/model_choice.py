@@ -27,9 +27,8 @@ from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import MemoryEvents
 from amiwarp.events.recording import Recording
-from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.imaging.votes import CanvasShape
+from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.optics.models import MODELS, ExactModel, compensate_by_each, predicted_error, rms, rungs, wrap_angle
 from amiwarp.optics.prism import UnsizedPrism
 from amiwarp.validation import real

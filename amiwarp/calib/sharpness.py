@@ -18,9 +18,8 @@ from amiwarp.calib.parameters import MOTION, build_model, like_size, units
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.settings import Settings, stage_share
 from amiwarp.choices import Sharpness
-from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.imaging.votes import CanvasShape, TileVotes, upload_events
+from amiwarp.imaging.votes import CanvasShape, TileVotes, Votes, upload_events
 from amiwarp.optics.camera import border
 from amiwarp.optics.models import MODELS, points_on_host
 from amiwarp.progress import Progress

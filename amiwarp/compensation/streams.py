@@ -17,8 +17,7 @@ from amiwarp.compensation.launch_plan import LaunchPlan
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, check_sensor, encoder_pieces, limits, wait
 from amiwarp.events.events import TIME_LIMIT, Events, held_bytes
-from amiwarp.imaging.iwe import Votes
-from amiwarp.imaging.votes import CanvasShape
+from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import EncoderParams, flag_events
 from amiwarp.kernels.launch import PageLockedPool, RecordedLaunch, background_worker, launch, pool

@@ -16,9 +16,9 @@ import numpy as np
 
 from amiwarp.choices import Layers
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.iwe import PIECE, Votes
+from amiwarp.imaging.iwe import PIECE
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
-from amiwarp.imaging.votes import CanvasShape
+from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.io.atomic_output import NewFile, allocate, check_output
 from amiwarp.io.formats import check_ending
 from amiwarp.validation import choice

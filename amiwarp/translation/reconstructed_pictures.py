@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from amiwarp.choices import CONTRAST, Sharpness, Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.imaging.votes import CanvasShape, upload_events
+from amiwarp.imaging.votes import CanvasShape, Votes, upload_events
 from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism

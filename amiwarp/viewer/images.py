@@ -15,9 +15,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import GAMMA, PERCENTILE
-from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
-from amiwarp.imaging.votes import CanvasShape
+from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.viewer.timeline import read_span
 from amiwarp.viewer.window import inside

@@ -15,9 +15,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.events.truth import Cause
 from amiwarp.imaging.corners import find_background_activity
-from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.sharpness import SharpnessMeter, relative_variance
-from amiwarp.imaging.votes import CanvasShape, UploadedEvents
+from amiwarp.imaging.votes import CanvasShape, UploadedEvents, Votes
 from amiwarp.optics.models import PHASE, size_names
 from amiwarp.viewer.timeline import Span
 

@@ -21,8 +21,7 @@ from amiwarp.calib.presets import simplified
 from amiwarp.choices import Vote
 from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.iwe import Votes
-from amiwarp.imaging.votes import TURNS, CanvasShape, Image, upload_events
+from amiwarp.imaging.votes import TURNS, CanvasShape, Image, Votes, upload_events
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.optics.models import Model, rungs, wrap_angle

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amiwarp.events.events import Events
-from amiwarp.imaging.iwe import Votes
-from amiwarp.imaging.votes import CanvasShape
+from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.optics.camera import CameraRotation
 from amiwarp.studies.evaluate.measures import smoothed
 
