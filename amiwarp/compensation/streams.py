@@ -20,10 +20,11 @@ from amiwarp.events.events import TIME_LIMIT, Events, held_bytes
 from amiwarp.imaging.iwe import Votes
 from amiwarp.imaging.votes import CanvasShape
 from amiwarp.kernels.compensation import Columns
-from amiwarp.kernels.events import EncoderParams, flag_events
+from amiwarp.kernels.events import flag_events
 from amiwarp.kernels.launch import RecordedLaunch, background_worker, launch, pool
 from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
 from amiwarp.kernels.page_locked import PageLockedPool
+from amiwarp.kernels.prism_angle import EncoderParams
 from amiwarp.validation import guarded, whole
 
 if TYPE_CHECKING:
