@@ -47,8 +47,8 @@ from amiwarp.io import read_encoder_csv
 from amiwarp.io.chunks import CHUNK
 from amiwarp.io.prophesee import Evt3Encoder
 from amiwarp.io.ros import PACKET_DEFINITION, opened_bag
-from amiwarp.kernels.events import EncoderParams, theta_u32_at
 from amiwarp.kernels.launch import launch
+from amiwarp.kernels.prism_angle import EncoderParams, theta_u32_at
 from amiwarp.optics.models import MODELS
 from reference import optics as oracle
 from reference.calibration_sample import exact_calibration

@@ -20,7 +20,7 @@ from amiwarp.io.reading_process import Reply, borrow, give_back, run
 from reference.io_samples import make_events, refusal, to_faery, write_dsec, write_native
 
 EVENTS = make_events(600)
-SERVED = "test_io_hdf5"
+SERVED = __name__
 """This module, as the reading process imports it."""
 
 
@@ -329,7 +329,7 @@ reading_process.CPU_SECONDS = 1
 source = open_recording(sys.argv[1]).events
 print(source._file._process[0]._child.pid, flush=True)
 if sys.argv[2] == "hang":
-    source._file._process[0].send("test_io_hdf5:hang")
+    source._file._process[0].send("tests.test_io_hdf5:hang")
 print("ready", flush=True)
 time.sleep(600)
 """
@@ -340,7 +340,7 @@ time.sleep(600)
 def test_the_process_ends_with_its_owner(dsec, ending, state):
     environment = {
         **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), str(Path(__file__).parent)]),
+        "PYTHONPATH": str(Path(__file__).parents[1]),
     }
     with subprocess.Popen(
         [sys.executable, "-c", SCRIPT, dsec, state], stdout=subprocess.PIPE, env=environment, stderr=subprocess.PIPE

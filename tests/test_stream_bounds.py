@@ -287,7 +287,7 @@ def test_a_window_that_never_ends_is_bounded(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_samples_that_wait_for_the_cameras_clock_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """A controller that sends without end while the camera sends nothing."""
-    monkeypatch.setattr("amiwarp.live.stream.camera_clock.MOST_WAITING", 1000)
+    monkeypatch.setattr("amiwarp.live.stream.session.MOST_WAITING", 1000)
     said: list[str] = []
 
     class Sending:

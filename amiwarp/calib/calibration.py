@@ -222,8 +222,8 @@ class Calibrator:
     def without_bad_pixels(self, tried: Attempt) -> tuple[Calibrator, Attempt]:
         """Mask hot and flickering pixels if they have a notable share of the events, and calibrate without them.
 
-        Return the calibrator of the masked recording and the better of both attempts. Raises :class:`AmiwarpError` if
-        most pixels flicker.
+        Return the calibrator of the masked recording, and its attempt unless only the first one was accepted.
+        Raises :class:`AmiwarpError` if most pixels flicker.
         """
         source, encoder = self.recording.events, self.recording.encoder
         assert encoder is not None

@@ -19,9 +19,10 @@ from amiwarp.events.device_events import DeviceEvents, check_sensor, encoder_pie
 from amiwarp.events.events import TIME_LIMIT, Events, held_bytes
 from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.kernels.compensation import Columns
-from amiwarp.kernels.events import EncoderParams, flag_events
+from amiwarp.kernels.events import flag_events
 from amiwarp.kernels.launch import PageLockedPool, RecordedLaunch, background_worker, launch, pool
 from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
+from amiwarp.kernels.prism_angle import EncoderParams
 from amiwarp.validation import guarded, whole
 
 if TYPE_CHECKING:

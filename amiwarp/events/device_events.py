@@ -31,7 +31,7 @@ from amiwarp.events.events import (
     regroup,
 )
 from amiwarp.kernels import events as kernels
-from amiwarp.kernels.events import EncoderParams
+from amiwarp.kernels.prism_angle import EncoderParams
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import guarded, instance, on_gpu, one_of, whole
 
@@ -162,7 +162,8 @@ def azimuths(device: str) -> wp.array:
 
 
 def encoder_params(encoder: Encoder, t_first: int, t_last: int, device: Any) -> EncoderParams:
-    """Return the encoder's samples around a span of event times [us] as parameters of the device function ``angle_at``.
+    """Return the encoder's samples around a span of event times [us] for the device functions of
+    :mod:`amiwarp.kernels.prism_angle`.
 
     Raises :class:`AmiwarpError` if the encoder does not cover that span.
     """

@@ -4,7 +4,6 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.events import THETA_U32_RAD, EncoderParams, piece_at, theta_u32_at, theta_u32_on
 from amiwarp.kernels.native_code import (
     load_float,
     load_int64,
@@ -14,6 +13,7 @@ from amiwarp.kernels.native_code import (
     store_uint8,
     store_uint32,
 )
+from amiwarp.kernels.prism_angle import THETA_U32_RAD, EncoderParams, piece_at, theta_u32_at, theta_u32_on
 from amiwarp.kernels.refraction import displace
 
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.

@@ -1,66 +1,10 @@
-"""Kernels on event arrays: checks and conversions, the prism angle at a time, background activity."""
+"""Kernels on event arrays: checks and conversions, and background activity."""
 
 from typing import Any
 
 import warp as wp
 
-# Prism angle at an event's time, in integer arithmetic with equal results on every device.
-#
-# Angles are fractions of a turn that wrap on overflow: one turn is 2**64 internally and 2**32 in results. Times are
-# whole microseconds, so slopes may wrap too: a whole turn per microsecond adds whole turns.
-
 wp.set_module_options({"enable_backward": False})
-
-THETA_U16_RAD = wp.constant(2.0 * 3.141592653589793 / 65536.0)  # unit of theta_u16, 2**-16 turn [rad]
-THETA_U32_RAD = wp.constant(2.0 * 3.141592653589793 / 4294967296.0)  # unit of theta_u32, 2**-32 turn [rad]
-
-
-@wp.struct
-class EncoderParams:
-    """Prism angle over time as a piecewise linear function.
-
-    The first and last pieces extend beyond the samples. Built by :mod:`amiwarp.events.device_events`.
-    """
-
-    origin: wp.int64  # event time at the start of the first bucket [us]
-    shift: int  # base-2 logarithm of the length of a bucket of time [us]
-    first: wp.array(dtype=int)  # index of the piece at the start of each bucket; shape (buckets + 1,)
-    start: wp.array(dtype=wp.int64)  # first event time of each piece, relative to the origin [us]
-    angle: wp.array(dtype=wp.uint64)  # prism angle at the start of each piece [2**-64 turn]
-    slope: wp.array(dtype=wp.uint64)  # speed on each piece [2**-64 turn per us]
-
-
-@wp.func
-def piece_at(encoder: EncoderParams, elapsed: wp.int64) -> int:
-    """Return the index of the piece at ``elapsed`` [us] from the origin, found by its bucket and bisection."""
-    buckets = encoder.first.shape[0] - 1
-    bucket = int(wp.clamp(elapsed >> wp.int64(encoder.shift), wp.int64(0), wp.int64(buckets - 1)))
-    low = encoder.first[bucket]
-    high = encoder.first[bucket + 1]
-    while low < high:
-        middle = (low + high + 1) / 2
-        if encoder.start[middle] <= elapsed:
-            low = middle
-        else:
-            high = middle - 1
-    return low
-
-
-@wp.func
-def theta_u32_on(encoder: EncoderParams, piece: int, elapsed: wp.int64) -> wp.uint32:
-    """Return theta_u32, the prism angle [2**-32 turn], on a given piece at ``elapsed`` [us] from the origin."""
-    since = wp.uint64(elapsed - encoder.start[piece])
-    return wp.uint32((encoder.angle[piece] + since * encoder.slope[piece]) >> wp.uint64(32))
-
-
-@wp.func
-def theta_u32_at(encoder: EncoderParams, t: wp.int64) -> wp.uint32:
-    """Return theta_u32, the prism angle [2**-32 turn], at event time ``t`` [us]."""
-    elapsed = t - encoder.origin
-    return theta_u32_on(encoder, piece_at(encoder, elapsed), elapsed)
-
-
-# Checks and conversions of event arrays that other libraries made, on their device.
 
 BEYOND = wp.constant(1 << 16)  # stands for an infinite coordinate among the largest coordinates
 TIME_LIMIT = wp.constant(wp.float64(2.0**62))  # amiwarp.events.events.TIME_LIMIT [us]

@@ -8,7 +8,7 @@ counted and written.
 import warp as wp
 
 from amiwarp.kernels.equations import HELD, QUIET, Pairs
-from amiwarp.kernels.events import THETA_U32_RAD, EncoderParams, piece_at
+from amiwarp.kernels.prism_angle import THETA_U32_RAD, EncoderParams, piece_at
 
 wp.set_module_options({"enable_backward": False})
 

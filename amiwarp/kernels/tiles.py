@@ -10,8 +10,8 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, undo_camera_rotation
-from amiwarp.kernels.events import THETA_U16_RAD
 from amiwarp.kernels.native_code import add_to_word, get_word, load_uint32, set_word, wait_for_block, window
+from amiwarp.kernels.prism_angle import THETA_U16_RAD
 from amiwarp.kernels.refraction import displace
 from amiwarp.kernels.votes import Canvas, dither_offset, events_of
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.events import EncoderParams, theta_u32_at
+from amiwarp.kernels.prism_angle import EncoderParams, theta_u32_at
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
