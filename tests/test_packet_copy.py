@@ -10,6 +10,7 @@ import pytest
 import warp as wp
 
 from amiwarp import Events
+from amiwarp.compensation import streams
 from amiwarp.compensation.streams import MOST_HELD, PIECE, ColumnCheck, PacketCopier, join_packets
 from amiwarp.kernels.launch import PageLockedPool
 
@@ -57,6 +58,15 @@ def test_a_step_back_in_a_packet_is_found(copy: Copy, at: int) -> None:
     (part,) = packets([PIECE + 100])
     part.t[at] = part.t[at - 1] - 1
     assert copied(copy, [part])[1].unsorted
+
+
+def test_an_unknown_layout_of_numpy_is_served_by_its_public_interface(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert streams.layout_is_known()
+    monkeypatch.setattr(streams, "layout_is_known", lambda: False)
+    parts = packets([10, 700])
+    found, check = copied(by_threads, parts)
+    np.testing.assert_array_equal(found.t, Events.concatenate(parts).t)
+    assert not check.unsorted
 
 
 def test_a_pooled_array_is_reused_once_it_is_released() -> None:

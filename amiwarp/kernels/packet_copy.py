@@ -10,7 +10,8 @@ wp.set_module_options({"enable_backward": False})
 ROW = 9
 """Number of entries per row of the table of packets.
 
-The entries are: addresses of x, y, t and p; destination addresses (p: 0 to skip it); and number of events.
+The entries are: addresses of the pointers to x, y, t and p; destination addresses (p: 0 to skip it); and number of
+events.
 """
 FOUND = 3
 """Number of results per row of the table of packets: 1 if the times are out of order, else 0; largest x [px]; largest y
@@ -20,10 +21,10 @@ FOUND = 3
 @wp.func_native("""
     const uint64_t* row = (const uint64_t*)table.data + 9 * i;
     const int64_t n = (int64_t)row[8];
-    const uint16_t* __restrict__ x = (const uint16_t*)row[0];
-    const uint16_t* __restrict__ y = (const uint16_t*)row[1];
-    const int64_t* __restrict__ t = (const int64_t*)row[2];
-    const uint8_t* __restrict__ p = (const uint8_t*)row[3];
+    const uint16_t* __restrict__ x = *(const uint16_t**)row[0];
+    const uint16_t* __restrict__ y = *(const uint16_t**)row[1];
+    const int64_t* __restrict__ t = *(const int64_t**)row[2];
+    const uint8_t* __restrict__ p = *(const uint8_t**)row[3];
     uint16_t* __restrict__ to_x = (uint16_t*)row[4];
     uint16_t* __restrict__ to_y = (uint16_t*)row[5];
     int64_t* __restrict__ to_t = (int64_t*)row[6];
