@@ -2,8 +2,9 @@
 
 :func:`calibrate` runs a :class:`Calibrator`, and for the model ``auto`` lets a :class:`ModelChooser` choose among the
 models. A calibrator makes attempts by the stages of the settings. If no brightness map explains the events, it tries
-three causes in turn: hot or flickering pixels, a rotating camera, and a wrong scale of the encoder. :func:`prepare`
-sets up an attempt: the encoder, the events and the parameter space.
+three causes in turn. Hot or flickering pixels are masked and the attempt repeated. The camera's rotation is freed, also
+at a low cost if it explains much of the rest, and then dropped from the result. A wrong scale of the encoder ends in an
+error. :func:`prepare` sets up an attempt: the encoder, the events and the parameter space.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The image of warped events (IWE): events voted into pixels, with or without motion compensation."""
+"""The image of warped events (IWE): events voted into pixels, with or without motion compensation.
+
+The votes are in :mod:`amiwarp.imaging.votes`.
+"""
 
 from __future__ import annotations
 

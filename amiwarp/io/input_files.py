@@ -197,7 +197,7 @@ MATLAB = "save x, y, t [us] and p from it as .npz, or as text 't x y p'"
 CAPTURE = "give the events as the camera's software saves them"
 UNPACK = "unpack it first"
 
-SIGNATURES: tuple[tuple[int, bytes, str, str], ...] = (
+MISTAKEN_FILES: tuple[tuple[int, bytes, str, str], ...] = (
     # position, bytes, what the file is, what to do
     (0, b"MATLAB 5.0 MAT-file", "a MATLAB 5 file", MATLAB),
     (0, b"MATLAB 7.3 MAT-file", "a MATLAB 7.3 file", MATLAB),
@@ -238,7 +238,7 @@ SIGNATURES: tuple[tuple[int, bytes, str, str], ...] = (
 
 def name_kind(head: bytes) -> str | None:
     """Return what a file is and what to do with it, from its first bytes, or None if it is unknown."""
-    for at, magic, what, remedy in SIGNATURES:
+    for at, magic, what, remedy in MISTAKEN_FILES:
         if head[at : at + len(magic)] == magic:
             return f"is {what}; {remedy}"
     if head.startswith(b"RIFF"):

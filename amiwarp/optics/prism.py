@@ -1,4 +1,7 @@
-"""The wedge prism: apex angle, refractive index, the side of its flat face, and its deflection."""
+"""The wedge prism: apex angle, refractive index, the side of its flat face, and its deflection.
+
+This is the glass only. Its motion is that of the encoder, :mod:`amiwarp.events.encoder`.
+"""
 
 from __future__ import annotations
 
