@@ -120,7 +120,7 @@ def test_programs_list_its_parameter(cylinder: Any, tmp_path: Path) -> None:
     assert ", cylinder, " in said
     printed = subprocess.run(
         [sys.executable, "-c", LOADED],
-        cwd=Path(amiwarp.__file__).parents[1], capture_output=True, text=True, check=True,
+        cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True,
     ).stdout  # fmt: skip
     assert "('cylinder power', '', ('-0.1', '0.1', '0.001'), \"model === 'cylinder'\") True" in printed
 
