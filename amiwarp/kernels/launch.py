@@ -425,14 +425,14 @@ def _without(line: str) -> Iterator[None]:
 _Kind = tuple[Any, ...]
 """What arrays that may take each other's place have in common: shape, type, and use."""
 _Numbered = tuple[int, wp.array]
-"""An array, and how many of its kind were made before it."""
+"""Number of an array among those of its kind, in the order in which they were made, and the array."""
 
 
 class PageLockedPool:
     """Page-locked host arrays of Warp, which are used again once their owners are deleted."""
 
     def __init__(self, most: int | None = None, *, locked: bool = True) -> None:
-        """Start without arrays. ``most``: largest number of :meth:`results` of a kind.
+        """Start without arrays. ``most``: largest number of :meth:`result` arrays of a kind.
 
         ``locked=False`` gives ordinary memory, for machines without CUDA.
         """
@@ -464,7 +464,7 @@ class PageLockedPool:
         return taken[1]
 
     def fill(self, size: int, dtypes: Iterable[Any]) -> None:
-        """Lock memory for :meth:`results` of each of ``dtypes`` in advance."""
+        """Lock memory for the :meth:`result` arrays of each of ``dtypes`` in advance."""
         for kind, taken in [(kind, self._take(kind)) for kind in [((size,), dtype) for dtype in dtypes]]:
             heapq.heappush(self._idle[kind], taken)
 
