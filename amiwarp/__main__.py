@@ -1,7 +1,5 @@
 """Entry point of ``python -m amiwarp`` and of the ``amiwarp`` command."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

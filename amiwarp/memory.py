@@ -1,7 +1,5 @@
 """Return of freed memory to the operating system."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import sys

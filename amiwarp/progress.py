@@ -1,7 +1,5 @@
 """Type of the callback by which long tasks report their progress."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeAlias
 

@@ -3,8 +3,6 @@
 Each check of a single value returns it in its plain type, or raises :class:`AmiwarpError` that says what was expected.
 """
 
-from __future__ import annotations
-
 import builtins
 import collections.abc
 import contextlib

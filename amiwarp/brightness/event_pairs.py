@@ -7,14 +7,18 @@ pairs.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
-from amiwarp.events.device_events import encoder_params, join, time_span
+from amiwarp.events.device_events import DeviceEvents, encoder_params, join, time_span
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
 from amiwarp.kernels import equations_cpu, equations_cuda
 from amiwarp.kernels import pairs as kernels
 from amiwarp.kernels.equations import HELD, Geometry, Pairs, slope_between, slope_of_changes, split_by_time
@@ -23,19 +27,8 @@ from amiwarp.kernels.equations_cuda import Ends, add_ends, list_ends, take_fract
 from amiwarp.kernels.launch import RepeatedLaunches, launch
 from amiwarp.kernels.map_positions import find_places, place_blocks, place_pairs, place_still
 from amiwarp.optics.camera import CameraRotation, pinhole_params
-from amiwarp.optics.models import model_camera
+from amiwarp.optics.models import Model, model_camera
 from amiwarp.validation import guarded
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from numpy.typing import NDArray
-
-    from amiwarp.events.device_events import DeviceEvents
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Events
-    from amiwarp.optics.models import Model
-
 
 SAMPLED = 1 << 15
 """Number of pairs whose times give the statistics of all."""

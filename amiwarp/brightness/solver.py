@@ -8,15 +8,17 @@ L. L is in units of the ON threshold. See ``docs/explanation/photometric.md``.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import islice, pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
-from amiwarp.brightness.event_pairs import FEW_BLOCKS, PairPositions
+from amiwarp.brightness.event_pairs import FEW_BLOCKS, PairPositions, PairSet
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import conjugate_gradients as cg
 from amiwarp.kernels import equations as eqs
@@ -25,18 +27,9 @@ from amiwarp.kernels import slow_pixels as slow_kernels
 from amiwarp.kernels.conjugate_gradients import gather
 from amiwarp.kernels.launch import BLOCK_DIM, SMALLEST_SLICE, Program, RepeatedLaunches, launch, slice_count, start_read
 from amiwarp.optics.camera import CameraRotation
-from amiwarp.optics.models import model_camera
+from amiwarp.optics.models import Model, model_camera
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from amiwarp.brightness.event_pairs import PairSet
-    from amiwarp.optics.models import Model
-
-    _Step = tuple[Any, int, list[Any], list[Any], int]  # kernel, number of threads, inputs, outputs, smallest slice
+_Step = tuple[Any, int, list[Any], list[Any], int]  # kernel, number of threads, inputs, outputs, smallest slice
 
 
 # Multigrid preconditioner for large maps.

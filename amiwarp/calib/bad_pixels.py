@@ -6,23 +6,15 @@ lamp makes the event rates of many neighbouring pixels oscillate together, at a 
 line in their spectrum.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from amiwarp.events.encoder import TWO_PI
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Events, EventSource
+from amiwarp.events.encoder import TWO_PI, Encoder
+from amiwarp.events.events import Events, EventSource
 
 MOST_TURNS, LEAST_TURNS, MOST_EVENTS = 8, 2, 2_500_000
 """Limits of the part of a recording that is searched for bad pixels: most turns of the prism, fewest turns, most

@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -32,13 +32,11 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
+from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, size_names
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.validation import check_names, guarded
-
-if TYPE_CHECKING:
-    from amiwarp.optics.camera import Camera
 
 
 @guarded

@@ -5,28 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import wait
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.calib.parameters import MOTION
+from amiwarp.calib.settings import Settings
 from amiwarp.events.device_events import NAMES, DeviceEvents
+from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.imaging.votes import upload_events
+from amiwarp.events.recording import Recording
+from amiwarp.imaging.votes import UploadedEvents, upload_events
 from amiwarp.kernels.launch import pool
 
-if TYPE_CHECKING:
-    from types import TracebackType
-
-    from numpy.typing import NDArray
-
-    from amiwarp.calib.settings import Settings
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.recording import Recording
-    from amiwarp.imaging.votes import UploadedEvents
-
-    SlopeOf = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+SlopeOf = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 
 
 # Events of a calibration with the encoder that gives their prism angles.

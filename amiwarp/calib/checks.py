@@ -1,25 +1,18 @@
 """Checks of a recording and of calibrated parameters. A failed check raises an error with the reason and the remedy."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
+from amiwarp.calib.bad_pixels import BadPixelSummary
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
 from amiwarp.imaging.sharpness import edge_coherence
+from amiwarp.imaging.votes import Image
 from amiwarp.optics.models import MODELS
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-    from amiwarp.calib.bad_pixels import BadPixelSummary
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.imaging.votes import Image
-    from amiwarp.optics.prism import Prism
+from amiwarp.optics.prism import Prism
 
 FEWEST_EVENTS = 2000
 """Smallest number of events for a calibration."""

@@ -1,23 +1,17 @@
 """First guesses from the events alone: the prism's speed, and the camera's angular velocity."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Events
-    from amiwarp.events.recording import Recording
-    from amiwarp.optics.camera import Camera
-
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
+from amiwarp.optics.camera import Camera
 
 # Speed of the prism from the events alone: the events of a still scene repeat in every turn.
 

@@ -10,40 +10,32 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.calib.calibration_events import CalibrationEvents, rotation_window, thin, thin_events
 from amiwarp.calib.parameters import DRIFTS, MOTION, ParameterSpace, like_size, make_space, values_of
 from amiwarp.calib.photometric.cost import LEAST_CURVATURE, UNDETERMINED_PX
-from amiwarp.calib.result import Calibration, FreedParameter, ModelCandidate, ModelChoice
+from amiwarp.calib.result import Calibration, FreedParameter, ModelCandidate, ModelChoice, PhotometricSummary
 from amiwarp.calib.settings import Settings
 from amiwarp.calib.sharpness import STEP_PX, HalfSharpness, Quadratic, gradient, padding, split_turns
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import MemoryEvents
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape, Votes
-from amiwarp.optics.models import MODELS, ExactModel, compensate_by_each, predicted_error, rms, rungs, wrap_angle
+from amiwarp.optics.models import MODELS, ExactModel, Model, compensate_by_each, predicted_error, rms, rungs, wrap_angle
 from amiwarp.optics.prism import UnsizedPrism
 from amiwarp.validation import real
 
-if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
-
-    from numpy.typing import NDArray
-
-    from amiwarp.calib.result import PhotometricSummary
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Events
-    from amiwarp.optics.models import Model
-
-    Vector = NDArray[np.float64]
+Vector = NDArray[np.float64]
 
 
 class ModelChooser:

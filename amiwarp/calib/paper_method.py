@@ -4,31 +4,24 @@ The grid is refined about the values that the hardware gives: the nominal prism 
 neither the grid nor η. As in the paper, the result is not checked and has no uncertainty.
 """
 
-from __future__ import annotations
-
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.calib.calibration import prepare
-from amiwarp.calib.nlopt_solver import best_of
+from amiwarp.calib.nlopt_solver import SearchStage, best_of
 from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.settings import STAGES, Settings
+from amiwarp.calib.sharpness import Search
 from amiwarp.choices import Sharpness
 from amiwarp.events.events import MemoryEvents
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-    from amiwarp.calib.nlopt_solver import SearchStage
-    from amiwarp.calib.sharpness import Search
-    from amiwarp.events.recording import Recording
-    from amiwarp.progress import Progress
+from amiwarp.events.recording import Recording
+from amiwarp.progress import Progress
 
 WINDOW_US = 2_000_000
 """Duration of the events that the paper calibrates on [us]."""

@@ -11,15 +11,16 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera import CameraRotation, RadialTangential
+from amiwarp.optics.camera import Camera, CameraRotation, RadialTangential
 from amiwarp.optics.models import (
     MODELS,
     PHASE,
+    Model,
     Parameter,
     check_given,
     compensate_by_each,
@@ -28,16 +29,8 @@ from amiwarp.optics.models import (
     size_names,
     wrap_angle,
 )
-from amiwarp.optics.prism import Prism, UnsizedPrism
+from amiwarp.optics.prism import NominalPrism, Prism, UnsizedPrism
 from amiwarp.validation import guarded, instance, one_of, real, shown, vector
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.optics.camera import Camera
-    from amiwarp.optics.models import Model
-    from amiwarp.optics.prism import NominalPrism
-
 
 NOMINAL_APEX = math.radians(2.0)
 """Apex angle assumed if a recording does not give it [rad]. The search goes up to twice this value."""

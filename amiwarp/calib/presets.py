@@ -6,11 +6,11 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from amiwarp.calib import Settings
+from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.parameters import values_of
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.errors import AmiwarpError
@@ -18,12 +18,8 @@ from amiwarp.io.atomic_output import write_text
 from amiwarp.io.formats import check_ending
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import fields_of, read_json
-from amiwarp.optics.models import MODELS, rungs
+from amiwarp.optics.models import MODELS, Model, rungs
 from amiwarp.validation import check_names, one_of, shown
-
-if TYPE_CHECKING:
-    from amiwarp.calib import Calibration
-    from amiwarp.optics.models import Model
 
 FORMAT, VERSION = "amiwarp-preset", 1
 KINDS = ("calibration", "compensation")

@@ -8,10 +8,12 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from amiwarp.calib.nlopt_solver import SearchStage
 from amiwarp.calib.parameters import MOTION, build_model, rotation_from_values, units
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
@@ -22,16 +24,9 @@ from amiwarp.io.formats import check_ending
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import build, fields_of, read_json
 from amiwarp.optics.camera import Camera, CameraRotation
-from amiwarp.optics.models import MODELS, ExactModel
+from amiwarp.optics.models import MODELS, ExactModel, Model
 from amiwarp.optics.prism import Prism
 from amiwarp.validation import guarded, one_of, real, shown
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.calib.nlopt_solver import SearchStage
-    from amiwarp.optics.models import Model
-
 
 # Parts of a calibration's result: the search stages, the photometric stage and the choice of the model.
 

@@ -7,34 +7,27 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.calib import checks
+from amiwarp.calib.calibration_events import CalibrationEvents, EventsAhead
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import MOTION, build_model, like_size, units
+from amiwarp.calib.parameters import MOTION, ParameterSpace, build_model, like_size, units
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.settings import Settings, stage_share
 from amiwarp.choices import Sharpness
+from amiwarp.events.events import Events
 from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.imaging.votes import CanvasShape, TileVotes, Votes, upload_events
-from amiwarp.optics.camera import border
-from amiwarp.optics.models import MODELS, points_on_host
+from amiwarp.imaging.votes import CanvasShape, Image, TileVotes, UploadedEvents, Votes, upload_events
+from amiwarp.optics.camera import Camera, border
+from amiwarp.optics.models import MODELS, Model, points_on_host
 from amiwarp.progress import Progress
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.calib.calibration_events import CalibrationEvents, EventsAhead
-    from amiwarp.calib.parameters import ParameterSpace
-    from amiwarp.events.events import Events
-    from amiwarp.imaging.votes import Image, UploadedEvents
-    from amiwarp.optics.camera import Camera
-    from amiwarp.optics.models import Model
-
-    Vector = NDArray[np.float64]
+Vector = NDArray[np.float64]
 
 # Sharpness as a function of the free parameters, computed on the device. All buffers are allocated once.
 

@@ -1,7 +1,5 @@
 """Application of the command line: registration of the subcommands, and exit codes for failures."""
 
-from __future__ import annotations
-
 import _thread
 import importlib
 import signal

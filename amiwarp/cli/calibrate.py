@@ -15,6 +15,7 @@ from amiwarp.cli.console import choose_device, progress, report, table
 from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, interval, number, span
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import check_output
 from amiwarp.io.formats import check_ending
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from amiwarp.calib import Calibration
     from amiwarp.calib.result import ModelCandidate, ModelChoice
     from amiwarp.calib.settings import PhotometricSettings
-    from amiwarp.events.recording import Recording
 
 EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.png"
 

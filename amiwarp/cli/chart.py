@@ -1,9 +1,7 @@
 """``amiwarp chart``: charts of speed against error on this machine, and settings for a budget."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -13,11 +11,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import check_output
 from amiwarp.progress import part
-from amiwarp.studies.chart.rows import beaten_by, fronts, told_apart
-
-if TYPE_CHECKING:
-    from amiwarp.studies.chart import Charts
-    from amiwarp.studies.chart.rows import Row
+from amiwarp.studies.chart import Charts
+from amiwarp.studies.chart.rows import Row, beaten_by, fronts, told_apart
 
 EXAMPLE = "amiwarp chart --out amiwarp-chart --budget-px 0.3"
 

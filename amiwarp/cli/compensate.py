@@ -15,11 +15,11 @@ from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.convert import EncoderOptions, Format, HdfCodec, Round, format_notes
 from amiwarp.cli.options import OUTPUT, Common, Topic
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
 from amiwarp.io.formats import COMPENSATED_HELP, Codec
 
 if TYPE_CHECKING:
-    from amiwarp.events.recording import Recording
     from amiwarp.imaging.export import IweFiles
 
 EXAMPLE = "amiwarp compensate recording.h5 compensated.h5 --calibration calibration.json --iwe iwe.png"

@@ -1,7 +1,5 @@
 """Functions that all commands use: choice of the device, progress bar, printed result."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

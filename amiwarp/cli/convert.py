@@ -1,24 +1,20 @@
 """``amiwarp convert``: conversion of recordings to the native format and to others."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from amiwarp.cli.console import progress, report
 from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, Topic
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
 from amiwarp.io import convert, open_recording, read_encoder_csv, read_encoder_triggers
 from amiwarp.io.formats import EXTENSION_HELP, LIMITS, Codec, OutputFormat, Rounding
-
-if TYPE_CHECKING:
-    from amiwarp.events.encoder import Encoder
 
 EXAMPLE = "amiwarp convert events.raw recording.h5 --encoder encoder.csv --counts-per-turn 4096 --fov-deg 60"
 

@@ -1,7 +1,5 @@
 """``amiwarp demo``: simulation, calibration, compensation and reconstruction of one picture."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from dataclasses import asdict

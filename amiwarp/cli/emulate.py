@@ -6,6 +6,7 @@ import contextlib
 import math
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,15 +19,12 @@ from amiwarp.cli.console import report
 from amiwarp.cli.live import stopped_by_interrupt
 from amiwarp.cli.options import NO_FILE, Common
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.link.emulator import Controller, EmulatedFault, Motor, Played, PseudoTerminal
+from amiwarp.live.link.emulator import Controller, EmulatedFault, Motor, Played, PseudoTerminal, Rotor
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from amiwarp.events.recording import Recording
-    from amiwarp.live.link.emulator import Rotor
     from amiwarp.live.stream.cameras import EmulatedCamera
 
 EXAMPLE = "amiwarp emulate --link ./prism --rpm 720 --fault slip@5 --fault unplug@10+2"

@@ -1,33 +1,25 @@
 """Command ``amiwarp info``: description of the content of a recording."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from amiwarp.cli.console import progress, report, table
 from amiwarp.cli.options import Common, Topic
-from amiwarp.events.encoder import rpm_between
-from amiwarp.events.events import DEFAULT_BLOCK
-from amiwarp.events.recording import mean_rate
+from amiwarp.events.encoder import Encoder, rpm_between
+from amiwarp.events.events import DEFAULT_BLOCK, EventSource
+from amiwarp.events.recording import ImageStore, ImuSamples, Recording, Truth, mean_rate
 from amiwarp.events.truth import Cause
 from amiwarp.io import open_recording
 from amiwarp.io.camera_files import camera_to_json
 from amiwarp.io.export import GAP_INTERVALS
 from amiwarp.io.file_scan import head_only
 from amiwarp.optics.prism import Prism
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import EventSource
-    from amiwarp.events.recording import ImageStore, ImuSamples, Recording, Truth
 
 EXAMPLE = "amiwarp info recording.h5"
 MOST_NAMES = 16

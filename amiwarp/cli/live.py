@@ -23,14 +23,13 @@ from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError, printable
 from amiwarp.io.live_writer import LiveWriter
 from amiwarp.live.link.link import Link
-from amiwarp.live.stream.adaptive import SpeedController, prism_orbit
+from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orbit
 from amiwarp.live.stream.camera_clock import clock_offset
 from amiwarp.live.stream.queues import Policy
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
     from amiwarp.compensation.streams import Compensated
-    from amiwarp.live.stream.adaptive import SpeedKeeper
     from amiwarp.live.stream.packets import Source
     from amiwarp.live.stream.session import RawConsumer, Session, SessionStatus
     from amiwarp.live.stream.sockets import PipeSink, SocketSink

@@ -1,7 +1,5 @@
 """``amiwarp motor``: status and speed of the prism's motor."""
 
-from __future__ import annotations
-
 import enum
 import math
 import time

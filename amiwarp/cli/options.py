@@ -15,6 +15,7 @@ import typer
 
 from amiwarp.choices import Seeing
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
 from amiwarp.io import atomic_output as output
 from amiwarp.io.camera_files import camera_from_json
 from amiwarp.io.formats import check_ending
@@ -24,12 +25,11 @@ from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
 from amiwarp.simulation.motion import EncoderModel, PrismMotion
+from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.worlds.world import WorldScene
 
 if TYPE_CHECKING:
-    from amiwarp.events.recording import Recording
-    from amiwarp.simulation.sensor import SensorModel
     from amiwarp.simulation.simulator import Simulation
-    from amiwarp.simulation.worlds.world import WorldScene
 
 
 # Options and texts of the command line, converted to cameras, prisms and numbers with units.

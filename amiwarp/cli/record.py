@@ -1,7 +1,5 @@
 """``amiwarp record``: recording of a live camera and encoder to a file that survives crashes."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 from typing import Annotated

@@ -15,12 +15,12 @@ from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.options import OUTPUT, Common, EncoderModelOptions, RigOptions, SensorOptions, WorldOptions, numbers
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
+from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import CameraMotion
+from amiwarp.simulation.worlds.world import WorldScene
 
 if TYPE_CHECKING:
-    from amiwarp.simulation.description import Scene
     from amiwarp.simulation.simulator import Simulation
-    from amiwarp.simulation.worlds.world import WorldScene
 
 EXAMPLE = "amiwarp simulate recording.h5 --picture photo.jpg --duration 0.5 --apex-deg 1 --rpm 720"
 

@@ -1,7 +1,5 @@
 """``amiwarp translate``: conversion of pictures and of recordings without a prism to recordings through the prism."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Annotated

@@ -1,23 +1,19 @@
 """Command ``amiwarp truth``: export of a simulated world's ground truth to the formats of public data sets."""
 
-from __future__ import annotations
-
 import re
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from amiwarp.cli.console import progress, report
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Truth
 from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import make_folder
 from amiwarp.io.truth_export import save_flow_dsec, save_flow_mvsec, save_poses_tum
-
-if TYPE_CHECKING:
-    from amiwarp.events.recording import Truth
 
 EXAMPLE = "amiwarp truth recording.h5 exported --flow dsec --poses tum"
 

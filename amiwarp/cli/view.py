@@ -17,12 +17,12 @@ from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.live import SourceOptions, check_angles
 from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, parse_size, span
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
 from amiwarp.io.formats import check_ending
 from amiwarp.viewer.serve import warning
 
 if TYPE_CHECKING:
-    from amiwarp.events.recording import Recording
     from amiwarp.viewer.inspector import Inspector, Library
 
 EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"

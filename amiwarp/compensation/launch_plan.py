@@ -1,19 +1,14 @@
 """Choice of the compensation kernel, and its launch arguments."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import warp as wp
 
-from amiwarp.events.device_events import azimuths
+from amiwarp.events.device_events import DeviceEvents, azimuths
 from amiwarp.kernels import compensation as kernels
 from amiwarp.kernels.launch import launch, load, specialised
 from amiwarp.optics.camera import camera_params, pinhole_params
-
-if TYPE_CHECKING:
-    from amiwarp.events.device_events import DeviceEvents
-    from amiwarp.optics.models import Model
+from amiwarp.optics.models import Model
 
 
 class LaunchPlan:

@@ -1,7 +1,5 @@
 """Motion compensation of recordings."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import threading
@@ -10,11 +8,13 @@ from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
+from amiwarp.calib.result import Calibration
 from amiwarp.compensation.launch_plan import LaunchPlan
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import (
@@ -26,7 +26,9 @@ from amiwarp.events.device_events import (
     limits,
     wait,
 )
-from amiwarp.events.events import Events
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, EventSource
+from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.io import RecordingWriter
 from amiwarp.io.atomic_output import check_output
 from amiwarp.io.chunks import CHUNK, compile_checksums, in_order
@@ -37,18 +39,9 @@ from amiwarp.io.native_writer import FlaggedEvents
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import join_columns
 from amiwarp.kernels.launch import RecordedLaunch, launch, page_locked
+from amiwarp.optics.models import Model
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.calib.result import Calibration
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import EventSource
-    from amiwarp.events.recording import MetadataValue, Recording
-    from amiwarp.optics.models import Model
-
 
 # Compensation of pieces of events on a GPU, through page-locked buffers that threads share.
 

@@ -1,14 +1,13 @@
 """Motion compensation of streams of events and encoder samples."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -17,6 +16,8 @@ from numpy.typing import NDArray
 from amiwarp.compensation.launch_plan import LaunchPlan
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, check_sensor, encoder_pieces, limits, wait
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import TIME_LIMIT, Events, held_bytes
 from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.kernels.compensation import Columns
@@ -24,15 +25,8 @@ from amiwarp.kernels.events import flag_events
 from amiwarp.kernels.launch import PageLockedPool, RecordedLaunch, background_worker, launch, pool
 from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
 from amiwarp.kernels.prism_angle import EncoderParams
+from amiwarp.optics.models import Model
 from amiwarp.validation import guarded, whole
-
-if TYPE_CHECKING:
-    from concurrent.futures import Future
-
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.encoder_stream import EncoderStream
-    from amiwarp.optics.models import Model
-
 
 # Copying of packets into the columns of a batch: by NumPy, or by several threads of native code if the batch is long.
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import events as checks
+from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import (
     COARSE_TIMES,
     DEFAULT_BLOCK,
@@ -34,10 +35,6 @@ from amiwarp.kernels import events as kernels
 from amiwarp.kernels.prism_angle import EncoderParams
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import guarded, instance, on_gpu, one_of, whole
-
-if TYPE_CHECKING:
-    from amiwarp.events.encoder import Encoder
-
 
 # Arrays of any library as Warp arrays, through DLPack: without a copy if the type allows, else with a checked copy.
 

@@ -1,15 +1,14 @@
 """A recording: events with their encoder, camera, prism, the records of other sensors and, if simulated, the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import EventSource, as_times
 from amiwarp.events.truth import (
     EventTruth,
@@ -21,13 +20,9 @@ from amiwarp.events.truth import (
     StoredInstants,
     WorldLabels,
 )
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import NominalPrism
 from amiwarp.validation import array, guarded
-
-if TYPE_CHECKING:
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.optics.camera import Camera
-    from amiwarp.optics.prism import NominalPrism
-
 
 # Records of other sensors in a recording: samples of an inertial measurement unit (IMU), and frames.
 

@@ -1,11 +1,10 @@
 """Corners among events: eFAST and Arc*."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.choices import CornerMethod
 from amiwarp.cpu_threads import cpu_threads
@@ -17,10 +16,6 @@ from amiwarp.kernels import events as event_kernels
 from amiwarp.kernels.launch import launch, load
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import choice, guarded, instance, vector, whole
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
 
 REDUNDANT_US = 50_000
 """Time after which an event of Arc* is no longer redundant [us], from the paper."""

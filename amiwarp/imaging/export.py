@@ -10,23 +10,20 @@ import itertools
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.choices import Layers
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import Events, EventSource
 from amiwarp.imaging.iwe import PIECE
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
 from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.io.atomic_output import NewFile, allocate, check_output
 from amiwarp.io.formats import check_ending
 from amiwarp.validation import choice
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.events import Events, EventSource
 
 PNG_LEVEL = 7
 """Level of compression of PNG files. The highest level, 9, takes five times as long, for files that are 1 % smaller."""

@@ -3,27 +3,21 @@
 The votes are in :mod:`amiwarp.imaging.votes`.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.choices import Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, check_order, device_for, wait
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
 from amiwarp.imaging.votes import CanvasShape, Votes, upload_events
 from amiwarp.optics.camera import CameraRotation
+from amiwarp.optics.models import Model
 from amiwarp.validation import guarded
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Events
-    from amiwarp.optics.models import Model
-
 
 PIECE = 1 << 22
 """Number of events that are copied to the device at a time."""

@@ -1,30 +1,23 @@
 """Quality metrics of compensation and of pictures: edge blur, contrast, entropy, error against ground truth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
+from amiwarp.events.recording import Truth
 from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.sharpness import sharpness
-from amiwarp.optics.models import ExactModel, ModelError, predicted_error
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, Model, ModelError, predicted_error
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.validation import guarded
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.recording import Truth
-    from amiwarp.optics.camera import Camera
-    from amiwarp.optics.models import Model
-    from amiwarp.optics.prism import FlatSide
 
 STRIP_HALF_WIDTH = 3.0
 """Half width of the strip along an edge in which events count as belonging to it [px]."""

@@ -1,13 +1,13 @@
 """Sharpness of an image of warped events: measures with one signature, and the directions of its edges."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterator
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
@@ -17,12 +17,6 @@ from amiwarp.kernels import iwe as kernels
 from amiwarp.kernels.iwe import SEGMENT, STRIP, find_largest, gather_sums, smooth_and_add, smooth_votes, sum_directions
 from amiwarp.kernels.launch import BLOCK_DIM, Program, launch, page_locked
 from amiwarp.validation import array, choice, guarded, on_gpu, real
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from numpy.typing import NDArray
-
 
 # Sharpness of an image of warped events: five measures with one signature. For all of them, higher is sharper.
 

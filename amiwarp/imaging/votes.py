@@ -6,15 +6,18 @@ import ctypes
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.choices import Vote
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, azimuths, cast, check_sensor, encoder_params, time_span
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
 from amiwarp.kernels import tiles as kernels
 from amiwarp.kernels.camera import CameraRotationParams
 from amiwarp.kernels.iwe import CPU_WIDTH, Frame, add_sums, add_totals, empty_words, read_sums, read_votes
@@ -46,15 +49,8 @@ from amiwarp.kernels.votes import (
 )
 from amiwarp.kernels.word_votes import TRASH, Cells, vote_events, vote_points, vote_quickly, vote_rotating_camera
 from amiwarp.optics.camera import LARGEST_SIZE, CameraRotation, pinhole_params
-from amiwarp.optics.models import model_camera
+from amiwarp.optics.models import Model, model_camera
 from amiwarp.validation import choice, whole
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Events
-    from amiwarp.optics.models import Model
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,6 @@ The address holds an event, a sample of a frame (APS) or of the inertial unit (I
 Pixels count from the bottom right, as jAER decodes them, and are turned into columns from the left, rows from the top.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass

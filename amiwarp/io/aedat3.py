@@ -3,8 +3,6 @@
 Pixels count from the upper left. Packets of events of the first source are read. Other packets are counted or skipped.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Reader and writer of iniVation's AEDAT 4.0 files, with faery: streams of events, frames and IMU samples."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 from collections.abc import Iterable, Iterator

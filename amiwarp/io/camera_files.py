@@ -1,22 +1,16 @@
 """Camera and prism in files: as JSON objects, and as attributes of an HDF5 group."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.json_files import LARGEST_INTEGER, build, fields_of
 from amiwarp.optics.camera import CAMERA_NUMBERS, DISTORTIONS, Camera, Distortion
-from amiwarp.optics.prism import FlatSide, Prism, UnsizedPrism
+from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
 from amiwarp.validation import array, instance, one_of, real, shown, whole
-
-if TYPE_CHECKING:
-    from amiwarp.optics.prism import NominalPrism
-
 
 # Camera as a JSON object, in files of calibrations and cameras.
 

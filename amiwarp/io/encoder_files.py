@@ -1,7 +1,5 @@
 """The prism's encoder from files: logs in CSV, and the trigger edges that a camera recorded with its events."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from array import array

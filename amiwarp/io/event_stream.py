@@ -1,7 +1,5 @@
 """Reader of Event Stream files (.es), with faery: events of DVS files, and change detections of ATIS files."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path

@@ -6,13 +6,14 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import SENSOR_DTYPE, Events, EventSource
+from amiwarp.events.recording import Recording
 from amiwarp.io import formats
 from amiwarp.io.atomic_output import NewFile, check_output
 from amiwarp.io.file_scan import RECORDS, FileEvents
@@ -20,13 +21,9 @@ from amiwarp.io.formats import LIMITS, Bag, Codec, Limits, Outline, OutputFormat
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_writer import write_recording
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import NominalPrism
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded, whole
-
-if TYPE_CHECKING:
-    from amiwarp.events.recording import Recording
-    from amiwarp.optics.prism import NominalPrism
-
 
 # Writing of events in formats other than the native one, in constant memory and completely or not at all.
 

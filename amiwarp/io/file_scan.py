@@ -5,8 +5,6 @@ it is moved to the largest time so far. An event outside the frame is dropped, u
 1 % of the events have one of these faults, the file is refused, because then its format, size or order must be wrong.
 """
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

@@ -4,8 +4,6 @@ HDF5 allows links, external storage and virtual datasets that refer to other fil
 the file are refused too. :mod:`amiwarp.io.hdf5_reader` receives the description of a file as JSON.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import math

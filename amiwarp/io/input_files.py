@@ -4,8 +4,6 @@ Every reader of the package opens its files with :func:`open_input` or :func:`re
 a library that opens files. So each input is a regular file, and no writer replaces it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -1,7 +1,5 @@
 """Reader of untrusted JSON and TOML files: limited in size, strict, and converted to dataclasses field by field."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import enum

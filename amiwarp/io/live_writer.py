@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,9 +32,7 @@ from amiwarp.io.hdf5_reader import open_hdf5
 from amiwarp.io.input_files import errors_name
 from amiwarp.io.native_writer import Columns, check_frame, check_lengths, ms_entries, save_recording, write_header
 from amiwarp.optics.camera import Camera
-
-if TYPE_CHECKING:
-    from amiwarp.optics.prism import NominalPrism
+from amiwarp.optics.prism import NominalPrism
 
 SMALL_CHUNK = 4096
 """Number of elements per chunk of the small datasets. They are not compressed, so that they grow in place."""

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, check_coordinates, check_events, inside_image, regroup
-from amiwarp.events.recording import ImuSamples, MetadataValue, check_image
+from amiwarp.events.recording import ImuSamples, MetadataValue, Recording, Truth, check_image
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS, EventTruth, FrameTruth, Poses, WorldLabels, as_poses, check_truth
 from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.camera_files import camera_attributes, prism_attributes
@@ -29,13 +29,9 @@ from amiwarp.io.chunks import CHUNK, ChunkFile, EncodedChunk, append_values, enc
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
 from amiwarp.io.input_files import errors_name
 from amiwarp.optics.camera import Camera, check_size
+from amiwarp.optics.prism import NominalPrism
+from amiwarp.progress import Progress
 from amiwarp.validation import choice, guarded, shown
-
-if TYPE_CHECKING:
-    from amiwarp.events.recording import Recording, Truth
-    from amiwarp.optics.prism import NominalPrism
-    from amiwarp.progress import Progress
-
 
 # Layout of the file: header, datasets, chunks and the millisecond index.
 

@@ -5,8 +5,6 @@ an event with y = 240 is no event but a mark: 2**13 us are added to the times af
 180 rows. Such marks are counted and dropped, as by the data sets' own reader.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path

@@ -8,8 +8,6 @@ the smallest known sensor that holds all events. A folder of EV-IMO2 holds ``dat
 size that a file declares.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import shutil

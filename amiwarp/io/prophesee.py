@@ -1,7 +1,5 @@
 """Prophesee's files and words: RAW (EVT 2.0, 2.1, 3.0) is read and written, DAT is read."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field

@@ -6,8 +6,6 @@ amiwarp that return a JSON value and arrays, which are sent through pipes. The s
 this file runs in the process.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import json

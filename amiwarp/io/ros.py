@@ -1,7 +1,5 @@
 """Readers and writer of ROS bags, with rosbags: ROS 1 bags, and the SQLite and MCAP files of ROS 2."""
 
-from __future__ import annotations
-
 import contextlib
 import heapq
 import itertools

@@ -3,8 +3,6 @@
 The checksum shows damage. Anybody can compute it, so that the values are checked as well before they are used.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Text in the format of the Event Camera Dataset: one event ``t x y p`` per line, t in seconds."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterable, Iterator
 from functools import partial

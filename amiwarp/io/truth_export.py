@@ -3,8 +3,6 @@
 ``docs/reference/recording-format.md`` describes the conventions.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import os

@@ -8,13 +8,12 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.validation import INT64, array, guarded, real, shown, whole
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from amiwarp.kernels import camera as kernels
 
 

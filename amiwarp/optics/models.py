@@ -6,14 +6,15 @@ The formulas are derived in ``docs/explanation/optics.md``.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar, cast
+from typing import Any, ClassVar, Self, TypeVar, cast
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import refraction as kernels
@@ -30,12 +31,6 @@ from amiwarp.optics.prism import (
     deflection_from_apex,
 )
 from amiwarp.validation import array, choice, guarded, instance, real, whole
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from numpy.typing import NDArray
-
 
 # Base class of the optical models: what a model knows of itself, and the displacement of points on any device.
 

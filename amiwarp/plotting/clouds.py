@@ -14,14 +14,12 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MISSING = "VTK found no OpenGL, so Matplotlib drew the point clouds; on Debian install libegl1 and libgl1-mesa-dri"
 """Note in a figure whose clouds Matplotlib drew because VTK cannot draw here."""

@@ -7,32 +7,30 @@ import io
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.calib import Calibration
 from amiwarp.calib.calibration_events import thin
 from amiwarp.calib.result import cost_surface
 from amiwarp.choices import Tone
 from amiwarp.compensation.recordings import compensate_events
+from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
+from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.iwe import iwe
+from amiwarp.imaging.metrics import PictureQuality
 from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
 from amiwarp.io.atomic_output import write_text
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import MODELS
 from amiwarp.plotting import clouds
+from amiwarp.plotting.clouds import Renderer
 from amiwarp.reconstruction.export import limits, tones
-
-if TYPE_CHECKING:
-    from amiwarp.calib import Calibration
-    from amiwarp.events.events import Events
-    from amiwarp.events.recording import Recording
-    from amiwarp.events.truth import FrameTruth
-    from amiwarp.imaging.metrics import PictureQuality
-    from amiwarp.plotting.clouds import Renderer
-    from amiwarp.reconstruction.picture import Picture
+from amiwarp.reconstruction.picture import Picture
 
 EVENTS = 2_000_000
 """Largest number of events in the image of a figure; more events are thinned evenly."""

@@ -1,25 +1,20 @@
 """Write reconstructed pictures to files: 8 and 16 bit pictures, arrays and video. Each file is complete or absent."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.choices import CONTRAST, Tone
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.export import encode_image
 from amiwarp.io.atomic_output import NewFile, check_output
 from amiwarp.io.formats import check_ending
+from amiwarp.reconstruction.picture import Picture
 from amiwarp.validation import choice
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.reconstruction.picture import Picture
 
 DARK, BRIGHT = 0.5, 99.5
 """Percentiles of intensity over the known pixels that are shown black and white."""

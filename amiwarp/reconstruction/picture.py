@@ -12,34 +12,28 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet
 from amiwarp.brightness.solver import BrightnessMap, Smoothness, Tiles
+from amiwarp.calib.result import Calibration
 from amiwarp.choices import Fill
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceMemoryEvents, device_of, read_between, wait
-from amiwarp.events.encoder import TWO_PI, turn_between
-from amiwarp.events.events import TIME_LIMIT
+from amiwarp.events.encoder import TWO_PI, Encoder, turn_between
+from amiwarp.events.events import TIME_LIMIT, EventSource
+from amiwarp.events.recording import Recording
 from amiwarp.kernels import known_nodes as kernels
 from amiwarp.kernels.known_nodes import drop_small_regions, exponentiate, find_large_regions
 from amiwarp.kernels.launch import launch, load, start_read
 from amiwarp.optics.camera import CameraRotation, border
+from amiwarp.optics.models import Model
 from amiwarp.validation import choice, guarded, real, whole
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.calib.result import Calibration
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import EventSource
-    from amiwarp.events.recording import Recording
-    from amiwarp.optics.models import Model
-
 
 # Decision which nodes of a brightness map the events determine.
 

@@ -1,12 +1,10 @@
 """Engine of the event simulator :class:`amiwarp.Simulation`: tables on the host, kernel launches, sorting of events."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -22,16 +20,13 @@ from amiwarp.kernels import event_keys as readout
 from amiwarp.kernels import launch as launching
 from amiwarp.optics.camera import camera_params
 from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
+from amiwarp.simulation.description import SimulationValues
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step_us
+from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.renderer import WorldMapRing, WorldSight, flicker_interval_s, image_speed
 from amiwarp.simulation.worlds.world import WorldScene
-
-if TYPE_CHECKING:
-    from amiwarp.simulation.description import SimulationValues
-    from amiwarp.simulation.sensor import SensorModel
-
 
 # Buffer on the device for the events that pixels generate, as sortable keys.
 

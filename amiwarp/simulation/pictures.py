@@ -1,7 +1,5 @@
 """Pictures: read files, convert pixel values to light, and make the maps of log intensity for the simulator."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from pathlib import Path

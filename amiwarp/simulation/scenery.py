@@ -1,11 +1,9 @@
 """The scene in front of a simulated camera: pictures, their placement, and the maps in which pixels look them up."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import warp as wp
@@ -16,12 +14,8 @@ from amiwarp.kernels import prism_view
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import camera_params
 from amiwarp.optics.models import ExactModel
-from amiwarp.simulation.description import Scene
+from amiwarp.simulation.description import Scene, SimulationValues
 from amiwarp.simulation.pictures import Placement, log_map, place_picture
-
-if TYPE_CHECKING:
-    from amiwarp.simulation.description import SimulationValues
-
 
 # Device memory for the maps of a simulation: pictures of the scene in which pixels look up their light.
 

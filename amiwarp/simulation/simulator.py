@@ -6,15 +6,17 @@ import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.events.device_events import NAMES, DeviceEvents, DeviceMemoryEvents, DeviceValues, join, wait
+from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events, EventSource, MemoryEvents
 from amiwarp.events.recording import MetadataValue, Recording
-from amiwarp.events.truth import EventTruth
+from amiwarp.events.truth import EventTruth, EventValues
 from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -27,13 +29,6 @@ from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.simulation.worlds.world_truth import RecordedTruth, chosen_instants
 from amiwarp.validation import guarded
-
-if TYPE_CHECKING:
-    import warp as wp
-
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.truth import EventValues
-
 
 # Values of a simulation: their checks, and the true parameters that they mean.
 

@@ -1,7 +1,5 @@
 """Workers that run the jobs of every study in parallel: a thread, local processes, or a Dask cluster by its address."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import importlib
@@ -11,21 +9,17 @@ import platform
 import re
 import signal
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from amiwarp._version import __version__
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import launch
 from amiwarp.validation import whole
-
-if TYPE_CHECKING:
-    from concurrent.futures import Future
-
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

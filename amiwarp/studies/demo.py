@@ -1,16 +1,15 @@
 """Demo: a recording is simulated from a picture, calibrated, compensated and reconstructed."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.brightness.event_pairs import SensorTiming
 from amiwarp.calib import Calibration, calibrate
@@ -18,6 +17,7 @@ from amiwarp.calib.calibration_events import thin
 from amiwarp.calib.model_choice import CIRCLES
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.compensation.recordings import compensate, compensate_events
+from amiwarp.events.recording import Recording
 from amiwarp.imaging import metrics
 from amiwarp.imaging.sharpness import gaussian
 from amiwarp.io import open_recording
@@ -39,7 +39,7 @@ from amiwarp.kernels.refraction import ExactParams, compensate_points
 from amiwarp.kernels.slow_pixels import find_time_constants
 from amiwarp.kernels.votes import turn_events
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting.clouds import Renderer
 from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
@@ -50,13 +50,6 @@ from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.recording import Recording
-    from amiwarp.optics.models import ExactModel
-
 
 # Kernels that the steps after a simulation need on a CPU, to be compiled before they are needed.
 #

@@ -1,7 +1,5 @@
 """Data sets that are translated by name: N-Caltech101 and MVSEC."""
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Iterator
 from dataclasses import dataclass

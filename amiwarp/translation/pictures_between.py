@@ -1,26 +1,21 @@
 """Pictures between the pictures of a sequence: by optical flow, and by the events between them."""
 
-from __future__ import annotations
-
 import contextlib
 import enum
 import math
 from collections.abc import Iterator
 from itertools import islice, pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.choices import CONTRAST
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import Events, EventSource
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.sequences import Pictures
 from amiwarp.translation.datasets import MvsecPictures
-
-if TYPE_CHECKING:
-    from amiwarp.events.events import Events, EventSource
-
 
 # Optical flow between two pictures, and pictures warped by it. OpenCV does both.
 

@@ -1,12 +1,10 @@
 """Fast pictures from events alone: brightness maps of time windows, moved as the camera turns."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +12,8 @@ from numpy.typing import NDArray
 from amiwarp.choices import CONTRAST, Sharpness, Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape, Votes, upload_events
 from amiwarp.optics.camera import Camera, CameraRotation
@@ -22,13 +22,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.simulation.motion import CameraMotion
-from amiwarp.translation.pictures_between import KnownPictures, light_of, warped
-
-if TYPE_CHECKING:
-    from amiwarp.events.events import Events
-    from amiwarp.events.recording import Recording
-    from amiwarp.translation.pictures_between import EventPictures
-
+from amiwarp.translation.pictures_between import EventPictures, KnownPictures, light_of, warped
 
 # Pictures of a camera with lens distortion or an off-centre axis, as a centred pinhole camera sees them.
 

@@ -1,21 +1,20 @@
 """Translate pictures and recordings of plain event cameras to recordings of the same scene through the prism."""
 
-from __future__ import annotations
-
 import inspect
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MetadataValue, Recording
 from amiwarp.io.formats import detect_format, open_recording
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.simulation import sequences
-from amiwarp.simulation.description import Scene, Still
+from amiwarp.simulation.description import Frames, Scene, Still
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.sensor import SensorModel
@@ -26,10 +25,6 @@ from amiwarp.translation.datasets import DataSet, MvsecPictures
 from amiwarp.translation.pictures_between import EventPictures, Interpolation, MotionPictures
 from amiwarp.translation.reconstructed_pictures import Window
 from amiwarp.validation import check_names, choice, guarded
-
-if TYPE_CHECKING:
-    from amiwarp.optics.prism import Prism
-    from amiwarp.simulation.description import Frames
 
 # What the translators read: pictures, pictures with events, or events alone, as pictures for the simulator.
 

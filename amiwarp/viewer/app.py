@@ -4,8 +4,6 @@ The window is a browser window without tabs or address bar that shows the same p
 to maintain, nothing extra to install, and the inspector works in the same way over SSH.
 """
 
-from __future__ import annotations
-
 import asyncio
 import math
 import os
@@ -19,10 +17,12 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from amiwarp.calib import Calibration
 from amiwarp.choices import View
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
 from amiwarp.io.atomic_output import check_output, interrupts_later
 from amiwarp.validation import guarded
 from amiwarp.viewer.clouds import Look, Scene
@@ -30,10 +30,6 @@ from amiwarp.viewer.inspector import Inspector, Library
 from amiwarp.viewer.layout import SETTABLE
 from amiwarp.viewer.panel import RECORDED, Panel
 from amiwarp.viewer.serve import serve
-
-if TYPE_CHECKING:
-    from amiwarp.calib import Calibration
-    from amiwarp.events.recording import Recording
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge", "brave-browser")
 """Commands of the browsers that can show a page in a window without tabs (``--app``), in order of preference."""

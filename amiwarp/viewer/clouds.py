@@ -7,31 +7,25 @@ import io
 import math
 import os
 import sys
+from collections.abc import Sequence
 from ctypes.util import find_library
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import Events
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.palette import BLUE, OFF_COLOUR, ON_COLOUR, ORANGE, PINK, VERMILION
 from amiwarp.plotting.figures import instance_colours
 from amiwarp.validation import choice
-from amiwarp.viewer.window import STORES
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
-
-    from amiwarp.events.events import Events
-    from amiwarp.viewer.images import Scale
-    from amiwarp.viewer.inspector import Inspector
-    from amiwarp.viewer.window import DisplayedWindow, DrawnTruth
-
+from amiwarp.viewer.images import Scale
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.window import STORES, DisplayedWindow, DrawnTruth
 
 # Colours for events by cause, instance and depth, and the legend of these colours.
 

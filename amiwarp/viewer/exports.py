@@ -1,17 +1,16 @@
 """Files that the page offers as downloads: images, events and films."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from amiwarp.choices import View
 from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
@@ -21,20 +20,12 @@ from amiwarp.io import RecordingWriter
 from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.io.formats import check_ending
+from amiwarp.progress import Progress
 from amiwarp.reconstruction.export import save_film
-from amiwarp.viewer.clouds import Scene, orbit_lines
-from amiwarp.viewer.window import kept
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.choices import View
-    from amiwarp.progress import Progress
-    from amiwarp.viewer.clouds import Look
-    from amiwarp.viewer.images import ShownImages
-    from amiwarp.viewer.inspector import Inspector
-    from amiwarp.viewer.window import Knobs
-
+from amiwarp.viewer.clouds import Look, Scene, orbit_lines
+from amiwarp.viewer.images import ShownImages
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.window import Knobs, kept
 
 BLOCK = 1 << 20
 """Number of events that are written at a time."""

@@ -1,15 +1,13 @@
 """Images of the shown window in different kinds, each with the scale of its values for a colour bar."""
 
-from __future__ import annotations
-
 import enum
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, MemoryEvents
@@ -17,17 +15,10 @@ from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import GAMMA, PERCENTILE
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
 from amiwarp.imaging.votes import CanvasShape, Votes
-from amiwarp.reconstruction.picture import Reconstruction
+from amiwarp.reconstruction.picture import Picture, Reconstruction
+from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.timeline import read_span
-from amiwarp.viewer.window import inside
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.reconstruction.picture import Picture
-    from amiwarp.viewer.inspector import Inspector
-    from amiwarp.viewer.window import DisplayedWindow, Knobs, LoadedWindow, Region
-
+from amiwarp.viewer.window import DisplayedWindow, Knobs, LoadedWindow, Region, inside
 
 # Selected events of the inspector's window as a recording of a smaller camera.
 

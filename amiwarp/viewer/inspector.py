@@ -1,42 +1,33 @@
 """State of the inspector without any user interface: recording, prism parameters, time window and its images."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.calib.bad_pixels import strange_pixels, stretch
 from amiwarp.calib.parameters import build_model, nominal
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import turn_between
+from amiwarp.events.encoder import Encoder, turn_between
+from amiwarp.events.events import Events
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import PERCENTILE
 from amiwarp.imaging.sharpness import random_variance
-from amiwarp.imaging.votes import upload_events
+from amiwarp.imaging.votes import UploadedEvents, upload_events
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, size_names
+from amiwarp.optics.models import MODELS, Model, size_names
 from amiwarp.reconstruction.picture import border_displacements
 from amiwarp.viewer import window
 from amiwarp.viewer.timeline import Span, read_span
 from amiwarp.viewer.window import Knobs, Selection, Source, WindowImager
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Events
-    from amiwarp.imaging.votes import UploadedEvents
-    from amiwarp.optics.models import Model
-
 
 # Region of the image that the inspector shows first: where compensation gains most sharpness.
 

@@ -1,28 +1,22 @@
 """Jobs of the inspector: estimate of the phase, calibration on what is shown, and a live stream as a recording."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import rpm_between
+from amiwarp.events.recording import Recording
+from amiwarp.live.stream.recent_events import RecentEvents
 from amiwarp.progress import Progress, silent
 from amiwarp.viewer.images import SelectedPart, select_part
+from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.window import CURVE_HALF_WIDTH, Source
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.recording import Recording
-    from amiwarp.live.stream.recent_events import RecentEvents
-    from amiwarp.viewer.inspector import Inspector
-
 
 # Estimate of the prism's phase at first sight, so that the page opens with compensated events.
 

@@ -1,24 +1,18 @@
 """Contents of the inspector's page: names, units, keys and texts, its template, and the values of its state."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.clouds import NO_ORBIT
 from amiwarp.viewer.exports import EXPORTS, FILMS
 from amiwarp.viewer.images import ImageKind
-from amiwarp.viewer.inspector import NO_ENCODER
+from amiwarp.viewer.inspector import NO_ENCODER, Inspector
+from amiwarp.viewer.jobs import CostSurface, FoundCalibration, LiveFigures
 from amiwarp.viewer.serve import Check, flag, number, one_of, read_template
-from amiwarp.viewer.window import SLIDING, Source, colours_on_offer, truth_text
-
-if TYPE_CHECKING:
-    from amiwarp.calib import Calibration
-    from amiwarp.viewer.inspector import Inspector
-    from amiwarp.viewer.jobs import CostSurface, FoundCalibration, LiveFigures
-    from amiwarp.viewer.window import DisplayedWindow
+from amiwarp.viewer.window import SLIDING, DisplayedWindow, Source, colours_on_offer, truth_text
 
 UNITS = {
     "apex": math.radians(1.0), "phase": math.radians(1.0), "clock_offset": 1.0,

@@ -1,7 +1,5 @@
 """Page of the inspector: passes input from the browser to the inspector, and the inspector's results to the browser."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math
@@ -10,29 +8,24 @@ import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
+from amiwarp.progress import Progress
 from amiwarp.viewer import clouds, exports, images, jobs, layout
 from amiwarp.viewer.images import ImageKind
-from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.inspector import Inspector, Library
 from amiwarp.viewer.layout import NAMES, UNITS
 from amiwarp.viewer.serve import finite, use_page
 from amiwarp.viewer.timeline import EventRates
 from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
-from amiwarp.viewer.window import Selection
+from amiwarp.viewer.window import DisplayedWindow, Knobs, Selection
 from amiwarp.viewer.work import SLOW, JobCancelled, JobProgress, PageWork
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from amiwarp.calib import Calibration
-    from amiwarp.progress import Progress
-    from amiwarp.viewer.inspector import Library
-    from amiwarp.viewer.window import DisplayedWindow, Knobs
 
 RECORDED = "events as recorded"
 """Title of the only cloud, if there is no motion to compensate."""

@@ -1,23 +1,16 @@
 """Timeline: event rates over a recording at any zoom, and reading of one time window."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from amiwarp.events.events import Events
+from amiwarp.events.events import Events, EventSource
+from amiwarp.events.truth import EventValues
 from amiwarp.io.file_scan import FileEvents
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.events import EventSource
-    from amiwarp.events.truth import EventValues
-
 
 # Rates of ON and OFF events over a recording at any zoom, counted once in bounded memory.
 

@@ -1,20 +1,16 @@
 """State of the inspector's page: what it shows, with which parameters; its history, and its text in the address."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.images import ImageKind
+from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.window import OTHERS, SLIDING, Knobs, Selection, Source
-
-if TYPE_CHECKING:
-    from amiwarp.viewer.inspector import Inspector
 
 LONGEST_QUERY = 2000
 """Largest length of a state as text [characters]."""

@@ -4,31 +4,25 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.calib.parameters import optical_parameters
 from amiwarp.choices import Colour, Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording, Truth
 from amiwarp.events.truth import Cause
 from amiwarp.imaging.corners import find_background_activity
 from amiwarp.imaging.sharpness import SharpnessMeter, relative_variance
 from amiwarp.imaging.votes import CanvasShape, UploadedEvents, Votes
-from amiwarp.optics.models import PHASE, size_names
+from amiwarp.optics.models import PHASE, Model, size_names
+from amiwarp.reconstruction.picture import Picture
 from amiwarp.viewer.timeline import Span
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
-
-    from amiwarp.events.recording import Recording, Truth
-    from amiwarp.optics.models import Model
-    from amiwarp.reconstruction.picture import Picture
-
 
 # Ground truth of the events that the inspector draws, read from the recording on first use.
 

@@ -1,7 +1,5 @@
 """Work of one page: its threads, jobs and updates, and the messages about their errors."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

@@ -8,14 +8,16 @@ residual each of a few likely causes would remove, were it free.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
-from amiwarp.calib.parameters import DRIFTS, LENS, RATES, widened
+from amiwarp.calib.parameters import DRIFTS, LENS, RATES, ParameterSpace, widened
 from amiwarp.calib.photometric.cost import (
     place_arguments,
     size_and_phase_directions,
@@ -24,17 +26,11 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.equations import multiply
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import CameraRotation
-from amiwarp.optics.models import predicted_error
+from amiwarp.optics.models import Model, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
-
-    from numpy.typing import NDArray
-
-    from amiwarp.calib.parameters import ParameterSpace
     from amiwarp.calib.photometric.cost import Cost
-    from amiwarp.optics.models import Model
 
     Vector = NDArray[np.float64]
 

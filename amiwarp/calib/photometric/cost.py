@@ -4,38 +4,32 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
 from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
-from amiwarp.brightness.solver import Tiles
+from amiwarp.brightness.solver import BrightnessMap, Tiles
 from amiwarp.calib.calibration_events import EventsAhead
 from amiwarp.calib.nlopt_solver import SearchStage, best_of
-from amiwarp.calib.parameters import RATES
-from amiwarp.calib.settings import GAUSS_NEWTON
+from amiwarp.calib.parameters import RATES, ParameterSpace
+from amiwarp.calib.settings import GAUSS_NEWTON, PhotometricSettings
 from amiwarp.calib.sharpness import reach
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import MemoryEvents
+from amiwarp.events.recording import Recording
+from amiwarp.imaging.votes import Image
 from amiwarp.kernels.iwe import sum_segments
 from amiwarp.kernels.launch import launch
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from numpy.typing import NDArray
-
-    from amiwarp.brightness.solver import BrightnessMap
-    from amiwarp.calib.parameters import ParameterSpace
-    from amiwarp.calib.settings import PhotometricSettings
     from amiwarp.calib.sharpness import Search
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.recording import Recording
-    from amiwarp.imaging.votes import Image
 
     Vector = NDArray[np.float64]
 

@@ -3,19 +3,14 @@
 A map is fitted to pulses that both clocks recorded, or to round trips of messages.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
 
 WRAP = 1 << 32
 """Period of the controller's 32-bit clock [us]."""

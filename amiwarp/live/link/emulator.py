@@ -11,25 +11,19 @@ import re
 import select
 import threading
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
 from amiwarp.live.link import protocol
 from amiwarp.live.link.clocks import WRAP, monotonic_us
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import ArrayLike, NDArray
-
-    from amiwarp.events.encoder import Encoder
-
 
 # Rotation of the emulated prism: by a simulated motor, or as in a recording.
 

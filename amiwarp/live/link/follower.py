@@ -1,25 +1,17 @@
 """Conversion of the controller's bytes to times, angles, pulses and messages, without a port or a thread."""
 
-from __future__ import annotations
-
 import enum
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.live.link import protocol
 from amiwarp.live.link.clocks import FEWEST_PAIRS, WRAP, ClockMap, UnwrappedClock, fit_to_round_trips
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from numpy.typing import NDArray
-
 
 # Absolute prism angle from encoder counts and index pulses, with detection of encoder faults.
 

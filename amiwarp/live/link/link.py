@@ -7,20 +7,23 @@ import errno
 import re
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.link.follower import Follower
-from amiwarp.live.link.protocol import REFUSALS, FrameDecoder, Message, Ping, SetCounts, SetSpeed, Stop, encode
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from amiwarp.live.link.clocks import ClockMap
-    from amiwarp.live.link.follower import LinkUpdate
-    from amiwarp.live.link.protocol import ControllerStatus
-
+from amiwarp.live.link.clocks import ClockMap, monotonic_us
+from amiwarp.live.link.follower import Follower, LinkUpdate
+from amiwarp.live.link.protocol import (
+    REFUSALS,
+    ControllerStatus,
+    FrameDecoder,
+    Message,
+    Ping,
+    SetCounts,
+    SetSpeed,
+    Stop,
+    encode,
+)
 
 # Serial ports, opened by name, by USB id, or by detection of the controller.
 

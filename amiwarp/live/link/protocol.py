@@ -4,8 +4,6 @@ A frame is a COBS-encoded packet, closed by a zero byte. A packet is version, ty
 in little-endian byte order. A simple controller may send text lines ``t_us,count`` instead.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 import zlib

@@ -15,16 +15,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events, held_bytes
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from amiwarp.compensation.streams import Compensated
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.encoder_stream import EncoderStream
     from amiwarp.optics.models import Model
 
 

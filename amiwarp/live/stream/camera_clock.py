@@ -8,13 +8,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.live.link.clocks import FEWEST_PAIRS, ClockMap, fit_to_pulses
+from amiwarp.live.link.link import Link
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from amiwarp.live.link.link import Link
     from amiwarp.live.stream.packets import Source
 
 

@@ -8,24 +8,20 @@ import time
 from collections.abc import Callable, Iterator
 from datetime import timedelta
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
 from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.link.emulator import Controller, Played
 from amiwarp.live.stream.packets import Packet, encode_events, encode_hello, encode_triggers, make_packet
 from amiwarp.live.stream.sockets import SocketSink
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.recording import Recording
-    from amiwarp.live.link.emulator import Controller, Played
-    from amiwarp.optics.camera import Camera
-    from amiwarp.optics.prism import NominalPrism
-
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import NominalPrism
 
 # Cameras: iniVation's through dv-processing, Prophesee's through Metavision or OpenEB. Both libraries are optional.
 #

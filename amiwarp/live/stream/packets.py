@@ -1,13 +1,11 @@
 """Packets of a live stream: in memory, and encoded as in ``docs/reference/stream-format.md``."""
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn, Protocol, TypeAlias
+from typing import Any, NoReturn, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +14,8 @@ from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, held_bytes
 from amiwarp.io.camera_files import camera_attributes, prism_attributes, read_camera, read_prism
-from amiwarp.optics.camera import LARGEST_SIZE
-
-if TYPE_CHECKING:
-    from amiwarp.optics.camera import Camera
-    from amiwarp.optics.prism import NominalPrism
-
+from amiwarp.optics.camera import LARGEST_SIZE, Camera
+from amiwarp.optics.prism import NominalPrism
 
 # Validation of the JSON of a hello message, the first message of a stream.
 #

@@ -1,25 +1,19 @@
 """Check during a stream that the prism's phase has not changed since the calibration."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from amiwarp.calib import calibrate
+from amiwarp.calib.result import Calibration
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI
+from amiwarp.events.encoder import TWO_PI, Encoder
+from amiwarp.events.encoder_stream import EncoderStream
 from amiwarp.events.events import Events, MemoryEvents, held_bytes
 from amiwarp.events.recording import Recording
-
-if TYPE_CHECKING:
-    from amiwarp.calib.result import Calibration
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.encoder_stream import EncoderStream
 
 SEARCH_RAD = math.radians(20.0)
 """Half width of the search about the calibrated phase [rad]. A phase outside is found at the edge of this range, and

@@ -1,32 +1,26 @@
 """The last seconds of a stream in memory, available as a recording at any time."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.encoder_stream import start_of_last_run
 from amiwarp.events.events import OVERHEAD, Events, MemoryEvents, held_bytes
 from amiwarp.events.recording import Recording
+from amiwarp.live.link.link import Link
+from amiwarp.live.stream.packets import Source
 from amiwarp.live.stream.queues import Policy
 from amiwarp.live.stream.session import Session, SessionStatus
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.live.link.link import Link
-    from amiwarp.live.stream.packets import Source
-    from amiwarp.optics.camera import Camera
-    from amiwarp.optics.prism import NominalPrism
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import NominalPrism
 
 SECONDS, MOST_BYTES = 2.0, 1 << 27
 """Limits of the latest events that are kept: their duration [s] and their memory [bytes], about eight million events.

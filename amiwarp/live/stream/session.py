@@ -1,7 +1,5 @@
 """Live session: takes events from a source, compensates them, and gives them to files, servers and callbacks."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time
@@ -9,35 +7,27 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from amiwarp.calib.result import Calibration
 from amiwarp.choices import Sharpness
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
 from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import held_bytes
+from amiwarp.events.events import Events, held_bytes
 from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape
+from amiwarp.io.live_writer import LiveWriter
 from amiwarp.live.link.clocks import ClockMap, monotonic_us
+from amiwarp.live.link.follower import LinkUpdate
+from amiwarp.live.link.link import Link
+from amiwarp.live.stream.adaptive import SpeedKeeper
 from amiwarp.live.stream.camera_clock import CameraClock, clock_offset
-from amiwarp.live.stream.packets import NO_TIMES
+from amiwarp.live.stream.packets import NO_TIMES, Packet, Source
 from amiwarp.live.stream.phase_check import PhaseCheck
 from amiwarp.live.stream.queues import BackgroundWorker, EventSorter, PacketQueue, Policy
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.calib.result import Calibration
-    from amiwarp.events.encoder_stream import EncoderStream
-    from amiwarp.events.events import Events
-    from amiwarp.io.live_writer import LiveWriter
-    from amiwarp.live.link.clocks import ClockMap
-    from amiwarp.live.link.follower import LinkUpdate
-    from amiwarp.live.link.link import Link
-    from amiwarp.live.stream.adaptive import SpeedKeeper
-    from amiwarp.live.stream.packets import Packet, Source
-
 
 # Consumers of a session's data: files and servers, each served by a background thread.
 

@@ -15,17 +15,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import Events
 from amiwarp.live.stream.packets import encode_encoder, encode_end, encode_events
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from amiwarp.events.events import Events
-
 
 # Connections over TCP and Unix sockets: connecting, listening, accepting.
 

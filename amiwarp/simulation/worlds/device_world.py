@@ -1,7 +1,5 @@
 """Upload of a simulated world to a device: meshes, textures, lights, and poses of moving bodies at given instants."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, cast

@@ -1,10 +1,8 @@
 """What is seen of a simulated world: surfaces that rays hit, maps of log intensity, and the light of each pixel."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -16,16 +14,12 @@ from amiwarp.kernels import world as kernels
 from amiwarp.kernels import world_rays
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera, camera_params
+from amiwarp.simulation.description import SimulationValues
 from amiwarp.simulation.pictures import DARK, Placement
 from amiwarp.simulation.scenery import SMALLEST_COSINE, TEXELS_PER_PIXEL, MapSlots
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.simulation.worlds.world import Body
-
-if TYPE_CHECKING:
-    from amiwarp.simulation.description import SimulationValues
-    from amiwarp.simulation.worlds.world import WorldScene
-
+from amiwarp.simulation.worlds.world import Body, WorldScene
 
 SMALLEST_LAUNCH = 1 << 10
 """Smallest number of rays that one CPU thread handles."""

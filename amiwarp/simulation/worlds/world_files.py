@@ -1,7 +1,5 @@
 """Reader of world files: TOML or JSON files that list meshes, materials, trajectories, lights and a sky."""
 
-from __future__ import annotations
-
 import importlib.util
 import io
 import urllib.parse
@@ -9,10 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from trimesh import Trimesh
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.input_files import errors_name, note_input, open_input
@@ -23,10 +22,6 @@ from amiwarp.simulation.worlds.named.catalogue import named_world
 from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
 from amiwarp.simulation.worlds.world import Body, Lamp, Material, Mesh, Sky, Sun, World
 from amiwarp.validation import guarded, one_of, real, shown
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
-
 
 # Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh. Colours become luminance.
 #

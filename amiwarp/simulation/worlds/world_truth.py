@@ -1,11 +1,9 @@
 """Ground truth of a simulated world: at instants, and next to the recorded events."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -14,19 +12,24 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import TIME_LIMIT
 from amiwarp.events.recording import Truth
-from amiwarp.events.truth import EventTruth, FrameTruth, MemoryFrames, MemoryMasks, Poses, WorldLabels, as_poses
+from amiwarp.events.truth import (
+    EventTruth,
+    EventValues,
+    FrameTruth,
+    MemoryFrames,
+    MemoryMasks,
+    Poses,
+    WorldLabels,
+    as_poses,
+)
 from amiwarp.kernels import prism_view
 from amiwarp.optics.models import ExactModel, wrap_angle
+from amiwarp.simulation.description import SimulationValues
 from amiwarp.simulation.scenery import KnownPixels
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.renderer import SurfaceView, WorldSight, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.validation import array, guarded, real, shown
-
-if TYPE_CHECKING:
-    from amiwarp.events.truth import EventValues
-    from amiwarp.simulation.description import SimulationValues
-
 
 # Ground truth of a simulated world at an instant: depth, normals, instances, optical flow and luminance.
 

@@ -4,8 +4,6 @@ Each measured setting is a row of the chart. Folding merges the events of all tu
 and bin of the prism angle. Each result is compared with the ground truth.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

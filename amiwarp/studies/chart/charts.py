@@ -11,12 +11,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from amiwarp.calib.presets import Preset
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.palette import BLACK, BLUE, GREEN, MODEL_COLOURS, ORANGE, PINK, SKY_BLUE, VERMILION
 from amiwarp.imaging.votes import TURNS
 from amiwarp.io.atomic_output import check_output, make_folder, write_text
@@ -37,10 +38,6 @@ from amiwarp.studies.chart.rows import (
 )
 from amiwarp.studies.cluster import machine, versions
 from amiwarp.studies.demo import Demo, simulation
-
-if TYPE_CHECKING:
-    from amiwarp.events.recording import Recording
-
 
 # Drawing of the speed-error charts as PNG and SVG.
 #

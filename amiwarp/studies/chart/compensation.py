@@ -12,28 +12,24 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
+from amiwarp.calib import Calibration
 from amiwarp.calib.presets import simplified
 from amiwarp.choices import Vote
 from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.votes import TURNS, CanvasShape, Image, Votes, upload_events
+from amiwarp.events.events import Events
+from amiwarp.imaging.votes import TURNS, CanvasShape, Image, UploadedEvents, Votes, upload_events
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.atomic_output import scratch_folder
 from amiwarp.optics.models import Model, rungs, wrap_angle
 from amiwarp.progress import Progress
 from amiwarp.studies.chart.rows import KnownRecording, Row, Task, exact_image, exact_places, measure, raw_places, rms
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.calib import Calibration
-    from amiwarp.events.events import Events
-    from amiwarp.imaging.votes import UploadedEvents
 
 IMAGE, FILE = "image of events", "file to file"
 """Names of the two measured jobs, an image and a file. Rows of one job can be compared and share a Pareto front."""

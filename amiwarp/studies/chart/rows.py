@@ -8,28 +8,22 @@ import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.calib import Calibration
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import MemoryEvents
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import truth_model
 from amiwarp.memory import only_new_garbage, release_memory
-from amiwarp.optics.models import axis_rotation
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, axis_rotation
 from amiwarp.optics.prism import FlatSide
 from amiwarp.progress import Progress
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Events
-    from amiwarp.optics.camera import Camera
-    from amiwarp.optics.models import ExactModel
-
 
 # Ground truth of the charts: the recording's true parameters, and the exact model in float64.
 

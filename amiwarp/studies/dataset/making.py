@@ -22,7 +22,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from amiwarp._version import __version__
 from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
@@ -33,7 +33,7 @@ from amiwarp.io.json_files import LARGEST_INTEGER, build
 from amiwarp.io.recorded_dataset import FORMAT, MANIFEST, VERSION
 from amiwarp.io.sealed_json import append_line, create_journal, read_journal
 from amiwarp.kernels import launch
-from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.progress import Progress, silent
 from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion
@@ -63,10 +63,6 @@ from amiwarp.studies.dataset.specification import (
 )
 from amiwarp.translation.translator import translation
 from amiwarp.validation import guarded, real, shown, whole
-
-if TYPE_CHECKING:
-    from amiwarp.optics.camera import Camera
-
 
 # Recordings of a data set: every combination of source, trajectory, prism, speed, sensor and seed.
 

@@ -1,7 +1,5 @@
 """Specification of a data set: a TOML file that names sources, prisms, speeds, sensors, seeds and splits."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import fnmatch

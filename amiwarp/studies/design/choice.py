@@ -1,17 +1,17 @@
 """Events, blur, refraction model and window for every apex angle and speed, and the recommended choice."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.calib.model_choice import QUANTISATION_PX, SHARE
 from amiwarp.errors import AmiwarpError
+from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import EllipseModel, ExactModel, Model, predicted_error, rungs
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, part, silent
@@ -20,12 +20,6 @@ from amiwarp.simulation.motion import PrismMotion
 from amiwarp.simulation.scenery import place_scene, seen_bearings
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.optics.camera import Camera
-
 
 # Effect of a prism on a camera's image: radii of the pixels' orbits, and error of each refraction model.
 

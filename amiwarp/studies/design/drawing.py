@@ -1,21 +1,16 @@
 """Chart of a design study: error and event rate over the apex angle, and a table of all apex angles and speeds."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from amiwarp.imaging.palette import MODEL_COLOURS, VERMILION
 from amiwarp.optics.models import rungs
 from amiwarp.plotting import figures
-from amiwarp.studies.design.choice import LEAST_SWING, degrees, headline
-
-if TYPE_CHECKING:
-    from amiwarp.studies.design.choice import Choice, Design
+from amiwarp.studies.design.choice import LEAST_SWING, Choice, Design, degrees, headline
 
 WIDTH, PANEL, LEFT, RIGHT, BETWEEN = 12.0, 3.9, 0.85, 1.15, 2.1
 """Figure width, panel height, left and right margins, and gap between panels, which contains the names of the lines

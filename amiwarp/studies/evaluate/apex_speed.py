@@ -1,7 +1,5 @@
 """Evaluation of apex and speed: blur of edges and event rate, for sensors of several bandwidths."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal, TypedDict

@@ -4,22 +4,16 @@ Source: G. Gallego, H. Rebecq and D. Scaramuzza, "A Unifying Contrast Maximizati
 2018. Coordinates may be those of a sensor, or compensated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.events.events import Events
 from amiwarp.imaging.votes import CanvasShape, Votes
-from amiwarp.optics.camera import CameraRotation
+from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.studies.evaluate.measures import smoothed
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.optics.camera import Camera
 
 SMOOTHING_PX = (5.0, 1.0)
 """Standard deviations of the Gaussian that smooths the image, from coarse to fine [px]."""

@@ -1,11 +1,9 @@
 """Evaluation of corners: how long corner tracks live, and how far they are from the truth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 import warp as wp
@@ -13,19 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.choices import CornerMethod
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.corners import detect_corners
 from amiwarp.kernels import corners, launch
+from amiwarp.optics.camera import Camera
+from amiwarp.simulation.worlds.trajectory import Trajectory
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.truth import FrameTruth
-    from amiwarp.optics.camera import Camera
-    from amiwarp.simulation.worlds.trajectory import Trajectory
-
 
 # Tracks of corner events, and their lifetime, error and update rate against truth.
 

@@ -1,29 +1,22 @@
 """Evaluation of edges: event images against the Canny edges of the grey picture and the edges of the geometry."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
+from typing import Annotated, Any, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
+from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.iwe import iwe
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.measures import library
 from amiwarp.studies.evaluate.report import CHANCE
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.truth import FrameTruth
-
 
 # Agreement of edge pixels with true edges: one-to-one matches within a tolerance, precision, recall and F-score.
 

@@ -1,23 +1,19 @@
 """Evaluation of fading: event rate of parts of the image over time, where the camera's motion cancels the prism's."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, TypedDict
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.prism import Prism
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 from amiwarp.validation import whole
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 TITLE = "Perceptual fading"
 PROTOCOL = (

@@ -1,17 +1,18 @@
 """Evaluation of optical flow on objects that do not move."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.events import Events
+from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.iwe import iwe
+from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.simulation.pictures import DARK
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.contrast_motion import (
@@ -25,14 +26,6 @@ from amiwarp.studies.evaluate.contrast_motion import (
 )
 from amiwarp.studies.evaluate.measures import library
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.events.events import Events
-    from amiwarp.events.truth import FrameTruth
-    from amiwarp.optics.camera import Camera, CameraRotation
-
 
 # Optical flow from events: dense inverse search between event images, and contrast maximisation per tile.
 

@@ -1,7 +1,5 @@
 """Quality of pictures, and what several evaluations use: optional libraries, and Gaussian smoothing."""
 
-from __future__ import annotations
-
 import importlib
 from dataclasses import dataclass
 from functools import cache

@@ -1,12 +1,10 @@
 """Evaluation of pictures that are reconstructed from events."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
+from typing import Annotated, Any, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
+from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import CameraRotation
 from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism
@@ -24,10 +23,6 @@ from amiwarp.studies.evaluate.contrast_motion import estimate_rotation
 from amiwarp.studies.evaluate.measures import BLOCK, displayed, fitted, niqe, similarity
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 from amiwarp.validation import real
-
-if TYPE_CHECKING:
-    from amiwarp.events.recording import Recording
-
 
 # Grey pictures of a stream: by our own reconstruction, or by a given function such as a learned one.
 

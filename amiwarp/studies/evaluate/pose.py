@@ -1,7 +1,5 @@
 """Evaluation of human pose over the rate of the pictures, with an adapter for detectors."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypedDict
 

@@ -1,16 +1,15 @@
 """Evaluation of the segmentation of a ball that is thrown before a moving camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
+from amiwarp.optics.camera import Camera
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.contrast_motion import (
     MOST_LOCAL,
@@ -25,12 +24,6 @@ from amiwarp.studies.evaluate.contrast_motion import (
 from amiwarp.studies.evaluate.flow import moving_instances
 from amiwarp.studies.evaluate.measures import library
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.optics.camera import Camera
-
 
 # Segmentation of moving bodies: what stays blurred after the camera's motion is compensated is clustered.
 #

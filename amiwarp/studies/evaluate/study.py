@@ -12,20 +12,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib import Settings as CalibrationSettings
-from amiwarp.calib import calibrate
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
-from amiwarp.events.truth import EventTruth
+from amiwarp.events.recording import Recording
+from amiwarp.events.truth import EventTruth, FrameTruth
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.models import ExactModel, Model
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.description import Scene
 from amiwarp.simulation.motion import PrismMotion
@@ -35,15 +37,6 @@ from amiwarp.simulation.worlds.named.catalogue import named_world
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.simulation.worlds.world_truth import TruthRenderer
 from amiwarp.validation import real, whole
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from amiwarp.calib import Calibration
-    from amiwarp.events.recording import Recording
-    from amiwarp.events.truth import FrameTruth
-    from amiwarp.optics.models import Model
-
 
 # Conditions of the evaluations, and the streams of events that are compared under each of them.
 

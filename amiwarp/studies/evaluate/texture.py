@@ -1,21 +1,16 @@
 """Evaluation of texture stability: how evenly events cover the image, and how many there are."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.events.events import Events
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.measures import smoothed
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Table
-
-if TYPE_CHECKING:
-    from amiwarp.events.events import Events
-
 
 # Evenness of events over the image: kernel density at each event's place, and its variance.
 

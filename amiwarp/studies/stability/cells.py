@@ -1,7 +1,5 @@
 """Cell of the stability study: a condition, a seed, and the result of each calibration method on that recording."""
 
-from __future__ import annotations
-
 import contextlib
 import enum
 import hashlib
@@ -11,13 +9,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache, partial
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.optimize import minimize
 
 from amiwarp._version import __version__
-from amiwarp.calib import Settings, calibrate
+from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.calib.model_choice import Places
 from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.calib.parameters import build_model
@@ -33,10 +31,6 @@ from amiwarp.progress import Progress
 from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs
 from amiwarp.studies.stability.conditions import AXES, Axis, Condition, SimulatedSample, make
 from amiwarp.validation import instance, real, whole
-
-if TYPE_CHECKING:
-    from amiwarp.calib import Calibration
-
 
 LIMIT_PX = 0.1
 """Largest model error of a successful calibration [px rms], unless the model's best fit to the truth has a large error

@@ -1,16 +1,15 @@
 """Conditions of the stability study: everything that determines a simulated recording."""
 
-from __future__ import annotations
-
 import enum
 import hashlib
 import json
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.events import Events, MemoryEvents
@@ -21,10 +20,6 @@ from amiwarp.simulation.description import Scene, Still
 from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
 
 # Scenes of the stability study, drawn from a seed: from a dense texture to a blank wall.
 

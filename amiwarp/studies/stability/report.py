@@ -1,7 +1,5 @@
 """Report of the stability study: rates along each axis, aims, a summary, tables and figures."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Built-in world ``ball``: a ball thrown across a room that bounces off the floor and at both ends of its path."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

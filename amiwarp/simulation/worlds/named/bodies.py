@@ -1,7 +1,5 @@
 """Building blocks of the built-in worlds: shapes, textures, furniture, and trajectories of the camera."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Built-in world ``corridor``: doors, notices, pillars, pipes and lights that repeat into the distance."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from amiwarp.simulation.worlds.named import bodies as parts

@@ -1,7 +1,5 @@
 """Built-in world ``desk``: a screen, a keyboard, printed pages, books, pens and a mug, seen from the chair."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from amiwarp.simulation.worlds.named import bodies as parts

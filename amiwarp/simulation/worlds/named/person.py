@@ -1,7 +1,5 @@
 """Built-in world ``person``: a figure of capsules and ellipsoids that walks in a circle in a hall."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

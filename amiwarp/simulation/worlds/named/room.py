@@ -1,7 +1,5 @@
 """Built-in world ``room``: gratings in all directions, pictures, printed pages, a table, shelves and a sofa."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from amiwarp.simulation.worlds.named import bodies as parts

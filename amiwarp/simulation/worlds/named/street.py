@@ -1,7 +1,5 @@
 """Built-in world ``street``, a small town: blocks of houses, pavements, parked cars, trees and a town hall."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
