@@ -3,6 +3,8 @@
 Each check of a single value returns it in its plain type, or raises :class:`AmiwarpError` that says what was expected.
 """
 
+from __future__ import annotations
+
 import builtins
 import collections.abc
 import contextlib
@@ -247,7 +249,9 @@ class _Parameter:
     def __init__(self, function: Any, label: str, name: str, numbers_too: bool) -> None:
         self._function, self._label, self._name = function, label, name
         self.known = set[type]()  # types of which each instance is accepted
-        words = frozenset(re.findall(r"[A-Za-z]\w*", str(function.__annotations__.get(name, "Any"))))
+        annotation = function.__annotations__.get(name, "Any")
+        assert isinstance(annotation, str), f"{function.__module__} needs: from __future__ import annotations"
+        words = frozenset(re.findall(r"[A-Za-z]\w*", annotation))
         self._number = numbers_too and words <= _NUMBERS
         self._text = numbers_too and words in _TEXT and function.__name__ == "__init__"
         plain = words <= _PLAIN and not (self._number or self._text or (numbers_too and words in _TEXTS))
@@ -259,8 +263,8 @@ class _Parameter:
     @functools.cached_property
     def _kind(self) -> Any:
         """The annotated type."""
-        annotation, names = self._function.__annotations__[self._name], self._function.__globals__
-        return eval(annotation, names, _PublicNames(names)) if isinstance(annotation, str) else annotation
+        names = self._function.__globals__
+        return eval(self._function.__annotations__[self._name], names, _PublicNames(names))
 
     def check(self, value: Any) -> Any:
         """Return the value, NumPy's numbers as plain ones; raise :class:`AmiwarpError` if it is not of the type."""

@@ -1,5 +1,7 @@
 """An optical model in one file: a wedge with cylinder power. ``test_new_model.py`` adds it and removes it again."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self

@@ -1,5 +1,7 @@
 """Maximisation of a score by NLopt's derivative-free algorithms. Only this module imports NLopt."""
 
+from __future__ import annotations
+
 import math
 import time
 from collections.abc import Callable, Sequence

@@ -1,5 +1,7 @@
 """Settings of a calibration and of its stages."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

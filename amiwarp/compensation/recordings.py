@@ -1,5 +1,7 @@
 """Motion compensation of recordings."""
 
+from __future__ import annotations
+
 import contextlib
 import os
 import threading

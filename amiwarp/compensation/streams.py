@@ -1,5 +1,7 @@
 """Motion compensation of streams of events and encoder samples."""
 
+from __future__ import annotations
+
 import ctypes
 import math
 from collections import deque

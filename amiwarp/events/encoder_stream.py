@@ -1,5 +1,7 @@
 """Encoder samples of a live rig: a buffer of the latest samples, with extrapolation after the last one."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 

@@ -1,5 +1,7 @@
 """A recording: events with their encoder, camera, prism, the records of other sensors and, if simulated, the truth."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeAlias

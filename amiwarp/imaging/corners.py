@@ -1,5 +1,7 @@
 """Corners among events: eFAST and Arc*."""
 
+from __future__ import annotations
+
 from typing import Any, overload
 
 import numpy as np

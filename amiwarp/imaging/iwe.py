@@ -3,6 +3,8 @@
 The votes are in :mod:`amiwarp.imaging.votes`.
 """
 
+from __future__ import annotations
+
 from typing import Any, overload
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Quality metrics of compensation and of pictures: edge blur, contrast, entropy, error against ground truth."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

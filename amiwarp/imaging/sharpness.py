@@ -1,5 +1,7 @@
 """Sharpness of an image of warped events: measures with one signature, and the directions of its edges."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from functools import cached_property

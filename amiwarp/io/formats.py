@@ -3,6 +3,8 @@
 A new format is a module with its functions, and its rows in the tables of this file.
 """
 
+from __future__ import annotations
+
 import enum
 import importlib
 import os

@@ -1,5 +1,7 @@
 """Data sets of recordings in a folder with a manifest, as ``amiwarp dataset`` writes them."""
 
+from __future__ import annotations
+
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping

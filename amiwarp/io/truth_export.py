@@ -3,6 +3,8 @@
 ``docs/reference/recording-format.md`` describes the conventions.
 """
 
+from __future__ import annotations
+
 import contextlib
 import itertools
 import os

@@ -3,6 +3,8 @@
 This is the glass only. Its motion is that of the encoder, :mod:`amiwarp.events.encoder`.
 """
 
+from __future__ import annotations
+
 import enum
 import math
 from dataclasses import dataclass

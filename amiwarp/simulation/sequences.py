@@ -1,5 +1,7 @@
 """Picture sequences with times: folders of pictures, arrays and videos."""
 
+from __future__ import annotations
+
 import csv
 import io
 import re

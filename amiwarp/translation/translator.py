@@ -1,5 +1,7 @@
 """Translate pictures and recordings of plain event cameras to recordings of the same scene through the prism."""
 
+from __future__ import annotations
+
 import inspect
 import math
 from collections.abc import Mapping

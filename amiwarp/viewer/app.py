@@ -4,6 +4,8 @@ The window is a browser window without tabs or address bar that shows the same p
 to maintain, nothing extra to install, and the inspector works in the same way over SSH.
 """
 
+from __future__ import annotations
+
 import asyncio
 import math
 import os

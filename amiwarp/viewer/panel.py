@@ -1,5 +1,7 @@
 """Page of the inspector: passes input from the browser to the inspector, and the inspector's results to the browser."""
 
+from __future__ import annotations
+
 import asyncio
 import contextlib
 import math

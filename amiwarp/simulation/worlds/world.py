@@ -1,5 +1,7 @@
 """Content of a simulated world: bodies with meshes and materials, lights and a sky."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

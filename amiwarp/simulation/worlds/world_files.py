@@ -1,5 +1,7 @@
 """Reader of world files: TOML or JSON files that list meshes, materials, trajectories, lights and a sky."""
 
+from __future__ import annotations
+
 import importlib.util
 import io
 import urllib.parse

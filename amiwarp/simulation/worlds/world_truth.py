@@ -1,5 +1,7 @@
 """Ground truth of a simulated world: at instants, and next to the recorded events."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace

@@ -1,5 +1,7 @@
 """Run of the evaluations on local processes or a cluster. Finished cells are kept."""
 
+from __future__ import annotations
+
 import contextlib
 import json
 import time

@@ -1,5 +1,7 @@
 """Catalogue of the built-in worlds, and the function that builds one by name."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 
