@@ -286,7 +286,7 @@ def run_shares(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 
 def run_videos(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    from amiwarp.simulation.sequences import open_pictures
+    from amiwarp.simulation.pictures import open_pictures
 
     for clip in sorted(p for p in args.folder.iterdir() if p.suffix in (".npy", ".mp4")):
         frames = open_pictures(clip, fps=240.0 if "240fps" in clip.name else 25.0 if clip.suffix == ".npy" else None)

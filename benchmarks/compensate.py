@@ -56,8 +56,7 @@ MOVED = {"x": np.float32, "y": np.float32, "t": np.int64, "p": np.uint8, "inside
 
 
 def half_a_second() -> Events:
-    from amiwarp.simulation.description import Scene
-    from amiwarp.simulation.motion import EncoderModel
+    from amiwarp.simulation.description import EncoderModel, Scene
     from amiwarp.simulation.simulator import Simulation
 
     scene = Scene.from_picture(blocks_picture())

@@ -22,8 +22,8 @@ import numpy as np
 import warp as wp
 
 from amiwarp import Camera, EncoderModel, ExactModel, Prism, Scene, Simulation
-from amiwarp.simulation.engine import Engine
 from amiwarp.simulation.scenery import step_us
+from amiwarp.simulation.simulator import Engine
 
 WIDTH, HEIGHT, FOV, INDEX = 640, 480, math.radians(60.0), 1.55
 

@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 
 from amiwarp import Camera, Events, EventTruth, Prism, Scene, Simulation, TruthRenderer, WorldScene, named_world
-from amiwarp.simulation.engine import Engine
+from amiwarp.simulation.simulator import Engine
 
 CAMERA, PRISM = Camera.from_fov(640, 480, math.radians(60.0)), Prism(math.radians(1.0))
 WIDE = math.radians(72.0)

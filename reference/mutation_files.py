@@ -56,8 +56,7 @@ from amiwarp.events.truth import MAPS
 from amiwarp.io import read_encoder_csv
 from amiwarp.io.sealed_json import append_line, sealed
 from amiwarp.io.text import read_calib
-from amiwarp.simulation.pictures import read_picture
-from amiwarp.simulation.sequences import _read_times, open_pictures
+from amiwarp.simulation.pictures import _read_times, open_pictures, read_picture
 from amiwarp.simulation.worlds.world_files import load_mesh
 from amiwarp.studies import stability
 from amiwarp.studies.dataset.making import JOURNAL, Journal, Made, list_items

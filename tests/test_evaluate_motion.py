@@ -26,7 +26,7 @@ from amiwarp import (
     World,
     WorldScene,
 )
-from amiwarp.simulation.worlds.trajectory import looking_at
+from amiwarp.simulation.worlds.world import looking_at
 from amiwarp.studies.evaluate import contrast_motion, flow, pictures, pose, segmentation
 from amiwarp.studies.evaluate.contrast_motion import estimate_rotation, rotated_back
 from amiwarp.studies.evaluate.flow import flow_by_contrast, flow_by_dis, flow_error, rotation_flow

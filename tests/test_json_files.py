@@ -14,7 +14,7 @@ from amiwarp import AmiwarpError, Calibration, Camera
 from amiwarp.calib.presets import Preset
 from amiwarp.cli.options import read_camera
 from amiwarp.io.json_files import MOST_BYTES, read_json
-from amiwarp.simulation.sequences import open_pictures
+from amiwarp.simulation.pictures import open_pictures
 
 READERS: dict[str, Callable[[Path], Any]] = {
     "calibration": Calibration.load,

@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 from amiwarp import AmiwarpError, Camera, Mesh, Trajectory, World, named_world
 from amiwarp.kernels import world as world_maps
 from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS, ball, bodies, room
+from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS, bodies, catalogue
 from amiwarp.simulation.worlds.named import person as gait
-from amiwarp.simulation.worlds.renderer import MapRenderer, device_pose, pixel_rays, surfaces_at
+from amiwarp.simulation.worlds.renderer import DeviceWorld, MapRenderer, device_pose, pixel_rays, surfaces_at
 
 FOV = math.radians(60.0)
 ALL_ROUND = [Rotation.from_rotvec(v).as_matrix() for v in np.pi / 2 * np.array(
@@ -175,7 +174,7 @@ def test_wrong_arguments(arguments: tuple[Any, ...], message: str) -> None:
 
 def motion_of(kind: str, name: str = "room") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Displacements [m] and turns [rad] of a camera against their means, 40 s at 100 per second."""
-    trajectory = bodies.camera_trajectory(room.VIEW, kind, 40.0, np.random.default_rng(3))
+    trajectory = bodies.camera_trajectory(catalogue.ROOM_VIEW, kind, 40.0, np.random.default_rng(3))
     rotation, position = trajectory.poses(np.arange(4000) / 100.0)
     turns = Rotation.from_matrix(rotation[0].T @ rotation).as_rotvec()
     return position - position.mean(axis=0), turns - turns.mean(axis=0)
@@ -234,14 +233,14 @@ def test_cameras_walk(name: str) -> None:
 
 
 def test_the_ball_falls_as_balls_do() -> None:
-    t, along, height = ball.flight(4.0)
-    free = np.flatnonzero(height <= ball.RADIUS)[0] - 2
+    t, along, height = catalogue.flight(4.0)
+    free = np.flatnonzero(height <= catalogue.BALL_RADIUS)[0] - 2
     assert t[free] > 0.8
     fall = np.diff(height[:free], 2) / np.diff(t)[0] ** 2
-    np.testing.assert_allclose(fall, -ball.GRAVITY, rtol=0, atol=1e-3)
-    assert height.min() >= ball.RADIUS
-    assert height.max() < room.SIZE[2] - ball.RADIUS
-    assert np.abs(along).max() < ball.LENGTH + 0.02
+    np.testing.assert_allclose(fall, -catalogue.GRAVITY, rtol=0, atol=1e-3)
+    assert height.min() >= catalogue.BALL_RADIUS
+    assert height.max() < catalogue.ROOM_SIZE[2] - catalogue.BALL_RADIUS
+    assert np.abs(along).max() < catalogue.PATH_HALF_LENGTH + 0.02
 
 
 def test_the_ball_is_seen_all_the_way() -> None:
@@ -273,7 +272,7 @@ def test_the_ball_touches_nothing_on_its_way() -> None:
         if body.name not in ("ball", "floor", "rug"):
             vertices = np.asarray(body.mesh.vertices)
             nearest = np.linalg.norm(vertices[:, None] - places[None], axis=2).min()
-            assert nearest > ball.RADIUS, body.name
+            assert nearest > catalogue.BALL_RADIUS, body.name
 
 
 def test_joints_of_the_person() -> None:

@@ -18,8 +18,7 @@ from amiwarp.io.input_files import check_regular
 from amiwarp.io.json_files import read_toml
 from amiwarp.io.sealed_json import read_journal
 from amiwarp.io.text import read_calib
-from amiwarp.simulation.pictures import read_picture
-from amiwarp.simulation.sequences import open_pictures
+from amiwarp.simulation.pictures import open_pictures, read_picture
 from amiwarp.studies.chart.charts import Charts
 from reference.io_samples import SIZE, make_events, write_text
 

@@ -184,7 +184,7 @@ def test_chunks_and_room_do_not_matter_with_everything_on(
 ) -> None:
     simulation = seen_through_prism(EVERYTHING, device)
     whole, points = events_of(simulation)
-    monkeypatch.setattr("amiwarp.simulation.engine.EVENTS_PER_PIXEL", 1)  # runs out of room and starts over
+    monkeypatch.setattr("amiwarp.simulation.simulator.EVENTS_PER_PIXEL", 1)  # runs out of room and starts over
     parts, part_points = events_of(simulation, chunk_us)
     same_events(whole, parts)
     np.testing.assert_array_equal(points, part_points)
@@ -358,7 +358,7 @@ def test_a_recording_stores_the_sensor() -> None:
 
 def test_causes_of_noise_are_kept(device: str) -> None:
     """A leak in a piece of a step is recognised, and so is a hot pixel in a sensor with uneven noise."""
-    from amiwarp.simulation.engine import Engine
+    from amiwarp.simulation.simulator import Engine
 
     sensor = quiet_sensor(
         leak_hz=100.0, cutoff_hz=300.0, shot_noise_hz=10.0, hot_fraction=0.1, hot_hz=50.0, noise_rate_cov_decades=0.3

@@ -181,8 +181,8 @@ def test_chunks_do_not_matter(device: str, chunk_us: int) -> None:
 
 def test_threads_and_room_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     many = base().run()
-    monkeypatch.setattr("amiwarp.simulation.engine.CPU_RUN", 100)
-    monkeypatch.setattr("amiwarp.simulation.engine.EVENTS_PER_PIXEL", 1)  # too small, so the run is repeated
+    monkeypatch.setattr("amiwarp.simulation.simulator.CPU_RUN", 100)
+    monkeypatch.setattr("amiwarp.simulation.simulator.EVENTS_PER_PIXEL", 1)  # too small, so the run is repeated
     monkeypatch.setattr(launching, "cpu_threads", lambda: 1)
     assert same(many, base().run())
 

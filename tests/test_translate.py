@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from amiwarp import AmiwarpError, Camera, Events, ExactModel, Prism, Recording, SensorModel, translate
-from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.sequences import open_pictures
+from amiwarp.simulation.pictures import DARK, open_pictures
 from amiwarp.translation.translator import translation
 
 CLEAR = Prism(0.0, 1.5)  # no deflection

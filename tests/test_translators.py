@@ -36,8 +36,7 @@ from amiwarp import (
 )
 from amiwarp.cli.app import app
 from amiwarp.events.truth import MemoryMasks
-from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.sequences import open_pictures
+from amiwarp.simulation.pictures import DARK, open_pictures
 from amiwarp.translation.datasets import SACCADE_US, SACCADES_PX, open_mvsec, saccades
 from amiwarp.translation.pictures_between import READ_US, EventPictures, MotionPictures, PicturePair
 from amiwarp.translation.reconstructed_pictures import find_motion

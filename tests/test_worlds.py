@@ -28,10 +28,9 @@ from amiwarp import (
     World,
     WorldScene,
 )
-from amiwarp.simulation.engine import Engine
-from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.renderer import WorldMapRing, pixel_rays, surfaces_at
-from amiwarp.simulation.worlds.trajectory import looking_at
+from amiwarp.simulation.simulator import Engine
+from amiwarp.simulation.worlds.renderer import DeviceWorld, WorldMapRing, pixel_rays, surfaces_at
+from amiwarp.simulation.worlds.world import looking_at
 from reference import optics as oracle
 
 CAMERA = Camera.from_fov(64, 48, math.radians(60.0))

@@ -121,8 +121,7 @@ def run(
     seen = _camera(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
-    from amiwarp.simulation.description import Scene
-    from amiwarp.simulation.sensor import SensorModel
+    from amiwarp.simulation.description import Scene, SensorModel
     from amiwarp.studies.demo import earth
     from amiwarp.studies.design import design
     from amiwarp.studies.design.drawing import draw

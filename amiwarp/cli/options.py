@@ -24,8 +24,7 @@ from amiwarp.io.json_files import read_json
 from amiwarp.io.text import read_calib
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
-from amiwarp.simulation.motion import EncoderModel, PrismMotion
-from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.description import EncoderModel, PrismMotion, SensorModel
 from amiwarp.simulation.worlds.world import WorldScene
 
 if TYPE_CHECKING:
@@ -423,7 +422,7 @@ class SensorOptions:
 
     def build(self) -> SensorModel:
         """Return the sensor model that the options describe."""
-        from amiwarp.simulation.sensor import SensorModel
+        from amiwarp.simulation.description import SensorModel
 
         if self.ideal and self.sensor is not None:
             raise AmiwarpError("--ideal and --sensor both describe the sensor; give one of them")

@@ -15,8 +15,7 @@ from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.options import OUTPUT, Common, EncoderModelOptions, RigOptions, SensorOptions, WorldOptions, numbers
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.simulation.description import Scene
-from amiwarp.simulation.motion import CameraMotion
+from amiwarp.simulation.description import CameraMotion, Scene
 from amiwarp.simulation.worlds.world import WorldScene
 
 if TYPE_CHECKING:

@@ -1,25 +1,513 @@
-"""Description of a simulated recording: the scene, and all other values that determine its events."""
+"""Description of a simulated recording: motion, sensor, scene, and all other values that determine its events."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.recording import MetadataValue
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism
-from amiwarp.simulation.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
+from amiwarp.optics.prism import Prism, check_phase, check_tilt
 from amiwarp.simulation.pictures import linear_luminance, read_picture
-from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.worlds.world import WorldScene
-from amiwarp.validation import guarded, instance, real, whole
+from amiwarp.validation import INT64, array, guarded, instance, one_of, real, whole
+
+# Motion of the prism and of the camera, and the encoder that measures the prism.
+
+ROTATION_INTERVAL = 1e-3
+"""Interval of the steps in which a changing angular velocity is integrated [s]."""
+LARGEST_SPEED = 1e9
+"""Largest accepted speed of a prism [turns/min] and of a camera's rotation [rad/s]; higher values are mistakes."""
+LONGEST_S = 86400.0
+"""Longest duration of a simulation [s]."""
+LARGEST_OFFSET_US = 1e7
+"""Largest clock offset of a simulated encoder [us]. The encoder is sampled for this much longer before and after the
+events."""
+
+
+@guarded
+@dataclass(frozen=True, slots=True, eq=False)
+class PrismMotion:
+    """Motion of the prism: its tilt azimuth is ``phase + angle(t)``, with ``angle(0) = 0``.
+
+    Examples
+    --------
+    >>> motion = amiwarp.PrismMotion(600.0)
+    >>> motion.angle([0.0, 50_000.0]).round(4)
+    array([0.    , 3.1416])
+    """
+
+    rpm: float | ArrayLike = 720.0
+    """Speed of the prism [turns/min], negative for backward rotation.
+
+    Or a table of rows (time [s], speed), interpolated linearly and constant outside, shape (n, 2).
+    """
+    phase: float = 0.0
+    """Azimuth of the prism's tilt at encoder angle 0, θ_b [rad]."""
+    tilt: tuple[float, float] = (0.0, 0.0)
+    """Tilt of the axis of rotation about the camera's x and y axes [rad], as in :class:`amiwarp.ExactModel`."""
+
+    def __post_init__(self) -> None:
+        _check_table("prism speed", self._table())
+        object.__setattr__(self, "phase", check_phase(self.phase, "prism phase"))
+        object.__setattr__(self, "tilt", check_tilt(self.tilt))
+
+    @classmethod
+    def from_function(
+        cls,
+        rpm: Callable[[NDArray[np.float64]], ArrayLike],
+        duration_s: float,
+        *,
+        phase: float = 0.0,
+        tilt: tuple[float, float] = (0.0, 0.0),
+    ) -> PrismMotion:
+        """Create a motion by sampling a function of time that gives the speed.
+
+        Parameters
+        ----------
+        rpm : callable
+            Function of times [s], shape ``(n,)``, that returns speeds [turns/min].
+        duration_s : float
+            Duration [s]; samples extend from 0 to just past it, one per millisecond.
+        phase : float, optional
+            Azimuth at angle 0 [rad].
+        tilt : tuple of float, optional
+            Tilt of the axis of rotation about the camera's x and y axes [rad].
+
+        Returns
+        -------
+        PrismMotion
+            Motion with a table of speeds.
+
+        Raises
+        ------
+        AmiwarpError
+            If the function returns another shape.
+        """
+        duration_s = real(duration_s, "duration_s", 0.0, LONGEST_S, " s")
+        t = np.arange(math.ceil(duration_s * 1e3) + 2, dtype=np.float64) * 1e-3
+        speed = array(rpm(t), "prism speed")
+        if speed.shape not in ((), t.shape):
+            raise AmiwarpError(f"prism speed has shape {speed.shape}; return one number, or one per time, {t.shape}")
+        return cls(np.column_stack([t, np.broadcast_to(speed, t.shape)]), phase, tilt)
+
+    def _table(self) -> NDArray[np.float64]:
+        """Return the speed as a table of rows (time [s], speed [rad/s])."""
+        rpm = array(self.rpm, "prism speed").astype(np.float64)
+        table = np.array([[0.0, rpm], [1.0, rpm]]) if rpm.ndim == 0 else rpm
+        return table * np.array([1.0, TWO_PI / 60.0]) if table.ndim == 2 and table.shape[1] == 2 else table
+
+    def angle(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Return the unwrapped angle, the exact integral of the speed.
+
+        Parameters
+        ----------
+        t_us : array_like
+            Times [us], shape ``(n,)``.
+
+        Returns
+        -------
+        ndarray
+            Angles [rad], shape ``(n,)``.
+        """
+        t_us = array(t_us, "t_us")
+        at, speed = self._table().T
+        before = np.concatenate([[0.0], np.cumsum(np.diff(at) * (speed[1:] + speed[:-1]) / 2.0)])
+
+        def integral(t: NDArray[np.float64]) -> NDArray[np.float64]:
+            inside = np.clip(t, at[0], at[-1])
+            i = np.clip(np.searchsorted(at, inside, side="right") - 1, 0, len(at) - 2)
+            mean = (speed[i] + np.interp(inside, at, speed)) / 2.0
+            return before[i] + mean * (inside - at[i]) + np.interp(t, at, speed) * (t - inside)
+
+        return np.asarray(integral(np.asarray(t_us, np.float64) * 1e-6) - integral(np.zeros(1)))
+
+    @property
+    def largest_speed(self) -> float:
+        """Largest magnitude of the prism's speed [rad/s]."""
+        return float(np.abs(self._table()[:, 1]).max())
+
+
+@guarded
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraMotion:
+    """Rotation of the camera about its own axes. At t = 0 it faces the picture.
+
+    Examples
+    --------
+    >>> amiwarp.CameraMotion((0.0, 0.5, 0.0)).constant
+    True
+    """
+
+    rates: ArrayLike = (0.0, 0.0, 0.0)
+    """Angular velocity of the camera in its own frame [rad/s], shape (3,).
+
+    Or a table of rows (time [s], ωx, ωy, ωz), interpolated linearly and constant outside, shape (n, 4).
+    """
+
+    def __post_init__(self) -> None:
+        _check_table("camera rotation", self._table(), columns=4)
+
+    def _table(self) -> NDArray[np.float64]:
+        rates = array(self.rates, "camera rotation").astype(np.float64)
+        return np.array([[0.0, *rates], [1.0, *rates]]) if rates.shape == (3,) else rates
+
+    @property
+    def largest_rates(self) -> NDArray[np.float64]:
+        """Largest magnitude of each component [rad/s], shape (3,)."""
+        return np.asarray(np.abs(self._table()[:, 1:]).max(axis=0))
+
+    @property
+    def constant(self) -> bool:
+        """Whether the angular velocity never changes."""
+        return bool((self._table()[:, 1:] == self._table()[0, 1:]).all())
+
+    def orientation(self, duration_s: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+        """Return the orientation as a function of time.
+
+        Parameters
+        ----------
+        duration_s : float
+            Duration [s].
+
+        Returns
+        -------
+        callable
+            Function of times [s], 0 to ``duration_s``, shape ``(n,)``. It returns rotation matrices from the camera's
+            frame to the picture's, shape ``(n, 3, 3)``.
+        """
+        from scipy.spatial.transform import Rotation
+
+        table = self._table()
+        if self.constant:
+            return lambda t: np.asarray(Rotation.from_rotvec(np.outer(t, table[0, 1:])).as_matrix())
+        step = ROTATION_INTERVAL
+        grid = np.arange(math.ceil(duration_s / step) + 2) * step
+        rates = np.stack([np.interp(grid + step / 2.0, table[:, 0], column) for column in table[:, 1:].T], axis=1)
+        nodes = [np.eye(3)]
+        for matrix in Rotation.from_rotvec(rates * step).as_matrix()[:-1]:
+            nodes.append(nodes[-1] @ matrix)
+        corners = np.stack(nodes)
+
+        def at(t: NDArray[np.float64]) -> NDArray[np.float64]:
+            i = np.clip((t / step).astype(np.int64), 0, len(grid) - 1)
+            rest = Rotation.from_rotvec(rates[i] * (t - grid[i])[:, None]).as_matrix()
+            return np.asarray(corners[i] @ rest)
+
+        return at
+
+
+def _check_table(what: str, table: NDArray[np.float64], columns: int = 2) -> None:
+    """Raise :class:`AmiwarpError` for a table of wrong shape, with values out of range or unsorted times."""
+    if table.ndim != 2 or table.shape[1] != columns or len(table) < 2:
+        raise AmiwarpError(f"{what} has shape {table.shape}; give one value, or at least 2 rows of {columns} numbers")
+    if not (np.abs(table) <= LARGEST_SPEED).all():  # NaN fails
+        worst = table[~(np.abs(table) <= LARGEST_SPEED)][0]
+        raise AmiwarpError(f"{what} contains {worst:g}; expected numbers in {-LARGEST_SPEED:g} .. {LARGEST_SPEED:g}")
+    if not (np.diff(table[:, 0]) > 0).all():
+        raise AmiwarpError(f"{what}: the times of its rows do not increase; sort the rows by time")
+
+
+@guarded
+@dataclass(frozen=True, slots=True)
+class EncoderModel:
+    """Errors that a simulated encoder makes.
+
+    Raises :class:`AmiwarpError` for values out of range.
+
+    Examples
+    --------
+    >>> encoder = amiwarp.EncoderModel.ideal().sample(amiwarp.PrismMotion(600.0), duration_us=1000, seed=0)
+    >>> encoder.angle_at([500]).round(6)
+    array([0.031416])
+    """
+
+    counts_per_turn: int | None = 8192
+    """Resolution of the encoder [counts/turn]: the angle is rounded to the nearest count; None disables rounding."""
+    rate_hz: float = 1000.0
+    """Rate of the encoder samples [Hz]."""
+    jitter_us: float = 1.0
+    """Standard deviation of the time stamp of an encoder sample [us]."""
+    clock_offset_us: float = 0.0
+    """Offset of the encoder's clock: encoder time minus event time [us]."""
+    dropouts_hz: float = 0.0
+    """Mean number of drop-outs per second [Hz]."""
+    dropout_us: float = 5000.0
+    """Duration of a drop-out, in which all encoder samples are lost [us]."""
+
+    def __post_init__(self) -> None:
+        if self.counts_per_turn is not None:
+            counts = whole(self.counts_per_turn, "encoder counts_per_turn", 1, 2**31, ", or None")
+            object.__setattr__(self, "counts_per_turn", counts)
+        limits = {"rate_hz": (0.1, 1e6), "jitter_us": (0.0, 1e6), "dropouts_hz": (0.0, 1e5), "dropout_us": (0.0, 1e9),
+                  "clock_offset_us": (-LARGEST_OFFSET_US, LARGEST_OFFSET_US)}  # fmt: skip
+        for name, (low, high) in limits.items():
+            object.__setattr__(self, name, real(getattr(self, name), f"encoder {name}", low, high))
+
+    @classmethod
+    def ideal(cls) -> EncoderModel:
+        """Return an encoder without rounding and jitter.
+
+        Returns
+        -------
+        EncoderModel
+            The encoder.
+        """
+        return cls(counts_per_turn=None, jitter_us=0.0)
+
+    def sample(self, motion: PrismMotion, duration_us: int, seed: int) -> Encoder:
+        """Sample the encoder from 0 to ``duration_us`` on the camera's clock, with a margin at both ends.
+
+        Parameters
+        ----------
+        motion : PrismMotion
+            Motion of the prism.
+        duration_us : int
+            Duration [us].
+        seed : int
+            Seed of the random errors.
+
+        Returns
+        -------
+        Encoder
+            Samples with times on the encoder's clock. Its clock offset is 0: calibration has to find it.
+        """
+        duration_us = whole(duration_us, "duration_us", 0, round(1e6 * LONGEST_S), " us")
+        seed = whole(seed, "seed", 0, INT64[1])
+        rng = np.random.default_rng([seed, 0xE2C])  # independent of the pixels' random numbers
+        interval = 1e6 / self.rate_hz
+        spare = math.ceil((abs(self.clock_offset_us) + 8.0 * self.jitter_us) / interval) + 2
+        true_t = np.rint(np.arange(-spare, math.ceil(duration_us / interval) + spare + 1) * interval).astype(np.int64)
+        angle = motion.angle(true_t - self.clock_offset_us)
+        if self.counts_per_turn is not None:
+            angle = np.rint(angle * (self.counts_per_turn / TWO_PI)) * (TWO_PI / self.counts_per_turn)
+        stamp = true_t + np.rint(rng.normal(0.0, self.jitter_us, len(true_t))).astype(np.int64)
+        kept = np.ones(len(stamp), np.bool_)
+        for start in rng.uniform(0.0, duration_us, rng.poisson(self.dropouts_hz * duration_us * 1e-6)):
+            kept &= (true_t < start) | (true_t >= start + self.dropout_us)
+        kept[[0, -1]] = True
+        stamp, angle = stamp[kept], angle[kept]
+        rising = np.concatenate([[True], stamp[1:] > np.maximum.accumulate(stamp)[:-1]])
+        return Encoder(stamp[rising], angle[rising])
+
+
+# Model of the sensor.
+
+
+@guarded
+@dataclass(frozen=True, slots=True)
+class SensorModel:
+    """Model of an event camera's pixels and readout.
+
+    The default values describe a good sensor in good light, with fast biases. By default, the photoreceptors have
+    unlimited bandwidth, noise does not depend on light, and every event is read out at once.
+
+    Notes
+    -----
+    Photoreceptor, leak and shot noise follow v2e (Y. Hu, S.-C. Liu and T. Delbruck, "v2e: From Video Frames to
+    Realistic DVS Events", CVPR Workshops 2021).
+
+    Examples
+    --------
+    >>> amiwarp.SensorModel(contrast_on=0.2).contrast_off
+    0.25
+    """
+
+    contrast_on: float = 0.25
+    """ON threshold: increase of natural log intensity that causes an ON event."""
+    contrast_off: float = 0.25
+    """OFF threshold: decrease of natural log intensity that causes an OFF event."""
+    mismatch: float = 0.03
+    """Relative standard deviation of the ON and OFF thresholds between pixels."""
+    refractory_us: float = 100.0
+    """Refractory period: time after an event in which the pixel is blind [us].
+
+    The new reference of the pixel is the brightness at the end of this period.
+    """
+    latency_us: float = 100.0
+    """Mean time from a brightness change to the time stamp of its event [us]."""
+    latency_jitter_us: float = 30.0
+    """Standard deviation of the latency [us]. The time stamps of one pixel stay in order."""
+    leak_hz: float = 0.1
+    """Rate of leak events [1/s]: ON events in constant light, caused by the drift of the pixel's reference."""
+    shot_noise_hz: float = 1.0
+    """Rate of random events per pixel due to shot noise [1/s]. Half of these events are ON.
+
+    Each random event sets the pixel's reference to the present brightness.
+    """
+    hot_fraction: float = 0.0002
+    """Fraction of the pixels that are hot: they fire additional random events."""
+    hot_hz: float = 100.0
+    """Additional rate of random events of a hot pixel [1/s]."""
+    cutoff_hz: float | None = 0.0
+    """Bandwidth of the photoreceptor at white [Hz]; 0 or None for unlimited bandwidth.
+
+    The photoreceptor is a first-order low-pass filter of the log intensity, with the time constant
+    ``1 / (2 pi cutoff)``. Its cut-off frequency is proportional to the luminance plus 0.02, the stray light and dark
+    current that the simulator adds to every picture.
+    """
+    shot_noise_dark: float = 1.0
+    """Rate of random events in the dark, relative to that at white, 1 to 1000; v2e uses 4.
+
+    The rate falls linearly with luminance from the dark to white.
+    """
+    leak_jitter_fraction: float = 0.0
+    """Relative standard deviation of the time between leak events of a pixel.
+
+    The leak rate is drawn anew after each event of the pixel, and is never below a tenth of its mean.
+    """
+    noise_rate_cov_decades: float = 0.0
+    """Standard deviation of the decimal logarithm of the rates of leak and random events between pixels.
+
+    The rates have a log-normal distribution whose medians are ``leak_hz`` and ``shot_noise_hz``.
+    """
+    row_us: float = 0.0
+    """Time to read out a row [us]; 0 if every event is read out at once.
+
+    The rows are read one after the other, from the first to the last and then from the first again, without a pause.
+    The events of a row share the time stamp of their readout. If a pixel fires several times between two readouts, only
+    the first event is kept. A scan of all rows must not take longer than 10 ms.
+    """
+    bus_rate_mev_s: float = 0.0
+    """Largest rate of events that the bus transmits [million events/s]; 0 for unlimited.
+
+    Events wait in a queue. The time stamp of an event is the time at which the bus transmits the event.
+    """
+    bus_queue: float = 4096.0
+    """Largest number of events that wait in the queue of the bus. Further events are lost."""
+
+    def __post_init__(self) -> None:
+        limits = {"mismatch": 0.5, "refractory_us": 1e6, "latency_us": 1e4, "latency_jitter_us": 1e3, "leak_hz": 1e3,
+                  "shot_noise_hz": 1e5, "hot_fraction": 1.0, "hot_hz": 1e5, "leak_jitter_fraction": 1.0,
+                  "noise_rate_cov_decades": 1.0, "row_us": 1e4, "bus_queue": 1e9}  # fmt: skip
+        for name, limit in limits.items():
+            object.__setattr__(self, name, real(getattr(self, name), f"sensor {name}", 0.0, limit))
+        for name, least, limit in (("cutoff_hz", 0.01, 1e7), ("bus_rate_mev_s", 1e-3, 1e5)):
+            object.__setattr__(self, name, _real_or_none(getattr(self, name), f"sensor {name}", least, limit))
+        object.__setattr__(self, "shot_noise_dark", real(self.shot_noise_dark, "sensor shot_noise_dark", 1.0, 1e3))
+        for name in ("contrast_on", "contrast_off"):
+            value = real(getattr(self, name), f"sensor {name}", 0.01, 10.0, " (log intensity)")
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def ideal(cls, contrast: float = 0.25) -> SensorModel:
+        """Return a sensor with equal thresholds and without noise, mismatch, latency and refractory period.
+
+        Parameters
+        ----------
+        contrast : float, optional
+            ON and OFF threshold [log intensity].
+
+        Returns
+        -------
+        SensorModel
+            The sensor model.
+        """
+        return cls(contrast, contrast, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @classmethod
+    def preset(cls, name: str) -> SensorModel:
+        """Return the model of a known event camera at the manufacturer's biases in good light.
+
+        Parameters
+        ----------
+        name : str
+            Camera: ``dvxplorer``, ``davis346`` or ``gen4``.
+
+        Returns
+        -------
+        SensorModel
+            The sensor model.
+
+        Raises
+        ------
+        AmiwarpError
+            If the name of the preset is unknown.
+
+        Notes
+        -----
+        Contrast thresholds C are published as relative changes of light, (maximum - minimum) / minimum (Prophesee,
+        "Event-based vision sensor characteristics"). The model uses ln(1 + C) for both polarities.
+
+        ``dvxplorer``: iniVation DVXplorer, 640x480, 9 um pixels. Its data are those of the manufacturer
+        (docs.inivation.com, DVXplorer):
+
+        - thresholds 13 %: at this contrast half of the pixels respond
+        - mismatch 0.32: 99.9 % of the pixels respond at 27.5 %, which is 3.09 standard deviations of ln(1 + C) away
+        - latency 200 us: published as "below 1 ms"; the number is a typical value, no source
+        - row_us 0.4: a scan of 480 rows takes the published time resolution of 200 us; the chip scans columns
+        - bus rate: 165 million events/s
+        - cutoff_hz 1000, refractory_us 200, jitter, queue, leak and shot noise: typical values, no source
+
+        ``davis346``: iniVation DAVIS346, 346x260, 18.5 um pixels.
+
+        - thresholds 14.3 % ON and 22.5 % OFF, at which half of the pixels respond: G. Gallego et al., "Event-based
+          Vision: A Survey", IEEE TPAMI 2022, table 1
+        - latency 20 us, the smallest; bus rate 12 million events/s: data sheet (inivation.com, DAVIS346.pdf)
+        - mismatch 0.15, refractory_us 500 and cutoff_hz 300: defaults of v2e (standard deviation 0.03 of thresholds of
+          0.2); the standard deviation of 2.1 % contrast that P. Lichtsteiner et al. measured on an earlier chip (IEEE
+          JSSC 43(2), 2008) is 0.16 of the ON threshold
+        - leak_hz 0.1: v2e's parameters for a noisy sensor
+        - jitter, queue, shot noise: typical values, no source
+
+        ``gen4``: Prophesee Gen4 and Sony IMX636, 1280x720, 4.86 um pixels.
+
+        - thresholds 25 %, nominal: data of the camera EVK4 (Prophesee); the smallest threshold is lower
+        - latency 100 us: published as "below 100 us at 1000 lux" (Prophesee, EVK4); its manual states 220 us as
+          typical at 25 % contrast
+        - bus rate 1066 million events/s: T. Finateu et al., "A 1280x720 Back-Illuminated Stacked Temporal Contrast
+          Event-Based Vision Sensor with 4.86 um Pixels, 1.066 GEPS Readout", ISSCC 2020; cameras with USB
+          transmit less
+        - cutoff_hz 2000, refractory_us 100, mismatch, jitter, queue, leak and shot noise: typical values, no source
+
+        In all three, shot noise is four times as strong in the dark, and the jitter of the leak and the spread of the
+        noise rates are 0.1, as in v2e. Hot pixels have the default: typical values, no source.
+
+        Examples
+        --------
+        >>> amiwarp.SensorModel.preset("davis346").bus_rate_mev_s
+        12.0
+        """
+        return cls(**_PRESETS[one_of(name, _PRESETS, "sensor preset")])
+
+
+def _real_or_none(value: float | None, what: str, least: float, limit: float) -> float:
+    """Return a value that must lie between ``least`` and ``limit``; return 0.0 if the value is None or 0."""
+    number = 0.0 if value is None else real(value, what, 0.0, limit)
+    return number if number == 0.0 else real(number, what, least, limit, " (or 0 for none)")
+
+
+_PRESETS: dict[str, dict[str, float]] = {
+    "dvxplorer": {
+        "contrast_on": math.log(1.13), "contrast_off": math.log(1.13), "mismatch": 0.32, "refractory_us": 200.0,
+        "latency_us": 200.0, "latency_jitter_us": 50.0, "leak_hz": 0.05, "shot_noise_hz": 0.5, "shot_noise_dark": 4.0,
+        "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "cutoff_hz": 1000.0, "row_us": 0.4,
+        "bus_rate_mev_s": 165.0, "bus_queue": 16384.0,
+    },
+    "davis346": {
+        "contrast_on": math.log(1.143), "contrast_off": math.log(1.225), "mismatch": 0.15, "refractory_us": 500.0,
+        "latency_us": 20.0, "latency_jitter_us": 10.0, "leak_hz": 0.1, "shot_noise_hz": 1.0, "shot_noise_dark": 4.0,
+        "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "cutoff_hz": 300.0, "bus_rate_mev_s": 12.0,
+        "bus_queue": 4096.0,
+    },
+    "gen4": {
+        "contrast_on": math.log(1.25), "contrast_off": math.log(1.25), "mismatch": 0.03, "refractory_us": 100.0,
+        "latency_us": 100.0, "latency_jitter_us": 30.0, "leak_hz": 0.05, "shot_noise_hz": 0.5, "shot_noise_dark": 4.0,
+        "leak_jitter_fraction": 0.1, "noise_rate_cov_decades": 0.1, "cutoff_hz": 2000.0, "bus_rate_mev_s": 1066.0,
+        "bus_queue": 65536.0,
+    },
+}  # fmt: skip
+
+
+# Scene, and all values of a simulation.
 
 
 class Frames(Protocol):

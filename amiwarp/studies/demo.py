@@ -46,9 +46,7 @@ from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.export import save_picture
 from amiwarp.reconstruction.picture import Picture, Reconstruction
-from amiwarp.simulation.description import Scene
-from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.simulator import Simulation
 
 # Kernels that the steps after a simulation need on a CPU, to be compiled before they are needed.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.input_files import errors_name, input_path
 from amiwarp.optics.camera import Camera
-from amiwarp.simulation.motion import CameraMotion
+from amiwarp.simulation.description import CameraMotion
 from amiwarp.simulation.pictures import linear_luminance
 
 SACCADES_PX = ((3.5, 7.0), (3.5, -7.0), (-7.0, 0.0))

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from amiwarp.choices import CONTRAST
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events, EventSource
-from amiwarp.simulation.pictures import DARK
-from amiwarp.simulation.sequences import Pictures
+from amiwarp.simulation.pictures import DARK, Pictures
 from amiwarp.translation.datasets import MvsecPictures
 
 # Optical flow between two pictures, and pictures warped by it. OpenCV does both.

@@ -21,7 +21,7 @@ from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.reconstruction.picture import Reconstruction
-from amiwarp.simulation.motion import CameraMotion
+from amiwarp.simulation.description import CameraMotion
 from amiwarp.translation.pictures_between import EventPictures, KnownPictures, light_of, warped
 
 # Pictures of a camera with lens distortion or an off-centre axis, as a centred pinhole camera sees them.

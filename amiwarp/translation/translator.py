@@ -15,12 +15,9 @@ from amiwarp.io.formats import detect_format, open_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
-from amiwarp.simulation import sequences
-from amiwarp.simulation.description import Frames, Scene, Still
-from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.simulation.pictures import read_picture
-from amiwarp.simulation.sensor import SensorModel
-from amiwarp.simulation.sequences import Pictures
+from amiwarp.simulation import pictures as sequences
+from amiwarp.simulation.description import CameraMotion, EncoderModel, Frames, PrismMotion, Scene, SensorModel, Still
+from amiwarp.simulation.pictures import Pictures, read_picture
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.translation import datasets, reconstructed_pictures
 from amiwarp.translation.datasets import DataSet, MvsecPictures

@@ -21,8 +21,7 @@ from amiwarp.io.json_files import at_field, build, fields_of, read_json, read_to
 from amiwarp.io.reading_process import borrow, give_back
 from amiwarp.simulation.pictures import BAND, LUMINANCE, MOST_PIXELS, PICTURE_FORMATS, read_picture, srgb_to_linear
 from amiwarp.simulation.worlds.named.catalogue import named_world
-from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
-from amiwarp.simulation.worlds.world import Body, Lamp, Material, Mesh, Sky, Sun, World
+from amiwarp.simulation.worlds.world import Body, Lamp, Material, Mesh, Sky, Sun, Trajectory, World, looking_at
 from amiwarp.validation import guarded, one_of, real, shown
 
 # Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh. Colours become luminance.

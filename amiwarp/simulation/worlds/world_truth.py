@@ -28,8 +28,7 @@ from amiwarp.kernels import prism_view
 from amiwarp.optics.models import ExactModel, wrap_angle
 from amiwarp.simulation.description import SimulationValues
 from amiwarp.simulation.scenery import KnownPixels
-from amiwarp.simulation.worlds.device_world import DeviceWorld
-from amiwarp.simulation.worlds.renderer import SurfaceView, WorldSight, pixel_rays, surfaces_at
+from amiwarp.simulation.worlds.renderer import DeviceWorld, SurfaceView, WorldSight, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.validation import array, guarded, real, shown
 

@@ -25,7 +25,7 @@ from amiwarp.io.input_files import read_text
 from amiwarp.optics.models import MODELS, rungs
 from amiwarp.plotting import figures
 from amiwarp.progress import Progress, part, silent
-from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.description import SensorModel
 from amiwarp.studies.chart import calibration, compensation
 from amiwarp.studies.chart.rows import (
     KnownRecording,

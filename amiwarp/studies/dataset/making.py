@@ -35,9 +35,7 @@ from amiwarp.io.sealed_json import append_line, create_journal, read_journal
 from amiwarp.kernels import launch
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.progress import Progress, silent
-from amiwarp.simulation.description import Scene
-from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.simulation.worlds.world_files import POSE_FILES, open_world
@@ -325,7 +323,7 @@ def simulation_of(item: Item, device: str, duration_s: float | None = None) -> S
 
 def _of_video(item: Item, source: str, entry: CameraEntry, **settings: Any) -> Simulation:
     """Return the simulation of a video, whose size is that of the camera unless the specification gives one."""
-    from amiwarp.simulation.sequences import open_pictures
+    from amiwarp.simulation.pictures import open_pictures
 
     pictures = open_pictures(source, fps=item.recipe["fps"])
     camera: Camera = entry.build(pictures.size)

@@ -15,10 +15,8 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import EllipseModel, ExactModel, Model, predicted_error, rungs
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, part, silent
-from amiwarp.simulation.description import Scene
-from amiwarp.simulation.motion import PrismMotion
+from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.scenery import place_scene, seen_bearings
-from amiwarp.simulation.sensor import SensorModel
 from amiwarp.simulation.simulator import Simulation
 
 # Effect of a prism on a camera's image: radii of the pixels' orbits, and error of each refraction model.

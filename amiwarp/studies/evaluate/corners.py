@@ -15,8 +15,7 @@ from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.corners import detect_corners
 from amiwarp.kernels import corners, launch
 from amiwarp.optics.camera import Camera
-from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.simulation.worlds.world import WorldScene
+from amiwarp.simulation.worlds.world import Trajectory, WorldScene
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 

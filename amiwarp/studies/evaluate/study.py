@@ -29,9 +29,7 @@ from amiwarp.events.truth import EventTruth, FrameTruth
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel, Model
 from amiwarp.optics.prism import Prism
-from amiwarp.simulation.description import Scene
-from amiwarp.simulation.motion import PrismMotion
-from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.named.catalogue import named_world
 from amiwarp.simulation.worlds.world import WorldScene

@@ -16,9 +16,7 @@ from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.description import Scene, Still
-from amiwarp.simulation.motion import CameraMotion, EncoderModel, PrismMotion
-from amiwarp.simulation.sensor import SensorModel
+from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel, Still
 from amiwarp.simulation.simulator import Simulation
 
 # Scenes of the stability study, drawn from a seed: from a dense texture to a blank wall.

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.simulation.worlds.trajectory import Trajectory, looking_at
-from amiwarp.simulation.worlds.world import Body, Material, Mesh
+from amiwarp.simulation.worlds.world import Body, Material, Mesh, Trajectory, looking_at
 
 # Generated textures for the built-in worlds: linear reflectances from 0.03 to 0.95.
 

@@ -5,13 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.simulation.worlds.named import bodies
 from amiwarp.simulation.worlds.named import bodies as parts
-from amiwarp.simulation.worlds.named import bodies as shapes
-from amiwarp.simulation.worlds.named import bodies as textures
 from amiwarp.simulation.worlds.named.bodies import Viewpoint
-from amiwarp.simulation.worlds.trajectory import Trajectory
-from amiwarp.simulation.worlds.world import Body, Lamp, Mesh, World
+from amiwarp.simulation.worlds.world import Body, Lamp, Mesh, Trajectory, World
 
 # Gait of the walking figure in the world ``person``.
 #
@@ -46,22 +42,22 @@ Places = tuple[Any, NDArray[np.float64]]
 def limbs() -> dict[str, Mesh]:
     """Return the meshes of the limbs by name, each in the frame of its joint: x forward, y to the left, z up."""
     out = {
-        "pelvis": bodies.moved(bodies.ellipsoid((0.12, 0.17, 0.13), tile_m=0.3), (0, 0, 0.03)),
-        "torso": bodies.moved(bodies.ellipsoid((0.13, 0.2, 0.3), sides=28, rings=18, tile_m=0.35), (0, 0, 0.31)),
-        "neck": bodies.moved(bodies.capsule(0.055, 0.14, tile_m=0.2), (0, 0, 0.1)),
-        "head": bodies.merged([
-            bodies.ellipsoid((0.1, 0.085, 0.125), sides=28, rings=16, tile_m=0.3),
-            bodies.moved(bodies.ellipsoid((0.03, 0.014, 0.02), sides=12, rings=6, tile_m=0.3), (0.1, 0, -0.01)),
+        "pelvis": parts.moved(parts.ellipsoid((0.12, 0.17, 0.13), tile_m=0.3), (0, 0, 0.03)),
+        "torso": parts.moved(parts.ellipsoid((0.13, 0.2, 0.3), sides=28, rings=18, tile_m=0.35), (0, 0, 0.31)),
+        "neck": parts.moved(parts.capsule(0.055, 0.14, tile_m=0.2), (0, 0, 0.1)),
+        "head": parts.merged([
+            parts.ellipsoid((0.1, 0.085, 0.125), sides=28, rings=16, tile_m=0.3),
+            parts.moved(parts.ellipsoid((0.03, 0.014, 0.02), sides=12, rings=6, tile_m=0.3), (0.1, 0, -0.01)),
         ]),
     }  # fmt: skip
     for side in SIDES:
-        out[f"{side} upper arm"] = bodies.capsule(0.05, UPPER_ARM, tile_m=0.25)
-        out[f"{side} forearm"] = bodies.capsule(0.04, FOREARM, tile_m=0.25)
-        out[f"{side} hand"] = bodies.moved(bodies.ellipsoid((0.045, 0.025, 0.09), sides=16, tile_m=0.2), (0, 0, -0.08))
-        out[f"{side} thigh"] = bodies.capsule(0.075, THIGH, tile_m=0.3)
-        out[f"{side} shin"] = bodies.capsule(0.055, SHIN, tile_m=0.3)
-        foot = bodies.ellipsoid((0.14, 0.05, 0.045), sides=20, rings=10, tile_m=0.2)
-        out[f"{side} foot"] = bodies.moved(foot, (0.06, 0, -0.03))
+        out[f"{side} upper arm"] = parts.capsule(0.05, UPPER_ARM, tile_m=0.25)
+        out[f"{side} forearm"] = parts.capsule(0.04, FOREARM, tile_m=0.25)
+        out[f"{side} hand"] = parts.moved(parts.ellipsoid((0.045, 0.025, 0.09), sides=16, tile_m=0.2), (0, 0, -0.08))
+        out[f"{side} thigh"] = parts.capsule(0.075, THIGH, tile_m=0.3)
+        out[f"{side} shin"] = parts.capsule(0.055, SHIN, tile_m=0.3)
+        foot = parts.ellipsoid((0.14, 0.05, 0.045), sides=20, rings=10, tile_m=0.2)
+        out[f"{side} foot"] = parts.moved(foot, (0.06, 0, -0.03))
     return out
 
 
@@ -143,12 +139,12 @@ LAMPS = (Lamp((-1.5, -1.5, 3.0), 4.5, shadows=True), Lamp((2.5, 1.5, 2.9), 3.0))
 def build(rng: np.random.Generator, duration_s: float) -> World:
     """Return the world: the hall and the figure. All bodies of the figure belong to the instance ``person``."""
     walls = [
-        textures.bricks(rng, mean=0.4),
-        textures.plaster(rng, 0.5, 0.45),
-        textures.plaster(rng),
-        textures.plaster(rng, 0.4),
+        parts.bricks(rng, mean=0.4),
+        parts.plaster(rng, 0.5, 0.45),
+        parts.plaster(rng),
+        parts.plaster(rng, 0.4),
     ]
-    bodies = parts.hall(SIZE, walls, textures.wood(rng, mean=0.35), textures.tiles(rng, mean=0.6, joint=0.2, count=4))
+    bodies = parts.hall(SIZE, walls, parts.wood(rng, mean=0.35), parts.tiles(rng, mean=0.6, joint=0.2, count=4))
     poses = walk(duration_s)
     return World(
         "person",
@@ -163,26 +159,26 @@ def _hall(rng: np.random.Generator) -> list[Body]:
     """Return the pictures and furniture of the hall, which leave the figure's path free."""
     north, y = (1.0, 0.0, 0.0), SIZE[1] / 2.0
     columns = [
-        shapes.moved(shapes.cylinder(0.18, SIZE[2], sides=32, tile_m=0.6), (x, 3.3, 0)) for x in (-3.3, -1.1, 1.1, 3.3)
+        parts.moved(parts.cylinder(0.18, SIZE[2], sides=32, tile_m=0.6), (x, 3.3, 0)) for x in (-3.3, -1.1, 1.1, 3.3)
     ]
     return [
         *parts.grating_strip("grating", (-2.0, y, 2.2), north, count=8, side=0.45, cycles=6.0),
-        *parts.picture("star", (-2.2, y, 1.3), north, textures.star(), 1.2, 1.2),
-        *parts.picture("poster", (0.0, y, 1.3), north, textures.poster(rng), 1.3, 1.2),
-        *parts.picture("page", (2.2, y, 1.3), north, textures.text_page(rng, letter=26), 0.95, 1.25),
-        parts.solid("columns", shapes.merged(columns), textures.plaid(rng, stripes=8), "column"),
-        parts.table("bench", (1.6, 0.4, 0.45), (-3.6, 1.6, 0), textures.wood(rng, boards=4), turn_deg=90.0),
-        parts.table("second bench", (1.6, 0.4, 0.45), (3.6, 1.2, 0), textures.wood(rng, boards=4), turn_deg=80.0),
+        *parts.picture("star", (-2.2, y, 1.3), north, parts.star(), 1.2, 1.2),
+        *parts.picture("poster", (0.0, y, 1.3), north, parts.poster(rng), 1.3, 1.2),
+        *parts.picture("page", (2.2, y, 1.3), north, parts.text_page(rng, letter=26), 0.95, 1.25),
+        parts.solid("columns", parts.merged(columns), parts.plaid(rng, stripes=8), "column"),
+        parts.table("bench", (1.6, 0.4, 0.45), (-3.6, 1.6, 0), parts.wood(rng, boards=4), turn_deg=90.0),
+        parts.table("second bench", (1.6, 0.4, 0.45), (3.6, 1.2, 0), parts.wood(rng, boards=4), turn_deg=80.0),
         parts.solid(
             "crate",
-            shapes.moved(shapes.standing_box((0.6, 0.6, 0.6)), (3.0, -1.6, 0), turn_deg=20),
-            textures.poster(rng),
+            parts.moved(parts.standing_box((0.6, 0.6, 0.6)), (3.0, -1.6, 0), turn_deg=20),
+            parts.poster(rng),
             "box",
         ),
         parts.solid(
             "carpet",
-            shapes.standing_box((4.6, 4.2, 0.01), (0, 0.8, -0.002)),
-            textures.plaid(rng, size=512, stripes=30),
+            parts.standing_box((4.6, 4.2, 0.01), (0, 0.8, -0.002)),
+            parts.plaid(rng, size=512, stripes=30),
             "carpet",
         ),
     ]
@@ -190,9 +186,9 @@ def _hall(rng: np.random.Generator) -> list[Body]:
 
 def _figure(rng: np.random.Generator, poses: dict[str, Trajectory]) -> list[Body]:
     """Return the limbs of the figure. Each limb has the trajectory of its upper joint."""
-    skin = textures.plaster(rng, 0.42, 0.25, size=256)
-    trousers = textures.plaster(rng, 0.16, 0.45, size=256)
-    shirt, shoe = textures.plaid(rng, stripes=12), textures.plaster(rng, 0.07, 0.4, size=128)
+    skin = parts.plaster(rng, 0.42, 0.25, size=256)
+    trousers = parts.plaster(rng, 0.16, 0.45, size=256)
+    shirt, shoe = parts.plaid(rng, stripes=12), parts.plaster(rng, 0.07, 0.4, size=128)
     cloth = dict.fromkeys(("head", "neck", "forearm", "hand"), skin)
     cloth |= dict.fromkeys(("torso", "upper arm"), shirt)
     cloth |= dict.fromkeys(("pelvis", "thigh", "shin"), trousers) | {"foot": shoe}

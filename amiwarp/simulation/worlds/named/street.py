@@ -3,10 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.simulation.worlds.named import bodies
 from amiwarp.simulation.worlds.named import bodies as parts
-from amiwarp.simulation.worlds.named import bodies as shapes
-from amiwarp.simulation.worlds.named import bodies as textures
 from amiwarp.simulation.worlds.named.bodies import Viewpoint
 from amiwarp.simulation.worlds.world import Body, Mesh, Sky, Sun, World
 
@@ -32,25 +29,25 @@ def house(
     away = 1.0 if place[1] > 0 else -1.0
     height = STOREY * storeys + 0.4
     middle = (place[0], place[1] + away * depth / 2.0, 0.1)
-    walls = bodies.standing_box((width, depth, height), middle)
+    walls = parts.standing_box((width, depth, height), middle)
     roof_foot = (middle[0], middle[1], 0.1 + height)
     if rng.uniform() < 0.6:
-        roof = bodies.gable_roof((width, depth + 0.8, float(rng.uniform(2.0, 3.6))), roof_foot, tile_m=3.0)
+        roof = parts.gable_roof((width, depth + 0.8, float(rng.uniform(2.0, 3.6))), roof_foot, tile_m=3.0)
     else:
-        roof = bodies.standing_box((width, depth, 0.5), roof_foot, tile_m=3.0)
-    chimney = bodies.standing_box(
+        roof = parts.standing_box((width, depth, 0.5), roof_foot, tile_m=3.0)
+    chimney = parts.standing_box(
         (0.6, 0.6, 4.4), (middle[0] + width * float(rng.uniform(-0.3, 0.3)), middle[1], 0.1 + height), tile_m=2.0
     )
-    trim = bodies.merged(_trim(place[0], place[1], away, width, storeys))
+    trim = parts.merged(_trim(place[0], place[1], away, width, storeys))
     surfaces = {
         "": (walls, front(rng, width, storeys)),
         " roof": (
-            bodies.merged([roof, chimney]),
-            bodies.bricks(rng, mean=float(rng.uniform(0.12, 0.3)), joint=0.06, size=256),
+            parts.merged([roof, chimney]),
+            parts.bricks(rng, mean=float(rng.uniform(0.12, 0.3)), joint=0.06, size=256),
         ),
-        " trim": (trim, bodies.plaster(rng, 0.6, 0.3, size=128)),
+        " trim": (trim, parts.plaster(rng, 0.6, 0.3, size=128)),
     }
-    return [bodies.solid(name + part, mesh, skin, "house", instance=name) for part, (mesh, skin) in surfaces.items()]
+    return [parts.solid(name + part, mesh, skin, "house", instance=name) for part, (mesh, skin) in surfaces.items()]
 
 
 def window_columns(width: float) -> NDArray[np.float64]:
@@ -70,21 +67,21 @@ def _trim(x: float, y: float, away: float, width: float, storeys: int) -> list[M
         for at in window_columns(width):
             centre = x - width / 2.0 + at
             if storey:
-                meshes.append(bodies.box((WINDOW[0] + 0.3, 0.3, 0.1), (centre, y, base + 0.85), tile_m=0.8))
+                meshes.append(parts.box((WINDOW[0] + 0.3, 0.3, 0.1), (centre, y, base + 0.85), tile_m=0.8))
             meshes.append(
-                bodies.box((WINDOW[0] + 0.3, 0.2, 0.18), (centre, y, base + 0.95 + WINDOW[1] + 0.05), tile_m=0.8)
+                parts.box((WINDOW[0] + 0.3, 0.2, 0.18), (centre, y, base + 0.95 + WINDOW[1] + 0.05), tile_m=0.8)
             )
-        meshes.append(bodies.box((width, 0.24, 0.14), (x, y, base + STOREY - 0.05), tile_m=0.8))
-    meshes.append(bodies.box((width, 0.6, 0.25), (x, y, 0.1 + STOREY * storeys + 0.3), tile_m=0.8))
+        meshes.append(parts.box((width, 0.24, 0.14), (x, y, base + STOREY - 0.05), tile_m=0.8))
+    meshes.append(parts.box((width, 0.6, 0.25), (x, y, 0.1 + STOREY * storeys + 0.3), tile_m=0.8))
     meshes.append(
-        bodies.standing_box(
+        parts.standing_box(
             (1.6, 0.7, 0.18), (x - width / 2.0 + window_columns(width)[0], y - away * 0.3, 0.1), tile_m=0.8
         )
     )
     return meshes
 
 
-def front(rng: np.random.Generator, width: float, storeys: int) -> bodies.Texture:
+def front(rng: np.random.Generator, width: float, storeys: int) -> parts.Texture:
     """Return the texture of a façade: windows in each storey, and a door at the left of the ground floor.
 
     ``width``: width of the façade [m].
@@ -92,10 +89,10 @@ def front(rng: np.random.Generator, width: float, storeys: int) -> bodies.Textur
     rows, columns = round((STOREY * storeys + 0.4) * TEXELS), round(width * TEXELS)
     wall = float(rng.uniform(0.2, 0.7))
     if rng.uniform() < 0.5:
-        masonry = bodies.bricks(rng, mean=wall, joint=min(0.9, 1.6 * wall), size=256)
+        masonry = parts.bricks(rng, mean=wall, joint=min(0.9, 1.6 * wall), size=256)
         values = np.tile(masonry, (rows // 256 + 1, columns // 256 + 1))[:rows, :columns].astype(np.float64)
     else:
-        values = wall * np.exp(0.3 * bodies.fractal(rng, rows, columns))
+        values = wall * np.exp(0.3 * parts.fractal(rng, rows, columns))
     for storey in range(storeys):
         foot = rows - round(STOREY * storey * TEXELS)
         for k, at in enumerate(window_columns(width)):
@@ -105,7 +102,7 @@ def front(rng: np.random.Generator, width: float, storeys: int) -> bodies.Textur
             else:
                 _window(rng, values, foot - round(0.9 * TEXELS), left)
     values[rows - round(0.5 * TEXELS) :] *= 0.45
-    return bodies.weathered(rng, values, 0.12)
+    return parts.weathered(rng, values, 0.12)
 
 
 def _window(rng: np.random.Generator, values: NDArray[np.float64], foot: int, left: int) -> None:
@@ -145,26 +142,26 @@ def _door(rng: np.random.Generator, values: NDArray[np.float64], foot: int, left
 def town_hall(rng: np.random.Generator, x: float) -> list[Body]:
     """Return a town hall with tower, clock and spire, which stands across the end of the street at ``x`` [m]."""
     wide, high = 26.0, 13.0
-    hall = bodies.standing_box((12.0, wide, high), (x + 6.0, 0.0, 0.0))
-    tower = bodies.standing_box((5.0, 5.0, 24.0), (x, 0.0, 0.0))
-    spire = bodies.moved(bodies.lathe([(3.9, 0.0), (0.4, 7.0), (0.0, 11.0)], sides=16, tile_m=2.0), (x, 0.0, 24.0))
+    hall = parts.standing_box((12.0, wide, high), (x + 6.0, 0.0, 0.0))
+    tower = parts.standing_box((5.0, 5.0, 24.0), (x, 0.0, 0.0))
+    spire = parts.moved(parts.lathe([(3.9, 0.0), (0.4, 7.0), (0.0, 11.0)], sides=16, tile_m=2.0), (x, 0.0, 24.0))
     shafts = [
-        bodies.moved(bodies.cylinder(0.45, 9.0, sides=20, tile_m=1.5), (x - 1.2, y, 0.0))
+        parts.moved(parts.cylinder(0.45, 9.0, sides=20, tile_m=1.5), (x - 1.2, y, 0.0))
         for y in np.linspace(-12, 12, 9)
         if abs(y) > 2.0
     ]
-    clock = bodies.panel((x - 2.52, 1.6, 18.0), (0.0, -3.2, 0.0), (0.0, 0.0, 3.2))
-    roof = bodies.moved(bodies.gable_roof((wide, 13.0, 5.0), tile_m=3.0), (x + 6.0, 0.0, high), turn_deg=90.0)
+    clock = parts.panel((x - 2.52, 1.6, 18.0), (0.0, -3.2, 0.0), (0.0, 0.0, 3.2))
+    roof = parts.moved(parts.gable_roof((wide, 13.0, 5.0), tile_m=3.0), (x + 6.0, 0.0, high), turn_deg=90.0)
     surfaces = {
         "": (hall, front(rng, wide, 4)),
         " tower": (tower, front(rng, 6.0, 7)),
-        " spire": (spire, bodies.bricks(rng, mean=0.15, joint=0.05, size=256)),
-        " columns": (bodies.merged(shafts), bodies.plaster(rng, 0.6, 0.35, size=256)),
-        " clock": (clock, bodies.star(12)),
-        " roof": (roof, bodies.bricks(rng, mean=0.2, joint=0.06, size=256)),
+        " spire": (spire, parts.bricks(rng, mean=0.15, joint=0.05, size=256)),
+        " columns": (parts.merged(shafts), parts.plaster(rng, 0.6, 0.35, size=256)),
+        " clock": (clock, parts.star(12)),
+        " roof": (roof, parts.bricks(rng, mean=0.2, joint=0.06, size=256)),
     }
     return [
-        bodies.solid(f"town hall{part}", mesh, skin, "house", instance="town hall")
+        parts.solid(f"town hall{part}", mesh, skin, "house", instance="town hall")
         for part, (mesh, skin) in surfaces.items()
     ]
 
@@ -186,28 +183,28 @@ VIEW = Viewpoint((-15.0, 0.5, 1.7), (10.0, -0.2, 3.1), walk_m=(8.0, 0.0, 0.0), w
 def build(rng: np.random.Generator, duration_s: float) -> World:
     """Return the world. No body moves, so ``duration_s`` has no effect."""
     bodies = [*_ground(rng), *_blocks(rng), *town_hall(rng, 76.0), *_cars(rng), *_trees(rng), *_posts(rng)]
-    sky = Sky(1.0, textures.sky(rng))
+    sky = Sky(1.0, parts.sky(rng))
     return World("street", tuple(bodies), ambient=0.38, sun=Sun((-0.8, -0.3, 0.62), 0.7), sky=sky)
 
 
 def _ground(rng: np.random.Generator) -> list[Body]:
     """Return the road, the pavements of the blocks, and the road markings."""
-    asphalt = textures.plaster(rng, 0.2, 0.5)
+    asphalt = parts.plaster(rng, 0.2, 0.5)
     slabs = [
-        shapes.standing_box(
+        parts.standing_box(
             (end - start + 4.0, 56.0, 0.14), ((start + end) / 2.0, side * (ROAD + 28.0), 0.0), tile_m=3.0
         )
         for start, end in BLOCKS
         for side in (-1, 1)
     ]
-    dashes = [shapes.box((2.0, 0.14, 0.01), (x, 0.0, 0.0)) for x in np.arange(-78.0, 66.0, 4.5)]
-    bars = [shapes.box((2.6, 0.45, 0.01), (x, y, 0.0)) for x in (-15.0, 17.0, 31.0) for y in np.arange(-3.0, 3.1, 1.0)]
-    paint = textures.weathered(rng, np.full((128, 128), 0.75), 0.3)
+    dashes = [parts.box((2.0, 0.14, 0.01), (x, 0.0, 0.0)) for x in np.arange(-78.0, 66.0, 4.5)]
+    bars = [parts.box((2.6, 0.45, 0.01), (x, y, 0.0)) for x in (-15.0, 17.0, 31.0) for y in np.arange(-3.0, 3.1, 1.0)]
+    paint = parts.weathered(rng, np.full((128, 128), 0.75), 0.3)
     return [
-        parts.solid("road", shapes.panel((-150, -150, 0), (300, 0, 0), (0, 300, 0), tile_m=5.0), asphalt, "road"),
-        parts.solid("pavement", shapes.merged(slabs), textures.tiles(rng, mean=0.42, joint=0.15), "pavement"),
-        parts.solid("lane markings", shapes.merged(dashes), paint, "marking"),
-        parts.solid("crossings", shapes.merged(bars), paint, "marking"),
+        parts.solid("road", parts.panel((-150, -150, 0), (300, 0, 0), (0, 300, 0), tile_m=5.0), asphalt, "road"),
+        parts.solid("pavement", parts.merged(slabs), parts.tiles(rng, mean=0.42, joint=0.15), "pavement"),
+        parts.solid("lane markings", parts.merged(dashes), paint, "marking"),
+        parts.solid("crossings", parts.merged(bars), paint, "marking"),
     ]
 
 
@@ -252,30 +249,28 @@ def _car(rng: np.random.Generator, name: str, place: tuple[float, float]) -> lis
     glass = np.full((64, 128), 0.05)
     glass[:, :6] = glass[:, 60:66] = glass[:, -6:] = glass[:6] = shade
     glass[14:34, 20:40] = 0.35
-    wheel = shapes.lathe([(0.0, -0.1), (0.18, -0.1), (0.31, -0.08), (0.31, 0.08), (0.18, 0.1), (0.0, 0.1)], sides=24)
-    wheels = [
-        shapes.moved(wheel, (x, y, 0.31), turn_deg=90, axis=(1, 0, 0)) for x in (-1.3, 1.3) for y in (-0.75, 0.75)
-    ]
-    rim = textures.clipped(np.repeat([[0.04], [0.04], [0.5], [0.04], [0.04], [0.5]], 16, axis=1))
-    body = shapes.merged(
-        [shapes.standing_box((4.2, 1.7, 0.55), (0, 0, 0.28)), shapes.standing_box((4.35, 1.6, 0.2), (0, 0, 0.3))]
+    wheel = parts.lathe([(0.0, -0.1), (0.18, -0.1), (0.31, -0.08), (0.31, 0.08), (0.18, 0.1), (0.0, 0.1)], sides=24)
+    wheels = [parts.moved(wheel, (x, y, 0.31), turn_deg=90, axis=(1, 0, 0)) for x in (-1.3, 1.3) for y in (-0.75, 0.75)]
+    rim = parts.clipped(np.repeat([[0.04], [0.04], [0.5], [0.04], [0.04], [0.5]], 16, axis=1))
+    body = parts.merged(
+        [parts.standing_box((4.2, 1.7, 0.55), (0, 0, 0.28)), parts.standing_box((4.35, 1.6, 0.2), (0, 0, 0.3))]
     )
-    top = shapes.tapered(shapes.standing_box(cabin, (0.35 if van else -0.25, 0, 0.82)), 0.88 if van else 0.68)
+    top = parts.tapered(parts.standing_box(cabin, (0.35 if van else -0.25, 0, 0.82)), 0.88 if van else 0.68)
     meshes = {
-        "": (body, textures.weathered(rng, paint, 0.15)),
-        " cabin": (top, textures.weathered(rng, glass, 0.2)),
-        " wheels": (shapes.merged(wheels), rim),
+        "": (body, parts.weathered(rng, paint, 0.15)),
+        " cabin": (top, parts.weathered(rng, glass, 0.2)),
+        " wheels": (parts.merged(wheels), rim),
     }
     turn = 0.0 if place[1] < 0 else 180.0
     return [
-        parts.solid(name + part, shapes.moved(mesh, at, turn_deg=turn), texture, "car", instance=name)
+        parts.solid(name + part, parts.moved(mesh, at, turn_deg=turn), texture, "car", instance=name)
         for part, (mesh, texture) in meshes.items()
     ]
 
 
 def _trees(rng: np.random.Generator) -> list[Body]:
     """Return trees along the pavements. A crown consists of six ellipsoids."""
-    bark, leaves = textures.plaster(rng, 0.15, 0.6, size=128), textures.plaster(rng, 0.22, 0.7, size=256)
+    bark, leaves = parts.plaster(rng, 0.15, 0.6, size=128), parts.plaster(rng, 0.22, 0.7, size=256)
     bodies = []
     spots = [
         (x + rng.uniform(-1.0, 1.0), side * (ROAD + 0.9))
@@ -284,42 +279,42 @@ def _trees(rng: np.random.Generator) -> list[Body]:
         for side in (-1, 1)
     ]
     for k, (x, y) in enumerate(spots):
-        trunk = shapes.lathe([(0.17, 0.0), (0.12, 0.6), (0.09, 3.0)], sides=12, tile_m=0.6)
+        trunk = parts.lathe([(0.17, 0.0), (0.12, 0.6), (0.09, 3.0)], sides=12, tile_m=0.6)
         balls = [
-            shapes.moved(
-                shapes.ellipsoid(rng.uniform(0.6, 1.05, 3), sides=14, rings=9, tile_m=1.0),
+            parts.moved(
+                parts.ellipsoid(rng.uniform(0.6, 1.05, 3), sides=14, rings=9, tile_m=1.0),
                 (*rng.uniform(-0.7, 0.7, 2), rng.uniform(2.7, 4.2)),
             )
             for _ in range(6)
         ]
         name = f"tree {k}"
-        bodies.append(parts.solid(f"{name} trunk", shapes.moved(trunk, (x, y, 0.1)), bark, "tree", instance=name))
+        bodies.append(parts.solid(f"{name} trunk", parts.moved(trunk, (x, y, 0.1)), bark, "tree", instance=name))
         bodies.append(
-            parts.solid(f"{name} crown", shapes.moved(shapes.merged(balls), (x, y, 0.1)), leaves, "tree", instance=name)
+            parts.solid(f"{name} crown", parts.moved(parts.merged(balls), (x, y, 0.1)), leaves, "tree", instance=name)
         )
     return bodies
 
 
 def _posts(rng: np.random.Generator) -> list[Body]:
     """Return street lamps, and signs with gratings, stars and checkerboards."""
-    iron = textures.plaster(rng, 0.1, 0.4, size=64)
+    iron = parts.plaster(rng, 0.1, 0.4, size=64)
     bodies = []
     xs = [x for start, end in BLOCKS for x in np.arange(start + 1.0, end, 16.0)]
     for k, x in enumerate(xs):
         side = 1.0 if k % 2 else -1.0
         y = side * (ROAD + 0.5)
-        head = shapes.ellipsoid((0.16, 0.3, 0.1), sides=16, tile_m=0.5)
+        head = parts.ellipsoid((0.16, 0.3, 0.1), sides=16, tile_m=0.5)
         post = [
-            shapes.lathe([(0.12, 0.0), (0.12, 0.8), (0.06, 0.9), (0.045, 5.2)], sides=16, tile_m=0.5),
-            shapes.box((0.06, 1.2, 0.06), (0, -side * 0.6, 5.2), tile_m=0.5),
-            shapes.moved(head, (0, -side * 1.2, 5.15)),
+            parts.lathe([(0.12, 0.0), (0.12, 0.8), (0.06, 0.9), (0.045, 5.2)], sides=16, tile_m=0.5),
+            parts.box((0.06, 1.2, 0.06), (0, -side * 0.6, 5.2), tile_m=0.5),
+            parts.moved(head, (0, -side * 1.2, 5.15)),
         ]
         bodies.append(
-            parts.solid(f"street lamp {k}", shapes.moved(shapes.merged(post), (x, y, 0.1)), iron, "street lamp")
+            parts.solid(f"street lamp {k}", parts.moved(parts.merged(post), (x, y, 0.1)), iron, "street lamp")
         )
-        face = (textures.grating(22.5 * k, 6.0), textures.star(16), textures.checkerboard(4))[k % 3]
-        plate = shapes.box((0.03, 0.6, 0.6), (x + 4.0, -y, 2.5))
-        pole = shapes.moved(shapes.cylinder(0.03, 2.3, sides=10, tile_m=0.4), (x + 4.03, -y, 0.1))
+        face = (parts.grating(22.5 * k, 6.0), parts.star(16), parts.checkerboard(4))[k % 3]
+        plate = parts.box((0.03, 0.6, 0.6), (x + 4.0, -y, 2.5))
+        pole = parts.moved(parts.cylinder(0.03, 2.3, sides=10, tile_m=0.4), (x + 4.03, -y, 0.1))
         bodies.append(parts.solid(f"sign {k}", plate, face, "sign", instance=f"sign {k}"))
         bodies.append(parts.solid(f"sign {k} pole", pole, iron, "sign", instance=f"sign {k}"))
     return bodies
