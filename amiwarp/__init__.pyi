@@ -124,8 +124,8 @@ from .studies.dataset.making import make_dataset as make_dataset
 from .studies.dataset.making import plan_dataset as plan_dataset
 from .studies.evaluate.run import EvaluationSummary as EvaluationSummary
 from .studies.evaluate.run import evaluate as evaluate
-from .translation.datasets import DataSet as DataSet
-from .translation.pictures_between import Interpolation as Interpolation
+from .translation.sources import DataSet as DataSet
+from .translation.sources import Interpolation as Interpolation
 from .translation.translator import translate as translate
 from .viewer.app import NotebookPage as NotebookPage
 from .viewer.app import view as view

@@ -51,7 +51,7 @@ from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape
 from amiwarp.live.stream.queues import PacketQueue, Policy
 from amiwarp.optics.models import MODELS
-from amiwarp.reconstruction.export import save_picture, tones
+from amiwarp.reconstruction.picture import save_picture, tones
 from amiwarp.viewer.clouds import Look
 
 CAMERA = Camera.from_fov(8, 6, 1.0)

@@ -821,7 +821,7 @@ import resource, sys
 from pathlib import Path
 import numpy as np
 from amiwarp.errors import AmiwarpError
-from amiwarp.reconstruction.export import save_grey
+from amiwarp.reconstruction.picture import save_grey
 from amiwarp.imaging.export import save_png
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 noise = np.random.default_rng(0).random((60, 80), np.float32)

@@ -40,8 +40,15 @@ from amiwarp.brightness.event_pairs import EventTable
 from amiwarp.choices import Tone
 from amiwarp.cli.app import app
 from amiwarp.io.text import read_calib
-from amiwarp.reconstruction.export import save_film, save_picture, save_video, tones
-from amiwarp.reconstruction.picture import nodes_near, without_small_holes, without_small_regions
+from amiwarp.reconstruction.picture import (
+    nodes_near,
+    save_film,
+    save_picture,
+    save_video,
+    tones,
+    without_small_holes,
+    without_small_regions,
+)
 from reference.calibration_sample import exact_calibration
 
 CAMERA = Camera.from_fov(200, 150, math.radians(50.0))

@@ -37,10 +37,17 @@ from amiwarp import (
 from amiwarp.cli.app import app
 from amiwarp.events.truth import MemoryMasks
 from amiwarp.simulation.pictures import DARK, open_pictures
-from amiwarp.translation.datasets import SACCADE_US, SACCADES_PX, open_mvsec, saccades
-from amiwarp.translation.pictures_between import READ_US, EventPictures, MotionPictures, PicturePair
-from amiwarp.translation.reconstructed_pictures import find_motion
-from amiwarp.translation.translator import translation, translator_input
+from amiwarp.translation.sources import (
+    READ_US,
+    SACCADE_US,
+    SACCADES_PX,
+    EventPictures,
+    MotionPictures,
+    PicturePair,
+    open_mvsec,
+    saccades,
+)
+from amiwarp.translation.translator import find_motion, translation, translator_input
 
 WEDGE = Prism(math.radians(1.0))
 SIZE = (48, 64)

@@ -114,8 +114,7 @@ def run(
     brightness.
     """
     from amiwarp.calib import Calibration
-    from amiwarp.reconstruction.export import MASK_SUFFIXES, VIDEO, check_path
-    from amiwarp.reconstruction.picture import Reconstruction
+    from amiwarp.reconstruction.picture import MASK_SUFFIXES, VIDEO, Reconstruction, check_path
 
     check_path(out)
     if picture.mask is not None:
@@ -143,7 +142,7 @@ def run(
 
 
 def _still(found: Picture, out: Path, options: PictureOptions) -> dict[str, Any]:
-    from amiwarp.reconstruction.export import save_mask, save_picture
+    from amiwarp.reconstruction.picture import save_mask, save_picture
 
     save_picture(found, out, tone=options.tone, bits=options.bits, contrast=options.contrast)
     if options.mask is not None:
@@ -162,7 +161,7 @@ def _still(found: Picture, out: Path, options: PictureOptions) -> dict[str, Any]
 def _video(
     work: Reconstruction, out: Path, span: tuple[int, int], fps: float, options: PictureOptions, advance: Progress
 ) -> dict[str, Any]:
-    from amiwarp.reconstruction.export import save_video
+    from amiwarp.reconstruction.picture import save_video
 
     step = 1e6 / fps
     count = work.count(*span, step_us=step)

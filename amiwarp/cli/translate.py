@@ -60,8 +60,7 @@ def run(
     Pictures alone, pictures with --events, or the events of a recording alone tell the brightness of the scene. The
     camera has the size of the source unless --size or --camera gives another one.
     """
-    from amiwarp.translation.datasets import DataSet
-    from amiwarp.translation.pictures_between import Interpolation
+    from amiwarp.translation.sources import DataSet, Interpolation
     from amiwarp.translation.translator import translation, translator_input
     from amiwarp.validation import choice
 

@@ -29,8 +29,7 @@ from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import MODELS
 from amiwarp.plotting import clouds
 from amiwarp.plotting.clouds import Renderer
-from amiwarp.reconstruction.export import limits, tones
-from amiwarp.reconstruction.picture import Picture
+from amiwarp.reconstruction.picture import Picture, limits, tones
 
 EVENTS = 2_000_000
 """Largest number of events in the image of a figure; more events are thinned evenly."""

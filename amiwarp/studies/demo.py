@@ -44,8 +44,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.plotting.clouds import Renderer
 from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
 from amiwarp.progress import Progress, silent
-from amiwarp.reconstruction.export import save_picture
-from amiwarp.reconstruction.picture import Picture, Reconstruction
+from amiwarp.reconstruction.picture import Picture, Reconstruction, save_picture
 from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.simulator import Simulation
 

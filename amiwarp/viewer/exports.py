@@ -21,7 +21,7 @@ from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.io.formats import check_ending
 from amiwarp.progress import Progress
-from amiwarp.reconstruction.export import save_film
+from amiwarp.reconstruction.picture import save_film
 from amiwarp.viewer.clouds import Look, Scene, orbit_lines
 from amiwarp.viewer.images import ShownImages
 from amiwarp.viewer.inspector import Inspector

@@ -33,7 +33,7 @@ from amiwarp.studies.evaluate.study import (
     Settings,
     Streams,
 )
-from amiwarp.translation.pictures_between import limited_opencv
+from amiwarp.translation.sources import limited_opencv
 from amiwarp.validation import guarded, real, whole
 
 # Cells of the study: one evaluation under one condition. Each is a file, so that a stopped run can be continued.
