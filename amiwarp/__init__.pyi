@@ -122,8 +122,8 @@ from .studies.dataset.making import DatasetPlan as DatasetPlan
 from .studies.dataset.making import DatasetSummary as DatasetSummary
 from .studies.dataset.making import make_dataset as make_dataset
 from .studies.dataset.making import plan_dataset as plan_dataset
-from .studies.evaluate.run import EvaluationSummary as EvaluationSummary
-from .studies.evaluate.run import evaluate as evaluate
+from .studies.evaluate.evaluation import EvaluationSummary as EvaluationSummary
+from .studies.evaluate.evaluation import evaluate as evaluate
 from .translation.sources import DataSet as DataSet
 from .translation.sources import Interpolation as Interpolation
 from .translation.translator import translate as translate

@@ -18,8 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from amiwarp.studies.cluster import Workers
-from amiwarp.studies.stability.cells import QUICK_METHODS, Cell, Store, chosen, quick_axes, run, run_cell
-from amiwarp.studies.stability.conditions import AXES
+from amiwarp.studies.stability.cells import AXES, QUICK_METHODS, Cell, Store, chosen, quick_axes, run, run_cell
 
 _started = multiprocessing.get_context("spawn").Value("i", 0)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from amiwarp import AmiwarpError
 from amiwarp.io.atomic_output import own_folder
 from amiwarp.studies.chart import Charts, make, simulated
-from amiwarp.studies.chart.rows import beaten_by, fronts
+from amiwarp.studies.chart.measurement import beaten_by, fronts
 from benchmarks.chart_libraries import library_tasks
 
 

@@ -11,8 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp import Vote
-from amiwarp.studies.chart.compensation import IMAGE, ErrorSample, LibraryTask, Uploads, circle
-from amiwarp.studies.chart.rows import Task
+from amiwarp.studies.chart.measurement import IMAGE, ErrorSample, LibraryTask, Task, Uploads, circle
 from benchmarks import libraries
 
 

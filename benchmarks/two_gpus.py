@@ -38,9 +38,8 @@ from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, machine, proce
 from amiwarp.studies.dataset import making
 from amiwarp.studies.dataset.making import Item, list_items, simulation_of, write_recording
 from amiwarp.studies.dataset.specification import content_digest, load_specification
-from amiwarp.studies.stability.cells import METHODS, Cell, Store, Stored, run_cell
+from amiwarp.studies.stability.cells import AXES, METHODS, Axis, Cell, Store, Stored, run_cell
 from amiwarp.studies.stability.cells import run as run_cells
-from amiwarp.studies.stability.conditions import AXES, Axis
 from benchmarks import compensate as file_benchmark
 from benchmarks import simulate
 from benchmarks.dataset import RESULTS, leave_out_tables, write_inputs

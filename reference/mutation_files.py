@@ -62,8 +62,7 @@ from amiwarp.studies import stability
 from amiwarp.studies.dataset.making import JOURNAL, Journal, Made, list_items
 from amiwarp.studies.dataset.specification import load_specification
 from amiwarp.studies.evaluate.edges import THRESHOLDS
-from amiwarp.studies.evaluate.report import CHANCE, section
-from amiwarp.studies.evaluate.run import Store
+from amiwarp.studies.evaluate.evaluation import CHANCE, Store, section
 from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, encode_picture
 from reference.calibration_sample import exact_calibration
 from reference.io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native

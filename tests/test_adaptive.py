@@ -19,7 +19,7 @@ from amiwarp import (
     compensate_events,
 )
 from amiwarp.live.stream.adaptive import DIRECTIONS, Coverage, CoverageMeter, SpeedController, prism_path
-from amiwarp.studies.stability.conditions import SceneKind, draw
+from amiwarp.studies.stability.cells import SceneKind, draw
 
 WINDOW_US = 33_000
 CAMERA, PRISM, PHASE = Camera.from_fov(200, 150, math.radians(40.0)), Prism(math.radians(1.8)), 0.7

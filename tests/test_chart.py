@@ -38,8 +38,8 @@ from amiwarp.cli.app import app
 from amiwarp.optics.models import MODELS
 from amiwarp.plotting import figures
 from amiwarp.progress import silent
-from amiwarp.studies.chart import Charts, calibration, compensation
-from amiwarp.studies.chart.rows import (
+from amiwarp.studies.chart import Charts, measurement
+from amiwarp.studies.chart.measurement import (
     KnownRecording,
     Row,
     Task,
@@ -137,7 +137,7 @@ def test_every_library_makes_the_same_image(known: KnownRecording) -> None:
 
 def test_compensation_rows_tell_speed_and_error(known: KnownRecording, device: str, tmp_path: Path) -> None:
     said = []
-    rows, _ = compensation.rows(
+    rows, _ = measurement.compensation_rows(
         known, device, repeats=1, quick=True, folder=tmp_path, progress=lambda what, share: said.append((what, share))
     )
     by_label = {row.label: row for row in rows}
@@ -161,14 +161,16 @@ def test_compensation_rows_tell_speed_and_error(known: KnownRecording, device: s
 def test_an_image_that_is_wrong_is_refused(
     known: KnownRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(compensation, "exact_image", lambda known: np.roll(exact_image(known), 1, axis=1))
+    monkeypatch.setattr(measurement, "exact_image", lambda known: np.roll(exact_image(known), 1, axis=1))
     with pytest.raises(AmiwarpError, match=r"exact, bilinear differs from the float64 one"):
-        compensation.rows(known, "cpu", repeats=1, quick=True, folder=tmp_path, progress=lambda what, share: None)
+        measurement.compensation_rows(
+            known, "cpu", repeats=1, quick=True, folder=tmp_path, progress=lambda what, share: None
+        )
 
 
 def test_settings_are_different_and_one_is_the_default(known: KnownRecording) -> None:
     for quick in (False, True):
-        ways = calibration.settings(known, quick=quick)
+        ways = measurement.calibration_settings(known, quick=quick)
         assert len({way.label for way in ways}) == len(ways)
         assert [way.label for way in ways if way.fields("cpu")["default"]] == ["default"]
         for way in ways:
@@ -462,7 +464,7 @@ def calibrations(known: KnownRecording, low_ms: float, high_ms: float, error_px:
     """The calibration rows of a whole chart with times and errors within these limits."""
     rng = np.random.default_rng(0)
     out = []
-    for way in calibration.settings(known, quick=False):
+    for way in measurement.calibration_settings(known, quick=False):
         late = 0.25 + 0.5 * (len(way.settings.stages) - 1) + rng.normal(0.0, 0.1)
         px = {"circle": 0.2, "radial": 0.06}.get(way.settings.model, error_px) * rng.uniform(1.0, 3.0)
         took = 1e-3 * low_ms * (high_ms / low_ms) ** min(max(late, 0.0), 1.0)
@@ -479,17 +481,17 @@ def compensations(mev_per_s: dict[str, float], others: dict[str, float], files: 
         return Row(**fields, events=10**6, seconds=1.0 / speed, spread=0.1, repeats=7, error_px=error_px)
 
     out = []
-    for way in compensation.settings(quick=False):
+    for way in measurement.compensation_settings(quick=False):
         speed = mev_per_s[way.model] * rng.uniform(0.95, 1.05) * way.share
         rough = math.hypot(errors[way.model], 12.0 / way.angles, 0.408 if way.vote is Vote.NEAREST else 0.0)
         out.append(made(way.fields("cpu"), speed, rough))
-    fixed: dict[str, Any] = {"chart": "compensation", "job": compensation.IMAGE, "family": "other libraries"}
+    fixed: dict[str, Any] = {"chart": "compensation", "job": measurement.IMAGE, "family": "other libraries"}
     for name, speed in others.items():
         mark = name.partition(",")[0]
         out.append(made({**fixed, "label": f"{name} (circle)", "mark": mark, "settings": {}}, speed, 0.5))
     for model, px in errors.items():
-        file = {**fixed, "job": compensation.FILE, "label": f"{model}, file to file", "family": model,
-                "mark": compensation.FILE, "settings": {"model": model}, "default": model == "exact"}  # fmt: skip
+        file = {**fixed, "job": measurement.FILE, "label": f"{model}, file to file", "family": model,
+                "mark": measurement.FILE, "settings": {"model": model}, "default": model == "exact"}  # fmt: skip
         out.append(made(file, files * rng.uniform(0.8, 1.2), px))
     return out
 

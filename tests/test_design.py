@@ -32,12 +32,16 @@ from amiwarp.calib.model_choice import QUANTISATION_PX
 from amiwarp.cli import design as command_line
 from amiwarp.cli.console import report
 from amiwarp.cli.options import Common, command
-from amiwarp.studies.design import Design, Limits, Timing, design
-from amiwarp.studies.design.choice import (
+from amiwarp.studies.design import (
     ACROSS,
     LEAST_SWING,
     QUARTER_SWING,
     TILE,
+    Design,
+    Limits,
+    Timing,
+    chart,
+    design,
     filled,
     headline,
     measure,
@@ -45,7 +49,6 @@ from amiwarp.studies.design.choice import (
     reasons,
     tiles,
 )
-from amiwarp.studies.design.drawing import chart
 
 GLASS = Prism(0.0)
 SMALL = Camera.from_fov(64, 48, math.radians(10.0))

@@ -132,10 +132,10 @@ def test_rows_are_selected_and_summarised(extension: Any) -> None:
 
 
 def test_a_report_of_evaluations_becomes_a_page(extension: Any, tmp_path: Path) -> None:
-    from amiwarp.studies.evaluate.report import write
+    from amiwarp.studies.evaluate.evaluation import write
     from amiwarp.studies.evaluate.study import QUICK, Chart, Claim, Table
 
-    report, page = extension("amiwarp.studies.evaluate.report"), extension("paper_results")
+    report, page = extension("amiwarp.studies.evaluate.evaluation"), extension("paper_results")
     chart = Chart("x", "y", "s", panels=("p",))
     tables = [Table("curve", "Curve", ("p", "s", "x", "y"), [("a", "b", k, 2.0 * k) for k in range(3)], "Up.", chart),
               Table("few", "Few", ("name", "y"), [("one | two", 0.5)]),

@@ -25,8 +25,18 @@ from amiwarp.progress import silent
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.evaluate import apex_speed, corners, fading, texture
 from amiwarp.studies.evaluate.edges import Counts, best_f, binary_entropy, geometric_edges, match
-from amiwarp.studies.evaluate.report import EVALUATIONS, load, refused, section, write
-from amiwarp.studies.evaluate.run import Job, Store, _run, plan, run_job
+from amiwarp.studies.evaluate.evaluation import (
+    EVALUATIONS,
+    Job,
+    Store,
+    _run,
+    load,
+    plan,
+    refused,
+    run_job,
+    section,
+    write,
+)
 from amiwarp.studies.evaluate.study import (
     DISCS,
     IDEAL,
@@ -424,7 +434,7 @@ def test_damaged_cells_are_run_again_and_said(tmp_path: Path) -> None:
 
 
 def test_a_table_without_values_has_no_chart() -> None:
-    from amiwarp.studies.evaluate.report import draw
+    from amiwarp.studies.evaluate.evaluation import draw
     from amiwarp.studies.evaluate.study import Chart
 
     empty = Table("t", "t", ("x", "y", "s"), [(1, None, "a")], chart=Chart("x", "y", "s"))

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from amiwarp import AmiwarpError
-from amiwarp.studies.evaluate import measures as naturalness
+from amiwarp.studies.evaluate import study as naturalness
 from amiwarp.studies.evaluate.flow import flow_error
-from amiwarp.studies.evaluate.measures import displayed, fitted, library, similarity
 from amiwarp.studies.evaluate.pose import PROPORTIONS, blob_keypoints, box_overlap, detected_joints
 from amiwarp.studies.evaluate.segmentation import overlap
+from amiwarp.studies.evaluate.study import displayed, fitted, library, similarity
 
 
 def picture(shape: tuple[int, int] = (120, 160), seed: int = 0) -> NDArray[np.float64]:

@@ -11,8 +11,7 @@ from amiwarp import AmiwarpError, ExactModel, calibrate, model_error
 from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.stability import AXES, Condition, Outcome, chosen, identity, make, quick_axes, run, sensible
-from amiwarp.studies.stability.cells import Store, best_fit, conditions
-from amiwarp.studies.stability.conditions import SceneKind, draw
+from amiwarp.studies.stability.cells import SceneKind, Store, best_fit, conditions, draw
 from tests.conftest import COARSE
 
 SMALL = Condition(width=160, height=120, turns=3.0)

@@ -12,7 +12,7 @@ from amiwarp.io import open_recording
 from amiwarp.io.atomic_output import check_output
 from amiwarp.progress import part
 from amiwarp.studies.chart import Charts
-from amiwarp.studies.chart.rows import Row, beaten_by, fronts, told_apart
+from amiwarp.studies.chart.measurement import Row, beaten_by, fronts, told_apart
 
 EXAMPLE = "amiwarp chart --out amiwarp-chart --budget-px 0.3"
 

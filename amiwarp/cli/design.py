@@ -123,8 +123,7 @@ def run(
     device = choose_device(common.device)
     from amiwarp.simulation.description import Scene, SensorModel
     from amiwarp.studies.demo import earth
-    from amiwarp.studies.design import design
-    from amiwarp.studies.design.drawing import draw
+    from amiwarp.studies.design import design, draw
 
     make_folder(out)
     files = {kind: str(out / f"design.{kind}") for kind in ("png", "svg", "json", "csv")}
@@ -156,7 +155,7 @@ def _list(text: str, name: str) -> tuple[float, ...]:
 
 def summary(design: Design) -> dict[str, Any]:
     """Return all results of the study for JSON, with angles in degrees."""
-    from amiwarp.studies.design.choice import headline, reasons
+    from amiwarp.studies.design import headline, reasons
 
     camera, volume = design.camera, design.volume
     return {
@@ -219,7 +218,7 @@ def _csv(rows: list[dict[str, Any]]) -> str:
 
 def lines(design: Design, files: dict[str, str]) -> list[Any]:
     """Return the results as tables and lines of text."""
-    from amiwarp.studies.design.choice import degrees, headline, rate, reasons
+    from amiwarp.studies.design import degrees, headline, rate, reasons
 
     rows = [
         (degrees(c.orbit.apex), f"{c.rpm:g}", rate(c.events_per_s), f"{c.orbit.radius:.1f} px", f"{c.error_px:.3f} px",

@@ -14,7 +14,7 @@ from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.studies.cluster import ANY_GPU
 
 if TYPE_CHECKING:
-    from amiwarp.studies.evaluate.run import EvaluationSummary
+    from amiwarp.studies.evaluate.evaluation import EvaluationSummary
 
 EXAMPLE = "amiwarp evaluate --out evaluation --only texture"
 AVERAGE_S = 600.0
@@ -64,7 +64,7 @@ def run(
     same command continues a stopped run. --device cuda uses all GPUs.
     """
     device = common.device if common.device == ANY_GPU else choose_device(common.device)
-    from amiwarp.studies.evaluate.run import evaluate
+    from amiwarp.studies.evaluate.evaluation import evaluate
 
     names = tuple(name.strip() for name in only.split(",") if name.strip()) if only else ()
     try:

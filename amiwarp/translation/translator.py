@@ -118,7 +118,7 @@ SMOOTHING_PX = COARSE_PX, FINE_PX = 2.0, 1.0
 TOLERANCE_PX = 0.02
 """A search ends when its steps move the image by less than this in the window [px]."""
 EVALUATIONS = 120
-"""Largest number of images of sources.warped events per search."""
+"""Largest number of images of warped events per search."""
 BEST = 2
 """Number of starts that are refined."""
 PAD = 16

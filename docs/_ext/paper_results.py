@@ -14,7 +14,7 @@ from typing import Any
 from generated_files import write_page
 from sphinx.application import Sphinx
 
-from amiwarp.studies.evaluate.report import draw, pivoted, save
+from amiwarp.studies.evaluate.evaluation import draw, pivoted, save
 from amiwarp.studies.evaluate.study import Chart, ChartKind, Table
 
 FOLDER = "paper-results"

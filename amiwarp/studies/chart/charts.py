@@ -26,16 +26,8 @@ from amiwarp.optics.models import MODELS, rungs
 from amiwarp.plotting import figures
 from amiwarp.progress import Progress, part, silent
 from amiwarp.simulation.description import SensorModel
-from amiwarp.studies.chart import calibration, compensation
-from amiwarp.studies.chart.rows import (
-    KnownRecording,
-    Row,
-    beaten_by,
-    fastest_within,
-    fronts,
-    most_accurate_within,
-    told_apart,
-)
+from amiwarp.studies.chart import measurement
+from amiwarp.studies.chart.measurement import KnownRecording, Row
 from amiwarp.studies.cluster import machine, versions
 from amiwarp.studies.demo import Demo, simulation
 
@@ -185,7 +177,7 @@ def draw(path: Path, rows: Sequence[Row], title: str, note: str) -> None:
 
     Raises :class:`ModuleNotFoundError` if Matplotlib or Pillow is missing.
     """
-    lines = [(job, chosen, LINES[k % len(LINES)]) for k, (job, chosen) in enumerate(fronts(rows)) if chosen]
+    lines = [(job, chosen, LINES[k % len(LINES)]) for k, (job, chosen) in enumerate(measurement.fronts(rows)) if chosen]
     lists = _numbered(rows, lines)
     keys = _keys(rows, lines)
     listed = LINE * max(len(each) for each in lists)
@@ -250,8 +242,11 @@ def _numbered(rows: Sequence[Row], lines: Sequence[tuple[str, list[Row], Any]]) 
     lists: list[list[tuple[str, Any]]] = []
     numbers = itertools.count(1)
     for job, chosen, _ in lines:
-        listed: list[tuple[str, Any]] = [("", job), *((str(next(numbers)), row) for row in told_apart(chosen))]
-        listed += [("–" if beaten_by(row, rows) else "≈", row)
+        listed: list[tuple[str, Any]] = [
+            ("", job),
+            *((str(next(numbers)), row) for row in measurement.told_apart(chosen)),
+        ]
+        listed += [("–" if measurement.beaten_by(row, rows) else "≈", row)
                    for row in rows if row.default and row.job == job and row not in chosen]  # fmt: skip
         lists.append(listed)
     if len(lists) == 1 and len(lists[0]) > 5:
@@ -375,13 +370,13 @@ class Charts:
         ``budget_px`` selects the fastest rows of both commands; ``budget_ms`` the most accurate calibration.
         """
         out: dict[str, Row | None] = {}
-        files = [r for r in self.compensation if r.job == compensation.FILE]
+        files = [r for r in self.compensation if r.job == measurement.FILE]
         if budget_px is not None:
-            out["calibration"] = fastest_within(self.calibration, budget_px)
+            out["calibration"] = measurement.fastest_within(self.calibration, budget_px)
             # without whole files, the images give the order of the models
-            out["compensation"] = fastest_within(files or _as_files(self.compensation), budget_px)
+            out["compensation"] = measurement.fastest_within(files or _as_files(self.compensation), budget_px)
         if budget_ms is not None:
-            out["calibration"] = most_accurate_within(self.calibration, budget_ms * 1e-3)
+            out["calibration"] = measurement.most_accurate_within(self.calibration, budget_ms * 1e-3)
         for kind, row in out.items():
             if row is not None:
                 _preset(kind, row).save(folder / f"preset_{kind}.json")
@@ -433,7 +428,7 @@ def make(
     device: str = "cpu",
     seed: int = 0,
     quick: bool = False,
-    libraries: compensation.Libraries | None = None,
+    libraries: measurement.Libraries | None = None,
     progress: Progress | None = None,
 ) -> Charts:
     """Measure a recording with ground truth; write both charts and their data into the folder ``out``.
@@ -449,7 +444,7 @@ def make(
         check_output(path)
     report = progress or silent
     repeats = dict.fromkeys(REPEATS, 1) if quick else REPEATS
-    compensated, notes = compensation.rows(
+    compensated, notes = measurement.compensation_rows(
         known,
         device,
         repeats=repeats["compensation"],
@@ -458,7 +453,7 @@ def make(
         progress=part(report, 0.0, 0.3),
         libraries=libraries,
     )
-    calibrated, more = calibration.rows(
+    calibrated, more = measurement.calibration_rows(
         known, device, repeats=repeats["calibration"], quick=quick, seed=seed, progress=part(report, 0.3, 0.97)
     )
     report("drawing", 0.97)
@@ -486,7 +481,7 @@ def _share_note(rows: Sequence[Row]) -> str:
 def _guess_note(rows: Sequence[Row]) -> str:
     """Return the note that is printed below the calibration chart."""
     text = "Model error: rms over image and turn, without the constant lag."
-    guess = round(math.degrees(calibration.GUESS))
+    guess = round(math.degrees(measurement.GUESS))
     if any(not r.comparable for r in rows):
         text += f" With a guess: the phase is known to {guess}°, so these points are not part of the front."
     return text
@@ -515,8 +510,10 @@ def _data(charts: Charts) -> dict[str, Any]:
         rows: tuple[Row, ...] = getattr(charts, name)
         out[name] = {
             "rows": [{**asdict(r), **_measured(r)} for r in rows],
-            "fronts": {job: [r.label for r in chosen] for job, chosen in fronts(rows)},
-            "defaults": {r.label: {"beaten_by": [b.label for b in beaten_by(r, rows)]} for r in rows if r.default},
+            "fronts": {job: [r.label for r in chosen] for job, chosen in measurement.fronts(rows)},
+            "defaults": {
+                r.label: {"beaten_by": [b.label for b in measurement.beaten_by(r, rows)]} for r in rows if r.default
+            },
         }
     return out
 
@@ -525,7 +522,12 @@ def _csv(rows: Sequence[Row]) -> str:
     """Return the rows as CSV, one line per measured setting. Settings that a row lacks are empty."""
     fixed = ("chart", "job", "label", "default", "on_front", "error_px", "mev_per_s", "ms", "spread",
              "repeats", "image_error")  # fmt: skip
-    on = {id(r) for name in REPEATS for _, chosen in fronts([r for r in rows if r.chart == name]) for r in chosen}
+    on = {
+        id(r)
+        for name in REPEATS
+        for _, chosen in measurement.fronts([r for r in rows if r.chart == name])
+        for r in chosen
+    }
     flat = []
     for r in rows:
         nested = r.settings.get("photometric", {})

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from amiwarp.events.events import Events
 from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.optics.camera import Camera, CameraRotation
-from amiwarp.studies.evaluate.measures import smoothed
+from amiwarp.studies.evaluate.study import smoothed
 
 SMOOTHING_PX = (5.0, 1.0)
 """Standard deviations of the Gaussian that smooths the image, from coarse to fine [px]."""

@@ -14,8 +14,7 @@ from amiwarp.events.events import Events
 from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.iwe import iwe
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.measures import library
-from amiwarp.studies.evaluate.report import CHANCE
+from amiwarp.studies.evaluate.evaluation import CHANCE
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 # Agreement of edge pixels with true edges: one-to-one matches within a tolerance, precision, recall and F-score.
@@ -125,7 +124,7 @@ def grey_picture(intensity: NDArray[np.floating]) -> NDArray[np.float64]:
 
 def canny_edges(intensity: NDArray[np.floating], sigma: float = CANNY_SIGMA) -> NDArray[np.bool_]:
     """Return the Canny edges of a picture of luminance, smoothed by a Gaussian of ``sigma`` [px]."""
-    return np.asarray(library("skimage.feature").canny(grey_picture(intensity), sigma=sigma), np.bool_)
+    return np.asarray(study.library("skimage.feature").canny(grey_picture(intensity), sigma=sigma), np.bool_)
 
 
 def geometric_edges(frame: FrameTruth) -> NDArray[np.bool_]:
@@ -133,7 +132,7 @@ def geometric_edges(frame: FrameTruth) -> NDArray[np.bool_]:
     edges = np.zeros(frame.depth.shape, np.bool_)
     for here, there in (((slice(None), slice(-1)), (slice(None), slice(1, None))), ((slice(-1),), (slice(1, None),))):
         edges[here] |= _differ(frame, here, there)
-    return np.asarray(library("skimage.morphology").skeletonize(edges), np.bool_)
+    return np.asarray(study.library("skimage.morphology").skeletonize(edges), np.bool_)
 
 
 def _differ(frame: FrameTruth, here: Any, there: Any) -> NDArray[np.bool_]:
@@ -259,7 +258,7 @@ class _Image:
             above = np.asarray(self.image >= threshold, np.bool_)
             count = int(above.sum())
             if count not in known:
-                known[count] = (above, np.asarray(library("skimage.morphology").skeletonize(above), np.bool_))
+                known[count] = (above, np.asarray(study.library("skimage.morphology").skeletonize(above), np.bool_))
             out.append(known[count])
         return out
 

@@ -14,17 +14,7 @@ from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.iwe import iwe
 from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.simulation.pictures import DARK
-from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.contrast_motion import (
-    MOST_LOCAL,
-    dithered,
-    estimate_rotation,
-    local_contrast,
-    rotated_back,
-    thinned,
-    velocity_grid,
-)
-from amiwarp.studies.evaluate.measures import library
+from amiwarp.studies.evaluate import contrast_motion, study
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 # Optical flow from events: dense inverse search between event images, and contrast maximisation per tile.
@@ -43,7 +33,7 @@ def flow_by_dis(first: Events, second: Events, size: tuple[int, int], interval_s
     ``size``: width and height [px]. ``interval_s``: time between the middles of the windows [s].
     Source: T. Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016.
     """
-    cv2 = library("cv2")
+    cv2 = study.library("cv2")
     images = [iwe(events, *size) for events in (first, second)]
     full = np.concatenate([image[image > 0.0] for image in images])
     top = float(np.percentile(full, BRIGHT_PERCENTILE)) if full.size else 1.0
@@ -60,12 +50,12 @@ def flow_by_contrast(events: Events, camera: Camera) -> NDArray[np.float32]:
     size = (camera.width, camera.height)
     if len(events) < 2 or events.t[-1] == events.t[0]:
         return np.zeros((*size[::-1], 2), np.float32)
-    events, seconds = dithered(events), (int(events.t[-1]) - int(events.t[0])) * 1e-6
-    rotation = estimate_rotation(events, camera)
-    grid = velocity_grid(REACH_PX, 1.0)
+    events, seconds = contrast_motion.dithered(events), (int(events.t[-1]) - int(events.t[0])) * 1e-6
+    rotation = contrast_motion.estimate_rotation(events, camera)
+    grid = contrast_motion.velocity_grid(REACH_PX, 1.0)
     rows, columns = (np.arange(min(TILE // 2, n // 2), n, TILE) for n in size[::-1])
-    back = rotated_back(thinned(events, MOST_LOCAL), camera, rotation)
-    maps = local_contrast(back, size, grid.reshape(-1, 2) / seconds, TILE / 2.0)
+    back = contrast_motion.rotated_back(contrast_motion.thinned(events, contrast_motion.MOST_LOCAL), camera, rotation)
+    maps = contrast_motion.local_contrast(back, size, grid.reshape(-1, 2) / seconds, TILE / 2.0)
     scores = np.array([sharpness[np.ix_(rows, columns)] for sharpness in maps])
     motion = sharpest(scores.reshape(*grid.shape[:2], len(rows), len(columns)), grid)
     at = np.meshgrid(*((np.arange(n) - c[0]) / TILE for n, c in zip(size[::-1], (rows, columns), strict=True)),

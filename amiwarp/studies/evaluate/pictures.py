@@ -20,7 +20,6 @@ from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.simulation.pictures import DARK
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.contrast_motion import estimate_rotation
-from amiwarp.studies.evaluate.measures import BLOCK, displayed, fitted, niqe, similarity
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 from amiwarp.validation import real
 
@@ -221,7 +220,7 @@ def _scores(streams: Streams, made: Made) -> list[dict[str, Any]]:
     rows = []
     for window, picture in made:
         truth = log_truth(streams, window.middle_us)
-        found = similarity(*fitted(picture, truth))
+        found = study.similarity(*study.fitted(picture, truth))
         rows.append({"time_ms": (window.middle_us - made[0][0].middle_us) * 1e-3, "psnr": found.psnr_db,
                      "ssim": found.ssim, "niqe": naturalness(picture), "niqe_truth": naturalness(truth)})  # fmt: skip
     return rows
@@ -234,7 +233,7 @@ def _held(streams: Streams, made: Made) -> list[dict[str, Any]]:
         for rate in RATES_HZ:
             for share in HOLD:
                 t_us = min(window.middle_us + round(share * 1e6 / rate), streams.end_us)
-                found = similarity(*fitted(picture, log_truth(streams, t_us)))
+                found = study.similarity(*study.fitted(picture, log_truth(streams, t_us)))
                 rows.append({"rate": rate, "psnr": found.psnr_db, "ssim": found.ssim})
     return rows
 
@@ -246,8 +245,8 @@ def log_truth(streams: Streams, t_us: int) -> NDArray[np.float64]:
 
 def naturalness(picture: NDArray[Any]) -> float | None:
     """Return the NIQE of a picture, or None if it is uniform or smaller than two blocks."""
-    rows, columns = (side // BLOCK for side in picture.shape)
-    return niqe(displayed(picture)) if rows * columns >= 2 and np.ptp(picture) > 0.0 else None
+    rows, columns = (side // study.BLOCK for side in picture.shape)
+    return study.niqe(study.displayed(picture)) if rows * columns >= 2 and np.ptp(picture) > 0.0 else None
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:

@@ -10,7 +10,6 @@ from scipy import ndimage
 from amiwarp.errors import AmiwarpError
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.measures import displayed
 from amiwarp.studies.evaluate.pictures import PictureMaker, Window, reconstructed_streams
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
@@ -160,7 +159,7 @@ def measure(streams: Streams, settings: Settings, detectors: Mapping[str, Detect
         for stream, maker in makers.items():
             for window, picture in zip(chosen, maker.pictures(chosen), strict=True):
                 for name, detect in found.items():
-                    joints = detect(displayed(picture))
+                    joints = detect(study.displayed(picture))
                     rows += _rows(streams, window, rate, joints, {"stream": stream.value, "detector": name})
     return {"rows": rows}
 

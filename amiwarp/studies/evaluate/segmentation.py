@@ -10,19 +10,8 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.optics.camera import Camera
-from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.contrast_motion import (
-    MOST_LOCAL,
-    dithered,
-    estimate_rotation,
-    local_agreement,
-    pixel_index,
-    rotated_back,
-    thinned,
-    velocity_grid,
-)
+from amiwarp.studies.evaluate import contrast_motion, study
 from amiwarp.studies.evaluate.flow import moving_instances
-from amiwarp.studies.evaluate.measures import library
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 # Segmentation of moving bodies: what stays blurred after the camera's motion is compensated is clustered.
@@ -68,7 +57,9 @@ def moving_events(events: Events, camera: Camera, settings: Sequence[Segmentatio
     if len(events) < 2 or events.t[-1] == events.t[0]:
         return [np.zeros(len(events), np.bool_) for _ in settings]
     size, scale = (camera.width, camera.height), camera.width / 640.0
-    back = rotated_back(dithered(events), camera, estimate_rotation(events, camera))
+    back = contrast_motion.rotated_back(
+        contrast_motion.dithered(events), camera, contrast_motion.estimate_rotation(events, camera)
+    )
     gain = agreement_gain(back, size, settings[0], scale)
     out = []
     for s in settings:
@@ -82,15 +73,17 @@ def moving_events(events: Events, camera: Camera, settings: Sequence[Segmentatio
 def agreement_gain(events: Events, size: tuple[int, int], s: SegmentationSettings, scale: float) -> NDArray[np.float64]:
     """Return how much better events agree under a further velocity where each event lies, shape (n,): a ratio."""
     seconds = (int(events.t[-1]) - int(events.t[0])) * 1e-6
-    grid = velocity_grid(s.reach_px * scale, max(s.step_px * scale, 1.0)).reshape(-1, 2)
+    grid = contrast_motion.velocity_grid(s.reach_px * scale, max(s.step_px * scale, 1.0)).reshape(-1, 2)
     fast = np.hypot(*grid.T) >= s.least_px * scale
     slow_best, fast_best = (np.zeros(size[::-1]) for _ in range(2))
-    found = local_agreement(thinned(events, MOST_LOCAL), size, grid / seconds, s.pool_px * scale)
+    found = contrast_motion.local_agreement(
+        contrast_motion.thinned(events, contrast_motion.MOST_LOCAL), size, grid / seconds, s.pool_px * scale
+    )
     for is_fast, agreement in zip(fast, found, strict=True):
         best = fast_best if is_fast else slow_best
         np.maximum(best, agreement, out=best)
     ratio = np.divide(fast_best, slow_best, out=np.where(fast_best > 0.0, np.inf, 0.0), where=slow_best > 0.0)
-    return np.asarray(ratio.ravel()[pixel_index(events, size)])
+    return np.asarray(ratio.ravel()[contrast_motion.pixel_index(events, size)])
 
 
 def in_large_clusters(
@@ -107,7 +100,7 @@ def in_large_clusters(
     chosen = np.random.default_rng(0).permutation(len(points))[:MOST_CLUSTERED]
     even = len(chosen) * 4.0 / 3.0 * np.pi * radius**2 / (WINDOW_RADII * size[0] * size[1])
     least = max(3, round(s.density * even))
-    label = library("sklearn.cluster").DBSCAN(eps=radius, min_samples=least).fit_predict(points[chosen])
+    label = study.library("sklearn.cluster").DBSCAN(eps=radius, min_samples=least).fit_predict(points[chosen])
     counts = np.bincount(label + 1, minlength=1)
     large = counts >= s.least_share * len(chosen)
     large[0] = False  # noise

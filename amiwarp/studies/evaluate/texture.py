@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from amiwarp.events.events import Events
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.measures import smoothed
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Table
 
 # Evenness of events over the image: kernel density at each event's place, and its variance.
@@ -48,7 +47,7 @@ def density_variance(counts: NDArray[np.float32], h_px: float) -> float:
     number = float(counts.sum(dtype=np.float64))
     if not number:
         return float("nan")
-    mass = smoothed(counts, FINENESS * h_px, truncate=TRUNCATE, mirrored=False)
+    mass = study.smoothed(counts, FINENESS * h_px, truncate=TRUNCATE, mirrored=False)
     density = mass / _inside_share(counts.shape, h_px)
     mean = float(np.sum(counts * density, dtype=np.float64)) / number
     return float(np.sum(counts * (density / mean - 1.0) ** 2, dtype=np.float64)) / number
@@ -60,7 +59,7 @@ def _inside_share(shape: tuple[int, int], h_px: float) -> NDArray[np.float32]:
     cells = np.ones(shape, np.float32)
     for edge in (cells[0], cells[-1], cells[:, 0], cells[:, -1]):
         edge *= 0.5
-    return smoothed(cells, FINENESS * h_px, truncate=TRUNCATE, mirrored=False)
+    return study.smoothed(cells, FINENESS * h_px, truncate=TRUNCATE, mirrored=False)
 
 
 # Evaluation.

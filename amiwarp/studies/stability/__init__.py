@@ -1,9 +1,12 @@
 """Stability study (atlas of failures): recordings under ever harder conditions, calibrated by several methods."""
 
 from amiwarp.studies.stability.cells import (
+    AXES,
     METHODS,
     QUICK_METHODS,
+    Axis,
     Cell,
+    Condition,
     Method,
     Outcome,
     Result,
@@ -11,11 +14,12 @@ from amiwarp.studies.stability.cells import (
     Stored,
     chosen,
     identity,
+    make,
     quick_axes,
     run,
     run_cell,
+    sensible,
 )
-from amiwarp.studies.stability.conditions import AXES, Axis, Condition, make, sensible
 from amiwarp.studies.stability.report import Atlas, aggregate, draw, load, summary
 
 __all__ = [

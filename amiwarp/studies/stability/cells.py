@@ -1,4 +1,4 @@
-"""Cell of the stability study: a condition, a seed, and the result of each calibration method on that recording."""
+"""Cells of the stability study: simulated recordings under conditions, and their calibration by each method."""
 
 import contextlib
 import enum
@@ -6,12 +6,13 @@ import hashlib
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache, partial
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
 from amiwarp._version import __version__
@@ -23,14 +24,632 @@ from amiwarp.calib.presets import settings_to
 from amiwarp.calib.settings import AUTO, STAGES
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import TWO_PI, Encoder
+from amiwarp.events.events import Events, MemoryEvents
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.metrics import model_error
 from amiwarp.io.json_files import build, fields_of, value_of
 from amiwarp.io.sealed_json import CellStore
+from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.models import ExactModel, predicted_error
+from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.progress import Progress
+from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel, Still
+from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs
-from amiwarp.studies.stability.conditions import AXES, Axis, Condition, SimulatedSample, make
 from amiwarp.validation import instance, real, whole
+
+# Scenes of the stability study, drawn from a seed: from a dense texture to a blank wall.
+
+DARK, BRIGHT = 0.2, 1.0
+"""Smallest and largest luminance of the scenes, relative to white."""
+LAMP_HZ = 100.0
+"""Frequency of the flickering lamp [Hz]."""
+FRAME_US = 1000
+"""Interval between two pictures of a changing scene [us]."""
+
+
+class SceneKind(enum.StrEnum):
+    """Kind of scene of the stability study."""
+
+    TEXTURE = "dense texture"
+    EDGES = "sparse edges"
+    ONE_DIRECTION = "one edge direction"
+    REPEATING = "repeating texture"
+    PRINT = "print"
+    LINES = "few thin lines"
+    BLANK = "blank wall"
+
+
+def draw(kind: SceneKind, width: int, height: int, *, period: float, seed: int) -> NDArray[np.float32]:
+    """Draw a scene of a kind, and return its linear luminance, shape ``(height, width)``.
+
+    ``period`` is the period of the repeating texture [texels].
+    """
+    rng = np.random.default_rng([seed, 0x5CE7E])
+    if kind is SceneKind.TEXTURE:
+        return leaves(rng, width, height)
+    if kind is SceneKind.EDGES:
+        return polygons(rng, width, height)
+    if kind is SceneKind.PRINT:
+        return printed(rng, width, height)
+    if kind is SceneKind.LINES:
+        return thin_lines(rng, width, height)
+    if kind is SceneKind.BLANK:
+        return np.full((height, width), 0.5, np.float32)
+    rows, cols = np.mgrid[:height, :width].astype(np.float64)
+    if kind is SceneKind.REPEATING:
+        waves = np.cos(2.0 * np.pi * cols / period) + np.cos(2.0 * np.pi * rows / period)
+        return _levels(0.5 + 0.25 * waves)
+    angle = rng.uniform(0.0, np.pi)
+    across = cols * math.cos(angle) + rows * math.sin(angle)
+    steps = np.sort(rng.uniform(across.min(), across.max(), max(6, (width + height) // 40)))
+    values = rng.uniform(0.0, 1.0, len(steps) + 1)
+    return _levels(values[np.searchsorted(steps, across)])
+
+
+def leaves(rng: np.random.Generator, width: int, height: int, count: int = 4000) -> NDArray[np.float32]:
+    """Return discs that occlude each other, with sizes by a power law: the statistics of natural images.
+
+    Lee, Mumford, Huang, "Occlusion models for natural images", IJCV 2001.
+    """
+    largest, smallest = height / 4.0, 3.0
+    out = np.full((height, width), 0.5)
+    u = rng.uniform(size=count)
+    radii = 1.0 / np.sqrt(u * (smallest**-2 - largest**-2) + largest**-2)  # density proportional to r^-3
+    middles = rng.uniform(0.0, 1.0, (count, 2)) * (height, width)
+    for radius, (y, x), value in zip(radii, middles, rng.uniform(size=count), strict=True):
+        _disc(out, y, x, radius, value)
+    return _levels(out)
+
+
+def _disc(out: NDArray[np.float64], y: float, x: float, radius: float, value: float) -> None:
+    """Draw a disc of one luminance into the picture ``out``."""
+    top, left = max(0, int(y - radius)), max(0, int(x - radius))
+    part = out[top : int(y + radius) + 2, left : int(x + radius) + 2]
+    rows, cols = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
+    part[(rows - y) ** 2 + (cols - x) ** 2 <= radius**2] = value
+
+
+def polygons(rng: np.random.Generator, width: int, height: int, count: int = 8) -> NDArray[np.float32]:
+    """Return a few triangles on a uniform background."""
+    out = np.full((height, width), 0.5)
+    rows, cols = np.mgrid[:height, :width]
+    for value in rng.choice([0.1, 0.9], count):
+        middle = rng.uniform(0.1, 0.9, 2) * (width, height)
+        corners = middle + rng.uniform(0.1, 0.25) * height * _triangle(rng.uniform(0.0, 2.0 * np.pi))
+        inside = np.ones(out.shape, np.bool_)
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            inside &= (b[0] - a[0]) * (rows - a[1]) - (b[1] - a[1]) * (cols - a[0]) >= 0.0
+        out[inside] = value
+    return _levels(out)
+
+
+def printed(rng: np.random.Generator, width: int, height: int) -> NDArray[np.float32]:
+    """Return a page of print: lines of signs on white, each of two to four straight strokes."""
+    out = np.ones((height, width))
+    size = max(8, round(height / 30))
+    for top in range(size, height - size, 2 * size):
+        left = size
+        while left < width - 2 * size:
+            if rng.uniform() < 0.15:  # space between two words
+                left += size
+                continue
+            for x0, y0, x1, y1 in rng.uniform(0.0, size, (rng.integers(2, 5), 4)):
+                _line(out, (left + 0.6 * x0, top + y0), (left + 0.6 * x1, top + y1), 0.1 * size, 0.0)
+            left += round(0.8 * size)
+    return _levels(out)
+
+
+def thin_lines(rng: np.random.Generator, width: int, height: int, count: int = 10) -> NDArray[np.float32]:
+    """Return short thin lines, brighter or darker than their uniform background."""
+    out = np.full((height, width), 0.5)
+    for value in rng.choice([0.15, 0.85], count):
+        middle, angle = rng.uniform(0.1, 0.9, 2) * (width, height), rng.uniform(0.0, np.pi)
+        half = 0.5 * rng.uniform(0.1, 0.3) * height * np.array([math.cos(angle), math.sin(angle)])
+        _line(out, middle - half, middle + half, rng.uniform(1.0, 2.5), value)
+    return _levels(out)
+
+
+def _line(out: NDArray[np.float64], start: ArrayLike, end: ArrayLike, half_width: float, value: float) -> None:
+    """Draw a straight line of one luminance into the picture ``out``; ends are ``(x, y)`` [texels]."""
+    ends = np.array([start, end])
+    left, top = np.maximum(np.floor(ends.min(axis=0) - half_width).astype(int), 0)
+    right, bottom = np.ceil(ends.max(axis=0) + half_width).astype(int) + 1
+    part = out[top:bottom, left:right]
+    rows, cols = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
+    along = ends[1] - ends[0]
+    share = ((cols - ends[0, 0]) * along[0] + (rows - ends[0, 1]) * along[1]) / max(float(along @ along), 1e-9)
+    share = np.clip(share, 0.0, 1.0)
+    away = np.hypot(cols - ends[0, 0] - share * along[0], rows - ends[0, 1] - share * along[1])
+    part[away <= half_width] = value
+
+
+def _triangle(angle: float) -> NDArray[np.float64]:
+    """Return the corners of a unit triangle."""
+    at = angle + np.arange(3) * (2.0 * np.pi / 3)
+    return np.stack([np.cos(at), np.sin(at)], axis=1)
+
+
+def _levels(share: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the luminance at shares 0 .. 1 of the scenes' range, on a logarithmic scale."""
+    return (DARK * (BRIGHT / DARK) ** np.clip(share, 0.0, 1.0)).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _ChangingStill:
+    """Still picture that changes with time (base class)."""
+
+    light: NDArray[np.float32]
+    """Linear luminance of the still picture, shape ``(height, width)``."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the picture [texels]."""
+        return self.light.shape[1], self.light.shape[0]
+
+    @property
+    def interval_us(self) -> float:
+        """Interval between two pictures [us]."""
+        return float(FRAME_US)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lamp(_ChangingStill):
+    """Still picture with a flickering square.
+
+    The square's luminance falls by ``depth`` and rises again :data:`LAMP_HZ` times per second. Satisfies
+    :class:`amiwarp.simulation.simulator.Frames`.
+    """
+
+    share: float
+    """Share of the picture's area that the lamp lights."""
+    duration_us: int
+    """Duration for which pictures are given [us]."""
+    depth: float = 0.7
+    """Relative decrease of the square's luminance when the lamp is dark."""
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Yield the time [us] and the picture with the square."""
+        height, width = self.light.shape
+        half = 0.5 * math.sqrt(self.share)
+        rows = slice(round((0.5 - half) * height), round((0.5 + half) * height))
+        cols = slice(round((0.5 - half) * width), round((0.5 + half) * width))
+        for t in range(0, self.duration_us + FRAME_US, FRAME_US):
+            out = self.light.copy()
+            out[rows, cols] *= 1.0 - self.depth * math.sin(math.pi * LAMP_HZ * t * 1e-6) ** 2
+            yield t, out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassingObject(_ChangingStill):
+    """Still picture in front of which a textured disc passes."""
+
+    share: float
+    """Share of the picture's area that the disc hides."""
+    widths_per_s: float
+    """Speed of the disc [picture widths/s]."""
+    duration_us: int
+    """Duration for which pictures are given [us]."""
+    seed: int
+    """Seed of the disc's texture."""
+
+    def read(self) -> Iterator[tuple[int, NDArray[np.float32]]]:
+        """Yield the time [us] and the picture with the disc."""
+        height, width = self.light.shape
+        radius = math.sqrt(self.share * width * height / math.pi)
+        side = 2 * math.ceil(radius) + 1
+        leaf = leaves(np.random.default_rng([self.seed, 0x0B1]), side, side, 600)
+        rows, cols = np.mgrid[:side, :side]
+        round_ = (rows - side // 2) ** 2 + (cols - side // 2) ** 2 <= radius**2
+        for t in range(0, self.duration_us + FRAME_US, FRAME_US):
+            out = self.light.copy()
+            path = self.widths_per_s * width * (t - self.duration_us / 2) * 1e-6
+            left, top = round(width / 2 + path) - side // 2, height // 2 - side // 2
+            x0, x1, y0, y1 = max(left, 0), min(left + side, width), max(top, 0), min(top + side, height)
+            if x0 < x1:
+                part = (slice(y0 - top, y1 - top), slice(x0 - left, x1 - left))
+                out[y0:y1, x0:x1][round_[part]] = leaf[part][round_[part]]
+            yield t, out
+
+
+TEXELS = 2.0
+"""Texels of the scene's picture per camera pixel, in the middle of the image."""
+HARDWARE_DEG = 10.0
+"""Standard deviation of the phase that the simulated hardware states [deg]."""
+HARDWARE_APEX = 0.05
+"""Relative standard deviation of the nominal apex angle that the simulated hardware states."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Condition under which a recording is simulated. The defaults are harmless.
+
+    Equal conditions and equal seeds give equal recordings.
+    """
+
+    scene: str = SceneKind.TEXTURE.value
+    """Kind of scene: a value of :class:`SceneKind`."""
+    width: int = 320
+    """Width of the camera's image [px]."""
+    height: int = 240
+    """Height of the camera's image [px]."""
+    fov_deg: float = 60.0
+    """Horizontal field of view of the camera [deg]."""
+    apex_deg: float = 1.0
+    """Apex angle of the prism [deg]."""
+    rpm: float = 720.0
+    """Speed of the prism [turns/min]."""
+    turns: float = 4.0
+    """Duration of the recording [turns of the prism]."""
+    contrast: float = 0.25
+    """Contrast threshold of the sensor [log intensity]."""
+    window_events: int = 0
+    """Number of events in the sensor's readout window; 0 for the whole sensor.
+
+    The window is a rectangle about the middle, just large enough for that number.
+    """
+    lost: float = 0.0
+    """Share of the events that are lost in the sensor, at random."""
+    noise: float = 0.0
+    """Share of background noise among all events, 0 to 1."""
+    hot: float = 0.0
+    """Share of hot pixels, each with 500 events/s."""
+    mismatch: float = 0.03
+    """Relative standard deviation of the contrast thresholds between pixels."""
+    latency_us: float = 100.0
+    """Latency of the sensor's pixels [us]."""
+    refractory_us: float = 100.0
+    """Refractory period of the pixels [us]."""
+    readout_us: float = 0.0
+    """Interval of readout scans [us]; time stamps are moved to the end of their scan. 0 for none."""
+    cutoff_hz: float = 0.0
+    """Bandwidth of the photoreceptor at white [Hz]; 0 for unlimited."""
+    bus_rate_mev_s: float = 0.0
+    """Largest rate of events on the sensor's bus [million events/s]; 0 for unlimited."""
+    counts_per_turn: int = 8192
+    """Resolution of the encoder [counts/turn]."""
+    jitter_deg: float = 0.0
+    """Standard deviation of the angle of an encoder sample [deg]."""
+    clock_offset_us: float = 0.0
+    """Offset between the clocks of encoder and camera [us]."""
+    dropouts_hz: float = 0.0
+    """Rate of drop-outs, in which encoder samples are lost [1/s]."""
+    encoder_scale: float = 0.0
+    """Relative error of the scale of the encoder's angles."""
+    slip_deg: float = 0.0
+    """Angle that the encoder loses per second [deg], in two steps per turn."""
+    backwards: bool = False
+    """Whether the encoder counts in the wrong direction."""
+    ripple: float = 0.0
+    """Relative amplitude of the speed ripple, three periods per turn; the encoder measures it."""
+    flat_side_wrong: bool = False
+    """Whether the recording states the wrong flat side."""
+    focal_error: float = 0.0
+    """Relative error of the focal length that the recording states."""
+    principal_px: float = 0.0
+    """Error of the principal point that the recording states, along x [px]."""
+    distortion: float = 0.0
+    """Distortion coefficient k1 of the true camera, which the recording does not state."""
+    start: str = "none"
+    """Phase that is given to the calibration: ``none``, ``right``, or ``wrong`` (by 90 degrees)."""
+    lamp: float = 0.0
+    """Share of the picture that flickers at 100 Hz."""
+    passing: float = 0.0
+    """Share of the picture that a passing object hides; its speed is half the picture's width per second."""
+    camera_deg_s: float = 0.0
+    """Speed of the camera's rotation [deg/s], about a tilted axis."""
+    cancelled: float = 0.0
+    """Share of the prism's motion in the image that a rotation of the camera cancels."""
+
+    @property
+    def key(self) -> str:
+        """Hash of the settings, which identifies the condition.
+
+        Later fields count only if they differ from the default, so that earlier results stay valid.
+        """
+        settings = {name: value for name, value in asdict(self).items() if value or name not in _LATER_FIELDS}
+        return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def camera(self) -> Camera:
+        """Camera with the true intrinsics."""
+        camera = Camera.from_fov(self.width, self.height, math.radians(self.fov_deg))
+        return replace(camera, distortion=RadialTangential(k1=self.distortion)) if self.distortion else camera
+
+    @property
+    def stated_camera(self) -> Camera:
+        """Camera with the intrinsics that the recording states."""
+        true, scale = self.camera, 1.0 + self.focal_error
+        return replace(true, fx=true.fx * scale, fy=true.fy * scale, cx=true.cx + self.principal_px, distortion=None)
+
+    @property
+    def stated_side(self) -> FlatSide:
+        """Flat side of the prism that the recording states."""
+        return FlatSide.CAMERA if self.flat_side_wrong else FlatSide.SCENE
+
+    @property
+    def prism(self) -> Prism:
+        """Prism with the true parameters."""
+        return Prism(math.radians(self.apex_deg))
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the recording [s]."""
+        return self.turns * 60.0 / self.rpm
+
+
+_LATER_FIELDS = ("cutoff_hz", "bus_rate_mev_s", "principal_px", "encoder_scale")
+"""Fields of :class:`Condition` with default 0 that did not exist when the first cells were stored."""
+
+
+@dataclass(frozen=True)
+class SimulatedSample:
+    """Simulated recording of the study, and the parameters that its hardware states."""
+
+    recording: Recording
+    """Simulated recording with its ground truth."""
+    hardware: dict[str, float]
+    """Approximate phase that the hardware states [rad]."""
+
+
+def make(condition: Condition, seed: int, device: str = "cpu") -> SimulatedSample:
+    """Simulate the recording of a condition."""
+    rng = np.random.default_rng([seed, int(condition.key, 16) & 0x7FFFFFFF])
+    simulation = _simulation(condition, seed, rng, device)
+    recording = simulation.run()
+    if condition.noise:
+        recording = replace(simulation, sensor=_noisy(condition, simulation, len(recording.events))).run()
+    events = recording.events.slice(0, len(recording.events))
+    if condition.window_events:
+        events = windowed(events, condition.width, condition.height, condition.window_events)
+    if condition.lost:
+        events = events[rng.uniform(size=len(events)) >= condition.lost]
+    if condition.readout_us:
+        events = scanned(events, condition.readout_us)
+    apex = condition.prism.apex * (1.0 + HARDWARE_APEX * rng.standard_normal())
+    nominal = Prism(apex, flat_side=condition.stated_side)
+    assert recording.encoder is not None
+    stated = replace(
+        recording,
+        events=MemoryEvents(events, condition.width, condition.height),
+        camera=condition.stated_camera,
+        encoder=distorted_encoder(recording.encoder, condition, rng),
+        prism=nominal,
+    )
+    stated_phase = simulation.motion.phase + math.radians(HARDWARE_DEG) * rng.standard_normal()
+    return SimulatedSample(stated, {"phase": stated_phase + (math.pi / 2 if condition.start == "wrong" else 0.0)})
+
+
+def _simulation(c: Condition, seed: int, rng: np.random.Generator, device: str) -> Simulation:
+    """Return the simulation of a condition without background noise."""
+    phase = rng.uniform(-math.pi, math.pi)
+    sensor = SensorModel(
+        contrast_on=c.contrast, contrast_off=c.contrast, mismatch=c.mismatch, latency_us=c.latency_us,
+        refractory_us=c.refractory_us, hot_fraction=c.hot, hot_hz=500.0, shot_noise_hz=0.1, leak_hz=0.1,
+        cutoff_hz=c.cutoff_hz, bus_rate_mev_s=c.bus_rate_mev_s,
+    )  # fmt: skip
+    encoder = EncoderModel(
+        counts_per_turn=c.counts_per_turn, clock_offset_us=c.clock_offset_us, dropouts_hz=c.dropouts_hz, jitter_us=1.0
+    )
+    motion = _prism_motion(c, phase)
+    return Simulation(
+        _scene(c, seed), c.camera, c.prism, c.duration_s, motion, _camera_motion(c, motion, rng), sensor, encoder,
+        seed=seed, device=device,
+    )  # fmt: skip
+
+
+def _scene(c: Condition, seed: int) -> Scene:
+    """Return the scene of a condition."""
+    wedge = 2.2 * c.prism.deflection
+    half = min(math.radians(c.fov_deg) / 2.0 + wedge, 1.35)
+    focal = TEXELS * c.camera.fx
+    width = 2 * math.ceil(focal * math.tan(half)) + 2
+    height = math.ceil(width * c.height / c.width) + 2 * math.ceil(focal * wedge)
+    diameter = 2.0 * c.prism.deflection * focal
+    light = draw(SceneKind(c.scene), width, height, period=diameter, seed=seed)
+    fov = 2.0 * math.atan(width / 2.0 / focal)
+    duration = math.ceil(c.duration_s * 1e6)
+    if c.lamp:
+        return Scene(Lamp(light, c.lamp, duration), fov)
+    if c.passing:
+        return Scene(PassingObject(light, c.passing, 0.5, duration, seed), fov)
+    return Scene(Still(light), fov)
+
+
+def _prism_motion(c: Condition, phase: float) -> PrismMotion:
+    """Return the prism's motion under a condition."""
+    if not c.ripple:
+        return PrismMotion(c.rpm, phase)
+    hz = 3.0 * c.rpm / 60.0
+    return PrismMotion.from_function(
+        lambda t: c.rpm * (1.0 + c.ripple * np.sin(TWO_PI * hz * t)), c.duration_s, phase=phase
+    )
+
+
+def _camera_motion(c: Condition, motion: PrismMotion, rng: np.random.Generator) -> CameraMotion:
+    """Return the camera's motion under a condition."""
+    if c.cancelled:
+        return _cancelling(c, motion)
+    axis = rng.standard_normal(3)
+    return CameraMotion(np.radians(c.camera_deg_s) * axis / np.linalg.norm(axis))
+
+
+def _cancelling(c: Condition, motion: PrismMotion) -> CameraMotion:
+    """Return the rotation of the camera that moves the image against the prism's motion.
+
+    The prism displaces the view of a pixel by δ (cos φ, sin φ) on the image plane. A rotation about y by a displaces it
+    by +a along x, and a rotation about x by -a along y.
+    """
+    t = np.arange(0.0, c.duration_s + 2e-3, 1e-3)
+    angle = motion.phase + motion.angle(t * 1e6)
+    size = -c.cancelled * c.prism.deflection
+    along = size * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rates = np.gradient(along, t, axis=0)
+    return CameraMotion(np.column_stack([t, -rates[:, 1], rates[:, 0], np.zeros(len(t))]))
+
+
+def _noisy(c: Condition, simulation: Simulation, clean: int) -> SensorModel:
+    """Return the sensor with the noise rate that gives the condition's share of noise.
+
+    ``clean`` is the number of events without noise.
+    """
+    hz = clean * c.noise / (1.0 - c.noise) / (c.width * c.height * c.duration_s)
+    return replace(simulation.sensor, shot_noise_hz=hz)
+
+
+def windowed(events: Events, width: int, height: int, count: int) -> Events:
+    """Return about ``count`` events in a readout window.
+
+    It is the smallest rectangle about the middle that holds them, with the aspect ratio of the image.
+    """
+    away = np.maximum(np.abs(events.x / (width - 1.0) - 0.5), np.abs(events.y / (height - 1.0) - 0.5))
+    if len(away) <= count:
+        return events
+    return events[away <= np.partition(away, count)[count]]
+
+
+def scanned(events: Events, interval_us: float) -> Events:
+    """Return events as read out in scans: each gets the time stamp of the end of its scan; rows are in order."""
+    t = (np.ceil(events.t / interval_us) * interval_us).astype(np.int64)
+    order = np.lexsort((events.x, events.y, t))
+    return Events(events.x[order], events.y[order], t[order], events.p[order])
+
+
+def distorted_encoder(encoder: Encoder, c: Condition, rng: np.random.Generator) -> Encoder:
+    """Return the encoder with the errors that the condition demands."""
+    angle = encoder.angle + math.radians(c.jitter_deg) * rng.standard_normal(len(encoder.angle))
+    if c.slip_deg:
+        half_turns = np.floor(angle / math.pi)
+        angle = angle - math.radians(c.slip_deg) * (half_turns - half_turns[0]) * 30.0 / c.rpm
+    angle = angle * (1.0 + c.encoder_scale)
+    if c.backwards:
+        angle = -angle
+    return Encoder(encoder.t, angle)
+
+
+_LARGEST: dict[str, float] = {
+    "noise": 0.5, "camera_deg_s": 30.0, "jitter_deg": 0.5,
+    "contrast": 0.6, "lost": 0.1, "hot": 0.001, "mismatch": 0.1, "latency_us": 1000.0, "refractory_us": 1000.0,
+    "readout_us": 500.0, "clock_offset_us": 1000.0, "dropouts_hz": 10.0, "slip_deg": 0.0, "backwards": 0.0,
+    "encoder_scale": 1e-4, "ripple": 0.2, "focal_error": 0.03, "principal_px": 10.0, "lamp": 0.05,
+    "passing": 0.02, "cancelled": 0.0,
+}  # fmt: skip
+"""Largest values of the condition fields for which a calibration is expected to work."""
+_SMALLEST: dict[str, float] = {"turns": 0.5, "counts_per_turn": 64, "distortion": -0.08, "apex_deg": 0.5}
+"""Smallest values of the condition fields for which a calibration is expected to work.
+
+An apex of 0.5 degrees gives an orbit of 1.2 px; at 0.25 degrees the orbit lies within a pixel.
+"""
+_SMALLEST_OR_NONE: dict[str, float] = {"cutoff_hz": 300.0, "bus_rate_mev_s": 3.0}
+"""Smallest values of condition fields for which a calibration is expected to work, where 0 also does, because it means
+no limit."""
+FEWEST_EVENTS = 20_000
+"""Smallest number of events for which a calibration is expected to work."""
+
+
+def sensible(c: Condition, events: int) -> bool:
+    """Return whether a calibration is expected to work under a condition (the sensible region).
+
+    That is a working rig, and a scene that the aims cover.
+    """
+    return (
+        events >= FEWEST_EVENTS
+        and c.scene in (SceneKind.TEXTURE, SceneKind.EDGES, SceneKind.PRINT)
+        and all(getattr(c, name) <= most for name, most in _LARGEST.items())
+        and all(getattr(c, name) >= least for name, least in _SMALLEST.items())
+        and all(not getattr(c, name) or getattr(c, name) >= least for name, least in _SMALLEST_OR_NONE.items())
+    )
+
+
+# Axes of the stability study: each varies one field of a condition, from harmless to hopeless.
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Axis of the study: values of one condition field, from harmless to hopeless."""
+
+    name: str
+    """Name of the axis in reports."""
+    field: str
+    """Name of the field of :class:`Condition` that the axis varies."""
+    values: tuple[Any, ...]
+    """Values of the field along the axis."""
+    unit: str = ""
+    """Unit of the values, as shown in reports."""
+    also: tuple[tuple[str, Any], ...] = ()
+    """Other fields of the condition, with values that differ from their defaults along the whole axis."""
+
+    def conditions(self) -> list[Condition]:
+        """Return the condition at each value of the axis."""
+        return [replace(Condition(), **dict(self.also), **{self.field: value}) for value in self.values]
+
+
+SCENES = tuple(kind.value for kind in SceneKind)
+"""Names of all kinds of scenes."""
+WIDE = (("fov_deg", 90.0), ("apex_deg", 2.0))
+"""Condition in which a wrong camera shows: a wide view and a large orbit."""
+
+AXES = (
+    Axis("events", "window_events", (0, 300_000, 100_000, 50_000, 20_000, 10_000, 5_000, 1_000)),
+    Axis("events lost", "lost", (0.0, 0.1, 0.3, 0.5, 0.7, 0.9), "of all events"),
+    Axis("many events", "contrast", (0.25, 0.12, 0.06, 0.03), "log intensity, 24 turns", (("turns", 24.0),)),
+    Axis("time window", "turns", (24.0, 8.0, 2.0, 1.0, 0.75, 0.5, 0.25, 0.125), "turns"),
+    Axis("background noise", "noise", (0.0, 0.1, 0.25, 0.5, 0.65, 0.8), "of all events"),
+    Axis("hot pixels", "hot", (0.0, 0.0002, 0.001, 0.005, 0.02, 0.05), "of all pixels"),
+    Axis("threshold", "contrast", (0.1, 0.15, 0.25, 0.4, 0.6, 1.0), "log intensity"),
+    Axis("threshold mismatch", "mismatch", (0.0, 0.03, 0.1, 0.2, 0.3), "relative"),
+    Axis("latency", "latency_us", (0.0, 100.0, 300.0, 1000.0, 3000.0), "µs"),
+    Axis("refractory time", "refractory_us", (0.0, 100.0, 1000.0, 3000.0, 10_000.0), "µs"),
+    Axis("readout in scans", "readout_us", (0.0, 200.0, 500.0, 1000.0, 2000.0), "µs"),
+    Axis("bandwidth", "cutoff_hz", (3000.0, 1000.0, 300.0, 100.0, 30.0), "Hz at white"),
+    Axis("bus rate", "bus_rate_mev_s", (10.0, 3.0, 1.0, 0.3, 0.1), "million events/s"),
+    Axis("encoder resolution", "counts_per_turn", (8192, 1024, 256, 64, 16, 4), "counts a turn"),
+    Axis("encoder jitter", "jitter_deg", (0.0, 0.1, 0.5, 2.0, 5.0, 20.0), "°"),
+    Axis("clock offset", "clock_offset_us", (0.0, 100.0, 1000.0, 5000.0, 20_000.0), "µs", (("ripple", 0.05),)),
+    Axis("encoder drop-outs", "dropouts_hz", (0.0, 3.0, 10.0, 30.0, 100.0), "of 5 ms, a second"),
+    Axis("slipping index", "slip_deg", (0.0, 1.0, 5.0, 20.0, 90.0), "° a second"),
+    Axis("direction", "backwards", (False, True)),
+    Axis("speed", "rpm", (60.0, 180.0, 720.0, 1800.0, 3600.0, 6000.0), "rpm"),
+    Axis("speed ripple", "ripple", (0.0, 0.01, 0.05, 0.2, 0.5), "relative"),
+    Axis("apex", "apex_deg", (4.0, 2.0, 1.0, 0.5, 0.25), "°"),
+    Axis("field of view", "fov_deg", (30.0, 45.0, 60.0, 80.0, 100.0), "°"),
+    Axis("flat side", "flat_side_wrong", (False, True)),
+    Axis("focal length", "focal_error", (0.0, 0.01, 0.03, 0.1, 0.3), "relative error"),
+    Axis("distortion ignored", "distortion", (0.0, -0.03, -0.1, -0.2), "k1"),
+    Axis("start", "start", ("none", "right", "wrong")),
+    Axis("scene", "scene", SCENES),
+    Axis("flickering lamp", "lamp", (0.0, 0.01, 0.05, 0.2, 0.6), "of the picture"),
+    Axis("camera turning", "camera_deg_s", (0.0, 1.0, 3.0, 10.0, 30.0, 60.0), "°/s"),
+    Axis("passing object", "passing", (0.0, 0.02, 0.1, 0.3, 0.6), "of the picture"),
+    Axis("motion cancelled", "cancelled", (0.0, 0.3, 0.6, 0.9, 1.0), "of the prism's"),
+    Axis("encoder scale", "encoder_scale", (0.0, 1e-4, 1e-3, 0.01, 0.1), "relative error"),
+    Axis("principal point", "principal_px", (0.0, 2.0, 5.0, 10.0, 20.0), "px"),
+    Axis("small orbit", "scene", SCENES, "apex 0.5°", (("apex_deg", 0.5),)),
+    Axis("events, sparse edges", "window_events", (0, 50_000, 20_000, 10_000), "", (("scene", SceneKind.EDGES.value),)),
+    Axis("thin lines and noise", "noise", (0.0, 0.1, 0.2, 0.35), "of all events",
+         (("scene", SceneKind.LINES.value),)),
+    Axis("focal length, wide", "focal_error", (0.0, 0.01, 0.03, 0.1, 0.3, 0.73), "relative error, 90°, apex 2°", WIDE),
+    Axis("principal point, wide", "principal_px", (0.0, 2.0, 5.0, 10.0, 20.0), "px, 90°, apex 2°", WIDE),
+    Axis("distortion ignored, wide", "distortion", (0.0, -0.03, -0.08, -0.15), "k1, 90°, apex 2°", WIDE),
+    Axis("flat side, wide", "flat_side_wrong", (False, True), "90°, apex 2°", WIDE),
+    Axis("focal length and distortion", "focal_error", (0.01, 0.03, 0.1), "relative error, k1 −0.05",
+         (("distortion", -0.05),)),
+    Axis("principal point and distortion", "principal_px", (2.0, 5.0, 10.0), "px, k1 −0.05", (("distortion", -0.05),)),
+    Axis("focal length and flat side", "focal_error", (0.01, 0.03, 0.1), "relative error, wrong side",
+         (("flat_side_wrong", True),)),
+    Axis("focal length, camera turning", "camera_deg_s", (1.0, 10.0, 30.0), "°/s, focal length 3 % off",
+         (("focal_error", 0.03),)),
+    Axis("bandwidth and noise", "cutoff_hz", (1000.0, 300.0, 100.0), "Hz at white, 25 % noise", (("noise", 0.25),)),
+    Axis("bandwidth and refractory time", "cutoff_hz", (1000.0, 300.0, 100.0), "Hz at white, 1 ms",
+         (("refractory_us", 1000.0),)),
+    Axis("events lost and noise", "lost", (0.1, 0.3, 0.5), "of all events, 25 % noise", (("noise", 0.25),)),
+    Axis("small orbit, few events", "window_events", (100_000, 50_000, 20_000), "apex 0.5°", (("apex_deg", 0.5),)),
+)  # fmt: skip
+"""All axes of the stability study. The last eight combine two troubles that are likely to occur together."""
+
+
+# Methods, and cells: a condition, a seed, and the result of each calibration method on that recording.
 
 LIMIT_PX = 0.1
 """Largest model error of a successful calibration [px rms], unless the model's best fit to the truth has a large error

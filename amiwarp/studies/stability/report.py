@@ -20,8 +20,19 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import BLACK, BLUE, PINK, SKY_BLUE
 from amiwarp.io.atomic_output import NewFile, write_text
 from amiwarp.plotting.figures import blank, save
-from amiwarp.studies.stability.cells import LIMIT_PX, Cell, Method, Outcome, Result, Store, Stored, identity
-from amiwarp.studies.stability.conditions import Axis, Condition, sensible
+from amiwarp.studies.stability.cells import (
+    LIMIT_PX,
+    Axis,
+    Cell,
+    Condition,
+    Method,
+    Outcome,
+    Result,
+    Store,
+    Stored,
+    identity,
+    sensible,
+)
 
 # Points of the stability study: rates and errors of one method at one value of an axis, and their text.
 
