@@ -27,12 +27,21 @@ from amiwarp import (
     WorldScene,
 )
 from amiwarp.simulation.worlds.world import looking_at
-from amiwarp.studies.evaluate import contrast_motion, flow, pictures, pose, segmentation
-from amiwarp.studies.evaluate.contrast_motion import estimate_rotation, rotated_back
+from amiwarp.studies.evaluate import flow, pictures, pose, segmentation, study
 from amiwarp.studies.evaluate.flow import flow_by_contrast, flow_by_dis, flow_error, rotation_flow
 from amiwarp.studies.evaluate.pose import PROPORTIONS
 from amiwarp.studies.evaluate.segmentation import SegmentationSettings, moving_events
-from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, Streams, Table, Verdict
+from amiwarp.studies.evaluate.study import (
+    QUICK,
+    CellResult,
+    Condition,
+    Stream,
+    Streams,
+    Table,
+    Verdict,
+    estimate_rotation,
+    rotated_back,
+)
 
 CAMERA = Camera.from_fov(160, 120, math.radians(40.0))
 RPM, DURATION_S = 1800.0, 0.05
@@ -177,7 +186,7 @@ def test_flow_of_still_objects(streams: Streams, monkeypatch: pytest.MonkeyPatch
 
 def test_pose_over_the_rate_of_pictures(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pose, "RATES_HZ", (100.0,))
-    monkeypatch.setattr(contrast_motion, "MOST_EVENTS", 5_000)
+    monkeypatch.setattr(study, "MOST_EVENTS", 5_000)
     shapes: list[tuple[int, ...]] = []
 
     def detect(image: NDArray[Any]) -> dict[str, NDArray[np.float64]]:
@@ -196,7 +205,7 @@ def test_pose_over_the_rate_of_pictures(streams: Streams, monkeypatch: pytest.Mo
 def test_a_learned_reconstruction_is_judged_next_to_ours(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pictures, "PICTURES", 1)
     monkeypatch.setattr(pictures, "TURNS", (pictures.STANDARD_TURNS,))
-    monkeypatch.setattr(contrast_motion, "MOST_EVENTS", 5_000)
+    monkeypatch.setattr(study, "MOST_EVENTS", 5_000)
     given: list[Events] = []
 
     def perfect(events: Events) -> NDArray[np.float64]:

@@ -10,8 +10,22 @@ import pytest
 from amiwarp import AmiwarpError, ExactModel, calibrate, model_error
 from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.studies.cluster import single_worker
-from amiwarp.studies.stability import AXES, Condition, Outcome, chosen, identity, make, quick_axes, run, sensible
-from amiwarp.studies.stability.cells import SceneKind, Store, best_fit, conditions, draw
+from amiwarp.studies.stability.cells import (
+    AXES,
+    Condition,
+    Outcome,
+    SceneKind,
+    Store,
+    best_fit,
+    chosen,
+    conditions,
+    draw,
+    identity,
+    make,
+    quick_axes,
+    run,
+    sensible,
+)
 from tests.conftest import COARSE
 
 SMALL = Condition(width=160, height=120, turns=3.0)

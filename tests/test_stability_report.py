@@ -18,25 +18,24 @@ from matplotlib.text import Text
 from PIL import Image
 from typer.testing import CliRunner, Result
 
-import amiwarp.studies.stability
 from amiwarp import AmiwarpError
 from amiwarp.cli.app import app
 from amiwarp.io.sealed_json import sealed
-from amiwarp.studies.stability import (
-    METHODS,
+from amiwarp.studies.stability import cells as study
+from amiwarp.studies.stability.cells import METHODS, Axis, Cell, Condition, Outcome, Store, Stored, identity
+from amiwarp.studies.stability.cells import Result as Found
+from amiwarp.studies.stability.report import (
+    OVERVIEW,
     Atlas,
-    Axis,
-    Cell,
-    Condition,
-    Outcome,
-    Store,
-    Stored,
+    Rate,
+    _overview,
+    _page,
     aggregate,
-    identity,
+    draw,
     load,
+    most_common_message,
+    value_label,
 )
-from amiwarp.studies.stability import Result as Found
-from amiwarp.studies.stability.report import OVERVIEW, Rate, _overview, _page, draw, most_common_message, value_label
 
 METHOD = {m.name: m for m in METHODS}
 NOISE = Axis("background noise", "noise", (0.0, 0.25, 0.5, 0.8), "of all events")
@@ -301,8 +300,8 @@ def test_figures_are_written_with_a_page_for_each_axis(atlas: Atlas, tmp_path: P
 def tiny(monkeypatch: pytest.MonkeyPatch) -> Axis:
     """Give the command a single axis with two small cameras."""
     axis = Axis("width", "width", (48, 64), "px", (("height", 48), ("turns", 1.0)))
-    monkeypatch.setattr(amiwarp.studies.stability, "AXES", (axis,))
-    monkeypatch.setattr(amiwarp.studies.stability, "quick_axes", lambda: (replace(axis, values=(48,)),))
+    monkeypatch.setattr(study, "AXES", (axis,))
+    monkeypatch.setattr(study, "quick_axes", lambda: (replace(axis, values=(48,)),))
     return axis
 
 

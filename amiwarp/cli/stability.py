@@ -19,7 +19,8 @@ from amiwarp.io.atomic_output import make_folder, own_folder
 from amiwarp.studies.cluster import start_workers, versions
 
 if TYPE_CHECKING:
-    from amiwarp.studies.stability import Atlas, Axis, Method, Store, Stored
+    from amiwarp.studies.stability.cells import Axis, Method, Store, Stored
+    from amiwarp.studies.stability.report import Atlas
 
 EXAMPLE = "amiwarp stability --quick --out amiwarp-atlas"
 SEEDS, QUICK_SEEDS = 20, 1
@@ -72,7 +73,8 @@ def run(
     Finished cells are saved in OUT/cells: the same command continues a stopped run and skips finished cells.
     """
     device = choose_device(common.device)
-    from amiwarp.studies.stability import Store, aggregate, draw, identity, load
+    from amiwarp.studies.stability.cells import Store, identity
+    from amiwarp.studies.stability.report import aggregate, draw, load
 
     chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
     cells_in = out / "cells"
@@ -100,7 +102,7 @@ def run(
 
 
 def _axes(names: Sequence[str], quick: bool) -> tuple[Axis, ...]:
-    from amiwarp.studies.stability import AXES, quick_axes
+    from amiwarp.studies.stability.cells import AXES, quick_axes
 
     known = quick_axes() if quick else AXES
     _check_known("axis", names, [a.name for a in known])
@@ -108,7 +110,7 @@ def _axes(names: Sequence[str], quick: bool) -> tuple[Axis, ...]:
 
 
 def _methods(names: Sequence[str], quick: bool) -> tuple[Method, ...]:
-    from amiwarp.studies.stability import METHODS, QUICK_METHODS, chosen
+    from amiwarp.studies.stability.cells import METHODS, QUICK_METHODS, chosen
 
     _check_known("method", names, [m.name for m in METHODS])
     return chosen(QUICK_METHODS if quick and not names else names)
@@ -126,7 +128,7 @@ def _run(
     minutes: float | None, first: int,
 ) -> tuple[list[Stored], int]:  # fmt: skip
     """Run all missing cells (single recordings). Return all cells and the number of new cells."""
-    from amiwarp.studies.stability import run
+    from amiwarp.studies.stability.cells import run
 
     end = None if minutes is None else time.monotonic() + 60.0 * minutes
     new = 0
@@ -156,7 +158,7 @@ def _about(cells: Sequence[Stored]) -> dict[str, Any]:
 
 def lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, took: float) -> list[Any]:
     """Return the results as tables and lines of text: where each method works, the aims, the files and the speed."""
-    from amiwarp.studies.stability import summary
+    from amiwarp.studies.stability.report import summary
 
     shown: list[Any] = [table(summary(atlas), "works at", *atlas.methods), "", *atlas.aims.lines(), ""]
     listed = ("overview", "pages", "summary", "data", "table")

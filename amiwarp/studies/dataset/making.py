@@ -39,26 +39,8 @@ from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.simulation.worlds.world_files import POSE_FILES, open_world
-from amiwarp.studies.cluster import (
-    ANY_GPU,
-    gpu_count,
-    result_of,
-    run_jobs,
-    start_workers,
-    threads_of_worker,
-    worker_count,
-)
-from amiwarp.studies.dataset.specification import (
-    LARGEST_SEED,
-    MOST_RECORDINGS,
-    CameraEntry,
-    PrismEntry,
-    Source,
-    Specification,
-    content_digest,
-    find_sources,
-    load_specification,
-)
+from amiwarp.studies import cluster
+from amiwarp.studies.dataset import specification as spec
 from amiwarp.translation.translator import translation
 from amiwarp.validation import guarded, real, shown, whole
 
@@ -98,7 +80,7 @@ class Item:
     @property
     def seed(self) -> int:
         """Seed of all random numbers except those of a named world. It depends on the recipe alone."""
-        return int(self.key, 16) & LARGEST_SEED
+        return int(self.key, 16) & spec.LARGEST_SEED
 
     @property
     def file(self) -> str:
@@ -112,22 +94,22 @@ def _digest(data: Any) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
-def list_items(specification: Specification) -> list[Item]:
+def list_items(specification: spec.Specification) -> list[Item]:
     """Return all recordings of a specification, in its order.
 
     Raises :class:`AmiwarpError` for sources not found, and for more than :data:`MOST_RECORDINGS` recordings.
     """
-    found = [(source, _axes(specification, source)) for source in find_sources(specification)]
+    found = [(source, _axes(specification, source)) for source in spec.find_sources(specification)]
     count = sum(math.prod(map(len, axes)) for _, axes in found)
-    if count > MOST_RECORDINGS:
+    if count > spec.MOST_RECORDINGS:
         raise AmiwarpError(
             f"{specification.path}: describes {count:,} recordings; divide it among specifications of at most "
-            f"{MOST_RECORDINGS:,} recordings each"
+            f"{spec.MOST_RECORDINGS:,} recordings each"
         )
     return [item for source, axes in found for item in _of_source(specification, source, axes)]
 
 
-def _of_source(specification: Specification, source: Source, axes: Sequence[Sequence[Any]]) -> Iterator[Item]:
+def _of_source(specification: spec.Specification, source: spec.Source, axes: Sequence[Sequence[Any]]) -> Iterator[Item]:
     """Yield the recordings of one source."""
     split: dict[str, str] = {}
     for recipe in _recipes(specification, source, axes):
@@ -138,7 +120,7 @@ def _of_source(specification: Specification, source: Source, axes: Sequence[Sequ
         yield Item(recipe, specification.folder, split[same], source.labels, source.entry.licence)
 
 
-def _axes(specification: Specification, source: Source) -> tuple[Sequence[Any], ...]:
+def _axes(specification: spec.Specification, source: spec.Source) -> tuple[Sequence[Any], ...]:
     """Return what one source is combined with: trajectories, prisms, speeds, sensors and seeds."""
     if source.entry.kind == "recordings":
         return ()
@@ -149,7 +131,9 @@ def _axes(specification: Specification, source: Source) -> tuple[Sequence[Any], 
     )  # fmt: skip
 
 
-def _recipes(specification: Specification, source: Source, axes: Sequence[Sequence[Any]]) -> Iterator[dict[str, Any]]:
+def _recipes(
+    specification: spec.Specification, source: spec.Source, axes: Sequence[Sequence[Any]]
+) -> Iterator[dict[str, Any]]:
     """Yield what determines each recording of one source."""
     entry = source.entry
     base: dict[str, Any] = {"source": {"kind": entry.kind, "name": source.name, "sha256": source.digest}}
@@ -167,21 +151,21 @@ def _recipes(specification: Specification, source: Source, axes: Sequence[Sequen
         yield base | trajectory | {"prism": prism, "rpm": rpm, "sensor": sensor, "seed": seed}
 
 
-def _trajectories(specification: Specification, source: Source) -> list[dict[str, Any]]:
+def _trajectories(specification: spec.Specification, source: spec.Source) -> list[dict[str, Any]]:
     """Return the camera motions through a world, with the digest of a file of poses. Other sources have none."""
     if source.entry.kind == "world_files" and source.entry.trajectories is None:
         return [{"trajectory": None}]
     if source.entry.kind not in ("worlds", "world_files"):
         return [{}]
     return [
-        {"trajectory": name, "poses_sha256": content_digest(specification.folder / name)}
+        {"trajectory": name, "poses_sha256": spec.content_digest(specification.folder / name)}
         if name.lower().endswith(POSE_FILES)
         else {"trajectory": name}
         for name in source.entry.trajectories or ("handheld",)
     ]
 
 
-def _split(specification: Specification, source: str) -> str:
+def _split(specification: spec.Specification, source: str) -> str:
     """Return the split of a source, drawn by a hash of it and of the split seed."""
     drawn = int(_digest([specification.split_seed, source])[:13], 16) / 16**13
     total = 0.0
@@ -253,7 +237,7 @@ class Job:
     scratch: Path
     """Folder for unfinished files, on the same disk."""
     device: str
-    """Device; :data:`ANY_GPU` is the worker's GPU."""
+    """Device; :data:`amiwarp.studies.cluster.ANY_GPU` is the worker's GPU."""
     threads: int | None
     """Number of CPU threads that the worker may use; None for all."""
 
@@ -275,10 +259,10 @@ def make(job: Job) -> Made | Failed:
 
 def _make(job: Job) -> Made:
     began, began_processor = time.perf_counter(), time.process_time()
-    item, device = job.item, "cuda:0" if job.device == ANY_GPU else job.device
+    item, device = job.item, "cuda:0" if job.device == cluster.ANY_GPU else job.device
     part, path = job.scratch / f"{item.key}.h5", job.out / item.file
     written = write_recording(item, part, device)
-    digest = content_digest(part, noted=False)
+    digest = spec.content_digest(part, noted=False)
     make_folder(path.parent)
     put_in_place(part, path, overwrite=True)
     return Made(
@@ -307,9 +291,9 @@ def write_recording(
 def simulation_of(item: Item, device: str, duration_s: float | None = None) -> Simulation:
     """Return the simulation of a recording. ``duration_s`` shortens it."""
     recipe = item.recipe
-    camera, source = CameraEntry(**recipe["camera"]), os.fspath(item.folder / item.source)
+    camera, source = spec.CameraEntry(**recipe["camera"]), os.fspath(item.folder / item.source)
     length = recipe["duration_s"] if duration_s is None else duration_s
-    prism, motion = PrismEntry(**recipe["prism"]).build(), PrismMotion(recipe["rpm"])
+    prism, motion = spec.PrismEntry(**recipe["prism"]).build(), PrismMotion(recipe["rpm"])
     sensor = SensorModel(**{name: value for name, value in recipe["sensor"].items() if name != "name"})
     if item.kind == "translated":
         return translation(open_recording(source), prism, duration_s=length, motion=motion, sensor=sensor,
@@ -321,7 +305,7 @@ def simulation_of(item: Item, device: str, duration_s: float | None = None) -> S
     return Simulation(scene, camera.build(), prism, length, motion, sensor=sensor, seed=item.seed, device=device)
 
 
-def _of_video(item: Item, source: str, entry: CameraEntry, **settings: Any) -> Simulation:
+def _of_video(item: Item, source: str, entry: spec.CameraEntry, **settings: Any) -> Simulation:
     """Return the simulation of a video, whose size is that of the camera unless the specification gives one."""
     from amiwarp.simulation.pictures import open_pictures
 
@@ -393,7 +377,7 @@ class Journal:
     def is_intact(self, item: Item) -> bool:
         """Return whether the file of a recording that is there has the checksum of the journal."""
         made = self.made[item.key]
-        if content_digest(self._out / made.file, noted=False) == made.sha256:
+        if spec.content_digest(self._out / made.file, noted=False) == made.sha256:
             return True
         self.damaged.append(f"{self._out / made.file}: does not have the checksum of {JOURNAL}")
         return False
@@ -406,7 +390,7 @@ class Journal:
 
 
 def write_manifest(
-    out: Path, specification: Specification, items: Sequence[Item], journal: Journal, failed: Sequence[Failed]
+    out: Path, specification: spec.Specification, items: Sequence[Item], journal: Journal, failed: Sequence[Failed]
 ) -> None:
     """Write the manifest of the recordings that are finished, as JSON and as Parquet."""
     rows = [_row(item, journal.made[item.key]) for item in items if item.key in journal.made]
@@ -603,10 +587,10 @@ def make_dataset(
     """
     began = time.perf_counter()
     out, report = Path(out), progress or silent
-    spec = load_specification(specification)
+    loaded = spec.load_specification(specification)
     require_pyarrow()
     check_folder(out)
-    items = list_items(spec)
+    items = list_items(loaded)
     count = _local_workers(scheduler, workers, device)
     make_folder(out)
     journal = Journal(out)
@@ -617,12 +601,12 @@ def make_dataset(
     events = most_workers = 0
     try:
         if todo:
-            target, threads = out.resolve(), threads_of_worker(device, count)
+            target, threads = out.resolve(), cluster.threads_of_worker(device, count)
             with (
                 scratch_folder(target) as scratch,
-                start_workers("amiwarp dataset", "dataset", scheduler, count or 0, device) as running,
+                cluster.start_workers("amiwarp dataset", "dataset", scheduler, count or 0, device) as running,
                 contextlib.closing(
-                    run_jobs(running, make, (Job(item, target, scratch, device, threads) for item in todo))
+                    cluster.run_jobs(running, make, (Job(item, target, scratch, device, threads) for item in todo))
                 ) as results,
             ):
                 first = time.perf_counter()
@@ -638,7 +622,7 @@ def make_dataset(
                     most_workers = max(most_workers, running.count())
                     report(_line(done, len(failed), len(todo), events, time.perf_counter() - first), done / len(todo))
     finally:
-        write_manifest(out, spec, items, journal, failed)
+        write_manifest(out, loaded, items, journal, failed)
     files = {item.key: item.file for item in items}
     return DatasetSummary(
         recordings=len(items),
@@ -688,16 +672,16 @@ def _local_workers(scheduler: str | None, workers: int | None, device: str) -> i
             raise AmiwarpError(f"workers = {workers} applies to local processes; leave it out with a scheduler")
         return None
     known = launch.start_quietly()
-    if device not in (*known, *([ANY_GPU] if gpu_count(known) else [])):
+    if device not in (*known, *([cluster.ANY_GPU] if cluster.gpu_count(known) else [])):
         raise AmiwarpError(f"device {device!r} is not available; choose one of {', '.join(known)}")
-    return worker_count(workers, device)
+    return cluster.worker_count(workers, device)
 
 
 def _result(job: Job, future: Future[Made | Failed]) -> Made | Failed:
     """Return the result of a job. A worker that dies, for example for want of memory, is a failure of its recording."""
     error = None if future.cancelled() else future.exception()
     if error is None or isinstance(error, AmiwarpError):
-        return result_of(future)
+        return cluster.result_of(future)
     return Failed(job.item.key, f"the worker died or lost its connection: {type(error).__name__}: {error}"[:500])
 
 
@@ -840,15 +824,15 @@ def plan_dataset(
     10
     """
     out = Path(out)
-    items = list_items(load_specification(specification))
+    items = list_items(spec.load_specification(specification))
     check_folder(out)
     journal = Journal(out)
     todo = sorted((item for item in items if not journal.is_there(item)), key=lambda item: item.key)
     by_kind: defaultdict[str, list[Item]] = defaultdict(list)
     for item in todo:
         by_kind[item.kind].append(item)
-    count = worker_count(workers, device)
-    threads = threads_of_worker(device, count)
+    count = cluster.worker_count(workers, device)
+    threads = cluster.threads_of_worker(device, count)
     total, samples, variance = _sample_all(list(by_kind.values()), out, device, threads, progress or silent)
     return DatasetPlan(
         recordings=len(items),
@@ -877,7 +861,7 @@ def _sample_all(
     near = next(folder for folder in (out.resolve(), *out.resolve().parents) if folder.is_dir())
     with scratch_folder(near) as scratch:
         for group in groups:
-            found = _sample(group, scratch, "cuda:0" if device == ANY_GPU else device, threads, progress)
+            found = _sample(group, scratch, "cuda:0" if device == cluster.ANY_GPU else device, threads, progress)
             for cost in found:
                 total = total.plus(cost, len(group) / len(found))
             samples += len(found)
@@ -931,7 +915,7 @@ def _cost(item: Item, scratch: Path, device: str, duration_s: float | None) -> _
     path = scratch / f"{item.key}.h5"
     began = time.perf_counter()
     events, *_ = write_recording(item, path, device, duration_s)
-    content_digest(path, noted=False)
+    spec.content_digest(path, noted=False)
     cost = _Cost(events, path.stat().st_size, time.perf_counter() - began)
     path.unlink()
     return cost

@@ -14,7 +14,7 @@ from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.iwe import iwe
 from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.simulation.pictures import DARK
-from amiwarp.studies.evaluate import contrast_motion, study
+from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
 # Optical flow from events: dense inverse search between event images, and contrast maximisation per tile.
@@ -50,12 +50,12 @@ def flow_by_contrast(events: Events, camera: Camera) -> NDArray[np.float32]:
     size = (camera.width, camera.height)
     if len(events) < 2 or events.t[-1] == events.t[0]:
         return np.zeros((*size[::-1], 2), np.float32)
-    events, seconds = contrast_motion.dithered(events), (int(events.t[-1]) - int(events.t[0])) * 1e-6
-    rotation = contrast_motion.estimate_rotation(events, camera)
-    grid = contrast_motion.velocity_grid(REACH_PX, 1.0)
+    events, seconds = study.dithered(events), (int(events.t[-1]) - int(events.t[0])) * 1e-6
+    rotation = study.estimate_rotation(events, camera)
+    grid = study.velocity_grid(REACH_PX, 1.0)
     rows, columns = (np.arange(min(TILE // 2, n // 2), n, TILE) for n in size[::-1])
-    back = contrast_motion.rotated_back(contrast_motion.thinned(events, contrast_motion.MOST_LOCAL), camera, rotation)
-    maps = contrast_motion.local_contrast(back, size, grid.reshape(-1, 2) / seconds, TILE / 2.0)
+    back = study.rotated_back(study.thinned(events, study.MOST_LOCAL), camera, rotation)
+    maps = study.local_contrast(back, size, grid.reshape(-1, 2) / seconds, TILE / 2.0)
     scores = np.array([sharpness[np.ix_(rows, columns)] for sharpness in maps])
     motion = sharpest(scores.reshape(*grid.shape[:2], len(rows), len(columns)), grid)
     at = np.meshgrid(*((np.arange(n) - c[0]) / TILE for n, c in zip(size[::-1], (rows, columns), strict=True)),

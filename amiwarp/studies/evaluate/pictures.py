@@ -19,8 +19,17 @@ from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.simulation.pictures import DARK
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.contrast_motion import estimate_rotation
-from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
+from amiwarp.studies.evaluate.study import (
+    CellResult,
+    Chart,
+    Claim,
+    Condition,
+    Settings,
+    Stream,
+    Streams,
+    Table,
+    estimate_rotation,
+)
 from amiwarp.validation import real
 
 # Grey pictures of a stream: by our own reconstruction, or by a given function such as a learned one.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import Events
 from amiwarp.optics.camera import Camera
-from amiwarp.studies.evaluate import contrast_motion, study
+from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.flow import moving_instances
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 
@@ -57,9 +57,7 @@ def moving_events(events: Events, camera: Camera, settings: Sequence[Segmentatio
     if len(events) < 2 or events.t[-1] == events.t[0]:
         return [np.zeros(len(events), np.bool_) for _ in settings]
     size, scale = (camera.width, camera.height), camera.width / 640.0
-    back = contrast_motion.rotated_back(
-        contrast_motion.dithered(events), camera, contrast_motion.estimate_rotation(events, camera)
-    )
+    back = study.rotated_back(study.dithered(events), camera, study.estimate_rotation(events, camera))
     gain = agreement_gain(back, size, settings[0], scale)
     out = []
     for s in settings:
@@ -73,17 +71,15 @@ def moving_events(events: Events, camera: Camera, settings: Sequence[Segmentatio
 def agreement_gain(events: Events, size: tuple[int, int], s: SegmentationSettings, scale: float) -> NDArray[np.float64]:
     """Return how much better events agree under a further velocity where each event lies, shape (n,): a ratio."""
     seconds = (int(events.t[-1]) - int(events.t[0])) * 1e-6
-    grid = contrast_motion.velocity_grid(s.reach_px * scale, max(s.step_px * scale, 1.0)).reshape(-1, 2)
+    grid = study.velocity_grid(s.reach_px * scale, max(s.step_px * scale, 1.0)).reshape(-1, 2)
     fast = np.hypot(*grid.T) >= s.least_px * scale
     slow_best, fast_best = (np.zeros(size[::-1]) for _ in range(2))
-    found = contrast_motion.local_agreement(
-        contrast_motion.thinned(events, contrast_motion.MOST_LOCAL), size, grid / seconds, s.pool_px * scale
-    )
+    found = study.local_agreement(study.thinned(events, study.MOST_LOCAL), size, grid / seconds, s.pool_px * scale)
     for is_fast, agreement in zip(fast, found, strict=True):
         best = fast_best if is_fast else slow_best
         np.maximum(best, agreement, out=best)
     ratio = np.divide(fast_best, slow_best, out=np.where(fast_best > 0.0, np.inf, 0.0), where=slow_best > 0.0)
-    return np.asarray(ratio.ravel()[contrast_motion.pixel_index(events, size)])
+    return np.asarray(ratio.ravel()[study.pixel_index(events, size)])
 
 
 def in_large_clusters(

@@ -20,19 +20,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import BLACK, BLUE, PINK, SKY_BLUE
 from amiwarp.io.atomic_output import NewFile, write_text
 from amiwarp.plotting.figures import blank, save
-from amiwarp.studies.stability.cells import (
-    LIMIT_PX,
-    Axis,
-    Cell,
-    Condition,
-    Method,
-    Outcome,
-    Result,
-    Store,
-    Stored,
-    identity,
-    sensible,
-)
+from amiwarp.studies.stability import cells as study
+from amiwarp.studies.stability.cells import Axis, Cell, Condition, Method, Outcome, Result, Store, Stored, identity
 
 # Points of the stability study: rates and errors of one method at one value of an axis, and their text.
 
@@ -333,7 +322,7 @@ def _aims(cells: Iterable[Stored], default: str | None, worse: Sequence[WorseTha
     outside: list[Outcome] = []
     for stored in cells:
         if default in stored.results:
-            here = inside if sensible(stored.cell.condition, stored.events) else outside
+            here = inside if study.sensible(stored.cell.condition, stored.events) else outside
             here.append(stored.results[default].outcome)
     return Aims(
         Rate(inside.count(Outcome.SUCCESS), len(inside)),
@@ -612,8 +601,11 @@ def _errors(ax: Any, spots: dict[tuple[str, Any], AxisPoint], values: Sequence[A
     """Draw all errors as markers, their median as a line, and the limit of a success as a dashed line."""
     ax.set_yscale("log")
     shown = [e for (method, _), spot in spots.items() if method in MARKS for e in spot.errors]
-    low, high = max(min(shown, default=LIMIT_PX), LEAST_PX), max(shown, default=LIMIT_PX)
-    ax.set(xlim=(-0.5, len(values) - 0.5), ylim=(min(low / 1.5, LIMIT_PX / 3.0), max(high * 1.5, LIMIT_PX * 3.0)))
+    low, high = max(min(shown, default=study.LIMIT_PX), LEAST_PX), max(shown, default=study.LIMIT_PX)
+    ax.set(
+        xlim=(-0.5, len(values) - 0.5),
+        ylim=(min(low / 1.5, study.LIMIT_PX / 3.0), max(high * 1.5, study.LIMIT_PX * 3.0)),
+    )
     for method, (mark, colour, aside) in MARKS.items():
         for column, value in enumerate(values):
             spot = spots.get((method, value))
@@ -623,9 +615,9 @@ def _errors(ax: Any, spots: dict[tuple[str, Any], AxisPoint], values: Sequence[A
             spread = 0.11 * np.sin(2.4 * np.arange(len(errors))) if len(errors) > 1 else np.zeros(1)
             ax.plot(x + spread, errors, mark, color=colour, markersize=4.0, alpha=0.55, markeredgewidth=0)
             ax.hlines(np.median(errors), x - 0.15, x + 0.15, color=colour, linewidth=2.0)
-            if spot.limit_px > LIMIT_PX:
+            if spot.limit_px > study.LIMIT_PX:
                 ax.hlines(spot.limit_px, x - 0.16, x + 0.16, color=colour, linewidth=1.2, linestyle=(0, (2, 1.5)))
-    ax.axhline(LIMIT_PX, color=BLUE, linewidth=1.2, linestyle="--", zorder=1)
+    ax.axhline(study.LIMIT_PX, color=BLUE, linewidth=1.2, linestyle="--", zorder=1)
     ax.set_ylabel("model error [px rms]", fontsize=NORMAL)
     ax.grid(True, axis="y", color="#e4e4e4")
     ax.set_axisbelow(True)
@@ -644,7 +636,7 @@ def _key(ax: Any) -> None:
         Line2D([], [], marker=mark, color=colour, markersize=5, linewidth=2.0, label=f"{name}, median")
         for name, (mark, colour, _) in MARKS.items()
     ]
-    handles.append(Line2D([], [], color=BLUE, linestyle="--", linewidth=1.2, label=f"{LIMIT_PX} px"))
+    handles.append(Line2D([], [], color=BLUE, linestyle="--", linewidth=1.2, label=f"{study.LIMIT_PX} px"))
     handles.append(Line2D([], [], color=BLACK, linestyle=(0, (2, 1.5)), linewidth=1.2,
                           label="limit of a success if the model itself has a larger error"))  # fmt: skip
     ax.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False, fontsize=SMALL,
