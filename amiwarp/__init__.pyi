@@ -105,6 +105,7 @@ from .simulation.pictures import Pictures as Pictures
 from .simulation.pictures import PictureStack as PictureStack
 from .simulation.pictures import VideoFile as VideoFile
 from .simulation.simulator import Simulation as Simulation
+from .simulation.simulator import TruthRenderer as TruthRenderer
 from .simulation.simulator import simulate as simulate
 from .simulation.worlds.named.catalogue import named_world as named_world
 from .simulation.worlds.world import Body as Body
@@ -117,7 +118,6 @@ from .simulation.worlds.world import Trajectory as Trajectory
 from .simulation.worlds.world import World as World
 from .simulation.worlds.world import WorldScene as WorldScene
 from .simulation.worlds.world_files import load_world as load_world
-from .simulation.worlds.world_truth import TruthRenderer as TruthRenderer
 from .studies.dataset.making import DatasetPlan as DatasetPlan
 from .studies.dataset.making import DatasetSummary as DatasetSummary
 from .studies.dataset.making import make_dataset as make_dataset

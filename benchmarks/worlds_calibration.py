@@ -31,8 +31,8 @@ from amiwarp import (
     named_world,
     truth_model,
 )
+from amiwarp.simulation.scenery import DeviceWorld, movers_speed, parallax_speed
 from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS
-from amiwarp.simulation.worlds.renderer import DeviceWorld, movers_speed, parallax_speed
 
 SECONDS, APEX, RPM = 0.4, math.radians(1.0), 720.0
 """Length of a recording [s], true apex angle [rad], and speed of the prism [turns/min]."""

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from amiwarp import AmiwarpError, Camera, Mesh, Trajectory, World, named_world
 from amiwarp.kernels import world as world_maps
 from amiwarp.simulation.pictures import DARK
+from amiwarp.simulation.scenery import DeviceWorld, MapRenderer, device_pose, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS, bodies, catalogue
 from amiwarp.simulation.worlds.named import person as gait
-from amiwarp.simulation.worlds.renderer import DeviceWorld, MapRenderer, device_pose, pixel_rays, surfaces_at
 
 FOV = math.radians(60.0)
 ALL_ROUND = [Rotation.from_rotvec(v).as_matrix() for v in np.pi / 2 * np.array(

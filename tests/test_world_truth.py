@@ -24,8 +24,8 @@ from amiwarp import AmiwarpError
 from amiwarp.cli.app import app
 from amiwarp.events.truth import MAPS
 from amiwarp.io.chunks import CHUNK
+from amiwarp.simulation.simulator import chosen_instants
 from amiwarp.simulation.worlds import world_files
-from amiwarp.simulation.worlds.world_truth import chosen_instants
 
 ROOT = Path(__file__).parents[1]
 SIZE = (64, 48)

@@ -28,8 +28,8 @@ from amiwarp import (
     World,
     WorldScene,
 )
+from amiwarp.simulation.scenery import DeviceWorld, WorldMapRing, pixel_rays, surfaces_at
 from amiwarp.simulation.simulator import Engine
-from amiwarp.simulation.worlds.renderer import DeviceWorld, WorldMapRing, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.world import looking_at
 from reference import optics as oracle
 

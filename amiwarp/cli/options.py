@@ -546,6 +546,6 @@ class WorldOptions:
         if self.preview is None:
             return
         from amiwarp.plotting.figures import draw_preview
-        from amiwarp.simulation.worlds.world_truth import TruthRenderer
+        from amiwarp.simulation.simulator import TruthRenderer
 
         draw_preview(self.preview, TruthRenderer(simulation).at(simulation.duration_us // 2))

@@ -420,8 +420,8 @@ def shown(value: Value, digits: int = 3) -> str:
     return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
 
 
-# Run on local processes or a cluster. A cell is one evaluation under one condition. Each is a file, so that a stopped run
-# can be continued.
+# Run on local processes or a cluster. A cell is one evaluation under one condition. Each is a file, so that a stopped
+# run can be continued.
 
 FORMAT = 4
 """Version of the files of cells, and of the streams and measures that all evaluations share."""

@@ -34,10 +34,9 @@ from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.optics.models import ExactModel, Model
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
-from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.simulator import Simulation, TruthRenderer
 from amiwarp.simulation.worlds.named.catalogue import named_world
 from amiwarp.simulation.worlds.world import WorldScene
-from amiwarp.simulation.worlds.world_truth import TruthRenderer
 from amiwarp.validation import real, whole
 
 # Test picture of discs, whose edges are known: their distance from compensated events is the blur that is left.
