@@ -1,7 +1,7 @@
 # Every public name, with the module it comes from. The front door loads names by this file: keep imports relative.
 
 from ._version import __version__ as __version__
-from .brightness.event_pairs import SensorTiming as SensorTiming
+from .brightness.solver import SensorTiming as SensorTiming
 from .calib.calibration import calibrate as calibrate
 from .calib.nlopt_solver import SearchStage as SearchStage
 from .calib.parameters import ParameterSpace as ParameterSpace

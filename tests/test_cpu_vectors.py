@@ -9,8 +9,7 @@ import pytest
 import warp as wp
 
 from amiwarp import CameraRotation, ExactModel, RadialTangential, Recording
-from amiwarp.brightness.event_pairs import EventTable, PairEnds
-from amiwarp.brightness.solver import BrightnessMap, GridHierarchy, Smoothness, Tiles
+from amiwarp.brightness.solver import BrightnessMap, EventTable, GridHierarchy, PairEnds, Smoothness, Tiles
 from amiwarp.kernels import conjugate_gradients as cg
 from amiwarp.kernels import equations_cuda, multilevel
 from amiwarp.kernels.conjugate_gradients import Prior

@@ -35,8 +35,7 @@ from amiwarp import (
     simulate,
     truth_model,
 )
-from amiwarp.brightness.event_pairs import EventTable, PairSet
-from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap, Residuals, Tiles
+from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap, EventTable, PairSet, Residuals, Tiles
 from amiwarp.calib.calibration_events import EventsAhead
 from amiwarp.calib.photometric.cost import TILE, Slopes, choose_tiles, iterate, near_tiles, one_tile, van_der_corput
 from amiwarp.imaging.votes import CanvasShape, Image

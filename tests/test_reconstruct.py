@@ -36,7 +36,7 @@ from amiwarp import (
     reconstruct,
     save_recording,
 )
-from amiwarp.brightness.event_pairs import EventTable
+from amiwarp.brightness.solver import EventTable
 from amiwarp.choices import Tone
 from amiwarp.cli.app import app
 from amiwarp.io.text import read_calib

@@ -8,8 +8,7 @@ import pytest
 import warp as wp
 
 from amiwarp import Calibration, ExactModel, PhotometricSettings, Settings, calibrate, model_error
-from amiwarp.brightness.event_pairs import EventTable
-from amiwarp.brightness.solver import THRESHOLD, BrightnessMap, Tiles, darkness, set_lags
+from amiwarp.brightness.solver import THRESHOLD, BrightnessMap, EventTable, Tiles, darkness, set_lags
 from amiwarp.studies.stability.cells import Condition, make
 
 SMALL = Condition(width=160, height=120, turns=3.0, latency_us=0.0)

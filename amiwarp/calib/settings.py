@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from amiwarp.brightness.event_pairs import SensorTiming
+from amiwarp.brightness.solver import SensorTiming
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
 from amiwarp.calib.parameters import check_names
 from amiwarp.choices import Sharpness

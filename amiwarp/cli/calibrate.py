@@ -130,7 +130,7 @@ class SearchOptions:
 
         ``base`` provides the photometric settings without an option.
         """
-        from amiwarp.brightness.event_pairs import SensorTiming
+        from amiwarp.brightness.solver import SensorTiming
 
         given = {name: value for name, value in vars(self).items() if value is not None and value is not False}
         if (given.get("global_algorithm") or "").lower() == "none":

@@ -20,8 +20,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.brightness.event_pairs import EventTable, PairSet
-from amiwarp.brightness.solver import BrightnessMap, Smoothness, Tiles
+from amiwarp.brightness.solver import BrightnessMap, EventTable, PairSet, Smoothness, Tiles
 from amiwarp.calib.result import Calibration
 from amiwarp.choices import CONTRAST, Fill, Tone
 from amiwarp.compensation.recordings import check_size

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.brightness.event_pairs import SensorTiming
+from amiwarp.brightness.solver import SensorTiming
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.calibration_events import thin
 from amiwarp.calib.model_choice import CIRCLES

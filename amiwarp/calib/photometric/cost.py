@@ -13,8 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.brightness.event_pairs import EventTable, PairSet, SensorTiming
-from amiwarp.brightness.solver import BrightnessMap, Tiles
+from amiwarp.brightness.solver import BrightnessMap, EventTable, PairSet, SensorTiming, Tiles
 from amiwarp.calib.calibration_events import EventsAhead
 from amiwarp.calib.nlopt_solver import SearchStage, best_of
 from amiwarp.calib.parameters import RATES, ParameterSpace

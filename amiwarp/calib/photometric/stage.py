@@ -17,8 +17,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.brightness.event_pairs import SensorTiming, off_excess
-from amiwarp.brightness.solver import BrightnessMap, Tiles, darkness, set_lags
+from amiwarp.brightness.solver import BrightnessMap, SensorTiming, Tiles, darkness, off_excess, set_lags
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
 from amiwarp.calib.parameters import LENS, MOTION, ParameterSpace, like_size
 from amiwarp.calib.photometric import consistency
