@@ -33,7 +33,6 @@ from amiwarp.imaging.export import encode_image
 from amiwarp.io.atomic_output import NewFile, check_output
 from amiwarp.io.formats import check_ending
 from amiwarp.kernels import known_nodes as kernels
-from amiwarp.kernels.known_nodes import drop_small_regions, exponentiate, find_large_regions
 from amiwarp.kernels.launch import launch, load, start_read
 from amiwarp.optics.camera import CameraRotation, border
 from amiwarp.optics.models import Model
@@ -94,12 +93,12 @@ def _without_small(mask: wp.array, value: int, least: int) -> wp.array:
     """Return the mask without regions of ``value`` that have fewer than ``least`` pixels."""
     if mask.device.is_cuda:
         out = wp.empty_like(mask)
-        launch(drop_small_regions, mask.size, [mask, value, least], [out], device=mask.device)
+        launch(kernels.drop_small_regions, mask.size, [mask, value, least], [out], device=mask.device)
         return out
     large = np.zeros(mask.shape, np.uint8)
     arrays = [wp.array(array, device="cpu", copy=False) for array in (mask.numpy() ^ np.uint8(1 - value), large)]
-    load(find_large_regions, mask.device)
-    wp.launch(find_large_regions, 1, [arrays[0], least, arrays[1]], device="cpu")
+    load(kernels.find_large_regions, mask.device)
+    wp.launch(kernels.find_large_regions, 1, [arrays[0], least, arrays[1]], device="cpu")
     return wp.array(large ^ np.uint8(1 - value), device="cpu", copy=False)
 
 
@@ -333,7 +332,7 @@ class Picture:
         contrast = real(contrast, "contrast", 0.0, 10.0)
         if isinstance(self.log, wp.array):
             out = wp.empty_like(self.log)
-            wp.launch(exponentiate, out.shape, inputs=[self.log, contrast], outputs=[out], device=out.device)
+            wp.launch(kernels.exponentiate, out.shape, inputs=[self.log, contrast], outputs=[out], device=out.device)
             wait(out.device)
             return out
         return np.exp(np.float32(contrast) * self.log)

@@ -19,17 +19,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.simulation.pictures import DARK
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.study import (
-    CellResult,
-    Chart,
-    Claim,
-    Condition,
-    Settings,
-    Stream,
-    Streams,
-    Table,
-    estimate_rotation,
-)
+from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
 from amiwarp.validation import real
 
 # Grey pictures of a stream: by our own reconstruction, or by a given function such as a learned one.
@@ -80,7 +70,9 @@ class PictureMaker:
         if not self.streams.simulation.scene.trajectory.moves:  # type: ignore[union-attr]  # a world
             return CameraRotation()
         middle, half = (self.streams.start_us + self.streams.end_us) // 2, 25_000
-        return estimate_rotation(self.streams.window(self.stream, middle - half, middle + half), self.streams.camera)
+        return study.estimate_rotation(
+            self.streams.window(self.stream, middle - half, middle + half), self.streams.camera
+        )
 
     def pictures(self, windows: Sequence[Window]) -> Iterator[NDArray[np.float64]]:
         """Yield the picture of each window, shape (height, width); uniform before there are enough events."""
