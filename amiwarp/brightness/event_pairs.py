@@ -21,7 +21,15 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.events import Events
 from amiwarp.kernels import equations_cpu, equations_cuda
 from amiwarp.kernels import pairs as kernels
-from amiwarp.kernels.equations import HELD, Geometry, Pairs, slope_between, slope_of_changes, split_by_time
+from amiwarp.kernels.equations import (
+    HELD,
+    Geometry,
+    Pairs,
+    angle_patterns,
+    slope_between,
+    slope_of_changes,
+    split_by_time,
+)
 from amiwarp.kernels.equations_cpu import BLOCK, Chains, make_chains, weigh_chains
 from amiwarp.kernels.equations_cuda import Ends, add_ends, list_ends, take_fractions
 from amiwarp.kernels.launch import RepeatedLaunches, launch
@@ -99,6 +107,16 @@ class PairSet:
         inputs = [self.arrays, float(middle.mean()), spread, float(np.partition(gap, rank)[rank])]
         launch(split_by_time, len(self), inputs, [late, long], device=self.device)
         return late, long
+
+    def angle_patterns(self, middle: tuple[float, float]) -> Any:
+        """Return patterns of errors of the prism's angle at the ends of each pair, one in each row, on the device.
+
+        They are cosine and sine of the encoder's angle and of twice the angle, and the distance of the pixel from
+        ``middle`` along x and y [px]. The shape is (6, 2 · padded pairs), that of the pairs' slopes in each row.
+        """
+        out = wp.zeros((6, 2 * self.arrays.stride), dtype=float, device=self.device)
+        launch(angle_patterns, len(self), [self.arrays, *map(float, middle)], [out], device=self.device)
+        return out
 
     def with_slope(self, slope_of: Callable[[NDArray[np.int64]], NDArray[np.float64]], middle_us: int) -> PairSet:
         """Attach to each pair the change of its prism angles per unit of a drifting parameter, and return the set.
