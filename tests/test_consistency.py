@@ -1,18 +1,23 @@
 """The photometric answer must hold everywhere in the image and over time; a wrong camera or flat side is corrected."""
 
 import math
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from amiwarp import (
+    AmiwarpError,
     Calibration,
     Camera,
     CameraMotion,
     Encoder,
+    Events,
     FlatSide,
+    MemoryEvents,
     PhotometricSettings,
     Prism,
     RadialTangential,
@@ -36,10 +41,8 @@ def wide(texture: np.ndarray) -> Recording:
 
 
 def calibrated(recording: Recording, **settings: Any) -> Calibration:
-    return calibrate(
-        recording, model="exact", events=60_000, global_evaluations=60, photometric=PhotometricSettings(pairs=60_000),
-        **settings,
-    )  # fmt: skip
+    given = {"model": "exact", "events": 60_000, "global_evaluations": 60, **settings}
+    return calibrate(recording, photometric=PhotometricSettings(pairs=60_000), **given)
 
 
 def error_px(recording: Recording, found: Calibration, camera: Camera = CAMERA) -> float:
@@ -50,6 +53,7 @@ def error_px(recording: Recording, found: Calibration, camera: Camera = CAMERA) 
 def test_a_right_camera_is_left_alone(wide: Recording) -> None:
     found = calibrated(wide)
     assert found.camera == CAMERA
+    assert found.harmonics is None
     assert found.warnings == ()
     assert error_px(wide, found) < 0.02
     assert abs(found.parameters["apex"] - PRISM.apex) < 3.0 * found.uncertainty["apex"]
@@ -79,6 +83,63 @@ def test_a_drifting_phase_is_reported(wide: Recording) -> None:
     assert wide.encoder is not None
     slipping = replace(wide, encoder=Encoder(wide.encoder.t, wide.encoder.angle * 1.008))
     assert any("drifts over the recording" in w and "encoder" in w for w in calibrated(slipping).warnings)
+
+
+HARMONICS = np.radians([1.2, 2.5, 0.0, -0.8])
+"""Error of an encoder: factors of cos, sin, cos 2 and sin 2 of the true angle."""
+
+
+def bent(encoder: Encoder) -> Encoder:
+    """Return an encoder that reads its angle wrongly, in the same way each turn."""
+    turns = np.stack(
+        [np.cos(encoder.angle), np.sin(encoder.angle), np.cos(2 * encoder.angle), np.sin(2 * encoder.angle)]
+    )
+    return replace(encoder, angle=encoder.angle + HARMONICS @ turns)
+
+
+@pytest.mark.parametrize("model", ["exact", "auto"])
+def test_an_encoder_that_is_off_centre_is_corrected(wide: Recording, model: str, tmp_path: Path) -> None:
+    assert wide.encoder is not None
+    given = replace(wide, encoder=bent(wide.encoder))
+    found = calibrated(given, model=model)
+    assert found.harmonics is not None
+    assert any(re.search(r"angle is wrong by 2\.[78] deg once a turn", said) for said in found.warnings)
+    t = np.arange(wide.events.t_first, wide.events.t_last, 97)
+    left = found.encoder_for(given.encoder, int(t[0]), int(t[-1])).angle_at(t) - wide.encoder.angle_at(t)
+    assert np.abs(left - left.mean()).max() < np.radians(0.25)  # 0.01 px
+    assert error_px(wide, found) < 0.02
+    found.save(tmp_path / "calibration.json")
+    assert Calibration.load(tmp_path / "calibration.json").harmonics == found.harmonics
+
+
+def test_an_error_that_cannot_be_corrected_is_refused(wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert wide.encoder is not None
+    given = replace(wide, encoder=bent(wide.encoder))
+    monkeypatch.setattr(Encoder, "with_harmonics", lambda self, _: replace(self, angle=1.2 * self.angle))
+    with pytest.raises(AmiwarpError, match=r"wrong by 2\.[78] deg once .* 0\.\d+ deg twice a turn.*not confirmed"):
+        calibrated(given)
+
+
+def test_pixels_that_are_read_one_after_another_are_named(wide: Recording) -> None:
+    events = wide.events.slice(0, len(wide.events))  # type: ignore[attr-defined]
+    t = events.t + 6 * events.x.astype(np.int64)
+    order = np.argsort(t, kind="stable")
+    skewed = Events(events.x[order], events.y[order], t[order], events.p[order])
+    assert wide.encoder is not None
+    with pytest.raises(AmiwarpError, match=r"events come late by .* us more from column to column") as refused:
+        calibrated(replace(wide, events=MemoryEvents(skewed, 160, 120)))
+    found = re.search(r"late by (\S+) us more", str(refused.value))
+    assert found is not None
+    assert float(found[1]) == pytest.approx(6.0, abs=1.0)
+
+
+def test_a_wrong_ratio_of_the_focal_lengths_is_found(texture: np.ndarray) -> None:
+    camera = replace(CAMERA, fy=1.05 * CAMERA.fx)
+    recording = simulate(texture, camera, PRISM, duration_s=0.17, seed=6)
+    found = calibrated(replace(recording, camera=CAMERA))
+    assert found.camera.fy / found.camera.fx == pytest.approx(1.05, abs=0.01)
+    assert found.harmonics is None
+    assert error_px(recording, found, camera) < 0.02
 
 
 def linear(truth: np.ndarray, noise: float, squares: int = 200) -> LinearFit:

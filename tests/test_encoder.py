@@ -97,6 +97,30 @@ def test_clock_offset_shifts_angle_and_coverage():
     assert encoder.clock_offset_us == 2500.0
 
 
+HARMONICS = (0.05, -0.1, 0.02, 0.03)
+
+
+@pytest.mark.parametrize("interval_us", [100, 90_000])
+def test_an_error_that_repeats_every_turn_is_corrected(interval_us):
+    encoder = Encoder.constant_speed(720.0, 0, 500_000, interval_us=interval_us)
+    t = np.arange(0, 500_000, 37)
+    read = encoder.angle_at(t)
+    true = read + 0.05 * np.cos(read) - 0.1 * np.sin(read) + 0.02 * np.cos(2 * read) + 0.03 * np.sin(2 * read)
+    bent = encoder.with_harmonics(HARMONICS)
+    assert np.abs(bent.angle_at(t) - true).max() < 4e-4  # between samples, 1/64 turn apart at most
+    assert bent.coverage[1] >= encoder.coverage[1] - interval_us
+    with pytest.raises(AmiwarpError, match="harmonics"):
+        encoder.with_harmonics((0.1, 0.2))
+
+
+def test_a_stream_corrects_its_angles_too():
+    encoder = Encoder.constant_speed(720.0, 0, 100_000)
+    stream = EncoderStream(harmonics=HARMONICS)
+    stream.append(encoder.t, encoder.angle)
+    t = np.arange(20_000, 80_000, 371)
+    assert np.array_equal(stream.over(20_000, 80_000).angle_at(t), encoder.with_harmonics(HARMONICS).angle_at(t))
+
+
 def test_extrapolates_one_interval_and_no_more():
     encoder = Encoder.from_angles([0, 1000, 2000], [0.0, 0.1, 0.3])
     np.testing.assert_allclose(encoder.angle_at([-1000, 3000]), [-0.1, 0.5], rtol=0, atol=1e-12)

@@ -108,6 +108,16 @@ class PairSet:
         launch(eqs.split_by_time, len(self), inputs, [late, long], device=self.device)
         return late, long
 
+    def angle_patterns(self, middle: tuple[float, float]) -> Any:
+        """Return patterns of errors of the prism's angle at the ends of each pair, one in each row, on the device.
+
+        They are cosine and sine of the encoder's angle and of twice the angle, and the distance of the pixel from
+        ``middle`` along x and y [px]. The shape is (6, 2 · padded pairs), that of the pairs' slopes in each row.
+        """
+        out = wp.zeros((6, 2 * self.arrays.stride), dtype=float, device=self.device)
+        launch(eqs.angle_patterns, len(self), [self.arrays, *map(float, middle)], [out], device=self.device)
+        return out
+
     def with_slope(self, slope_of: Callable[[NDArray[np.int64]], NDArray[np.float64]], middle_us: int) -> PairSet:
         """Attach to each pair the change of its prism angles per unit of a drifting parameter, and return the set.
 

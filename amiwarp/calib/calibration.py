@@ -98,7 +98,7 @@ def calibrate(
     if settings.model != AUTO:
         return Calibrator(recording, settings, device, progress).run()
     chooser = ModelChooser(recording, settings, device)
-    exact = Calibrator(recording, chooser.settings, device, progress, chooser.prepare).run()
+    exact = Calibrator(recording, chooser.settings, device, progress, meanwhile=chooser.prepare).run()
     return chooser.choose(exact, lambda again, free: Calibrator(again, free, device, progress).run())
 
 
@@ -158,6 +158,8 @@ class Calibrator:
     settings: Settings
     device: Any
     progress: Progress | None
+    harmonics: tuple[float, ...] | None = None
+    """Correction of the recording's encoder that is in its angles already, as in :attr:`Calibration.harmonics`."""
     meanwhile: Callable[[Calibration], Iterator[None]] | None = None
     """Function that gets the answer of the first attempt's sharpness stage and returns other work. Some of its steps
     are taken while a GPU works on the photometric stage, those that are left after the stage."""
@@ -174,13 +176,14 @@ class Calibrator:
             return tried.found()
         recording, calibrator = self.recording, replace(self, meanwhile=None)
         if recording.encoder is not None:
+            calibrator, tried = calibrator.with_straight_angles(tried)
             if tried.unexplained:
                 calibrator, tried = calibrator.without_bad_pixels(tried)
             if tried.unexplained:
                 tried = calibrator.explained(tried)
             elif self.settings.free is None and tried.camera_turned:
                 tried = calibrator.with_rotation(tried)
-        found = tried.found()
+        found = replace(tried.found(), harmonics=calibrator.harmonics)
         if not tried.accepted:  # the answer of sharpness alone may be off by tenths of a pixel
             reasons = [w for w in found.warnings if "photometric" in w]
             raise AmiwarpError(
@@ -217,6 +220,24 @@ class Calibrator:
         except AmiwarpError as error:
             return Attempt(None, error)
         return Attempt(replace(found, seconds=time.perf_counter() - began))
+
+    def with_straight_angles(self, tried: Attempt) -> tuple[Calibrator, Attempt]:
+        """Correct an error of the encoder that repeats every turn, if the events ask for it, and calibrate again.
+
+        Return the calibrator of the corrected recording, and its attempt.
+        """
+        encoder, found = self.recording.encoder, tried.photometric
+        harmonics = () if found is None else found.harmonics
+        assert encoder is not None
+        if not harmonics:
+            return self, tried
+        straight = replace(self.recording, encoder=encoder.with_harmonics(harmonics))
+        calibrator = replace(self, recording=straight, harmonics=harmonics)
+        again = calibrator.attempt()
+        if again.calibration is None or again.cost > tried.cost:
+            return self, tried
+        said = f"{stage.harmonics_in_words(harmonics)}: it was corrected"
+        return calibrator, Attempt(_warning(again.calibration, said))
 
     def without_bad_pixels(self, tried: Attempt) -> tuple[Calibrator, Attempt]:
         """Mask hot and flickering pixels if they have a notable share of the events, and calibrate without them.

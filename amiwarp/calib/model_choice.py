@@ -70,6 +70,9 @@ class ModelChooser:
         # the camera and the flat side are those that the calibration found
         prism = replace(self._recording.prism or UnsizedPrism(), flat_side=first.prism.flat_side)
         recording = replace(self._recording, camera=first.camera, prism=prism)
+        if first.harmonics is not None and recording.encoder is not None:
+            recording, self._ready = replace(recording, encoder=recording.encoder.with_harmonics(first.harmonics)), None
+        harmonics, first = first.harmonics, replace(first, harmonics=None)
         trial, parameters = self._with_free_parameters(recording, first, calibrate)
         candidates = compare_models(trial)
         chosen = express(trial, next(c.model for c in candidates if c.chosen), self.settings)
@@ -89,7 +92,9 @@ class ModelChooser:
             *_whole_image_warning(trial, chosen),
             *(f"prediction and held-out turns disagree on the {c.model} model: {c.verdict}" for c in disagreements),
         )
-        return replace(chosen, ladder=choice, seconds=whole, warnings=(*chosen.warnings, *warnings))
+        return replace(
+            chosen, ladder=choice, seconds=whole, warnings=(*chosen.warnings, *warnings), harmonics=harmonics
+        )
 
     def _with_free_parameters(
         self, recording: Recording, first: Calibration, calibrate: Callable[[Recording, Settings], Calibration]

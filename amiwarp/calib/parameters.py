@@ -42,9 +42,9 @@ CHANGES = ("change_x", "change_y", "change_z")
 """Angular acceleration of the camera about its x, y and z axes: names of the parameters."""
 MOTION = (*RATES, *CHANGES)
 """Names of all parameters of the camera's rotation."""
-LENS = ("focal_length", "center_x", "center_y", "k1")
-"""Parameters of the camera's lens. The principal point (px) and the first radial coefficient of distortion are freed by
-the photometric stage only, if the events contradict the given camera."""
+LENS = ("focal_length", "center_x", "center_y", "k1", "fy_over_fx")
+"""Parameters of the camera's lens. All but the focal length are freed by the photometric stage only, if the events
+contradict the given camera: the principal point (px), the first radial coefficient of distortion, and fy / fx."""
 _UNITS = {
     "clock_offset": "us",
     "rpm": "1/min",
@@ -341,11 +341,12 @@ def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
     if values.keys().isdisjoint(LENS):
         return camera
     fx = values.get("focal_length", camera.fx)
+    fy = fx * values.get("fy_over_fx", camera.fy / camera.fx)
     lens = camera.distortion
     if "k1" in values:
         lens = replace(lens or RadialTangential(), k1=values["k1"])
     cx, cy = values.get("center_x", camera.cx), values.get("center_y", camera.cy)
-    return replace(camera, fx=fx, fy=camera.fy * (fx / camera.fx), cx=cx, cy=cy, distortion=lens)
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=lens)
 
 
 def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
@@ -445,8 +446,9 @@ def widened(space: ParameterSpace, names: tuple[str, ...]) -> ParameterSpace:
     """
     camera, lens = space.camera, space.camera.distortion
     given = {"focal_length": camera.fx, "center_x": camera.cx, "center_y": camera.cy, "k1": lens.k1 if lens else 0.0}
+    given["fy_over_fx"] = camera.fy / camera.fx
     values = {**{n: given.get(n, 0.0) for n in names}, **space.start}
-    half = {"focal_length": 0.6 * values.get("focal_length", 0.0), "k1": 0.5}
+    half = {"focal_length": 0.6 * values.get("focal_length", 0.0), "k1": 0.5, "fy_over_fx": 0.3}
     half |= dict.fromkeys(("center_x", "center_y"), 0.2 * camera.width)
     half |= {name: parameter.half_range for name, parameter in optical_parameters().items()}
     shifts = _pixels_per_unit(
@@ -529,7 +531,7 @@ def _pixels_per_unit(
     """
     kind = MODELS[model].closed_form()
     nominal = {**values, kind.SIZE: kind.size_from_apex(prism.apex, prism)}
-    lens = {"center_x": 1.0, "center_y": 1.0, "k1": 0.01}
+    lens = {"center_x": 1.0, "center_y": 1.0, "k1": 0.01, "fy_over_fx": 0.01}
     steps = {**dict.fromkeys((kind.SIZE, *optical_parameters()), 0.02), **lens}
     steps |= {kind.SIZE: 0.25 * nominal[kind.SIZE], "phase": 0.05}
     steps = {n: h for n, h in steps.items() if n in names or (n == "phase" and set(DRIFTS) & set(names))}

@@ -130,6 +130,9 @@ class PhotometricSummary:
     A tilt of the prism's axis asks for nearly the same correction."""
     held: tuple[str, ...] = ()
     """Free parameters that the events do not determine. They keep the values of the sharpness stage."""
+    harmonics: tuple[float, ...] = ()
+    """Correction of the encoder's angle by an error that repeats every turn, in the form of
+    :attr:`Calibration.harmonics`, if the events ask for one; else empty."""
     warnings: tuple[str, ...] = ()
     """Corrections of the given camera and prism, and where the result does not hold, one sentence each."""
 
@@ -212,7 +215,7 @@ FORMAT = "amiwarp-calibration"
 VERSION = 1
 NEEDED = ("format", "version", "model", "camera", "prism", "parameters", "sharpness", "zero_us", "photometric",
           "events", "seconds", "warnings", "stages")  # fmt: skip
-OPTIONAL = ("middle_us", "ladder")
+OPTIONAL = ("middle_us", "ladder", "harmonics")
 """Fields of the calibration file that files of earlier versions lack."""
 SHARPNESS = [kind.value for kind in Sharpness]
 
@@ -276,6 +279,9 @@ class Calibration:
     """Time on the events' clock for which the camera's rates hold [us]; None if its rotation was not free."""
     ladder: ModelChoice | None = None
     """Evidence for the choice of the model; None if the settings named a model."""
+    harmonics: tuple[float, ...] | None = None
+    """Correction of the encoder's angle e by an error that repeats every turn: the factors of cos e, sin e, cos 2e and
+    sin 2e [rad] (see :meth:`amiwarp.Encoder.with_harmonics`); None for no correction."""
 
     @property
     def model(self) -> Model:
@@ -314,8 +320,8 @@ class Calibration:
         Returns
         -------
         Encoder
-            The given encoder with the calibrated clock offset; without an encoder, one of the calibrated constant
-            speed. If the prism's size is 0, an encoder at rest: the angle then has no effect.
+            The given encoder with the calibrated clock offset and correction; without an encoder, one of the calibrated
+            constant speed. If the prism's size is 0, an encoder at rest: the angle then has no effect.
 
         Raises
         ------
@@ -325,7 +331,8 @@ class Calibration:
         if self.parameters.get(MODELS[self.model_name].SIZE) == 0.0:
             return constant_speed(0.0, t_first, t_last, t_first)
         if encoder is not None:
-            return encoder.with_clock_offset(self.parameters.get("clock_offset", encoder.clock_offset_us))
+            encoder = encoder.with_clock_offset(self.parameters.get("clock_offset", encoder.clock_offset_us))
+            return encoder if self.harmonics is None else encoder.with_harmonics(self.harmonics)
         if "rpm" not in self.parameters or self.zero_us is None:
             raise AmiwarpError(
                 "the recording has no encoder and the calibration has no rpm; calibrate this recording itself"
@@ -354,6 +361,7 @@ class Calibration:
             },
             "zero_us": self.zero_us,
             "middle_us": self.middle_us,
+            "harmonics": None if self.harmonics is None else list(self.harmonics),
             "photometric": None if self.photometric is None else asdict(self.photometric),
             "ladder": None if self.ladder is None else asdict(self.ladder),
             "events": self.events,
@@ -477,6 +485,7 @@ class _PlainFields:
     photometric: PhotometricSummary | None
     middle_us: int | None = None
     ladder: ModelChoice | None = None
+    harmonics: tuple[float, ...] | None = None
 
 
 def _entry(name: str, data: Any) -> _Entry:

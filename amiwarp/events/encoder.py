@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.events import TIME_LIMIT, as_times
-from amiwarp.validation import array, guarded, instance, real, whole
+from amiwarp.validation import array, guarded, instance, real, vector, whole
 
 # Unwrap an encoder's counts and angles: find the period at which they wrap, and reject ambiguous samples.
 #
@@ -323,6 +323,8 @@ TWO_PI = 2.0 * math.pi
 """One turn [rad]."""
 MOST_SAMPLES = 1 << 28
 """Largest number of samples that :meth:`Encoder.constant_speed` makes: three days at one sample per millisecond."""
+LONGEST_BENT_STEP = TWO_PI / 64.0
+"""Longest step between samples of an encoder whose error within a turn is corrected [rad]."""
 LARGEST_ANGLE = 1e10
 """Largest accepted magnitude of a prism angle [rad]: 1.6e9 turns. Up to this angle float64 resolves 2e-6 rad."""
 
@@ -521,6 +523,43 @@ class Encoder:
             The encoder.
         """
         return dataclasses.replace(self, clock_offset_us=clock_offset_us)
+
+    def with_harmonics(self, harmonics: ArrayLike) -> Encoder:
+        """Return an encoder whose angles are corrected by an error that repeats every turn.
+
+        The error of an encoder disc or magnet that is off centre, or of a speed that ripples in each turn where the
+        encoder has but an index pulse.
+
+        Parameters
+        ----------
+        harmonics : array_like
+            Factors of cos e, sin e, cos 2e and sin 2e in the correction of the angle e [rad], shape (4,).
+
+        Returns
+        -------
+        Encoder
+            The encoder. Where its samples are further apart than 1/64 turn, samples are added between them.
+
+        Raises
+        ------
+        AmiwarpError
+            If there are not four finite numbers.
+
+        Examples
+        --------
+        >>> encoder = amiwarp.Encoder.from_angles([0, 1000], [0.0, 1.5])
+        >>> encoder.with_harmonics([0.0, 0.1, 0.0, 0.0]).angle_at([1000]).round(4)
+        array([1.5997])
+        """
+        factors = vector(harmonics, 4, "harmonics", real)
+        parts = np.ceil(np.abs(np.diff(self.angle)) / LONGEST_BENT_STEP).astype(np.int64)
+        parts = np.clip(parts, 1, np.diff(self.t))
+        first = np.repeat(np.arange(parts.size), parts)
+        within = np.arange(first.size) - np.repeat(np.cumsum(parts) - parts, parts)
+        t = np.append(self.t[first] + within * np.diff(self.t)[first] // parts[first], self.t[-1])
+        angle = np.interp(t - self.t[0], self.t - self.t[0], self.angle)
+        turn = np.stack([np.cos(angle), np.sin(angle), np.cos(2.0 * angle), np.sin(2.0 * angle)])
+        return dataclasses.replace(self, t=t, angle=angle + factors @ turn)
 
     def with_index(self, index_t_us: ArrayLike) -> Encoder:
         """Return an encoder with the same samples whose angle is zero at the index pulses.

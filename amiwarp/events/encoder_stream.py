@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.events import as_times
-from amiwarp.validation import array, guarded, real, whole
+from amiwarp.validation import array, guarded, real, vector, whole
 
 RESTART_US = 1
 """Time between the extrapolated sample that ends the samples before a restart and the first sample after it [us]."""
@@ -27,6 +27,8 @@ class EncoderStream:
     ----------
     clock_offset_us : float, default 0.0
         Encoder time minus event time [us].
+    harmonics : array_like, optional
+        Correction of the angles by an error that repeats every turn, as in :meth:`Encoder.with_harmonics`.
     capacity : int, default 65536
         Number of samples that are always kept, at least 16.
 
@@ -52,8 +54,11 @@ class EncoderStream:
     MAX_GAPS = 64
     """Number of latest gaps that are remembered."""
 
-    def __init__(self, clock_offset_us: float = 0.0, *, capacity: int = 1 << 16) -> None:
+    def __init__(
+        self, clock_offset_us: float = 0.0, *, harmonics: ArrayLike | None = None, capacity: int = 1 << 16
+    ) -> None:
         capacity = whole(capacity, "capacity", 16, 1 << 28, " samples")
+        self._harmonics = None if harmonics is None else vector(harmonics, 4, "harmonics", real)
         self.clock_offset_us = real(clock_offset_us, "clock_offset_us")
         self.dropped = 0
         """Number of samples that were dropped because they were not later than the sample before them."""
@@ -194,7 +199,8 @@ class EncoderStream:
         t, angle = times[low:high].copy(), angles[low:high].copy()
         if end > t[-1]:
             t, angle = np.append(t, end + 1), np.append(angle, self._extrapolate(end + 1))
-        return Encoder(t, angle, self.clock_offset_us)
+        encoder = Encoder(t, angle, self.clock_offset_us)
+        return encoder if self._harmonics is None else encoder.with_harmonics(self._harmonics)
 
     def knows(self, t_first: int, t_last: int) -> bool:
         """Return whether samples determine all angles of a span of event times.

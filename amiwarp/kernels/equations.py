@@ -318,6 +318,26 @@ def split_by_time(
 
 
 @wp.kernel
+def angle_patterns(pairs: Pairs, cx: float, cy: float, start: int, out: wp.array2d(dtype=float)):
+    """Compute patterns of errors of the prism's angle, at both events of each pair.
+
+    The six rows of ``out`` are cosine and sine of the encoder's angle and of twice the angle, and the pixel's distance
+    from the image's middle along x and along y [px]. Each has the form of ``Pairs.slope``.
+    """
+    i = start + wp.tid()
+    for k in range(2):
+        at = k * pairs.stride + i
+        c = pairs.azimuth[2 * k * pairs.stride + i]
+        s = pairs.azimuth[(2 * k + 1) * pairs.stride + i]
+        out[0, at] = c
+        out[1, at] = s
+        out[2, at] = c * c - s * s
+        out[3, at] = 2.0 * c * s
+        out[4, at] = float(pairs.x[i]) - cx
+        out[5, at] = float(pairs.y[i]) - cy
+
+
+@wp.kernel
 def find_squares(
     pairs: Pairs,
     rows: wp.array2d(dtype=float),

@@ -25,7 +25,7 @@ from amiwarp.calib.photometric.cost import (
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.equations import multiply
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.camera import CameraRotation
+from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.optics.models import Model, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 
@@ -37,6 +37,12 @@ if TYPE_CHECKING:
 
 # Causes of an answer that does not hold everywhere in the image: what may be wrong in the given camera and prism.
 
+HARMONICS = ("cos 1", "sin 1", "cos 2", "sin 2")
+"""Names of the unknown factors of cos e, sin e, cos 2e and sin 2e in the error of the encoder's angle e."""
+SKEW = ("skew x", "skew y")
+"""Names of the unknown changes of the prism's angle from column to column and from row to row [rad/px]."""
+PATTERNS = (*HARMONICS, *SKEW)
+"""Names of all errors of the prism's angle that are examined, in the order of ``PairSet.angle_patterns``."""
 FLAT_SIDE = "flat_side"
 """Name of the unknown that is 0 for the given flat side of the prism, and 1 for the other."""
 
@@ -62,10 +68,12 @@ CAUSES = (
     CENTER,
     Cause("the flat side of the prism", (FLAT_SIDE,)),
     Cause("the lens distortion k1", ("k1",)),
+    Cause("the ratio of the focal lengths fy / fx", ("fy_over_fx",)),
     Cause("the direction of the prism's axis", ("tilt_x", "tilt_y")),
 )
 """All causes that the photometric stage can name and correct, the likeliest first."""
-SCREENED = CAUSES[:3]
+ASPECT = CAUSES[4]
+SCREENED = (*CAUSES[:3], ASPECT)
 """Causes that every answer is tested for. The effects of the others resemble those of the first two."""
 
 
@@ -237,10 +245,14 @@ def masked(column: Any, factor: Any) -> Any:
 
 SLOPE_PX = 0.02
 """Step of the finite differences that give the derivatives of the residuals [px]."""
+STEP_RAD = 0.004
+"""Step of the finite differences that give the derivatives of the residuals by an angle [rad]."""
 SIGNIFICANT = 5.0
 """Number of standard deviations from which on a cause is significant."""
 LEAST_GAIN = 0.002
 """Smallest share of the squared residuals that a cause must remove. Right answers leave 0.001 at most."""
+LEAST_ANGLE_GAIN = 0.01
+"""Smallest share that an error of the prism's angle must remove. Right angles leave 0.003 at most."""
 LEAST_FURTHER_GAIN = 0.0005
 """Smallest share that a further cause must remove once the given lens has turned out to be wrong."""
 LEAST_MOVE_PX = 0.005
@@ -469,6 +481,20 @@ def slopes(cost: Cost, space: ParameterSpace, v: Vector, names: Iterable[str]) -
     return columns
 
 
+def shifted(cost: Cost, v: Vector, shift: Any) -> Any:
+    """Return the derivative of the residuals by a factor of ``shift``, changes of the angles at the ends of pairs.
+
+    ``shift`` is a Warp array of shape (2 · padded pairs,), or (2, padded pairs).
+    """
+    pairs, at = cost.brightness.pairs, cost.at(v)
+    none = pairs.arrays.slope
+    pairs.arrays.slope = shift.flatten()
+    ends = {**at, "drift": STEP_RAD}, {**at, "drift": -STEP_RAD}
+    column = cost.brightness.find_slope(*ends, 2.0 * STEP_RAD)
+    pairs.arrays.slope = none
+    return column
+
+
 def _rotation_columns(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by a slow rotation of the camera about each axis, if it is not free."""
     space, at, columns = cost.space, cost.at(best), {}
@@ -478,6 +504,74 @@ def _rotation_columns(cost: Cost, best: Vector) -> dict[str, Any]:
         # one-sided differences: a camera at rest is faster to compute, and only the gain counts
         columns[name] = cost.brightness.find_slope({**at, "camera_rotation": CameraRotation((x, y, z))}, at, SLOPE_PX)
     return columns
+
+
+def _angle_columns(cost: Cost, best: Vector) -> dict[str, Any]:
+    """Return the derivatives of the residuals by patterns of the prism's angle, for a still camera."""
+    pairs, camera = cost.brightness.pairs, cost.space.camera
+    if cost.space.moving or pairs.arrays.slope.shape[0] or not _orbit(cost.space):
+        return {}
+    rows = pairs.angle_patterns((0.5 * camera.width, 0.5 * camera.height))
+    return {name: shifted(cost, best, rows[k]) for k, name in enumerate(PATTERNS)}
+
+
+@dataclass(frozen=True)
+class AngleFit:
+    """Errors of the prism's angle, by a linearised fit."""
+
+    change: Vector
+    """Correction of the angle: factors of :data:`PATTERNS`, 0 for those that were not fitted, shape (6,)."""
+    moved_px: float
+    """How far the correction moves events [px rms]."""
+
+
+def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...]) -> AngleFit | None:
+    """Return the errors ``names`` of the prism's angle, by a linearised fit at ``best`` [px].
+
+    None if they cannot be examined.
+    """
+    angles = _angle_columns(cost, best)
+    if not angles or not names:
+        return None
+    given = _rivals_of_angles(cost, best)
+    fit = linear_fit(cost, given | angles)
+    found = dict(zip(names, fit.fit((*given, *names)).change[len(given) :].tolist(), strict=True))
+    change = np.array([found.get(name, 0.0) for name in PATTERNS])
+    return AngleFit(change, px_per_rad(cost.space, best) * rms_angle(cost.space.camera, change))
+
+
+def angle_errors(cost: Cost, best: Vector) -> tuple[str, ...]:
+    """Return the names of those errors of the prism's angle that are significant at ``best`` [px], of PATTERNS.
+
+    What a slow rotation of the camera or a wrong fy / fx explains does not count.
+    """
+    angles = _angle_columns(cost, best)
+    if not angles:
+        return ()
+    given = _rivals_of_angles(cost, best)
+    fit = linear_fit(cost, given | angles)
+    found: list[str] = []
+    for group, other in ((HARMONICS, SKEW), (SKEW, HARMONICS)):
+        _, significance, gain = fit.adding((*given, *other), group)
+        found += group if significance >= SIGNIFICANT and gain >= LEAST_ANGLE_GAIN else ()
+    return tuple(found)
+
+
+def _rivals_of_angles(cost: Cost, best: Vector) -> dict[str, Any]:
+    """Return the derivatives of the residuals by what may look like an error of the prism's angle."""
+    columns = slopes(cost, cost.space, best, cost.space.names) | _rotation_columns(cost, best)
+    return columns | (_cause_columns(cost, best, ASPECT) if ASPECT in testable(cost.space) else {})
+
+
+def rms_angle(camera: Camera, factors: Vector) -> float:
+    """Return how large an error of the angle is, given by factors of :data:`PATTERNS`, shape (6,) [rad rms]."""
+    spread = np.sqrt([0.5, 0.5, 0.5, 0.5, camera.width**2 / 12.0, camera.height**2 / 12.0])
+    return float(np.linalg.norm(factors * spread))
+
+
+def px_per_rad(space: ParameterSpace, best: Vector) -> float:
+    """Return how far events move per angle of the prism [px rms/rad]."""
+    return float(np.linalg.norm(best[:2])) if space.cartesian else space.pixels.get("phase", 0.0)
 
 
 def _rotation_gain(space: ParameterSpace, fit: LinearFit) -> float:
@@ -530,21 +624,21 @@ def _findings(cost: Cost, best: Vector, fit: LinearFit, causes: list[Cause], lea
         estimate, significance, gain = fit.adding(cost.space.names, cause.names)
         if significance < SIGNIFICANT or gain < least_gain:
             continue
-        moved, start = _corrected(cost, best, cause, estimate)
+        moved, start = _corrected(cost, best, cause, estimate.change)
         if moved >= LEAST_MOVE_PX:
             found.append(Finding(cause, moved, gain, significance, start))
     return sorted(found, key=lambda f: -f.gain)
 
 
-def _corrected(cost: Cost, best: Vector, cause: Cause, estimate: Estimate) -> tuple[float, Vector]:
+def _corrected(cost: Cost, best: Vector, cause: Cause, change: Vector) -> tuple[float, Vector]:
     """Return how far the correction of a cause changes the model [px rms], and the corrected search vector."""
     space, n = cost.space, len(best)
     here = space.build(space.to_values(best))
     wide, v = with_cause(space, cause, space.to_values(best))
     if cause.names == (FLAT_SIDE,):
-        return float(estimate.change[n]) * _distance(wide.build(wide.to_values(v)), here), v
+        return float(change[n]) * _distance(wide.build(wide.to_values(v)), here), v
     low, high = wide.bounds()
-    v = np.clip(v + estimate.change, low, high)
+    v = np.clip(v + change, low, high)
     return _distance(wide.build(wide.to_values(v)), here), v
 
 

@@ -9,9 +9,8 @@ sensor's timing and then the given camera and prism, where the events contradict
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -34,6 +33,7 @@ from amiwarp.calib.result import PhotometricSummary, StageSummary
 from amiwarp.calib.settings import GAUSS_NEWTON, LINEAR_UNKNOWNS, PhotometricSettings
 from amiwarp.calib.sharpness import Search
 from amiwarp.events.recording import Recording
+from amiwarp.optics.camera import Camera
 
 Vector = NDArray[np.float64]
 
@@ -49,7 +49,14 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
     answer = found.answers.search(found.start)
     rpm, sensor, time_constant = search.calibration_events.encoder.rpm, given, 0.0
     rad_per_us, direction = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm)
-    if timing_can_be_found(answer, found.answers.cost) and rpm:
+    examined = can_be_examined(answer, found.answers.cost) and bool(rpm)
+    error = find_angle_error(found.answers, answer.stage.x) if examined else None
+    if error is not None:
+        space, v = found.answers.cost.space, answer.stage.x
+        verdict = judge_angles(space.camera, error, consistency.px_per_rad(space, v), direction * rad_per_us)
+        harmonics = tuple(error[:4].tolist()) if error[:4].any() else ()
+        return found.finished(replace(answer, result=replace(answer.result, harmonics=harmonics)).judged(*verdict))
+    if examined:
         v = answer.stage.x
         pause, lag = timing_steps(found.answers.cost, v, direction)
         if pause and not given.refractory_us:
@@ -66,13 +73,8 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
     answers = found.answers
     answer = checked(answers, answer).judged(*judge_lag(time_constant * rad_per_us))
     notes = (*timing_notes(sensor.refractory_us - given.refractory_us, time_constant), *answer.result.warnings)
-    result = replace(
-        answer.result, sharpness_parameters=answers.sharpest, pairs=len(found.pairs), held=found.held, warnings=notes,
-        refractory_us=sensor.refractory_us, time_constant_us=time_constant,
-    )  # fmt: skip
-    space = answers.cost.space
-    values = map(space.to_values, answer.stage.points)
-    return result, StageSummary.of("photometric", answer.stage, space.names, values), space
+    timed = replace(answer.result, warnings=notes, refractory_us=sensor.refractory_us, time_constant_us=time_constant)
+    return found.finished(replace(answer, result=timed))
 
 
 # Equations of the stage.
@@ -141,6 +143,13 @@ class _Equations:
         """Return the search on a new map with one node per pixel."""
         tiles = self.answers.cost.brightness.tiles
         return replace(self.answers, cost=self._solved_on(tiles.at_density(1.0)))
+
+    def finished(self, answer: Answer) -> tuple[PhotometricSummary, StageSummary, ParameterSpace]:
+        """Return the result of the stage with ``answer``, the summary of the search, and the space of the result."""
+        space, answers = self.answers.cost.space, self.answers
+        result = replace(answer.result, sharpness_parameters=answers.sharpest, pairs=len(self.pairs), held=self.held)
+        values = map(space.to_values, answer.stage.points)
+        return result, StageSummary.of("photometric", answer.stage, space.names, values), space
 
     def with_slow_pixels(self, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:
         """Return the answer for pixels with slow photoreceptors, and the angle per time constant [rad]; 0 if it fails.
@@ -489,6 +498,78 @@ def start_costs_around(
     return result
 
 
+# Errors of the prism's angle: harmonics of the encoder's angle, which repeat every turn, and delays of the read-out.
+
+MOST_ANGLE_FITS = 6
+"""Largest number of linearised fits of the errors of the angle."""
+FIRST_SHARE, LEAST_SHARE = 0.5, 0.25
+"""Share of the error that the first linearised fit is taken to find, and the least share of a later one."""
+LEAST_ANGLE_PX = 0.003
+"""Length of a correction of the angle below which the search ends [px rms]."""
+LARGEST_SKEW_PX = 0.02
+"""Largest accepted error by pixels that are read one after another [px rms]. Compensation does not correct it."""
+
+
+def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
+    """Return the correction of the prism's angle that the events ask for; None for none.
+
+    It is the factors of :data:`consistency.PATTERNS`, shape (6,). A linearised fit finds a share of the error only,
+    because the map absorbs the other part. The share is told by the next fit.
+    """
+    cost, camera = search.cost, search.cost.space.camera
+    cost.converge(v)
+    names = consistency.angle_errors(cost, v)
+    found = consistency.fit_angles(cost, v, names)
+    if found is None or found.moved_px < consistency.LEAST_MOVE_PX:
+        return None
+    pairs = cost.brightness.pairs
+    waves = pairs.angle_patterns((0.5 * camera.width, 0.5 * camera.height)).numpy().reshape(6, 2, -1)
+    angle, azimuth = np.arctan2(waves[1], waves[0]), pairs.arrays.azimuth
+    given = azimuth.numpy().copy()
+    total, share, at = np.zeros(6), FIRST_SHARE, v
+    for _ in range(MOST_ANGLE_FITS):
+        step = found.change / share
+        total += step
+        bent = angle + np.tensordot(total, waves, 1)
+        azimuth.assign(np.stack([np.cos(bent), np.sin(bent)], axis=1).astype(np.float32).ravel())
+        cost.renew(at)
+        at = search.descend(at).x
+        if found.moved_px / share < LEAST_ANGLE_PX:
+            break
+        cost.converge(at)
+        before, found = found, consistency.fit_angles(cost, at, names)
+        assert found is not None
+        share = float(np.clip((before.change - found.change) @ step / (step @ step), LEAST_SHARE, 1.0))
+    azimuth.assign(given)
+    cost.renew(v)
+    return total
+
+
+def judge_angles(camera: Camera, error: Vector, px_per_rad: float, rad_per_us: float) -> tuple[bool, str]:
+    """Return that an answer whose angles have an ``error`` is rejected, and the reason.
+
+    ``px_per_rad`` is how far events move per angle, ``rad_per_us`` the speed of the prism.
+    """
+    skew = np.append(np.zeros(4), error[4:])
+    px = px_per_rad * consistency.rms_angle(camera, skew)
+    if px >= LARGEST_SKEW_PX:
+        x, y = (-error[4:] / rad_per_us).tolist()
+        return False, (
+            f"the sensor reads its pixels one after another: events come late by {x:.2g} us more from column to column "
+            f"and {y:.2g} us from row to row, an error of {px:.2f} px; subtract {x:.3g} * x + {y:.3g} * y from "
+            "the events' times [us]"
+        )
+    return False, f"{harmonics_in_words(error[:4])}, and its correction was not confirmed: check how it is mounted"
+
+
+def harmonics_in_words(harmonics: Sequence[float] | Vector) -> str:
+    """Return the error of an encoder in words: its amplitude, and whether it repeats once or twice a turn."""
+    sizes = [math.degrees(math.hypot(*harmonics[:2])), math.degrees(math.hypot(*harmonics[2:]))]
+    often = ("once a turn", "twice a turn")
+    named = [f"{x:.2g} deg {how}" for x, how in zip(sizes, often, strict=True) if x >= 0.2 * max(sizes)]
+    return f"the encoder's angle is wrong by {' and '.join(named)}"
+
+
 # Timing of the sensor that was not given: its refractory period, and the time constant of slow photoreceptors.
 #
 # Both shift the angles of the prism at which events tell the brightness. A linearised fit tells whether one of them
@@ -498,8 +579,6 @@ LEAST_TIMING_GAIN = 0.03
 """Smallest share of the squared residuals that a time must explain. Right ones explain 0.01 at most."""
 SIGNIFICANT_TIMING = 10.0
 """Smallest number of standard deviations of a time from 0."""
-STEP_RAD = 0.004
-"""Step of the finite differences that give the derivatives of the residuals by an angle [rad]."""
 LARGEST_RAD = 0.5
 """Largest angle that is searched [rad]."""
 FACTOR, MOST_TRIALS = 1.7, 7
@@ -508,8 +587,8 @@ PARABOLAS = 2
 """Number of parabolas that are laid through the lowest costs."""
 
 
-def timing_can_be_found(answer: Answer, cost: Cost) -> bool:
-    """Return whether the sensor's timing can be examined: for a still camera, if a map explains most of the events."""
+def can_be_examined(answer: Answer, cost: Cost) -> bool:
+    """Return whether the angles of the events can be examined: for a still camera, if a map explains most events."""
     space = cost.space
     drifts = cost.brightness.pairs.arrays.slope.shape[0]
     return space.sized and not space.moving and not drifts and answer.result.cost <= LARGEST_EXAMINED_COST
@@ -526,7 +605,7 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
     reference = wp.zeros_like(relative)
     reference[0].fill_(1.0)
     columns = consistency.slopes(cost, cost.space, v, cost.space.names)
-    columns["refractory"], columns["slow"] = (_shifted(cost, v, shift) for shift in (reference, relative))
+    columns["refractory"], columns["slow"] = (consistency.shifted(cost, v, shift) for shift in (reference, relative))
     fit = consistency.linear_fit(cost, columns)
 
     def angle(name: str, sign: float) -> float:
@@ -535,20 +614,6 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
         return change if change > 0.0 and significance >= SIGNIFICANT_TIMING and gain >= LEAST_TIMING_GAIN else 0.0
 
     return angle("refractory", direction), angle("slow", -direction)
-
-
-def _shifted(cost: Cost, v: Vector, shift: Any) -> Any:
-    """Return the derivative of the residuals by a factor of ``shift``, changes of the angles at the ends of pairs.
-
-    ``shift`` is a Warp array of shape (2, pairs), padded.
-    """
-    pairs, at = cost.brightness.pairs, cost.at(v)
-    none = pairs.arrays.slope
-    pairs.arrays.slope = shift.flatten()
-    ends = {**at, "drift": STEP_RAD}, {**at, "drift": -STEP_RAD}
-    column = cost.brightness.find_slope(*ends, 2.0 * STEP_RAD)
-    pairs.arrays.slope = none
-    return column
 
 
 def find_refractory(search: AnswerSearch, v: Vector, first: float, direction: float) -> float:
@@ -790,7 +855,7 @@ def _corrections(given: ParameterSpace, space: ParameterSpace, answer: Answer) -
     for name in space.names:
         if name not in given.names:
             scale, unit = (math.degrees(1.0), "deg") if name.startswith("tilt") else (1.0, "px")
-            unit = "" if name == "k1" else f" {unit}"
+            unit = "" if name in ("k1", "fy_over_fx") else f" {unit}"
             was, now, by = (scale * x for x in (space.start[name], found[name], std[name]))
             remedy = "; calibrate the lens" if name in LENS else ""
             out.append(

@@ -263,7 +263,8 @@ class Session:
         # A source's own samples are already shifted by its file's clock offset; the calibrated offset is more accurate.
         own = clock_offset(source, link)
         known = {} if calibration is None else calibration.parameters
-        self.encoder = EncoderStream(known.get("clock_offset", own) - own)
+        harmonics = None if calibration is None else calibration.harmonics
+        self.encoder = EncoderStream(known.get("clock_offset", own) - own, harmonics=harmonics)
         self._source, self._link, self._sinks, self._keeper = source, link, list(sinks), keeper
         self._stop, self._hasty = threading.Event(), False
         self._failure: BaseException | None = None
