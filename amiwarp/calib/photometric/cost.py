@@ -21,7 +21,7 @@ from amiwarp.calib.settings import GAUSS_NEWTON, PhotometricSettings
 from amiwarp.calib.sharpness import reach
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import MemoryEvents
+from amiwarp.events.events import Events, MemoryEvents
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.votes import Image
 from amiwarp.kernels.iwe import sum_segments
@@ -284,6 +284,13 @@ FEWEST_TILES = 6
 """Number of tiles of the scene that are always used."""
 
 
+SECTORS = 64
+"""Number of parts of a turn in which silence is looked for."""
+FEWEST_OF_SECTOR, SILENT_SHARE = 20, 0.05
+"""Median number of events of a part of a turn from which on silence is looked for, and the share of that number below
+which a part is silent."""
+
+
 class _PairCollector:
     """Collector of pairs of events that fall on the same tile, compensated by the result of the sharpness stage."""
 
@@ -300,6 +307,12 @@ class _PairCollector:
         self._tile_of, self._near = (wp.array(a, dtype=int, device=search.device) for a in (tile_of, near))
         self._found: list[PairSet] = []
         self._done = 0
+        self._heard_us = self._read_us = 0
+
+    @property
+    def silent_share(self) -> float:
+        """Share of the time in which no events came."""
+        return 1.0 - self._heard_us / max(1, self._read_us)
 
     def read(self, spans: list[tuple[int, int]]) -> int:
         """Collect the pairs of events inside the time spans [us], which extend those of earlier calls.
@@ -319,7 +332,13 @@ class _PairCollector:
         search, source = self.search, self.recording.events
         space, best, calibration_events = search.space, search.best, search.calibration_events
         joined = None if search.ahead is None else search.ahead.take(spans)
-        table = EventTable([source.between(*span) for span in spans], self._near, search.device, joined=joined)
+        sector = turn_length(self.recording, calibration_events.encoder) / SECTORS
+        parts = [part for span in spans for part in split_at_silence(source.between(*span), sector)]
+        self._heard_us += sum(int(part.t[-1]) - int(part.t[0]) for part in parts)
+        self._read_us += sum(stop - start for start, stop in spans)
+        if joined is not None and sum(map(len, parts)) < len(joined):
+            joined = None
+        table = EventTable(parts, self._near, search.device, joined=joined)
         pairs = table.pairs(
             calibration_events.encoder, longest_gap_us=LONGEST_GAP_US, shortest_gap_us=2.0 * self.sensor.refractory_us,
             sensor=self.sensor, middle_us=space.middle_us,
@@ -329,6 +348,22 @@ class _PairCollector:
         if calibration_events.slope_of is not None:
             pairs = pairs.with_slope(calibration_events.slope_of, space.middle_us)
         return pairs.on_tiles(space.build(best), space.camera_rotation(best), space.drift(best), self._tile_of)
+
+
+def split_at_silence(events: Events, length_us: float) -> list[Events]:
+    """Return the events in parts, without the silence between them: times of ``length_us`` and more with few events.
+
+    Where a sensor or its link loses all events for a while, the next event of a pixel does not follow the last one.
+    """
+    t = events.t
+    edges = np.arange(int(t[0]), int(t[-1]) + length_us, length_us) if len(t) else np.zeros(0)
+    at = np.searchsorted(t, edges)
+    counts = np.diff(at)
+    if not len(counts) or np.median(counts) < FEWEST_OF_SECTOR:
+        return [events] if len(t) else []
+    heard = np.concatenate([[0], (counts >= SILENT_SHARE * np.median(counts)).astype(np.int8), [0]])
+    starts, stops = (at[np.flatnonzero(np.diff(heard) == step)].tolist() for step in (1, -1))
+    return [events[a:b] for a, b in zip(starts, stops, strict=True)]
 
 
 def turn_length(recording: Recording, encoder: Encoder) -> float:
@@ -362,11 +397,12 @@ def upload_ahead(recording: Recording, search: Search) -> AbstractContextManager
     return EventsAhead(source, time_spans(recording, search), most, device)
 
 
-def collect_pairs(recording: Recording, search: Search, settings: PhotometricSettings) -> tuple[PairSet, Tiles]:
-    """Return about ``settings.pairs`` pairs of events, from whole turns spread over the recording, and the map's tiles.
+def collect_pairs(recording: Recording, search: Search, settings: PhotometricSettings) -> tuple[PairSet, Tiles, float]:
+    """Return pairs of events from whole turns spread over the recording, the map's tiles, and the share of silence.
 
-    At least :data:`FEWEST_TURNS` turns are used, if the recording has them. If these hold too many pairs, whole tiles
-    are left out: fewer pairs on the same tiles would not determine the map.
+    There are about ``settings.pairs`` pairs. At least :data:`FEWEST_TURNS` turns are used, if the recording has them.
+    If these hold too many pairs, whole tiles are left out: fewer pairs on the same tiles would not determine the map.
+    Silence is the time in which no events came.
     """
     first = recording.events.t_first
     turn = turn_length(recording, search.calibration_events.encoder)
@@ -386,8 +422,9 @@ def collect_pairs(recording: Recording, search: Search, settings: PhotometricSet
     pairs, count = collector.pairs(), len(tiles.origin)
     keep = max(FEWEST_TILES, round(count * settings.pairs / max(len(pairs), 1)))
     if keep >= count:
-        return pairs, tiles
-    return pairs.of_tiles(np.isin(np.arange(count), van_der_corput(count)[:keep])), tiles
+        return pairs, tiles, collector.silent_share
+    pairs = pairs.of_tiles(np.isin(np.arange(count), van_der_corput(count)[:keep]))
+    return pairs, tiles, collector.silent_share
 
 
 def van_der_corput(n: int) -> list[int]:

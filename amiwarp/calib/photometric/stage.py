@@ -50,6 +50,7 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
     rpm, sensor, time_constant = search.calibration_events.encoder.rpm, given, 0.0
     rad_per_us, direction = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm)
     examined = can_be_examined(answer, found.answers.cost) and bool(rpm)
+    missing = missing_step(found.answers.cost) if examined else 0.0
     error = find_angle_error(found.answers, answer.stage.x) if examined else None
     if error is not None:
         space, v = found.answers.cost.space, answer.stage.x
@@ -72,7 +73,11 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
             found.answers.timing = answer.stage.x - v
     answers = found.answers
     answer = checked(answers, answer).judged(*judge_lag(time_constant * rad_per_us))
-    notes = (*timing_notes(sensor.refractory_us - given.refractory_us, time_constant), *answer.result.warnings)
+    answer = answer.judged(*judge_losses(missing)) if examined else answer
+    notes = (
+        *timing_notes(sensor.refractory_us - given.refractory_us, time_constant),
+        *loss_notes(found.silent_share, missing), *answer.result.warnings,
+    )  # fmt: skip
     timed = replace(answer.result, warnings=notes, refractory_us=sensor.refractory_us, time_constant_us=time_constant)
     return found.finished(replace(answer, result=timed))
 
@@ -84,18 +89,23 @@ LARGEST_FINE_COST = 0.3
 half of the events are noise, a finer map follows them, and orbits come out too small."""
 
 
+LEAST_SILENCE = 0.05
+"""Share of the time without events from which on it is reported: the turns are not whole."""
+
+
 class _Equations:
     """Equations of the stage: pairs of events, a map, and the search on it."""
 
     def __init__(self, recording: Recording, search: Search, sensor: SensorTiming) -> None:
         """Collect the pairs and solve a first map. Raises :class:`AmiwarpError` for too few pairs."""
         self._search, self._settings = search, replace(search.settings.photometric, sensor=sensor)
-        self.pairs, tiles = collect_pairs(recording, search, self._settings)
+        self.pairs, tiles, self.silent_share = collect_pairs(recording, search, self._settings)
         best, full = search.best, search.full_space
         self._linear = tuple(n for n in search.settings.free or () if n in LINEAR_UNKNOWNS)
         # the count of OFF and ON events gives the ratio of thresholds only if brightness returns after a whole turn
         duration_us = recording.events.t_last - recording.events.t_first
         whole_turn = abs(search.calibration_events.encoder.rpm) * duration_us >= 60e6
+        whole_turn &= self.silent_share < LEAST_SILENCE
         self._off_excess = off_excess(self.pairs, with_leak="leak" in self._linear) if whole_turn else 0.0
         space = full.holding({n: x for n, x in best.items() if n not in full.names})
         v = space.to_vector({**space.start, **best})
@@ -496,6 +506,56 @@ def start_costs_around(
         return sorted(zip(points, rises, strict=True), key=lambda found: found[1])
 
     return result
+
+
+# Events that the sensor or its link lost.
+
+SAMPLED_PAIRS = 1 << 15
+"""Number of pairs whose residuals tell whether events are missing."""
+NOTABLE_STEP, LARGEST_STEP = 0.12, 0.2
+"""Median change of brightness beyond one threshold between the two events of a pair from which on lost events are
+reported, and from which on the answer is rejected [thresholds].
+
+It is 0.03 for a sensor that loses nothing, 0.07 for one that loses a fifth of its events, 0.2 for a third, 0.3 for half
+of them; then the answer is off by 0.06 px. Slow pixels leave 0.1.
+"""
+
+
+def missing_step(cost: Cost) -> float:
+    """Return the median change of brightness beyond one threshold between the events of a pair [thresholds].
+
+    Between two events of a pixel the brightness changes by one threshold, or by more if events between them were lost.
+    """
+    pairs, residuals = cost.brightness.pairs, cost.brightness.residuals.values
+    every = max(1, len(pairs) // SAMPLED_PAIRS)
+    change = residuals[: len(pairs) : every].numpy()
+    on = pairs.arrays.on[: len(pairs) : every].numpy() & 1
+    beyond = np.where(on, change, -change)[np.isfinite(change)]
+    return float(np.median(beyond)) if len(beyond) else 0.0
+
+
+def judge_losses(step: float) -> tuple[bool, str]:
+    """Return whether to accept an answer from events with this :func:`missing_step`, and the reason."""
+    if step < LARGEST_STEP:
+        return True, ""
+    return False, (
+        "a third or more of the events are missing, so that brightness changes by more than one threshold between two "
+        "events of a pixel: lower the event rate (thresholds, region of interest, slower prism), or record without a "
+        "filter that drops events"
+    )
+
+
+def loss_notes(silent_share: float, step: float) -> list[str]:
+    """Return a sentence for each kind of loss of events that was found."""
+    notes = []
+    if silent_share >= LEAST_SILENCE:
+        notes.append(
+            f"no events came in {100.0 * silent_share:.0f} % of the time: the sensor or its link lost them; lower the "
+            "event rate"
+        )
+    if NOTABLE_STEP <= step < LARGEST_STEP:
+        notes.append("a fifth or more of the events are missing: lower the event rate, or record without a filter")
+    return notes
 
 
 # Errors of the prism's angle: harmonics of the encoder's angle, which repeat every turn, and delays of the read-out.
