@@ -49,8 +49,9 @@ from amiwarp import (
     load_world,
     open_recording,
 )
-from amiwarp.cli.info import describe
-from amiwarp.cli.options import _read_speed, read_camera
+from amiwarp.cli.options import read_camera
+from amiwarp.cli.recordings import describe
+from amiwarp.cli.simulation import _read_speed
 from amiwarp.events.events import check_events
 from amiwarp.events.truth import MAPS
 from amiwarp.io import read_encoder_csv

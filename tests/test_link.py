@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from amiwarp import AmiwarpError
-from amiwarp.cli import motor as command
+from amiwarp.cli import rig as command
 from amiwarp.live.link import follower as following
 from amiwarp.live.link import follower as updates
 from amiwarp.live.link import link as link_module
@@ -545,7 +545,7 @@ def motor(*args: object) -> tuple[int, str, BaseException | None]:
     from amiwarp.cli.options import command as register
 
     app = typer.Typer()
-    register(app, command.run, name="motor", example=command.EXAMPLE)
+    register(app, command.run_motor, name="motor", example="")
     done = CliRunner().invoke(app, [str(a) for a in args])
     return done.exit_code, done.stdout, done.exception
 

@@ -14,8 +14,8 @@ import typer
 from amiwarp.choices import OPTICAL_MODELS, Axis, Colour, View
 from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
-from amiwarp.cli.live import SourceOptions, check_angles
 from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, parse_size, span
+from amiwarp.cli.rig import SourceOptions, check_angles
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
@@ -24,8 +24,6 @@ from amiwarp.viewer.serve import warning
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector, Library
-
-EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
 
 _PICTURE, _SERVER = "Picture", "Server"
 RETURN_S = 3600.0
@@ -215,7 +213,7 @@ class StartOptions:
         return inspector
 
 
-def run(
+def run_view(
     recording: Annotated[
         Path, typer.Argument(help="Recording in any supported format. With --live: a source as for 'amiwarp live'.")
     ],
