@@ -49,7 +49,7 @@ from amiwarp.choices import Axis, Colour, Tone, View
 from amiwarp.imaging.export import IweFiles, to_picture
 from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.imaging.votes import CanvasShape
-from amiwarp.live.stream.queues import PacketQueue, Policy
+from amiwarp.live.queues import PacketQueue, Policy
 from amiwarp.optics.models import MODELS
 from amiwarp.reconstruction.export import save_picture, tones
 from amiwarp.viewer.clouds import Look

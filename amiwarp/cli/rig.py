@@ -31,17 +31,16 @@ from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.link.emulator import Controller, EmulatedFault, Motor, Played, PseudoTerminal, Rotor
 from amiwarp.live.link.link import Link
 from amiwarp.live.link.protocol import FAULTS, STATES
+from amiwarp.live.queues import Policy
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orbit
-from amiwarp.live.stream.camera_clock import clock_offset
-from amiwarp.live.stream.queues import Policy
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
     from amiwarp.compensation.streams import Compensated
-    from amiwarp.live.stream.cameras import EmulatedCamera
     from amiwarp.live.stream.packets import Source
     from amiwarp.live.stream.session import RawConsumer, Session, SessionStatus
     from amiwarp.live.stream.sockets import PipeSink, SocketSink
+    from amiwarp.live.stream.sources import EmulatedCamera
     from amiwarp.optics.models import Model
 
 
@@ -307,6 +306,7 @@ def run_live(
     """
     from amiwarp.calib import Calibration
     from amiwarp.compensation.recordings import check_size
+    from amiwarp.live.stream.session import clock_offset
 
     device = choose_device(common.device)
     found = Calibration.load(calibration)
@@ -465,7 +465,7 @@ def run_record(
     During recording the file is called NAME.part.h5. It can be read at any time; after a crash it lacks at most the
     last second.
     """
-    from amiwarp.live.stream.session import Session
+    from amiwarp.live.stream.session import Session, clock_offset
 
     stop = threading.Event()
     with StatusLine(stop, stream.seconds) as line, stream.link() as link:
@@ -682,7 +682,7 @@ class _Playback:
     address: str
 
     def camera(self, controller: Controller, now_us: Callable[[], int]) -> EmulatedCamera:
-        from amiwarp.live.stream.cameras import EmulatedCamera
+        from amiwarp.live.stream.sources import EmulatedCamera
 
         return EmulatedCamera(self.recording, self.rotor, controller, self.address, now_us)
 

@@ -112,7 +112,7 @@ class StreamOptions:
         if not self.live:
             yield None
             return
-        from amiwarp.live.stream.recent_events import RecentEvents, followed
+        from amiwarp.live.stream.session import RecentEvents, followed
         from amiwarp.live.stream.sources import SOCKETS, open_source
         from amiwarp.viewer.jobs import LiveSource
 

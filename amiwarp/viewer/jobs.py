@@ -12,7 +12,7 @@ from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import rpm_between
 from amiwarp.events.recording import Recording
-from amiwarp.live.stream.recent_events import RecentEvents
+from amiwarp.live.stream.session import RecentEvents
 from amiwarp.progress import Progress, silent
 from amiwarp.viewer.images import SelectedPart, select_part
 from amiwarp.viewer.inspector import Inspector
