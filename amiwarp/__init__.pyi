@@ -127,5 +127,5 @@ from .studies.evaluate.run import evaluate as evaluate
 from .translation.datasets import DataSet as DataSet
 from .translation.pictures_between import Interpolation as Interpolation
 from .translation.translator import translate as translate
-from .viewer.app import NotebookPage as NotebookPage
-from .viewer.app import view as view
+from .viewer.panel import NotebookPage as NotebookPage
+from .viewer.panel import view as view

@@ -69,10 +69,10 @@ class ScreenshotOptions:
 
         Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
         """
-        from amiwarp.viewer.app import save_screenshot
-        from amiwarp.viewer.clouds import Look
+        from amiwarp.viewer.drawing import Look
         from amiwarp.viewer.jobs import estimate_phase
         from amiwarp.viewer.layout import notes
+        from amiwarp.viewer.panel import save_screenshot
 
         check_ending(path, "pictures are written", [".png"])
         third = self.axis or (Axis.ANGLE if inspector.has_encoder or inspector.knobs.rpm else Axis.TIME)
@@ -156,7 +156,7 @@ class PageOptions:
 
         ``library``: other recordings that the page may open; ``name``: name of the recording.
         """
-        from amiwarp.viewer.app import has_display, open_window, serve_panel
+        from amiwarp.viewer.panel import has_display, open_window, serve_panel
 
         in_browser = self.web or not has_display()
 
