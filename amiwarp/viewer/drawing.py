@@ -440,12 +440,11 @@ def _depths(depth: NDArray[Any], scale: tuple[float, float]) -> NDArray[np.float
 
     ``scale``: depths at both ends of the scale [m].
     """
-    from matplotlib import colormaps
-    from matplotlib.colors import to_rgb
+    from matplotlib import colormaps, colors
 
     low, high = scale
     share = np.log(np.clip(depth, low, high) / low) / math.log(high / low)
-    return np.asarray(np.where(np.isfinite(depth)[:, None], colormaps[DEPTH_MAP](share)[:, :3], to_rgb(GREY)))
+    return np.asarray(np.where(np.isfinite(depth)[:, None], colormaps[DEPTH_MAP](share)[:, :3], colors.to_rgb(GREY)))
 
 
 def _scale(depth: NDArray[Any]) -> tuple[float, float]:
