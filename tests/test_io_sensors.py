@@ -19,7 +19,7 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
-from amiwarp.cli.info import _rows, describe
+from amiwarp.cli.recordings import _rows, describe
 from amiwarp.io.file_scan import head_only
 from reference.io_samples import SIZE, make_events, refusal
 from reference.io_samples_extra import arrays, packets, typestore, write_aedat2, write_mvsec, write_ros1, write_ros2

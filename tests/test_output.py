@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import fcntl
-import importlib
 import inspect
 import json
 import math
@@ -45,7 +44,7 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
-from amiwarp.cli.app import SUMMARIES, app
+from amiwarp.cli.app import COMMANDS, app, function_of
 from amiwarp.cli.options import NO_FILE, OUTPUT, OUTPUT_FOLDER
 from amiwarp.events.truth import MAPS, MemoryFrames
 from amiwarp.imaging.export import IweFiles
@@ -173,8 +172,7 @@ OVER_INPUTS = (
 
 def path_options(name: str) -> Iterator[tuple[str, bool]]:
     """Yield the options and arguments of a command that are paths, and whether the command writes to them."""
-    function = importlib.import_module(f"amiwarp.cli.{name}").run
-    for key, kind in get_type_hints(function, include_extras=True).items():
+    for key, kind in get_type_hints(function_of(name), include_extras=True).items():
         group = get_type_hints(kind, include_extras=True) if is_dataclass(kind) else {key: kind}
         for one, hint in group.items():
             marks = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, str)]
@@ -193,7 +191,7 @@ def test_every_input_of_every_command_is_in_the_tables() -> None:
     """A new command or option that reads a file gets its lines in both tables."""
     over = {pair for line, _ in OVER_INPUTS for pair in options_of(line)}
     endless = {pair for line in ENDLESS for pair in options_of(line)}
-    for command in SUMMARIES:
+    for command in COMMANDS:
         options = list(path_options(command))
         read = {(command, option) for option, writes in options if not writes}
         assert read <= endless
@@ -309,8 +307,8 @@ NAMES: dict[tuple[str, str], tuple[str, tuple[str, ...]]] = {
 def output_options() -> set[tuple[str, str]]:
     """Return command and name of every option that is marked as an output."""
     found = set()
-    for command in SUMMARIES:
-        hints = get_type_hints(importlib.import_module(f"amiwarp.cli.{command}").run, include_extras=True)
+    for command in COMMANDS:
+        hints = get_type_hints(function_of(command), include_extras=True)
         for kind in [hint for hint in hints.values() if is_dataclass(hint)]:
             hints |= get_type_hints(kind, include_extras=True)
         marked = {OUTPUT, OUTPUT_FOLDER}

@@ -213,7 +213,7 @@ OPENED_OTHERWISE = {
     "amiwarp.io.npz: (folder / name).open('rb')": "own file",
     "amiwarp.plotting.clouds: np.load(picture)": "own file",
     "amiwarp.plotting.clouds: np.load(points)": "own file",
-    "amiwarp.viewer.exports: path.read_bytes()": "own file",
+    "amiwarp.viewer.jobs: path.read_bytes()": "own file",
     # What is no file.
     "amiwarp.io.text: np.loadtxt(kept, ndmin=2, comments=None, encoding='ascii')": "lines",
     "amiwarp.plotting.figures: Image.open(buffer)": "bytes",
