@@ -51,11 +51,11 @@ from amiwarp import (
 )
 from amiwarp.cli.info import describe
 from amiwarp.cli.options import _read_speed, read_camera
-from amiwarp.events.events import check_events
+from amiwarp.events.recording import check_events
 from amiwarp.events.truth import MAPS
 from amiwarp.io import read_encoder_csv
-from amiwarp.io.sealed_json import append_line, sealed
-from amiwarp.io.text import read_calib
+from amiwarp.io.json_files import append_line, sealed
+from amiwarp.io.plain_files import read_calib
 from amiwarp.simulation.pictures import read_picture
 from amiwarp.simulation.sequences import _read_times, open_pictures
 from amiwarp.simulation.worlds.world_files import load_mesh

@@ -39,7 +39,7 @@ from amiwarp import (
 from amiwarp.brightness.event_pairs import EventTable
 from amiwarp.choices import Tone
 from amiwarp.cli.app import app
-from amiwarp.io.text import read_calib
+from amiwarp.io.plain_files import read_calib
 from amiwarp.reconstruction.export import save_film, save_picture, save_video, tones
 from amiwarp.reconstruction.picture import nodes_near, without_small_holes, without_small_regions
 from reference.calibration_sample import exact_calibration

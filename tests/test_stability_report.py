@@ -21,7 +21,7 @@ from typer.testing import CliRunner, Result
 import amiwarp.studies.stability
 from amiwarp import AmiwarpError
 from amiwarp.cli.app import app
-from amiwarp.io.sealed_json import sealed
+from amiwarp.io.json_files import sealed
 from amiwarp.studies.stability import (
     METHODS,
     Atlas,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from amiwarp.events.device_events import DeviceEvents, encoder_params, join, time_span
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
+from amiwarp.events.recording import Events
 from amiwarp.kernels import equations_cpu, equations_cuda
 from amiwarp.kernels import pairs as kernels
 from amiwarp.kernels.equations import HELD, Geometry, Pairs, slope_between, slope_of_changes, split_by_time

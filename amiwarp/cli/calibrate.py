@@ -14,10 +14,9 @@ from amiwarp.choices import OPTICAL_MODELS, Sharpness
 from amiwarp.cli.console import choose_device, progress, report, table
 from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, interval, number, span
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import MemoryEvents
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.io import open_recording
-from amiwarp.io.atomic_output import check_output
+from amiwarp.io.files import check_output
 from amiwarp.io.formats import check_ending
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from amiwarp.cli.console import choose_device, progress, report, table
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.io.atomic_output import check_output
+from amiwarp.io.files import check_output
 from amiwarp.progress import part
 from amiwarp.studies.chart import Charts
 from amiwarp.studies.chart.rows import Row, beaten_by, fronts, told_apart

@@ -37,7 +37,7 @@ def run(
     device = choose_device(common.device)
     with progress("starting") as advance:
         from amiwarp.cli.options import parse_size
-        from amiwarp.io.atomic_output import own_folder
+        from amiwarp.io.files import own_folder
         from amiwarp.studies.demo import Demo, run_demo
 
         width, height = parse_size(size)

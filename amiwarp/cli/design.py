@@ -15,7 +15,8 @@ import typer
 
 from amiwarp.cli.console import choose_device, plain, progress, report, table
 from amiwarp.cli.options import OUTPUT_FOLDER, CameraOptions, Common, numbers, parse_size
-from amiwarp.io.atomic_output import check_output, make_folder, write_text
+from amiwarp.io.files import check_output, write_text
+from amiwarp.io.formats import make_folder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 

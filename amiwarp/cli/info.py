@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from amiwarp.cli.console import progress, report, table
 from amiwarp.cli.options import Common, Topic
 from amiwarp.events.encoder import Encoder, rpm_between
-from amiwarp.events.events import DEFAULT_BLOCK, EventSource
-from amiwarp.events.recording import ImageStore, ImuSamples, Recording, Truth, mean_rate
-from amiwarp.events.truth import Cause
+from amiwarp.events.recording import DEFAULT_BLOCK, EventSource, ImageStore, ImuSamples, Recording, mean_rate
+from amiwarp.events.truth import Cause, Truth
 from amiwarp.io import open_recording
-from amiwarp.io.camera_files import camera_to_json
 from amiwarp.io.export import GAP_INTERVALS
 from amiwarp.io.file_scan import head_only
+from amiwarp.io.rig_files import camera_to_json
 from amiwarp.optics.prism import Prism
 
 EXAMPLE = "amiwarp info recording.h5"

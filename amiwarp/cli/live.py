@@ -21,7 +21,7 @@ from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
 from amiwarp.cli.options import OUTPUT, Common
 from amiwarp.errors import AmiwarpError, printable
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.io.native_writer import LiveWriter
 from amiwarp.live.link.link import Link
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orbit
 from amiwarp.live.stream.camera_clock import clock_offset

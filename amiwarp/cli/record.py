@@ -9,7 +9,7 @@ import typer
 from amiwarp.cli.console import report
 from amiwarp.cli.live import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt, summary
 from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.io.native_writer import LiveWriter
 from amiwarp.live.stream.camera_clock import clock_offset
 
 EXAMPLE = "amiwarp record dv recording.h5 --port find --seconds 10"

@@ -15,7 +15,8 @@ from amiwarp.cli.console import choose_device, made_again, progress, report, tab
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.atomic_output import make_folder, own_folder
+from amiwarp.io.files import own_folder
+from amiwarp.io.formats import make_folder
 from amiwarp.studies.cluster import start_workers, versions
 
 if TYPE_CHECKING:

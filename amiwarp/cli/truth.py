@@ -10,10 +10,10 @@ import typer
 from amiwarp.cli.console import progress, report
 from amiwarp.cli.options import OUTPUT_FOLDER, Common
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Truth
+from amiwarp.events.truth import Truth
 from amiwarp.io import open_recording
-from amiwarp.io.atomic_output import make_folder
-from amiwarp.io.truth_export import save_flow_dsec, save_flow_mvsec, save_poses_tum
+from amiwarp.io.export import save_flow_dsec, save_flow_mvsec, save_poses_tum
+from amiwarp.io.formats import make_folder
 
 EXAMPLE = "amiwarp truth recording.h5 exported --flow dsec --poses tum"
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from amiwarp.choices import CONTRAST, Tone
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.export import encode_image
-from amiwarp.io.atomic_output import NewFile, check_output
+from amiwarp.io.files import NewFile, check_output
 from amiwarp.io.formats import check_ending
 from amiwarp.reconstruction.picture import Picture
 from amiwarp.validation import choice

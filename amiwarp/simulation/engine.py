@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from amiwarp.choices import Seeing
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import NAMES, DeviceEvents, wait
-from amiwarp.events.events import Events
+from amiwarp.events.recording import Events
 from amiwarp.events.truth import EventTruth
 from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.kernels import event_keys as readout

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import input_path
+from amiwarp.io.files import input_path
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear red, green and blue in the luminance (ITU-R BT.709)."""

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import TIME_LIMIT
-from amiwarp.io.input_files import errors_name, input_path, open_input, register_reader
+from amiwarp.io.files import errors_name, input_path, open_input, register_reader
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.simulation.pictures import MOST_PIXELS, linear_luminance, read_picture, srgb_to_linear
-from amiwarp.validation import guarded, real, shown, vector, whole
+from amiwarp.validation import TIME_LIMIT, guarded, real, shown, vector, whole
 
 MOST_TABLE_BYTES, MOST_PICTURES = 64 << 20, 1_000_000
 """Largest ``times.csv`` that is read [bytes], and largest number of pictures in it."""

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.events.device_events import NAMES, DeviceEvents, DeviceMemoryEvents, DeviceValues, join, wait
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, EventSource, MemoryEvents
-from amiwarp.events.recording import MetadataValue, Recording
+from amiwarp.events.recording import Events, EventSource, MemoryEvents, MetadataValue, Recording
 from amiwarp.events.truth import EventTruth, EventValues
 from amiwarp.io import RecordingWriter
 from amiwarp.optics.camera import Camera

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name, input_path
+from amiwarp.io.files import errors_name, input_path
 from amiwarp.optics.camera import Camera
 from amiwarp.simulation.motion import CameraMotion
 from amiwarp.simulation.pictures import linear_luminance

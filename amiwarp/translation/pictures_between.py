@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from amiwarp.choices import CONTRAST
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, EventSource
+from amiwarp.events.recording import Events, EventSource
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.sequences import Pictures
 from amiwarp.translation.datasets import MvsecPictures

@@ -25,7 +25,7 @@ from amiwarp.calib import Calibration
 from amiwarp.choices import View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.atomic_output import check_output, interrupts_later
+from amiwarp.io.files import check_output, interrupts_later
 from amiwarp.validation import guarded
 from amiwarp.viewer.clouds import Look, Scene
 from amiwarp.viewer.inspector import Inspector, Library

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
+from amiwarp.events.recording import Events
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.palette import BLUE, OFF_COLOUR, ON_COLOUR, ORANGE, PINK, VERMILION
 from amiwarp.plotting.figures import instance_colours

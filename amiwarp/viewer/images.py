@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.export import GAMMA, PERCENTILE
+from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
-from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.timeline import read_span

@@ -17,11 +17,10 @@ from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, turn_between
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.imaging.export import PERCENTILE
-from amiwarp.imaging.sharpness import random_variance
-from amiwarp.imaging.votes import UploadedEvents, upload_events
+from amiwarp.imaging.iwe import UploadedEvents, upload_events
+from amiwarp.imaging.metrics import random_variance
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, Model, size_names
 from amiwarp.reconstruction.picture import border_displacements

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.events.events import Events, EventSource
+from amiwarp.events.recording import Events, EventSource
 from amiwarp.events.truth import EventValues
 from amiwarp.io.file_scan import FileEvents
 

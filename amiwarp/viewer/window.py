@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from amiwarp.calib.parameters import optical_parameters
 from amiwarp.choices import Colour, Sharpness
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording, Truth
-from amiwarp.events.truth import Cause
+from amiwarp.events.recording import Events, Recording
+from amiwarp.events.truth import Cause, Truth
 from amiwarp.imaging.corners import find_background_activity
-from amiwarp.imaging.sharpness import SharpnessMeter, relative_variance
-from amiwarp.imaging.votes import CanvasShape, UploadedEvents, Votes
+from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes
+from amiwarp.imaging.metrics import SharpnessMeter, relative_variance
 from amiwarp.optics.models import PHASE, Model, size_names
 from amiwarp.reconstruction.picture import Picture
 from amiwarp.viewer.timeline import Span
@@ -114,7 +113,7 @@ class MeasuredImage:
     events."""
     sharpness: float
     """Relative variance of the smoothed region, see
-    :func:`amiwarp.imaging.sharpness.relative_variance`. It does not depend on the number of events."""
+    :func:`amiwarp.imaging.metrics.relative_variance`. It does not depend on the number of events."""
 
 
 class WindowImager:

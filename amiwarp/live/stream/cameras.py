@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.link.emulator import Controller, Played
 from amiwarp.live.stream.packets import Packet, encode_events, encode_hello, encode_triggers, make_packet

@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from amiwarp.calib import calibrate
 from amiwarp.calib.result import Calibration
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events, MemoryEvents, held_bytes
-from amiwarp.events.recording import Recording
+from amiwarp.events.encoder import TWO_PI, Encoder, EncoderStream
+from amiwarp.events.recording import Events, MemoryEvents, Recording, held_bytes
 
 SEARCH_RAD = math.radians(20.0)
 """Half width of the search about the calibrated phase [rad]. A phase outside is found at the edge of this range, and

@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.encoder_stream import start_of_last_run
-from amiwarp.events.events import OVERHEAD, Events, MemoryEvents, held_bytes
-from amiwarp.events.recording import Recording
+from amiwarp.events.encoder import TWO_PI, Encoder, start_of_last_run
+from amiwarp.events.recording import OVERHEAD, Events, MemoryEvents, Recording, held_bytes
 from amiwarp.live.link.link import Link
 from amiwarp.live.stream.packets import Source
 from amiwarp.live.stream.queues import Policy

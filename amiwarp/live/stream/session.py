@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from amiwarp.calib.result import Calibration
 from amiwarp.choices import Sharpness
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events, held_bytes
-from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.imaging.votes import CanvasShape
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.events.encoder import EncoderStream
+from amiwarp.events.recording import Events, held_bytes
+from amiwarp.imaging.iwe import CanvasShape
+from amiwarp.imaging.metrics import SharpnessMeter
+from amiwarp.io.native_writer import LiveWriter
 from amiwarp.live.link.clocks import ClockMap, monotonic_us
 from amiwarp.live.link.follower import LinkUpdate
 from amiwarp.live.link.link import Link

@@ -13,7 +13,7 @@ import numpy as np
 
 from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
+from amiwarp.events.recording import Events
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.stream.cameras import DvSource, PropheseeSource

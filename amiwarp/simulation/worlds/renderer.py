@@ -9,7 +9,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.sharpness import gaussian
+from amiwarp.imaging.metrics import gaussian
 from amiwarp.kernels import world as kernels
 from amiwarp.kernels import world_rays
 from amiwarp.kernels.launch import launch

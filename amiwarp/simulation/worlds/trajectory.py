@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.atomic_output import write_text
+from amiwarp.io.files import text_lines, write_text
 from amiwarp.io.formats import POSE_ENDINGS, check_ending
-from amiwarp.io.input_files import text_lines
 from amiwarp.validation import array, guarded, real, shown
 
 if TYPE_CHECKING:

@@ -12,8 +12,6 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import TIME_LIMIT
-from amiwarp.events.recording import Truth
 from amiwarp.events.truth import (
     EventTruth,
     EventValues,
@@ -21,6 +19,7 @@ from amiwarp.events.truth import (
     MemoryFrames,
     MemoryMasks,
     Poses,
+    Truth,
     WorldLabels,
     as_poses,
 )
@@ -31,7 +30,7 @@ from amiwarp.simulation.scenery import KnownPixels
 from amiwarp.simulation.worlds.device_world import DeviceWorld
 from amiwarp.simulation.worlds.renderer import SurfaceView, WorldSight, pixel_rays, surfaces_at
 from amiwarp.simulation.worlds.world import WorldScene
-from amiwarp.validation import array, guarded, real, shown
+from amiwarp.validation import TIME_LIMIT, array, guarded, real, shown
 
 # Ground truth of a simulated world at an instant: depth, normals, instances, optical flow and luminance.
 

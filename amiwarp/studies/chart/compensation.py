@@ -23,10 +23,10 @@ from amiwarp.calib.presets import simplified
 from amiwarp.choices import Vote
 from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
-from amiwarp.imaging.votes import TURNS, CanvasShape, Image, UploadedEvents, Votes, upload_events
+from amiwarp.events.recording import Events
+from amiwarp.imaging.iwe import TURNS, CanvasShape, Image, UploadedEvents, Votes, upload_events
 from amiwarp.io import open_recording, save_recording
-from amiwarp.io.atomic_output import scratch_folder
+from amiwarp.io.files import scratch_folder
 from amiwarp.optics.models import Model, rungs, wrap_angle
 from amiwarp.progress import Progress
 from amiwarp.studies.chart.rows import KnownRecording, Row, Task, exact_image, exact_places, measure, raw_places, rms

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from amiwarp.calib import Calibration
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.metrics import truth_model
 from amiwarp.memory import only_new_garbage, release_memory
 from amiwarp.optics.camera import Camera

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.events.events import Events
-from amiwarp.imaging.votes import CanvasShape, Votes
+from amiwarp.events.recording import Events
+from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.studies.evaluate.measures import smoothed
 

@@ -18,7 +18,8 @@ import numpy as np
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import BLACK, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, VERMILION
-from amiwarp.io.atomic_output import NewFile, make_folder, write_text
+from amiwarp.io.files import NewFile, write_text
+from amiwarp.io.formats import make_folder
 from amiwarp.studies.cluster import machine, versions
 from amiwarp.studies.evaluate.study import (
     CellResult,

@@ -14,9 +14,9 @@ from amiwarp._version import __version__
 from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.io.atomic_output import check_output, make_folder, own_folder
-from amiwarp.io.json_files import fields_of, value_of
-from amiwarp.io.sealed_json import CellStore
+from amiwarp.io.files import check_output, own_folder
+from amiwarp.io.formats import make_folder
+from amiwarp.io.json_files import CellStore, fields_of, value_of
 from amiwarp.kernels.launch import load_all, load_kernels
 from amiwarp.progress import Progress, silent
 from amiwarp.studies.cluster import Workers, result_of, run_jobs, start_workers, worker_count

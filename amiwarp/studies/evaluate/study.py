@@ -23,8 +23,7 @@ from amiwarp.calib import Settings as CalibrationSettings
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.events.truth import EventTruth, FrameTruth
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel, Model

@@ -24,8 +24,7 @@ from amiwarp.calib.settings import AUTO, STAGES
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import model_error
-from amiwarp.io.json_files import build, fields_of, value_of
-from amiwarp.io.sealed_json import CellStore
+from amiwarp.io.json_files import CellStore, build, fields_of, value_of
 from amiwarp.optics.models import ExactModel, predicted_error
 from amiwarp.progress import Progress
 from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs

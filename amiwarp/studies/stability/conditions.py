@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.description import Scene, Still
