@@ -77,9 +77,9 @@ def test_the_speed_of_threads_does_not_change_a_file(tmp_path, monkeypatch):
 
     def write(path, delays):
         monkeypatch.setattr(
-            "amiwarp.io.native_writer.encode_parts", lambda *a: (time.sleep(next(delays)), encode_parts(*a))[1]
+            "amiwarp.io.hdf5_files.encode_parts", lambda *a: (time.sleep(next(delays)), encode_parts(*a))[1]
         )
-        monkeypatch.setattr("amiwarp.io.hdf5_files.cpu_threads", lambda: 4)
+        monkeypatch.setattr("amiwarp.cpu_threads.cpu_threads", lambda: 4)
         with RecordingWriter(path.with_suffix(".filled.h5"), width=99, height=99) as writer:
             pieces = [lambda s=slice(k, k + CHUNK): (events[s], flags[s], {}) for k in range(0, n, CHUNK)]
             writer.fill(pieces, count=CHUNK, t_first=int(t[0]), done=lambda *_: None)
@@ -127,7 +127,7 @@ import resource, sys
 import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events
-from amiwarp.events.recording import MAPS, FrameTruth
+from amiwarp.events.truth import MAPS, FrameTruth
 from amiwarp.io import RecordingWriter
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
 rng, n = np.random.default_rng(0), 1 << 19

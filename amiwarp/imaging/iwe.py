@@ -19,20 +19,13 @@ from amiwarp.events import device_events
 from amiwarp.events.device_events import DeviceEvents, azimuths, cast, device_for, wait
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events
+from amiwarp.kernels import launch as launches
 from amiwarp.kernels import pixel_votes
 from amiwarp.kernels import tiles as kernels
 from amiwarp.kernels import votes as event_kernels
 from amiwarp.kernels.camera import CameraRotationParams
 from amiwarp.kernels.iwe import CPU_WIDTH, Frame, add_sums, add_totals, empty_words, read_sums, read_votes
-from amiwarp.kernels.launch import (
-    Program,
-    RecordedLaunch,
-    launch,
-    launch_slices,
-    page_locked,
-    run_together,
-    specialised,
-)
+from amiwarp.kernels.launch import Program, RecordedLaunch, launch, page_locked, specialised
 from amiwarp.kernels.pixel_votes import BLOCK, CAPACITY
 from amiwarp.kernels.word_votes import TRASH, Cells, vote_events, vote_points, vote_quickly, vote_rotating_camera
 from amiwarp.optics.camera import LARGEST_SIZE, CameraRotation, pinhole_params
@@ -422,7 +415,7 @@ class PixelVotes:
     def _clear_stale(self) -> None:
         """Clear the sums if they are to be cleared, so that they can be used."""
         if self._stale:
-            run_together([one.zero_ for one in self._slices])
+            launches.run_together([one.zero_ for one in self._slices])
             self._stale = False
 
     def range_voter(self, x: Any, y: Any, layer: Any) -> Callable[[int, int], None]:
@@ -446,7 +439,7 @@ class PixelVotes:
             n = min(piece, blocks - first)
             self._reserve(total if n == blocks else CAPACITY)
             columns = [*inputs, count]
-            launch_slices(kernel, n, columns, self._slices, first=first, smallest=SMALLEST, clear=self._stale)
+            launches.launch_slices(kernel, n, columns, self._slices, first=first, smallest=SMALLEST, clear=self._stale)
             self._stale = False
 
     def _reserve(self, events: int) -> None:

@@ -405,11 +405,16 @@ def _check_header(path: Path, header: bytes) -> int:
         raise AmiwarpError(f"{path}: the header is damaged: {error}") from error
 
 
-def read_head(path: str) -> Reply:
-    """Return width, height and number of the first stream of events. Called in the reading process."""
+def _decoder(path: str) -> Any:
+    """Open a file with faery, which loads slowly. Called in the reading process."""
     from faery.extension import aedat
 
-    with aedat.Decoder(path) as decoder:
+    return aedat.Decoder(path)
+
+
+def read_head(path: str) -> Reply:
+    """Return width, height and number of the first stream of events. Called in the reading process."""
+    with _decoder(path) as decoder:
         for track in decoder.tracks():
             if track.data_type == "events" and track.dimensions is not None:
                 return (int(track.dimensions[0]), int(track.dimensions[1]), track.id), []
@@ -425,9 +430,7 @@ def aedat4_triggers(path: Path) -> Iterator[Packet]:
 
 def read_packets(notes: dict[str, int], path: str, number: int, triggers: bool) -> Iterator[Packet]:
     """Yield the packets of a stream of events, or the edges at the external input. Runs in the reading process."""
-    from faery.extension import aedat
-
-    with aedat.Decoder(path) as decoder:
+    with _decoder(path) as decoder:
         for track, packet in noting_progress(decoder, path, notes):
             if name := COUNTED.get(track.data_type):
                 notes[name] = notes.get(name, 0) + (1 if name == "frames" else len(packet))
@@ -471,9 +474,7 @@ def read_images(notes: dict[str, int], path: str) -> Iterator[tuple[NDArray[Any]
 
 def _packets_of(path: str, kind: str) -> Iterator[Any]:
     """Yield the packets of the first stream of a type."""
-    from faery.extension import aedat
-
-    with aedat.Decoder(path) as decoder:
+    with _decoder(path) as decoder:
         number = next((track.id for track in decoder.tracks() if track.data_type == kind), None)
         for track, packet in decoder:
             if track.id == number:

@@ -23,19 +23,10 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.cpu_threads import in_order
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import recording as checks
+from amiwarp.events import truth as ground_truth
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, ImuSamples, MetadataValue, Recording, regroup
-from amiwarp.events.truth import (
-    EVENT_COLUMNS,
-    MAPS,
-    EventTruth,
-    FrameTruth,
-    Poses,
-    Truth,
-    WorldLabels,
-    as_poses,
-    check_truth,
-)
+from amiwarp.events.truth import EventTruth, FrameTruth, Poses, Truth, WorldLabels
 from amiwarp.io import hdf5_files
 from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
@@ -118,7 +109,7 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
         if points.shape != (count, 2):
             raise AmiwarpError(f"truth points have shape {points.shape}; expected ({count}, 2)")
         columns["truth/x"], columns["truth/y"] = points[:, 0], points[:, 1]
-    for name, (dtype, row) in EVENT_COLUMNS.items():
+    for name, (dtype, row) in ground_truth.EVENT_COLUMNS.items():
         given = getattr(truth, name)
         if given is not None:
             values = np.asarray(given, dtype)
@@ -126,7 +117,7 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
                 raise AmiwarpError(f"truth of {name} has shape {values.shape}; expected {(count, *row)}")
             columns[f"truth/events/{name}"] = values
     for name, values in columns.items():
-        check_truth(name, values)
+        ground_truth.check_truth(name, values)
     return columns
 
 
@@ -163,7 +154,7 @@ class RecordWriter:
         """Append the ground truth of an instant, which must be later than the previous instants."""
         width, height = self._size
         rows: dict[str, NDArray[Any]] = {}
-        for name, (dtype, tail) in MAPS.items():
+        for name, (dtype, tail) in ground_truth.MAPS.items():
             rows[name] = np.asarray(getattr(frame, name), dtype)
             if rows[name].shape != (height, width, *tail):
                 raise AmiwarpError(
@@ -172,7 +163,7 @@ class RecordWriter:
                 )
         self._check_later("truth/frames/t", frame.t_us)
         self._append("truth/frames/t", np.array([frame.t_us], np.int64), ROWS)
-        self._append("truth/frames/pose", as_poses(frame.rotation, frame.position)[None], ROWS)
+        self._append("truth/frames/pose", ground_truth.as_poses(frame.rotation, frame.position)[None], ROWS)
         self._append_joints("truth/frames/joints", {name: at[None] for name, at in frame.joints.items()})
         for name, values in rows.items():
             self._append(f"truth/frames/{name}", values[None], 1)
@@ -243,7 +234,7 @@ class RecordWriter:
     def _append(self, name: str, values: NDArray[Any], chunk_rows: int) -> None:
         """Append rows to a dataset, which is created at the first call with ``chunk_rows`` rows per chunk."""
         if name.startswith("truth/"):
-            check_truth(name, values)
+            ground_truth.check_truth(name, values)
         if name not in self._datasets:
             self._datasets[name] = hdf5_files.make_dataset(
                 self._file, name, values.dtype, values.shape[1:], chunk_rows, self._codec

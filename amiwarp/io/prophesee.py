@@ -417,11 +417,16 @@ def open_es(path: Path) -> Recording:
     return Recording(events=events, metadata={"format": "es", **events.metadata}, name=path.stem)
 
 
-def read_es_head(path: str) -> Reply:
-    """Return width and height of the sensor. Called in the reading process."""
+def _es_decoder(path: str) -> Any:
+    """Open a file with faery, which loads slowly. Called in the reading process."""
     from faery.extension import es
 
-    with es.Decoder(path, 0) as decoder:
+    return es.Decoder(path, 0)
+
+
+def read_es_head(path: str) -> Reply:
+    """Return width and height of the sensor. Called in the reading process."""
+    with _es_decoder(path) as decoder:
         kind, size = decoder.event_type, decoder.dimensions
         if kind not in ("dvs", "atis") or size is None:
             raise AmiwarpError(f"holds {kind} events; expected dvs or atis")
@@ -430,9 +435,7 @@ def read_es_head(path: str) -> Reply:
 
 def read_es_packets(notes: dict[str, int], path: str, height: int) -> Iterator[Packet]:
     """Yield packets of events. Called in the reading process."""
-    from faery.extension import es
-
-    with es.Decoder(path, 0) as decoder:
+    with _es_decoder(path) as decoder:
         atis = decoder.event_type == "atis"
         for packet in noting_progress(decoder, path, notes):
             events = packet[~packet["exposure"].astype(bool)] if atis else packet
