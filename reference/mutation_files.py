@@ -52,11 +52,11 @@ from amiwarp import (
 from amiwarp.cli.options import read_camera
 from amiwarp.cli.recordings import describe
 from amiwarp.cli.simulation import _read_speed
-from amiwarp.events.events import check_events
+from amiwarp.events.recording import check_events
 from amiwarp.events.truth import MAPS
 from amiwarp.io import read_encoder_csv
-from amiwarp.io.sealed_json import append_line, sealed
-from amiwarp.io.text import read_calib
+from amiwarp.io.json_files import append_line, sealed
+from amiwarp.io.plain_files import read_calib
 from amiwarp.simulation.pictures import _read_times, open_pictures, read_picture
 from amiwarp.simulation.worlds.world_files import load_mesh
 from amiwarp.studies.dataset.making import JOURNAL, Journal, Made, list_items

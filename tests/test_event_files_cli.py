@@ -83,7 +83,7 @@ def test_large_files_with_an_index_are_exact(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("large")
 def test_large_folders_are_estimated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("amiwarp.io.npz.DEFAULT_BLOCK", 500)
+    monkeypatch.setattr("amiwarp.io.plain_files.DEFAULT_BLOCK", 500)
     write_evimo2(tmp_path / "scene", EVENTS)
     data = json.loads(run("info", tmp_path / "scene", "--json"))
     assert (data["events"], data["estimated"], data["share_read"]) == (len(EVENTS), True, 0.2)

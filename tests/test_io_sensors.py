@@ -245,7 +245,7 @@ def test_aedat2_samples_have_the_ranges_of_the_header(tmp_path: Path, monkeypatc
     now = int(EVENTS.t[100])
     values = [4096, -8192, 100, 0, 328, -656, 131]
     # Blocks of few records, so that samples cross their ends; the last sample lacks a record.
-    monkeypatch.setattr("amiwarp.io.aedat2.DEFAULT_BLOCK", 4)
+    monkeypatch.setattr("amiwarp.io.aedat.DEFAULT_BLOCK", 4)
     extra = aedat2_sample(now, values) * 3 + aedat2_sample(now, values[:6])
     write_aedat2(tmp_path / "a.aedat", EVENTS, between=extra)
     recording = open_recording(tmp_path / "a.aedat")

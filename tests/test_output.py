@@ -48,10 +48,10 @@ from amiwarp.cli.app import COMMANDS, app, function_of
 from amiwarp.cli.options import NO_FILE, OUTPUT, OUTPUT_FOLDER
 from amiwarp.events.truth import MAPS, MemoryFrames
 from amiwarp.imaging.export import IweFiles
-from amiwarp.io import atomic_output as output
-from amiwarp.io.atomic_output import NewFile, check_output, own_folder, remove_abandoned, write_text
+from amiwarp.io import files as output
+from amiwarp.io.files import NewFile, check_output, own_folder, remove_abandoned, write_text
 from amiwarp.io.json_files import read_json
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.io.native_writer import LiveWriter
 from reference.calibration_sample import exact_calibration
 
 SPECIFICATION = """
@@ -625,7 +625,7 @@ def test_a_replaced_file_keeps_who_may_read_it(tmp_path: Path) -> None:
 
 WRITER = """
 import os, sys
-from amiwarp.io.atomic_output import NewFile, scratch_folder
+from amiwarp.io.files import NewFile, scratch_folder
 os.getpid = lambda: int(sys.argv[1])  # a number in another namespace, or on another machine
 new = NewFile("a.txt")
 new.part.write_text("half")
@@ -729,7 +729,7 @@ def test_what_may_still_be_written_is_kept(tmp_path: Path, monkeypatch: pytest.M
 
 def test_sigkill_leaves_nothing_after_the_next_run(tmp_path: Path) -> None:
     script = (
-        "import os, signal, sys; from pathlib import Path; from amiwarp.io.atomic_output import NewFile\n"
+        "import os, signal, sys; from pathlib import Path; from amiwarp.io.files import NewFile\n"
         "new = NewFile(Path(sys.argv[1])); new.part.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
     )
     done = subprocess.run([sys.executable, "-c", script, tmp_path / "a.txt"], env=environment(), check=False)

@@ -20,7 +20,7 @@ from typer.testing import CliRunner, Result
 
 from amiwarp import AmiwarpError
 from amiwarp.cli.app import app
-from amiwarp.io.sealed_json import sealed
+from amiwarp.io.json_files import sealed
 from amiwarp.studies.stability import cells as study
 from amiwarp.studies.stability.cells import METHODS, Axis, Cell, Condition, Outcome, Store, Stored, identity
 from amiwarp.studies.stability.cells import Result as Found

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from amiwarp import AmiwarpError, Compensated, Compensator, Encoder, EncoderStream, Events, EventSource
-from amiwarp.events.events import held_bytes
+from amiwarp.events.recording import held_bytes
 from amiwarp.live.link.emulator import (
     MOST_OUT_BYTES,
     MOST_SEGMENTS,

@@ -32,8 +32,8 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.choices import Axis, Colour, View
-from amiwarp.imaging.sharpness import random_variance, relative_variance
-from amiwarp.imaging.votes import CanvasShape, Votes
+from amiwarp.imaging.iwe import CanvasShape, Votes
+from amiwarp.imaging.metrics import random_variance, relative_variance
 from amiwarp.viewer import drawing, jobs
 from amiwarp.viewer import inspector as timeline
 from amiwarp.viewer import inspector as viewer

@@ -30,10 +30,9 @@ from amiwarp.cli.options import (
 )
 from amiwarp.cli.recordings import EncoderOptions, Format, HdfCodec, Round, format_notes
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import MemoryEvents
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.io import open_recording
-from amiwarp.io.atomic_output import check_output
+from amiwarp.io.files import check_output
 from amiwarp.io.formats import COMPENSATED_HELP, Codec, check_ending
 from amiwarp.optics.camera import CameraRotation
 from amiwarp.progress import Progress
@@ -44,7 +43,6 @@ if TYPE_CHECKING:
     from amiwarp.calib.settings import PhotometricSettings
     from amiwarp.imaging.export import IweFiles
     from amiwarp.reconstruction.picture import Picture, Reconstruction
-
 
 # ``amiwarp calibrate``: estimation of the prism's parameters from a recording.
 

@@ -15,11 +15,11 @@ import typer
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io import atomic_output as output
-from amiwarp.io.camera_files import camera_from_json
-from amiwarp.io.input_files import check_regular, errors_name
+from amiwarp.io import files as output
+from amiwarp.io.files import check_regular, errors_name
 from amiwarp.io.json_files import read_json
-from amiwarp.io.text import read_calib
+from amiwarp.io.plain_files import read_calib
+from amiwarp.io.rig_files import camera_from_json
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, NominalPrism, UnsizedPrism
 

@@ -17,16 +17,13 @@ from amiwarp.cli.console import progress, report, table
 from amiwarp.cli.options import OUTPUT, OUTPUT_FOLDER, CameraOptions, Common, NominalPrismOptions, Topic
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, rpm_between
-from amiwarp.events.events import DEFAULT_BLOCK, EventSource
-from amiwarp.events.recording import ImageStore, ImuSamples, Recording, Truth, mean_rate
-from amiwarp.events.truth import Cause
+from amiwarp.events.recording import DEFAULT_BLOCK, EventSource, ImageStore, ImuSamples, Recording, mean_rate
+from amiwarp.events.truth import Cause, Truth
 from amiwarp.io import convert, open_recording, read_encoder_csv, read_encoder_triggers
-from amiwarp.io.atomic_output import make_folder
-from amiwarp.io.camera_files import camera_to_json
-from amiwarp.io.export import GAP_INTERVALS
+from amiwarp.io.export import GAP_INTERVALS, save_flow_dsec, save_flow_mvsec, save_poses_tum
 from amiwarp.io.file_scan import head_only
-from amiwarp.io.formats import EXTENSION_HELP, LIMITS, Codec, OutputFormat, Rounding
-from amiwarp.io.truth_export import save_flow_dsec, save_flow_mvsec, save_poses_tum
+from amiwarp.io.formats import EXTENSION_HELP, LIMITS, Codec, OutputFormat, Rounding, make_folder
+from amiwarp.io.rig_files import camera_to_json
 from amiwarp.optics.prism import Prism
 
 # ``amiwarp info``: description of the content of a recording.

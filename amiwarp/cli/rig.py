@@ -26,7 +26,7 @@ from amiwarp.cli.options import NO_FILE, OUTPUT, CameraOptions, Common, NominalP
 from amiwarp.errors import AmiwarpError, printable
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.io.native_writer import LiveWriter
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.link.emulator import Controller, EmulatedFault, Motor, Played, PseudoTerminal, Rotor
 from amiwarp.live.link.link import Link
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.sockets import PipeSink, SocketSink
     from amiwarp.live.stream.sources import EmulatedCamera
     from amiwarp.optics.models import Model
-
 
 # Functions that ``record`` and ``live`` share: event source, link to the controller, status line, end of session.
 

@@ -16,8 +16,8 @@ from amiwarp.cli.console import choose_device, progress, report
 from amiwarp.cli.options import OUTPUT, Common, numbers, parse_size, read_camera
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
+from amiwarp.io.files import text_lines
 from amiwarp.io.formats import check_ending
-from amiwarp.io.input_files import text_lines
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel

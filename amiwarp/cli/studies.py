@@ -22,7 +22,8 @@ from amiwarp.cli.options import OUTPUT_FOLDER, CameraOptions, Common, numbers, p
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.io.atomic_output import check_output, make_folder, own_folder, write_text
+from amiwarp.io.files import check_output, own_folder, write_text
+from amiwarp.io.formats import make_folder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.progress import part

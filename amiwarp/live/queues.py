@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from amiwarp.events.events import OVERHEAD, Events
+from amiwarp.events.recording import OVERHEAD, Events
 from amiwarp.validation import choice, whole
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ LAST_JOB_S = 5.0
 class BackgroundWorker:
     """Runs jobs in order in a background thread. :meth:`put` blocks while the jobs hold ``most_bytes`` of memory.
 
-    A job's memory is the given number plus :data:`~amiwarp.events.events.OVERHEAD`, so that the number of jobs
+    A job's memory is the given number plus :data:`~amiwarp.events.recording.OVERHEAD`, so that the number of jobs
     without events is limited too. A single job larger than the limit runs alone.
     """
 

@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.export import GAMMA, PERCENTILE, save_png
+from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.palette import BLUE, OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK, ORANGE, PINK, VERMILION
-from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.plotting.figures import instance_colours
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.validation import choice

@@ -21,13 +21,12 @@ from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.choices import Colour, Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, turn_between
-from amiwarp.events.events import Events, EventSource
-from amiwarp.events.recording import Recording, Truth
-from amiwarp.events.truth import Cause, EventValues
+from amiwarp.events.recording import Events, EventSource, Recording
+from amiwarp.events.truth import Cause, EventValues, Truth
 from amiwarp.imaging.corners import find_background_activity
 from amiwarp.imaging.export import PERCENTILE
-from amiwarp.imaging.sharpness import SharpnessMeter, random_variance, relative_variance
-from amiwarp.imaging.votes import CanvasShape, UploadedEvents, Votes, upload_events
+from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, upload_events
+from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_variance
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, PHASE, Model, size_names
@@ -293,7 +292,7 @@ class MeasuredImage:
     events."""
     sharpness: float
     """Relative variance of the smoothed region, see
-    :func:`amiwarp.imaging.sharpness.relative_variance`. It does not depend on the number of events."""
+    :func:`amiwarp.imaging.metrics.relative_variance`. It does not depend on the number of events."""
 
 
 class WindowImager:

@@ -23,12 +23,11 @@ from amiwarp.choices import View
 from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, rpm_between
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.imaging.export import encode_image, encode_png
 from amiwarp.io import RecordingWriter
-from amiwarp.io.atomic_output import NewFile
 from amiwarp.io.file_scan import FileEvents
+from amiwarp.io.files import NewFile
 from amiwarp.io.formats import check_ending
 from amiwarp.live.stream.session import RecentEvents
 from amiwarp.progress import Progress, silent

@@ -26,7 +26,7 @@ from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.atomic_output import check_output, interrupts_later
+from amiwarp.io.files import check_output, interrupts_later
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events, held_bytes
+from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.recording import Events, held_bytes
 
 if TYPE_CHECKING:
     from amiwarp.compensation.streams import Compensated

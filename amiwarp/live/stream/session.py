@@ -21,13 +21,11 @@ from amiwarp.calib.result import Calibration
 from amiwarp.choices import Sharpness
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.encoder_stream import EncoderStream, start_of_last_run
-from amiwarp.events.events import OVERHEAD, Events, MemoryEvents, held_bytes
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.imaging.votes import CanvasShape
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.events.encoder import TWO_PI, Encoder, EncoderStream, start_of_last_run
+from amiwarp.events.recording import OVERHEAD, Events, MemoryEvents, Recording, held_bytes
+from amiwarp.imaging.iwe import CanvasShape
+from amiwarp.imaging.metrics import SharpnessMeter
+from amiwarp.io.native_writer import LiveWriter
 from amiwarp.live.link.clocks import CameraClock, ClockMap, monotonic_us
 from amiwarp.live.link.link import Link, LinkUpdate
 from amiwarp.live.queues import BackgroundWorker, EventSorter, PacketQueue, Policy

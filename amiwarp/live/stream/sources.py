@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.link.emulator import Controller, Played
