@@ -25,7 +25,7 @@ from types import FunctionType
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 
@@ -141,6 +141,60 @@ def array(value: object, what: str, kinds: str = "iuf") -> NDArray[Any]:
     if found.dtype.kind not in kinds:
         raise AmiwarpError(f"{what} is {shown(value)}, of type {found.dtype}; expected numbers")
     return found
+
+
+TIME_LIMIT = 2**62
+"""Limit of the magnitude of times of events, encoder samples and index pulses [us]: 146,000 years.
+
+The difference and the sum of any two times then fit int64.
+"""
+
+TIME_UNITS = {"us": 1.0, "s": 1e6}
+"""Microseconds in each unit of times that arrays may have."""
+
+FRACTION_OF_US = "times are whole microseconds; for seconds, give t_unit='s' (events) or np.rint(t * 1e6)"
+"""Message for floating times with a fraction."""
+COARSE_TIMES = "does not resolve 1 us there; give float64 or int64 from the start"
+"""Message for floating times that were rounded before."""
+
+
+def as_times(values: ArrayLike, what: str = "times", unit: str = "us") -> NDArray[np.int64]:
+    """Return times given in Python, of any numeric type and in one of :data:`TIME_UNITS`, as int64 [us].
+
+    Times in seconds are rounded. Floating times in microseconds must be whole: others are likely in seconds. Raises
+    :class:`AmiwarpError`, also for a time that is not finite, beyond :data:`TIME_LIMIT`, or too late for its type.
+    """
+    given = array(values, what)
+    scale = TIME_UNITS[one_of(unit, TIME_UNITS, "t_unit")]
+    if scale == 1.0 and given.dtype.kind != "f":
+        return rounded_times(given, what)
+    limit = largest_exact_time(given.dtype)
+    with np.errstate(over="ignore"):
+        scaled = given.astype(np.float64) * scale
+    times = rounded_times(scaled, what)
+    if scale == 1.0 and not np.array_equal(times, scaled):
+        at = int(np.argmax(times != scaled))
+        raise AmiwarpError(f"{what} hold {scaled.flat[at]:.9g} (number {at}): {FRACTION_OF_US}")
+    if times.size and max(-int(times.min()), int(times.max())) > limit:
+        raise AmiwarpError(f"{what} reach {np.abs(times).max()} us, and {given.dtype} {COARSE_TIMES}")
+    return times
+
+
+def largest_exact_time(dtype: np.dtype[Any]) -> float:
+    """Return the largest time whose neighbours in a type are at most 1 us away [us]."""
+    return 2.0 / float(np.finfo(dtype).eps) if dtype.kind == "f" else TIME_LIMIT
+
+
+def rounded_times(values: ArrayLike, what: str = "times") -> NDArray[np.int64]:
+    """Return times of a file, of any numeric type, as int64 [us], rounded.
+
+    Raises :class:`AmiwarpError` for a time that is not finite or beyond :data:`TIME_LIMIT`.
+    """
+    given = array(values, what)
+    if given.size and not (given.min() > -TIME_LIMIT and given.max() < TIME_LIMIT):
+        spans = f"{what} span {given.min()} .. {given.max()} us: not finite or beyond int64"
+        raise AmiwarpError(f"{spans}; expected microseconds within {TIME_LIMIT} us of 0")
+    return np.asarray(np.rint(given) if given.dtype.kind == "f" else given, np.int64)
 
 
 def on_gpu(value: Any) -> bool:

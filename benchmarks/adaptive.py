@@ -38,7 +38,7 @@ from amiwarp import (
     Simulation,
     compensate_events,
 )
-from amiwarp.io.atomic_output import write_text
+from amiwarp.io.files import write_text
 from amiwarp.kernels import prism_view as sight
 from amiwarp.kernels.launch import launch
 from amiwarp.live.stream.adaptive import CoverageMeter, SpeedController, prism_orbit, prism_path

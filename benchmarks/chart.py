@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from amiwarp import AmiwarpError
-from amiwarp.io.atomic_output import own_folder
+from amiwarp.io.files import own_folder
 from amiwarp.studies.chart import Charts, make, simulated
 from amiwarp.studies.chart.measurement import beaten_by, fronts
 from benchmarks.chart_libraries import library_tasks

@@ -32,7 +32,7 @@ from PIL import Image
 
 from amiwarp import DatasetSummary, make_dataset
 from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
-from amiwarp.io.sealed_json import read_journal
+from amiwarp.io.json_files import read_journal
 from amiwarp.kernels.launch import start_quietly
 from amiwarp.simulation.simulator import Engine
 from amiwarp.studies.cluster import ANY_GPU, machine, threads_of_worker, versions

@@ -40,10 +40,8 @@ from amiwarp import (
 )
 from amiwarp.choices import Axis, Colour
 from amiwarp.studies.cluster import machine
-from amiwarp.viewer.clouds import cloud_state, jpeg, scale_state
-from amiwarp.viewer.images import ImageKind, count_images, make_images, prepare
-from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.window import Selection
+from amiwarp.viewer.drawing import ImageKind, cloud_state, count_images, jpeg, make_images, prepare, scale_state
+from amiwarp.viewer.inspector import Inspector, Selection
 
 WIDTH, HEIGHT = 640, 480
 """Width and height of the sensor [px]."""
@@ -58,7 +56,7 @@ import sys, time
 began, cpu = time.perf_counter(), time.process_time()
 from amiwarp.io import open_recording
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.window import Selection
+from amiwarp.viewer.inspector import Selection
 opened = Inspector(open_recording(sys.argv[1]), device=sys.argv[2])
 start, length = opened.first_window()
 opened.open(start, int(sys.argv[3]) or length)
@@ -177,7 +175,7 @@ def opening(path: Path, device: str, n: int, length_us: int) -> dict[str, Any]:
 def rates(path: Path, n: int) -> dict[str, Any]:
     """Measure the count of all events over time, and a curve of 1,000 bins at four zooms."""
     from amiwarp.io import open_recording
-    from amiwarp.viewer.timeline import EventRates
+    from amiwarp.viewer.inspector import EventRates
 
     source = open_recording(path).events
     counted, began, cpu = EventRates(source), time.perf_counter(), time.process_time()

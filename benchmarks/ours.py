@@ -12,8 +12,8 @@ import numpy as np
 import warp as wp
 
 from amiwarp import Calibration, Model, Picture, Reconstruction, Vote, calibrate, model_error
+from amiwarp.imaging.iwe import TURNS, CanvasShape, Image, TileVotes, Votes, upload_events
 from amiwarp.imaging.metrics import PictureQuality, picture_quality
-from amiwarp.imaging.votes import TURNS, CanvasShape, Image, TileVotes, Votes, upload_events
 from amiwarp.optics.models import MODELS
 from benchmarks import peers, truth
 from benchmarks.job import Job

@@ -54,7 +54,7 @@ from amiwarp import (
 )
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.metrics import TRUTH_PERCENTILES, picture_quality
-from amiwarp.io.text import read_calib
+from amiwarp.io.plain_files import read_calib
 from amiwarp.simulation.scenery import place_scene
 
 CAMERA = Camera.from_fov(346, 260, math.radians(60.0))

@@ -31,7 +31,7 @@ import numpy as np
 import psutil
 
 from amiwarp import AmiwarpError, open_recording
-from amiwarp.io.atomic_output import NewFile, remove_abandoned
+from amiwarp.io.files import NewFile, remove_abandoned
 
 LIMIT_S = 180.0
 """Time after a signal at which a command that still runs is considered hanging [s]."""
@@ -174,8 +174,7 @@ def prepare(folder: Path) -> Path:
 def many_events(inputs: Path, count: int = 3_000_000) -> None:
     """Write a recording of two seconds with evenly spread events, long enough to kill a command while it runs."""
     from amiwarp.events.encoder import Encoder
-    from amiwarp.events.events import Events, MemoryEvents
-    from amiwarp.events.recording import Recording
+    from amiwarp.events.recording import Events, MemoryEvents, Recording
     from amiwarp.io import save_recording
 
     rng = np.random.default_rng(2)

@@ -49,21 +49,23 @@ from amiwarp import (
     load_world,
     open_recording,
 )
-from amiwarp.cli.info import describe
-from amiwarp.cli.options import _read_speed, read_camera
-from amiwarp.events.events import check_events
+from amiwarp.cli.options import read_camera
+from amiwarp.cli.recordings import describe
+from amiwarp.cli.simulation import _read_speed
+from amiwarp.events.recording import check_events
 from amiwarp.events.truth import MAPS
 from amiwarp.io import read_encoder_csv
-from amiwarp.io.sealed_json import append_line, sealed
-from amiwarp.io.text import read_calib
+from amiwarp.io.json_files import append_line, sealed
+from amiwarp.io.plain_files import read_calib
 from amiwarp.simulation.pictures import _read_times, open_pictures, read_picture
 from amiwarp.simulation.worlds.world_files import load_mesh
-from amiwarp.studies import stability
 from amiwarp.studies.dataset.making import JOURNAL, Journal, Made, list_items
 from amiwarp.studies.dataset.specification import load_specification
 from amiwarp.studies.evaluate.edges import THRESHOLDS
 from amiwarp.studies.evaluate.evaluation import CHANCE, Store, section
 from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, encode_picture
+from amiwarp.studies.stability import cells as stability
+from amiwarp.studies.stability.report import aggregate
 from reference.calibration_sample import exact_calibration
 from reference.io_samples import CALIB, SIZE, WRITERS, make_events, refusal, write_native
 from reference.io_samples_extra import MORE_WRITERS, packets, small, write_bin, write_ros2
@@ -276,7 +278,7 @@ def read_cell(make: Callable[[], CellResult | stability.Stored], path: Path) -> 
             for known in store.load_all():
                 methods = [m for m in stability.METHODS if stability.identity(m) in known.results]
                 if methods and known.cell == cell.cell:
-                    atlas = stability.aggregate([known], stability.AXES[:1], methods, {})
+                    atlas = aggregate([known], stability.AXES[:1], methods, {})
                     json.dumps(atlas.aims.to_json(), allow_nan=False)
     if store.damaged:
         raise AmiwarpError(store.damaged[0].replace(str(file), str(path)))

@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from amiwarp.live.link.follower import Follower
+from amiwarp.live.link.link import Follower
 from amiwarp.live.link.protocol import (
     LONGEST,
     Answer,

@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator
 from amiwarp.live.link.emulator import PseudoTerminal
 from amiwarp.live.link.link import Link
 from amiwarp.live.link.protocol import Answer
-from amiwarp.live.stream.cameras import EmulatedCamera
 from amiwarp.live.stream.packets import Packet, Source
 from amiwarp.live.stream.session import Session
+from amiwarp.live.stream.sources import EmulatedCamera
 
 LONG_S = 120.0
 """Limit of every wait [s]. Only a hang takes so long."""

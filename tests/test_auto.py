@@ -249,10 +249,10 @@ def test_the_file_keeps_the_ladder(as_circle: Calibration, tmp_path: Path) -> No
 def test_the_command_shows_the_table(found: Calibration, capsys: pytest.CaptureFixture[str]) -> None:
     from rich.console import Console
 
-    from amiwarp.cli.calibrate import lines, summary
+    from amiwarp.cli.calibration import calibration_lines, calibration_summary
 
     console = Console(width=1000)
-    for line in lines(found, summary(found) | {"file": "c.json", "device": "cpu"}):
+    for line in calibration_lines(found, calibration_summary(found) | {"file": "c.json", "device": "cpu"}):
         console.print(line, markup=False)
     out = capsys.readouterr().out
     assert all(f"\n{name} " in out for name in MODELS)

@@ -47,12 +47,12 @@ from amiwarp.calib.presets import simplified
 from amiwarp.calib.settings import STAGES
 from amiwarp.choices import Axis, Colour, Tone, View
 from amiwarp.imaging.export import IweFiles, to_picture
-from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.imaging.votes import CanvasShape
-from amiwarp.live.stream.queues import PacketQueue, Policy
+from amiwarp.imaging.iwe import CanvasShape
+from amiwarp.imaging.metrics import SharpnessMeter
+from amiwarp.live.queues import PacketQueue, Policy
 from amiwarp.optics.models import MODELS
 from amiwarp.reconstruction.picture import save_picture, tones
-from amiwarp.viewer.clouds import Look
+from amiwarp.viewer.drawing import Look
 
 CAMERA = Camera.from_fov(8, 6, 1.0)
 EVENTS = Events.from_arrays([1, 2, 1, 2], [1, 2, 1, 2], [0, 10, 20, 30], [0, 1, 0, 1])
@@ -180,7 +180,7 @@ def test_simplified_names_its_models() -> None:
 
 
 def test_views_are_taken_by_name(tmp_path: Path) -> None:
-    from amiwarp.viewer.clouds import CAMERA_DIRECTIONS
+    from amiwarp.viewer.drawing import CAMERA_DIRECTIONS
 
     assert set(CAMERA_DIRECTIONS) == {view.value for view in View}  # names and members select the same camera position
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from amiwarp import Events, RecordingWriter
-from amiwarp.io.chunks import CHUNK, ChunkFile, EncodedChunk, encode, encode_parts, make_dataset
+from amiwarp.io.hdf5_files import CHUNK, ChunkFile, EncodedChunk, encode, encode_parts, make_dataset
 
 assert hdf5plugin.FILTERS  # its import registers the filter
 
@@ -39,7 +39,7 @@ def stored(path, columns):
 
 
 def in_two_pieces(output, data):
-    """Write data as :class:`amiwarp.io.chunks._Output` does, but not at once."""
+    """Write data as :class:`amiwarp.io.hdf5_files._Output` does, but not at once."""
     output.write_at([data[:7]], output.tell())
     output.write_at([data[7:]], output.tell() + 7)
     output.seek(output.tell() + len(data))
@@ -57,7 +57,7 @@ def make():
 def test_threads_write_chunks_in_any_order(tmp_path, monkeypatch, in_one_piece):
     """Also if HDF5 wrote the bytes of a chunk in an unknown way, so that their place is not found."""
     if not in_one_piece:
-        monkeypatch.setattr("amiwarp.io.chunks._Output.write", in_two_pieces)
+        monkeypatch.setattr("amiwarp.io.hdf5_files._Output.write", in_two_pieces)
     columns = make()
     stored(tmp_path / "a.h5", columns)
     with h5py.File(tmp_path / "a.h5") as file:
@@ -77,9 +77,9 @@ def test_the_speed_of_threads_does_not_change_a_file(tmp_path, monkeypatch):
 
     def write(path, delays):
         monkeypatch.setattr(
-            "amiwarp.io.native_writer.encode_parts", lambda *a: (time.sleep(next(delays)), encode_parts(*a))[1]
+            "amiwarp.io.hdf5_files.encode_parts", lambda *a: (time.sleep(next(delays)), encode_parts(*a))[1]
         )
-        monkeypatch.setattr("amiwarp.io.chunks.cpu_threads", lambda: 4)
+        monkeypatch.setattr("amiwarp.cpu_threads.cpu_threads", lambda: 4)
         with RecordingWriter(path.with_suffix(".filled.h5"), width=99, height=99) as writer:
             pieces = [lambda s=slice(k, k + CHUNK): (events[s], flags[s], {}) for k in range(0, n, CHUNK)]
             writer.fill(pieces, count=CHUNK, t_first=int(t[0]), done=lambda *_: None)
@@ -126,7 +126,7 @@ FULL = """
 import resource, sys
 import numpy as np
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
+from amiwarp.events.recording import Events
 from amiwarp.events.truth import MAPS, FrameTruth
 from amiwarp.io import RecordingWriter
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
@@ -167,8 +167,8 @@ def test_a_full_disk_leaves_nothing(tmp_path, way, limit):
 FAILING = """
 import errno, os, sys
 import numpy as np
-from amiwarp.io.chunks import ChunkFile
-from amiwarp.io.chunks import make_dataset
+from amiwarp.io.hdf5_files import ChunkFile
+from amiwarp.io.hdf5_files import make_dataset
 written = os.pwritev
 calls = 0
 def failing(*arguments):

@@ -1,7 +1,6 @@
 """Command line: help, examples, JSON output and failures of the commands."""
 
 import contextlib
-import importlib
 import inspect
 import json
 import os
@@ -21,70 +20,24 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from amiwarp import AmiwarpError, Calibration, open_recording
-from amiwarp.cli import (
-    calibrate,
-    chart,
-    compensate,
-    convert,
-    dataset,
-    demo,
-    design,
-    emulate,
-    evaluate,
-    info,
-    live,
-    motor,
-    reconstruct,
-    record,
-    simulate,
-    stability,
-    translate,
-    truth,
-    view,
-)
-from amiwarp.cli.app import SUMMARIES, app
+from amiwarp.cli.app import COMMANDS, app, function_of
 from amiwarp.cli.options import number
-
-COMMANDS = {
-    module.__name__.rpartition(".")[2]: module
-    for module in (
-        demo,
-        emulate,
-        info,
-        live,
-        motor,
-        record,
-        view,
-        convert,
-        simulate,
-        translate,
-        dataset,
-        truth,
-        calibrate,
-        compensate,
-        reconstruct,
-        chart,
-        design,
-        stability,
-        evaluate,
-    )
-}  # fmt: skip
 
 
 def test_help_and_info_load_only_what_they_need(made: tuple[Path, str]) -> None:
     """The list of commands repeats what the commands say of themselves, without loading them."""
-    for name, summary in SUMMARIES.items():
-        first = inspect.getdoc(importlib.import_module(f"amiwarp.cli.{name}").run).split("\n\n")[0]
-        assert first.replace("\n", " ") == summary, name
+    for name, command in COMMANDS.items():
+        first = inspect.getdoc(function_of(name)).split("\n\n")[0]
+        assert first.replace("\n", " ") == command.summary, name
     code = (
-        "import sys; from amiwarp.cli.app import SUMMARIES, app\n"
+        "import sys; from amiwarp.cli.app import app\n"
         "try: app(['--help'])\n"
         "except SystemExit: print({m.split('.')[0] for m in sys.modules} & {'numpy', 'warp', 'scipy'})\n"
         "try: app(['info', sys.argv[1]])\n"
         "except SystemExit: print({m.split('.')[0] for m in sys.modules} & {'warp', 'scipy', 'matplotlib'})"
     )
-    command = [sys.executable, "-c", code, str(made[0] / "recording.h5")]
-    ran = subprocess.run(command, capture_output=True, text=True, check=True)
+    words = [sys.executable, "-c", code, str(made[0] / "recording.h5")]
+    ran = subprocess.run(words, capture_output=True, text=True, check=True)
     assert "fx" in ran.stdout
     assert ran.stdout.splitlines().count("set()") == 2
 
@@ -124,7 +77,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, texture: np.ndarray) -> tuple
         "--duration", "0.2", "--apex-deg", "2", "--nominal-apex-deg", "2.4", "--phase-deg", "100", "--seed", "4",
     )  # fmt: skip
     with contextlib.chdir(folder):
-        result = run(*shlex.split(calibrate.EXAMPLE)[1:])
+        result = run(*shlex.split(COMMANDS["calibrate"].example)[1:])
     assert result.exit_code == 0, result.stderr
     (folder / "calibration.png").unlink()
     return folder, result.stdout
@@ -147,11 +100,11 @@ def left_behind(place: Path, *expected: str) -> set[str]:
 
 def test_help_of_everything_shows_an_example() -> None:
     assert set(COMMANDS) == set(re.findall(r"^│ (\w+)  ", run("--help").stdout, re.M))
-    for name, module in COMMANDS.items():
+    for name, command in COMMANDS.items():
         result = run(name, "--help")
         assert result.exit_code == 0
         text = " ".join(result.stdout.split())
-        assert f"Example: {module.EXAMPLE}" in text
+        assert f"Example: {command.example}" in text
         assert all(option in text for option in ("--json", "--device", "--seed"))
 
 
@@ -164,19 +117,20 @@ def test_version() -> None:
 def test_examples_of_the_help_run(place: Path, texture: np.ndarray) -> None:
     """Run the help examples that need only the fixture's files. The fixture ran calibrate's, other tests run demo's."""
     for name in ("info", "compensate"):
-        words = shlex.split(COMMANDS[name].EXAMPLE)
+        words = shlex.split(COMMANDS[name].example)
         assert words[:2] == ["amiwarp", name]
         ok(*words[1:])
     assert left_behind(place) == {"compensated.h5", "iwe.png"}
     (place / "recording.h5").unlink()
-    ok(*shlex.split(simulate.EXAMPLE)[1:], "--size", "64x48", "--duration", "0.05")
+    ok(*shlex.split(COMMANDS["simulate"].example)[1:], "--size", "64x48", "--duration", "0.05")
     _own_recording(place)
-    ok(*shlex.split(convert.EXAMPLE.replace("events.raw", "events.npz").replace("recording.h5", "mine.h5"))[1:])
+    line = COMMANDS["convert"].example.replace("events.raw", "events.npz").replace("recording.h5", "mine.h5")
+    ok(*shlex.split(line)[1:])
     (place / "pictures").mkdir()
     for k in range(3):
         Image.fromarray(np.roll(texture, k)[:60, :80]).save(place / "pictures" / f"{k}.png")
-    words = shlex.split(translate.EXAMPLE.replace("video.mp4", "pictures").replace("recording.h5", "moved.h5"))
-    assert ok(*words[1:], "--fps", "50")["duration_s"] == pytest.approx(0.06, abs=1e-9)
+    line = COMMANDS["translate"].example.replace("video.mp4", "pictures").replace("recording.h5", "moved.h5")
+    assert ok(*shlex.split(line)[1:], "--fps", "50")["duration_s"] == pytest.approx(0.06, abs=1e-9)
     assert open_recording(place / "moved.h5").events.size == (80, 60)
 
 

@@ -42,9 +42,9 @@ from amiwarp.cli.app import app
 from amiwarp.compensation.recordings import compensated_blocks
 from amiwarp.events.device_events import encoder_params
 from amiwarp.events.encoder import TWO_PI
-from amiwarp.events.events import inside_image
+from amiwarp.events.recording import inside_image
 from amiwarp.io import read_encoder_csv
-from amiwarp.io.chunks import CHUNK
+from amiwarp.io.hdf5_files import CHUNK
 from amiwarp.io.prophesee import Evt3Encoder
 from amiwarp.io.ros import PACKET_DEFINITION, opened_bag
 from amiwarp.kernels.launch import launch

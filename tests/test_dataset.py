@@ -25,7 +25,7 @@ from typer.testing import CliRunner, Result
 import amiwarp
 from amiwarp import AmiwarpError, DatasetSummary, make_dataset
 from amiwarp.cli.app import app
-from amiwarp.io.sealed_json import append_line, create_journal, read_journal
+from amiwarp.io.json_files import append_line, create_journal, read_journal
 from amiwarp.kernels import launch
 from amiwarp.studies import cluster
 from amiwarp.studies.cluster import ANY_GPU, Workers, run_jobs, single_worker, threads_of_worker

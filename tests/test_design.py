@@ -29,7 +29,7 @@ from amiwarp import (
     apex_from_deflection,
 )
 from amiwarp.calib.model_choice import QUANTISATION_PX
-from amiwarp.cli import design as command_line
+from amiwarp.cli import studies as command_line
 from amiwarp.cli.console import report
 from amiwarp.cli.options import Common, command
 from amiwarp.studies.design import (
@@ -281,7 +281,7 @@ def test_no_letters_of_the_chart_overlap(made: Design, count: tuple[int, int]) -
 
 def test_the_command_writes_chart_and_tables(tmp_path: Path, texture: np.ndarray) -> None:
     app = typer.Typer()
-    command(app, command_line.run, name="design", example=command_line.EXAMPLE)
+    command(app, command_line.run_design, name="design", example="")
     picture = tmp_path / "picture.png"
     Image.fromarray(texture).save(picture)
     grid = ["--size", "64x48", "--fov-deg", "10", "--apex-deg", "0.5,1,2", "--rpm", "720,360"]
@@ -303,7 +303,7 @@ def test_the_command_writes_chart_and_tables(tmp_path: Path, texture: np.ndarray
 
 
 def test_what_people_read(made: Design, capsys: pytest.CaptureFixture[str]) -> None:
-    report(Common(), {}, command_line.lines(made, {"png": "design.png"}))
+    report(Common(), {}, command_line.design_lines(made, {"png": "design.png"}))
     assert made.chosen is not None
     said = capsys.readouterr().out.splitlines()
     (row,) = [line.split() for line in said if "recommended" in line]

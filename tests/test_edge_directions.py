@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from amiwarp.imaging.sharpness import EDGE_SMOOTHING_PX, LEAST_PADDING, STRONG, edge_coherence
-from amiwarp.imaging.votes import CanvasShape, Image
+from amiwarp.imaging.iwe import CanvasShape, Image
+from amiwarp.imaging.metrics import EDGE_SMOOTHING_PX, LEAST_PADDING, STRONG, edge_coherence
 
 INSET = 8
 

@@ -20,7 +20,7 @@ from scipy.special import ndtr
 
 import amiwarp
 from amiwarp.cli.console import made_again
-from amiwarp.io.sealed_json import sealed
+from amiwarp.io.json_files import sealed
 from amiwarp.progress import silent
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.evaluate import apex_speed, corners, fading, texture

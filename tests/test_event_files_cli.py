@@ -31,8 +31,8 @@ def fails(*args: str | Path) -> str:
 @pytest.fixture
 def large(monkeypatch: pytest.MonkeyPatch) -> None:
     """Treat files from 1 kB on as large, and their first 600 events as the part that is read, in blocks of 500."""
-    monkeypatch.setattr("amiwarp.cli.info.LARGE_BYTES", 1000)
-    monkeypatch.setattr("amiwarp.cli.info.HEAD_EVENTS", 600)
+    monkeypatch.setattr("amiwarp.cli.recordings.LARGE_BYTES", 1000)
+    monkeypatch.setattr("amiwarp.cli.recordings.HEAD_EVENTS", 600)
     for module in ("prophesee", "aedat2", "text"):
         name, value = ("READ_BYTES", 4000) if module == "text" else ("DEFAULT_BLOCK", 500)
         monkeypatch.setattr(f"amiwarp.io.{module}.{name}", value)
@@ -83,7 +83,7 @@ def test_large_files_with_an_index_are_exact(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("large")
 def test_large_folders_are_estimated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("amiwarp.io.npz.DEFAULT_BLOCK", 500)
+    monkeypatch.setattr("amiwarp.io.plain_files.DEFAULT_BLOCK", 500)
     write_evimo2(tmp_path / "scene", EVENTS)
     data = json.loads(run("info", tmp_path / "scene", "--json"))
     assert (data["events"], data["estimated"], data["share_read"]) == (len(EVENTS), True, 0.2)
@@ -96,8 +96,8 @@ def test_small_parts_of_a_file_are_only_read_by_info(tmp_path: Path) -> None:
 
 
 def test_real_large_raw_file(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("amiwarp.cli.info.LARGE_BYTES", 1000)
-    monkeypatch.setattr("amiwarp.cli.info.HEAD_EVENTS", 1000)
+    monkeypatch.setattr("amiwarp.cli.recordings.LARGE_BYTES", 1000)
+    monkeypatch.setattr("amiwarp.cli.recordings.HEAD_EVENTS", 1000)
     path = data_dir / "evt/evt2_balls_640x480.raw"
     data = json.loads(run("info", path, "--json"))
     # Where the system does not tell how far the decoder has read, all is read.

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from amiwarp import AmiwarpError, DeviceEvents, Events, EventSource, MemoryEvents, Truth
 from amiwarp.events.device_events import device_for
-from amiwarp.events.events import check_events, regroup
+from amiwarp.events.recording import check_events, regroup
 
 
 def make(t: list[int]) -> Events:

@@ -15,7 +15,7 @@ import pytest
 
 from amiwarp import AmiwarpError, open_recording
 from amiwarp.io import reading_process
-from amiwarp.io.chunks import CHUNK, checksum, decode
+from amiwarp.io.hdf5_files import CHUNK, checksum, decode
 from amiwarp.io.reading_process import Reply, borrow, give_back, run
 from reference.io_samples import make_events, refusal, to_faery, write_dsec, write_native
 

@@ -32,7 +32,8 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
-from amiwarp.io.chunks import CHUNK, StoredColumn, checksum, decode, encode, in_order
+from amiwarp.cpu_threads import in_order
+from amiwarp.io.hdf5_files import CHUNK, StoredColumn, checksum, decode, encode
 from amiwarp.kernels.checksum import Checksums
 
 SIZE = (320, 240)

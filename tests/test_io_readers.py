@@ -194,7 +194,7 @@ LINES = [f"{i * 1e-4:.6f} {i % 240} {i % 180} {i % 2}" for i in range(1000)]
     ],
 )
 def test_text_names_the_bad_line(tmp_path, monkeypatch, line, message):
-    monkeypatch.setattr("amiwarp.io.text.READ_BYTES", 1000)
+    monkeypatch.setattr("amiwarp.io.plain_files.READ_BYTES", 1000)
     path = write_lines(tmp_path / "events.txt", [*LINES[:300], line, *LINES[300:]])
     with pytest.raises(AmiwarpError, match=f"events.txt: .*{message}"):
         open_recording(path)
@@ -333,7 +333,7 @@ def test_one_fraction_in_text_is_damage(tmp_path):
 
 def test_fractions_in_text_are_read_block_by_block(tmp_path, monkeypatch):
     """What the first block shows holds for the whole file, also for a block of whole numbers."""
-    monkeypatch.setattr("amiwarp.io.text.READ_BYTES", 200)
+    monkeypatch.setattr("amiwarp.io.plain_files.READ_BYTES", 200)
     lines = [f"{k * 1e-4:.6f} {k / (8 if k < 90 else 1)} -0.25 1" for k in range(100)]
     write_lines(tmp_path / "a.txt", lines)
     events = open_recording(tmp_path / "a.txt").events.slice(0, 100)

@@ -19,7 +19,7 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
-from amiwarp.cli.info import _rows, describe
+from amiwarp.cli.recordings import _rows, describe
 from amiwarp.io.file_scan import head_only
 from reference.io_samples import SIZE, make_events, refusal
 from reference.io_samples_extra import arrays, packets, typestore, write_aedat2, write_mvsec, write_ros1, write_ros2
@@ -245,7 +245,7 @@ def test_aedat2_samples_have_the_ranges_of_the_header(tmp_path: Path, monkeypatc
     now = int(EVENTS.t[100])
     values = [4096, -8192, 100, 0, 328, -656, 131]
     # Blocks of few records, so that samples cross their ends; the last sample lacks a record.
-    monkeypatch.setattr("amiwarp.io.aedat2.DEFAULT_BLOCK", 4)
+    monkeypatch.setattr("amiwarp.io.aedat.DEFAULT_BLOCK", 4)
     extra = aedat2_sample(now, values) * 3 + aedat2_sample(now, values[:6])
     write_aedat2(tmp_path / "a.aedat", EVENTS, between=extra)
     recording = open_recording(tmp_path / "a.aedat")

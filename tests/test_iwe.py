@@ -7,8 +7,8 @@ import pytest
 import warp as wp
 
 from amiwarp import AmiwarpError, Camera, Encoder, Events, ExactModel, Prism, Vote, iwe
-from amiwarp.imaging import votes as pixel_votes
-from amiwarp.imaging.votes import FIRST_BATCH, CanvasShape, Image, Votes, upload_events
+from amiwarp.imaging import iwe as pixel_votes
+from amiwarp.imaging.iwe import FIRST_BATCH, CanvasShape, Image, Votes, upload_events
 from amiwarp.optics.models import MODELS
 
 

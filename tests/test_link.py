@@ -16,14 +16,11 @@ import pytest
 from typer.testing import CliRunner
 
 from amiwarp import AmiwarpError
-from amiwarp.cli import motor as command
-from amiwarp.live.link import follower as following
-from amiwarp.live.link import follower as updates
+from amiwarp.cli import rig as command
 from amiwarp.live.link import link as link_module
 from amiwarp.live.link.clocks import WRAP
 from amiwarp.live.link.emulator import LASTING_FAULTS, Controller, EmulatedFault, Motor, PseudoTerminal
-from amiwarp.live.link.follower import Follower, LinkUpdate
-from amiwarp.live.link.link import Link, open_port, usb_id
+from amiwarp.live.link.link import Follower, Link, LinkUpdate, open_port, usb_id
 from amiwarp.live.link.protocol import Answer, ControllerStatus, FrameDecoder, Index, Message, Ping, Samples, encode
 from tests.rig_world import LONG_S, Wire, World
 
@@ -243,7 +240,7 @@ def test_lines_of_text_are_given_out_at_once() -> None:
     for k, line in enumerate([b"123,\n", b"t_us,count\n", *text(range(5 * S, 8 * S, 1000))]):
         follower.feed(line, HOST + k * 1000)
     (news,) = taken(follower)
-    assert news.messages == ("port: lines of text have no index pulse: " + following.FROM_FIRST,)
+    assert news.messages == ("port: lines of text have no index pulse: " + link_module.FROM_FIRST,)
     assert len(news.t_us) == 3000
     np.testing.assert_allclose(news.angle, math.tau * np.arange(3000) / 1000, atol=1e-9)
     silent = Follower("port")
@@ -296,7 +293,7 @@ def test_a_host_that_sleeps_takes_nothing_for_a_reset() -> None:
 
 
 def test_memory_is_bounded_and_what_is_dropped_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(updates, "MOST_WAITING_SAMPLES", 1000)
+    monkeypatch.setattr(link_module, "MOST_WAITING_SAMPLES", 1000)
     line = Line("reset@1.5")
     news = [n for n in (line.follower.take(), *line.run(4.0)) if len(n.t_us)]
     assert sum(len(n.t_us) for n in news) == 1000
@@ -545,7 +542,7 @@ def motor(*args: object) -> tuple[int, str, BaseException | None]:
     from amiwarp.cli.options import command as register
 
     app = typer.Typer()
-    register(app, command.run, name="motor", example=command.EXAMPLE)
+    register(app, command.run_motor, name="motor", example="")
     done = CliRunner().invoke(app, [str(a) for a in args])
     return done.exit_code, done.stdout, done.exception
 

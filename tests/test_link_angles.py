@@ -5,7 +5,7 @@ import math
 import pytest
 
 from amiwarp import AmiwarpError
-from amiwarp.live.link.follower import AngleTracker, EncoderFault, FaultReport
+from amiwarp.live.link.link import AngleTracker, EncoderFault, FaultReport
 
 PER_TURN = 1000
 

@@ -26,8 +26,8 @@ from amiwarp import (
     RecordingWriter,
     open_recording,
 )
-from amiwarp.io.chunks import CHUNK
-from amiwarp.io.live_writer import MAX_WASTE_BYTES, LiveWriter
+from amiwarp.io.hdf5_files import CHUNK
+from amiwarp.io.native_writer import MAX_WASTE_BYTES, LiveWriter
 from reference.io_samples import refusal
 
 SIZE = (320, 240)
@@ -161,8 +161,8 @@ def test_a_copy_at_any_moment_is_a_recording(tmp_path, seed):
 KILLED = """
 import sys, time
 import numpy as np
-from amiwarp.events.events import Events
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.events.recording import Events
+from amiwarp.io.native_writer import LiveWriter
 n, zeros = int(sys.argv[2]), np.zeros(int(sys.argv[2]), np.uint16)
 with LiveWriter(sys.argv[1], width=320, height=240, flush_s=0.05) as writer:
     while True:
@@ -213,8 +213,8 @@ import os, signal, sys
 from pathlib import Path
 import h5py, hdf5plugin
 from amiwarp.io import open_recording
-from amiwarp.io.atomic_output import NewFile, remove_abandoned
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.io.files import NewFile, remove_abandoned
+from amiwarp.io.native_writer import LiveWriter
 here, part = Path.cwd(), Path("a.part.h5")
 opened = absent = 0
 LiveWriter("a.h5", width=320, height=240).__enter__()  # imports all that is needed
@@ -269,8 +269,8 @@ FULL = """
 import resource, sys
 import numpy as np
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.events.recording import Events
+from amiwarp.io.native_writer import LiveWriter
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), int(sys.argv[2])))
 rng, n = np.random.default_rng(0), 10_000
 writer = LiveWriter(sys.argv[1], width=320, height=240, flush_s=float(sys.argv[3]))
@@ -313,7 +313,7 @@ def test_an_interrupt_during_the_start_leaves_no_file(tmp_path, monkeypatch, mom
         assert list(tmp_path.glob(".a.part.h5.*.part"))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(f"amiwarp.io.live_writer.{moment}", interrupt)
+    monkeypatch.setattr(f"amiwarp.io.native_writer.{moment}", interrupt)
     with pytest.raises(KeyboardInterrupt), live(tmp_path / "a.h5"):
         pass
     assert os.listdir(tmp_path) == []

@@ -35,7 +35,7 @@ from amiwarp import (
 from amiwarp.calib.calibration_events import thin
 from amiwarp.calib.first_guess import estimate_rates
 from amiwarp.calib.parameters import RATES
-from amiwarp.io.text import read_calib
+from amiwarp.io.plain_files import read_calib
 from amiwarp.simulation.pictures import linear_luminance
 from tests.conftest import TRUE_PRISM
 

@@ -3,7 +3,6 @@
 import contextlib
 import errno
 import fcntl
-import importlib
 import inspect
 import json
 import math
@@ -45,14 +44,14 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
-from amiwarp.cli.app import SUMMARIES, app
+from amiwarp.cli.app import COMMANDS, app, function_of
 from amiwarp.cli.options import NO_FILE, OUTPUT, OUTPUT_FOLDER
 from amiwarp.events.truth import MAPS, MemoryFrames
 from amiwarp.imaging.export import IweFiles
-from amiwarp.io import atomic_output as output
-from amiwarp.io.atomic_output import NewFile, check_output, own_folder, remove_abandoned, write_text
+from amiwarp.io import files as output
+from amiwarp.io.files import NewFile, check_output, own_folder, remove_abandoned, write_text
 from amiwarp.io.json_files import read_json
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.io.native_writer import LiveWriter
 from reference.calibration_sample import exact_calibration
 
 SPECIFICATION = """
@@ -173,8 +172,7 @@ OVER_INPUTS = (
 
 def path_options(name: str) -> Iterator[tuple[str, bool]]:
     """Yield the options and arguments of a command that are paths, and whether the command writes to them."""
-    function = importlib.import_module(f"amiwarp.cli.{name}").run
-    for key, kind in get_type_hints(function, include_extras=True).items():
+    for key, kind in get_type_hints(function_of(name), include_extras=True).items():
         group = get_type_hints(kind, include_extras=True) if is_dataclass(kind) else {key: kind}
         for one, hint in group.items():
             marks = [mark for mark in getattr(hint, "__metadata__", ()) if isinstance(mark, str)]
@@ -193,7 +191,7 @@ def test_every_input_of_every_command_is_in_the_tables() -> None:
     """A new command or option that reads a file gets its lines in both tables."""
     over = {pair for line, _ in OVER_INPUTS for pair in options_of(line)}
     endless = {pair for line in ENDLESS for pair in options_of(line)}
-    for command in SUMMARIES:
+    for command in COMMANDS:
         options = list(path_options(command))
         read = {(command, option) for option, writes in options if not writes}
         assert read <= endless
@@ -309,8 +307,8 @@ NAMES: dict[tuple[str, str], tuple[str, tuple[str, ...]]] = {
 def output_options() -> set[tuple[str, str]]:
     """Return command and name of every option that is marked as an output."""
     found = set()
-    for command in SUMMARIES:
-        hints = get_type_hints(importlib.import_module(f"amiwarp.cli.{command}").run, include_extras=True)
+    for command in COMMANDS:
+        hints = get_type_hints(function_of(command), include_extras=True)
         for kind in [hint for hint in hints.values() if is_dataclass(hint)]:
             hints |= get_type_hints(kind, include_extras=True)
         marked = {OUTPUT, OUTPUT_FOLDER}
@@ -627,7 +625,7 @@ def test_a_replaced_file_keeps_who_may_read_it(tmp_path: Path) -> None:
 
 WRITER = """
 import os, sys
-from amiwarp.io.atomic_output import NewFile, scratch_folder
+from amiwarp.io.files import NewFile, scratch_folder
 os.getpid = lambda: int(sys.argv[1])  # a number in another namespace, or on another machine
 new = NewFile("a.txt")
 new.part.write_text("half")
@@ -731,7 +729,7 @@ def test_what_may_still_be_written_is_kept(tmp_path: Path, monkeypatch: pytest.M
 
 def test_sigkill_leaves_nothing_after_the_next_run(tmp_path: Path) -> None:
     script = (
-        "import os, signal, sys; from pathlib import Path; from amiwarp.io.atomic_output import NewFile\n"
+        "import os, signal, sys; from pathlib import Path; from amiwarp.io.files import NewFile\n"
         "new = NewFile(Path(sys.argv[1])); new.part.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)"
     )
     done = subprocess.run([sys.executable, "-c", script, tmp_path / "a.txt"], env=environment(), check=False)

@@ -38,7 +38,7 @@ from amiwarp import (
 from amiwarp.brightness.solver import CONTRAST, DAMPING, BrightnessMap, EventTable, PairSet, Residuals, Tiles
 from amiwarp.calib.calibration_events import EventsAhead
 from amiwarp.calib.photometric.cost import TILE, Slopes, choose_tiles, iterate, near_tiles, one_tile, van_der_corput
-from amiwarp.imaging.votes import CanvasShape, Image
+from amiwarp.imaging.iwe import CanvasShape, Image
 from tests.conftest import COARSE, TRUE_PHASE, TRUE_PRISM
 
 KNOWN = PhotometricSettings(sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))

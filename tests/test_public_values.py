@@ -29,10 +29,10 @@ from amiwarp import (
     open_recording,
 )
 from amiwarp.events.encoder import LARGEST_ANGLE
-from amiwarp.events.events import TIME_LIMIT, check_events
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.events.recording import check_events
+from amiwarp.io.native_writer import LiveWriter
 from amiwarp.optics.camera import LARGEST_FOCAL
-from amiwarp.validation import shown
+from amiwarp.validation import TIME_LIMIT, shown
 from tests.public_calls import CAMERA, RECORDING, REFUSED, PublicCall, public_calls, write_files
 
 

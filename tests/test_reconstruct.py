@@ -39,7 +39,7 @@ from amiwarp import (
 from amiwarp.brightness.solver import EventTable
 from amiwarp.choices import Tone
 from amiwarp.cli.app import app
-from amiwarp.io.text import read_calib
+from amiwarp.io.plain_files import read_calib
 from amiwarp.reconstruction.picture import (
     nodes_near,
     save_film,

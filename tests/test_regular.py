@@ -14,10 +14,9 @@ import pytest
 
 from amiwarp import AmiwarpError, Format, Trajectory, open_recording
 from amiwarp.io import read_encoder_csv
-from amiwarp.io.input_files import check_regular
-from amiwarp.io.json_files import read_toml
-from amiwarp.io.sealed_json import read_journal
-from amiwarp.io.text import read_calib
+from amiwarp.io.files import check_regular
+from amiwarp.io.json_files import read_journal, read_toml
+from amiwarp.io.plain_files import read_calib
 from amiwarp.simulation.pictures import open_pictures, read_picture
 from amiwarp.studies.chart.charts import Charts
 from reference.io_samples import SIZE, make_events, write_text

@@ -23,7 +23,7 @@ from amiwarp import (
     Simulation,
     simulate,
 )
-from amiwarp.cli.options import SensorOptions
+from amiwarp.cli.simulation import SensorOptions
 from amiwarp.kernels import pixels
 from amiwarp.simulation.pictures import DARK
 

@@ -32,15 +32,14 @@ from amiwarp import (
     save_recording,
 )
 from amiwarp.compensation.streams import OUTSIDE
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.io.native_writer import LiveWriter
 from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.queues import BackgroundWorker, Policy
 from amiwarp.live.stream import session as session_module
 from amiwarp.live.stream import sources
-from amiwarp.live.stream.cameras import LEAD_US, EmulatedCamera
 from amiwarp.live.stream.packets import Packet, make_packet
-from amiwarp.live.stream.queues import BackgroundWorker, Policy
 from amiwarp.live.stream.session import Session, SessionStatus
-from amiwarp.live.stream.sources import open_source
+from amiwarp.live.stream.sources import LEAD_US, EmulatedCamera, open_source
 from reference.calibration_sample import exact_calibration
 from tests.rig_world import LONG_S, Counted, Wire, World, has_taken_in
 

@@ -6,8 +6,8 @@ import warp as wp
 from scipy import ndimage
 
 from amiwarp import AmiwarpError, Sharpness, sharpness
-from amiwarp.imaging.sharpness import PAPER_ETA, SharpnessMeter, gaussian
-from amiwarp.imaging.votes import CanvasShape
+from amiwarp.imaging.iwe import CanvasShape
+from amiwarp.imaging.metrics import PAPER_ETA, SharpnessMeter, gaussian
 
 
 @pytest.fixture

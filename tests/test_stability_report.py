@@ -20,7 +20,7 @@ from typer.testing import CliRunner, Result
 
 from amiwarp import AmiwarpError
 from amiwarp.cli.app import app
-from amiwarp.io.sealed_json import sealed
+from amiwarp.io.json_files import sealed
 from amiwarp.studies.stability import cells as study
 from amiwarp.studies.stability.cells import METHODS, Axis, Cell, Condition, Outcome, Store, Stored, identity
 from amiwarp.studies.stability.cells import Result as Found
@@ -340,5 +340,5 @@ def test_command_says_what_is_wrong(tiny: Axis, tmp_path: Path) -> None:
 
 def test_command_names_the_extra_that_is_missing(tiny: Axis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    monkeypatch.setattr("amiwarp.cli.stability.cpu_threads", lambda: 2)  # a single worker needs no cluster
+    monkeypatch.setattr("amiwarp.cli.studies.cpu_threads", lambda: 2)  # a single worker needs no cluster
     assert "pip install 'amiwarp[cluster]'" in fails("--quick", "--out", tmp_path, "--device", "cpu")

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from amiwarp import AmiwarpError, Compensated, Compensator, Encoder, EncoderStream, Events, EventSource
-from amiwarp.events.events import held_bytes
+from amiwarp.events.recording import held_bytes
 from amiwarp.live.link.emulator import (
     MOST_OUT_BYTES,
     MOST_SEGMENTS,
@@ -28,18 +28,15 @@ from amiwarp.live.link.emulator import (
     Played,
     PseudoTerminal,
 )
-from amiwarp.live.link.follower import LinkUpdate
+from amiwarp.live.link.link import LinkUpdate
+from amiwarp.live.queues import BackgroundWorker, PacketQueue, Policy
 from amiwarp.live.stream import adaptive as speed_module
-from amiwarp.live.stream import phase_check as watch_module
-from amiwarp.live.stream import recent_events as ring_module
+from amiwarp.live.stream import session as session_module
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orbit
-from amiwarp.live.stream.cameras import EmulatedCamera
 from amiwarp.live.stream.packets import Packet, encode_hello, make_packet
-from amiwarp.live.stream.phase_check import PhaseCheck
-from amiwarp.live.stream.queues import BackgroundWorker, PacketQueue, Policy
-from amiwarp.live.stream.recent_events import RecentEvents
-from amiwarp.live.stream.session import Session
+from amiwarp.live.stream.session import PhaseCheck, RecentEvents, Session
 from amiwarp.live.stream.sockets import MOST_CLIENTS, PACKET_OVERHEAD, REST_S, PipeSink, SocketSink
+from amiwarp.live.stream.sources import EmulatedCamera
 from tests.rig_world import World
 from tests.test_session import KNOWN, MODEL, Made, points, world
 
@@ -256,7 +253,7 @@ def test_a_compensator_bounds_packets_of_one_event() -> None:
 
 
 def test_the_last_seconds_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ring_module, "MOST_BYTES", MOST)
+    monkeypatch.setattr(session_module, "MOST_BYTES", MOST)
     ring = RecentEvents(Made([]))
     for k in range(2000):
         ring.append(events(1, 7))
@@ -266,7 +263,7 @@ def test_the_last_seconds_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_the_watch_remembers_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(watch_module, "MOST_BYTES", MOST)
+    monkeypatch.setattr(session_module, "MOST_CHECK_BYTES", MOST)
     watch = PhaseCheck(KNOWN, 1.0, print)
     for k in range(3000):
         watch.put(events(1, k))

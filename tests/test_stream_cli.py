@@ -37,7 +37,7 @@ from amiwarp import (
     save_recording,
 )
 from amiwarp.cli.app import app
-from amiwarp.cli.live import describe
+from amiwarp.cli.rig import describe
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
 from amiwarp.live.stream.session import SessionStatus
 from amiwarp.live.stream.sockets import close_listener, listen

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from amiwarp.live.link.clocks import fit_to_round_trips
-from amiwarp.live.stream.camera_clock import CameraClock
+from amiwarp.live.link.clocks import CameraClock, fit_to_round_trips
 
 OFFSET, DRIFT = 1_700_000_000_000_000, 40e-6
 

@@ -8,7 +8,7 @@ import tracemalloc
 import pytest
 
 from amiwarp import AmiwarpError
-from amiwarp.live.link.follower import MOST_UPDATES, Follower
+from amiwarp.live.link.link import MOST_UPDATES, Follower
 from amiwarp.live.link.protocol import LONGEST, ControllerStatus, FrameDecoder, Samples, Sync, encode
 from amiwarp.live.stream.packets import HEADER, HELLO, LONGEST_HELLO, MAGIC, Hello, PacketDecoder
 from reference.mutation_frames import CAMERA, mutated_serial, mutated_stream, packed, read_serial, read_stream

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amiwarp import AmiwarpError, Camera, Compensated, Events, Fisheye, FlatSide, Prism, RadialTangential
+from amiwarp.live.queues import EventSorter
 from amiwarp.live.stream.packets import (
     ENCODER,
     HEADER,
@@ -30,7 +31,6 @@ from amiwarp.live.stream.packets import (
     encode_hello,
     encode_triggers,
 )
-from amiwarp.live.stream.queues import EventSorter
 
 CAMERAS = (
     None,

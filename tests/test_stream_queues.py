@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from amiwarp import AmiwarpError, Events
+from amiwarp.live.queues import PacketQueue, Policy
 from amiwarp.live.stream.packets import Packet
-from amiwarp.live.stream.queues import PacketQueue, Policy
 
 
 def packet(first: int, n: int) -> Packet:

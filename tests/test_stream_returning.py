@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from amiwarp import AmiwarpError, Camera, Encoder, Events, Prism, open_recording
 from amiwarp.cli.app import app
 from amiwarp.live.stream.packets import Packet, encode_encoder, encode_end, encode_events, encode_hello, encode_triggers
-from amiwarp.live.stream.recent_events import RecentEvents, followed
+from amiwarp.live.stream.session import RecentEvents, followed
 from amiwarp.live.stream.sockets import close_listener, listen
 from amiwarp.live.stream.sources import open_source
 from reference.calibration_sample import exact_calibration

@@ -15,8 +15,9 @@ import pytest
 
 from amiwarp import AmiwarpError, Camera, Encoder, Events, Prism, RecordingWriter
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream import cameras, sockets, sources
+from amiwarp.live.stream import sockets, sources
 from amiwarp.live.stream import sockets as connections
+from amiwarp.live.stream import sources as cameras
 from amiwarp.live.stream.packets import (
     HEADER,
     End,

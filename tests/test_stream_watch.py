@@ -29,11 +29,10 @@ from amiwarp import (
     save_recording,
     simulate,
 )
-from amiwarp.live.stream import recent_events as ring_module
+from amiwarp.live.stream import session as ring_module
 from amiwarp.live.stream.adaptive import WINDOW_US, SpeedController, SpeedKeeper, prism_orbit
 from amiwarp.live.stream.packets import EncoderSamples, Packet, PacketDecoder
-from amiwarp.live.stream.phase_check import PhaseCheck
-from amiwarp.live.stream.recent_events import SECONDS, RecentEvents, followed
+from amiwarp.live.stream.session import SECONDS, PhaseCheck, RecentEvents, followed
 from amiwarp.live.stream.sockets import Forward
 from amiwarp.live.stream.sources import FileSource, open_source
 from amiwarp.viewer.inspector import Inspector

@@ -186,10 +186,10 @@ OPEN_NO_FILE = {
 }  # fmt: skip
 """Functions with such names that read no file."""
 OPENED_OTHERWISE = {
-    "amiwarp.io.input_files: open(path, 'rb')": "the way that all take",
+    "amiwarp.io.files: open(path, 'rb')": "the way that all take",
     # Functions of the reading process. ReadingProcess.send has checked and noted the path.
-    "amiwarp.io.aedat4: aedat.Decoder(path)": "reading process",
-    "amiwarp.io.event_stream: es.Decoder(path, 0)": "reading process",
+    "amiwarp.io.aedat: aedat.Decoder(path)": "reading process",
+    "amiwarp.io.prophesee: es.Decoder(path, 0)": "reading process",
     "amiwarp.io.prophesee: evt.Decoder(path, WIDEST, 'evt3')": "reading process",
     "amiwarp.io.hdf5_server: h5py.File(path, 'r')": "reading process",
     "amiwarp.io.hdf5_server: h5py.File(path, 'r', rdcc_nbytes=CACHE_BYTES)": "reading process",
@@ -199,7 +199,7 @@ OPENED_OTHERWISE = {
     "amiwarp.io.ros: open(path, 'rb')": "reading process",
     "amiwarp.io.ros: bag.open()": "reading process",
     # Files of the system and of the package.
-    "amiwarp.io.atomic_output: Path('/proc/sys/kernel/random/boot_id').read_text()": "system",
+    "amiwarp.io.files: Path('/proc/sys/kernel/random/boot_id').read_text()": "system",
     "amiwarp.io.reading_process: open('/proc/self/statm')": "system",
     "amiwarp.io.reading_process: open(f'/proc/self/fdinfo/{number}')": "system",
     "amiwarp.studies.cluster: info.read_text()": "system",
@@ -208,14 +208,14 @@ OPENED_OTHERWISE = {
     "amiwarp.viewer.serve: (FOLDER / 'page.html').read_text(encoding='utf-8')": "file of the package",
     # Unfinished files of this process, or of a child of it.
     "amiwarp.imaging.export: open(part, 'r+b')": "own file",
-    "amiwarp.io.atomic_output: open(path, 'r+b')": "lock file",
-    "amiwarp.io.live_writer: open(self.part, 'r+b')": "own file",
-    "amiwarp.io.npz: (folder / name).open('rb')": "own file",
+    "amiwarp.io.files: open(path, 'r+b')": "lock file",
+    "amiwarp.io.native_writer: open(self.part, 'r+b')": "own file",
+    "amiwarp.io.plain_files: (folder / name).open('rb')": "own file",
     "amiwarp.plotting.clouds: np.load(picture)": "own file",
     "amiwarp.plotting.clouds: np.load(points)": "own file",
-    "amiwarp.viewer.exports: path.read_bytes()": "own file",
+    "amiwarp.viewer.jobs: path.read_bytes()": "own file",
     # What is no file.
-    "amiwarp.io.text: np.loadtxt(kept, ndmin=2, comments=None, encoding='ascii')": "lines",
+    "amiwarp.io.plain_files: np.loadtxt(kept, ndmin=2, comments=None, encoding='ascii')": "lines",
     "amiwarp.plotting.figures: Image.open(buffer)": "bytes",
     "amiwarp.simulation.worlds.world_files: Image.open(io.BytesIO(data), formats=PICTURE_FORMATS)": "bytes",
     "amiwarp.simulation.worlds.world_files: trimesh.load(file, file_type=kind, resolver=files, force='scene', "

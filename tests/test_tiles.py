@@ -18,7 +18,7 @@ from amiwarp import (
     RadialTangential,
     Vote,
 )
-from amiwarp.imaging.votes import CanvasShape, Image, TileVotes, Votes, upload_events
+from amiwarp.imaging.iwe import CanvasShape, Image, TileVotes, Votes, upload_events
 
 pytestmark = pytest.mark.skipif(not wp.is_cuda_available(), reason="no CUDA device")
 

@@ -26,7 +26,7 @@ from amiwarp import (
 )
 from amiwarp.cli.app import app
 from amiwarp.cli.options import NominalPrismOptions
-from amiwarp.io.camera_files import prism_attributes, read_prism
+from amiwarp.io.rig_files import prism_attributes, read_prism
 from amiwarp.viewer.inspector import Inspector
 
 APEX, INDEX = math.radians(1.0), 1.55

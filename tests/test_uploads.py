@@ -7,7 +7,7 @@ import pytest
 
 from amiwarp import AmiwarpError, Camera, Encoder, Events, ExactModel, Prism
 from amiwarp.calib.calibration_events import CalibrationEvents
-from amiwarp.imaging.votes import LARGEST_WEIGHT, TURNS, CanvasShape, Votes, upload_events
+from amiwarp.imaging.iwe import LARGEST_WEIGHT, TURNS, CanvasShape, Votes, upload_events
 
 
 def still_scene(n: int, points: int = 200, seed: int = 0) -> Events:

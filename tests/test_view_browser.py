@@ -27,11 +27,10 @@ from amiwarp import (
     save_recording,
     simulate,
 )
-from amiwarp.viewer import exports, jobs
+from amiwarp.viewer import jobs
 from amiwarp.viewer.inspector import Inspector, Library
-from amiwarp.viewer.jobs import LiveFigures, LiveSource, estimate_phase
+from amiwarp.viewer.jobs import JobCancelled, LiveFigures, LiveSource, estimate_phase
 from amiwarp.viewer.layout import KEYS, SETTABLE
-from amiwarp.viewer.work import JobCancelled
 from tests.test_serve import WAIT_S, served, until
 
 pytest.importorskip("trame_client")
@@ -480,7 +479,7 @@ def test_downloads_leave_no_file_on_the_server(
 
     folder = recording.events.path.parent  # type: ignore[attr-defined]
     before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
-    monkeypatch.setattr(exports, "FRAMES", 4)
+    monkeypatch.setattr(jobs, "FRAMES", 4)
     with Image.open(download(page, "picture", tmp_path)) as picture:
         assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
     left, top, right, bottom = region(page)

@@ -21,9 +21,9 @@ from typer.testing import CliRunner
 import amiwarp
 from amiwarp import Camera, MemoryEvents, Prism, open_recording, save_recording, simulate
 from amiwarp.cli.app import app
-from amiwarp.viewer import app as viewer_app
-from amiwarp.viewer.app import BROWSERS, has_display, open_window
+from amiwarp.viewer import panel as viewer_app
 from amiwarp.viewer.inspector import Inspector, Library
+from amiwarp.viewer.panel import BROWSERS, has_display, open_window
 from reference.calibration_sample import exact_calibration
 
 

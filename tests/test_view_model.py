@@ -32,21 +32,32 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.choices import Axis, Colour, View
-from amiwarp.imaging.sharpness import random_variance, relative_variance
-from amiwarp.imaging.votes import CanvasShape, Votes
-from amiwarp.viewer import exports, timeline
-from amiwarp.viewer import images as log_intensity
-from amiwarp.viewer import images as selected_part
+from amiwarp.imaging.iwe import CanvasShape, Votes
+from amiwarp.imaging.metrics import random_variance, relative_variance
+from amiwarp.viewer import drawing, jobs
+from amiwarp.viewer import inspector as timeline
 from amiwarp.viewer import inspector as viewer
-from amiwarp.viewer.exports import as_bytes, write_events, write_image
-from amiwarp.viewer.images import ImageKind, Scale, make_images
-from amiwarp.viewer.inspector import Inspector, suggest_region
-from amiwarp.viewer.jobs import cost_surface, estimate_phase, find_calibration, scope_text
-from amiwarp.viewer.layout import events_text
+from amiwarp.viewer.drawing import ImageKind, Scale, make_images
+from amiwarp.viewer.inspector import EventRates, Inspector, Knobs, Selection, Source, suggest_region
+from amiwarp.viewer.jobs import (
+    as_bytes,
+    cost_surface,
+    estimate_phase,
+    find_calibration,
+    scope_text,
+    write_events,
+    write_image,
+)
+from amiwarp.viewer.layout import (
+    History,
+    ViewState,
+    apply_state,
+    current_state,
+    decode_state,
+    encode_state,
+    events_text,
+)
 from amiwarp.viewer.panel import Panel
-from amiwarp.viewer.timeline import EventRates
-from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
-from amiwarp.viewer.window import Knobs, Selection, Source
 
 TRUE = Prism(math.radians(1.0))
 
@@ -394,11 +405,11 @@ def test_a_log_intensity_is_that_of_the_scene(inspector: Inspector) -> None:
 
 
 def test_preparing_a_log_intensity_does_not_change_it(inspector: Inspector, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(log_intensity, "_prepared", set())
+    monkeypatch.setattr(drawing, "_prepared", set())
     expected = make_images(inspector, ImageKind.LOG_INTENSITY).after
     inspector.loaded.chosen.clear()
-    log_intensity.prepare(inspector)
-    assert log_intensity._prepared == {"cpu"}
+    drawing.prepare(inspector)
+    assert drawing._prepared == {"cpu"}
     assert inspector.loaded.chosen == []
     np.testing.assert_array_equal(make_images(inspector, ImageKind.LOG_INTENSITY).after, expected)
 
@@ -431,8 +442,8 @@ def test_a_log_intensity_of_a_large_image_uses_a_part_of_its_pixels(
 ) -> None:
     inspector.open(*inspector.first_window())
     whole = make_images(inspector, ImageKind.LOG_INTENSITY).after
-    monkeypatch.setattr(log_intensity, "MOST_WORK", 20_000)
-    monkeypatch.setattr(selected_part, "MOST_EVENTS", 40_000)
+    monkeypatch.setattr(drawing, "MOST_WORK", 20_000)
+    monkeypatch.setattr(drawing, "MOST_EVENTS", 40_000)
     found = make_images(inspector, ImageKind.LOG_INTENSITY)
     assert found.after.shape == whole.shape
     assert "25 % of the pixels" in found.note
@@ -704,7 +715,7 @@ def test_the_events_of_the_window_are_downloaded(
     inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, compensated: bool, most_events: int
 ) -> None:
     monkeypatch.setattr(viewer, "MOST_EVENTS", most_events)
-    monkeypatch.setattr(exports, "BLOCK", 10_000)
+    monkeypatch.setattr(jobs, "BLOCK", 10_000)
     region, (start, length) = (20, 10, 140, 110), inspector.first_window()
     inspector.open(start, length, Selection(1, region))
     path = tmp_path / "events.h5"
@@ -735,7 +746,7 @@ def test_the_noise_filter_of_a_download_does_not_restart_at_its_blocks(
     expected = inspector.loaded.events
     assert 0.2 * inspector.loaded.span.count < len(expected) < 0.95 * inspector.loaded.span.count
     monkeypatch.setattr(viewer, "MOST_EVENTS", 6400)
-    monkeypatch.setattr(exports, "BLOCK", 500)
+    monkeypatch.setattr(jobs, "BLOCK", 500)
     thinned = Inspector(inspector.recording)
     thinned.open(*window, Selection(noise_us=300))
     assert write_events(thinned, tmp_path / "events.h5", compensated=False) == len(expected)

@@ -26,11 +26,10 @@ from amiwarp import (
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.cli.app import app
 from amiwarp.viewer import inspector as viewer
-from amiwarp.viewer import window
-from amiwarp.viewer.clouds import CAUSE_COLOURS, GREY, Look, Scene, colours_of, event_text, legend_of
-from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer import inspector as window
+from amiwarp.viewer.drawing import CAUSE_COLOURS, GREY, Look, Scene, colours_of, event_text, legend_of
+from amiwarp.viewer.inspector import Inspector, Selection, colours_on_offer, truth_text
 from amiwarp.viewer.layout import initial_state
-from amiwarp.viewer.window import Selection, colours_on_offer, truth_text
 
 COUNT, SIZE = 6000, (40, 30)
 WITHOUT = [Colour.POLARITY, Colour.ANGLE, Colour.TIME, Colour.DENSITY, Colour.RESIDUAL]

@@ -29,11 +29,9 @@ from amiwarp.calib.bad_pixels import MaskedEventSource
 from amiwarp.calib.parameters import build_model
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
-from amiwarp.viewer import window
-from amiwarp.viewer.clouds import WIDEST_PX, Look, Scene, axis_range, colours_of, orbit_lines, residual, third_axis
-from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.timeline import read_span
-from amiwarp.viewer.window import Knobs, Selection
+from amiwarp.viewer import inspector as window
+from amiwarp.viewer.drawing import WIDEST_PX, Look, Scene, axis_range, colours_of, orbit_lines, residual, third_axis
+from amiwarp.viewer.inspector import Inspector, Knobs, Selection, read_span
 from reference.calibration_sample import exact_calibration
 
 TRUE = Prism(math.radians(1.0))

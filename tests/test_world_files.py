@@ -17,7 +17,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from amiwarp import AmiwarpError, Sun, Trajectory, load_world
-from amiwarp.io.input_files import inputs_in_use, inputs_noted
+from amiwarp.io.files import inputs_in_use, inputs_noted
 from amiwarp.simulation.pictures import LUMINANCE, linear_luminance
 from amiwarp.simulation.worlds.world_files import load_mesh
 

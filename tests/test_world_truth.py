@@ -23,7 +23,7 @@ import amiwarp
 from amiwarp import AmiwarpError
 from amiwarp.cli.app import app
 from amiwarp.events.truth import MAPS
-from amiwarp.io.chunks import CHUNK
+from amiwarp.io.hdf5_files import CHUNK
 from amiwarp.simulation.simulator import chosen_instants
 from amiwarp.simulation.worlds import world_files
 
@@ -432,7 +432,7 @@ def test_flow_as_dsec_stores_it(recording: amiwarp.Recording, tmp_path: Path) ->
 
 
 def test_unknown_and_large_flow_is_marked() -> None:
-    from amiwarp.io.truth_export import dsec_picture
+    from amiwarp.io.export import dsec_picture
 
     moved = np.array([[[np.nan, 0.0], [256.0, 0.0], [255.99, -256.0], [0.0, 0.0]]])
     picture = dsec_picture(moved)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, encoder_params, join, time_span
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
+from amiwarp.events.recording import Events
 from amiwarp.kernels import conjugate_gradients as cg
 from amiwarp.kernels import equations as eqs
 from amiwarp.kernels import equations_cpu, equations_cuda, multilevel

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.events import Events, EventSource
+from amiwarp.events.recording import Events, EventSource
 
 MOST_TURNS, LEAST_TURNS, MOST_EVENTS = 8, 2, 2_500_000
 """Limits of the part of a recording that is searched for bad pixels: most turns of the prism, fewest turns, most

@@ -30,8 +30,7 @@ from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, Settings
 from amiwarp.calib.sharpness import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, size_names
 from amiwarp.optics.prism import Prism

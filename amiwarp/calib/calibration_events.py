@@ -16,9 +16,8 @@ from amiwarp.calib.parameters import MOTION
 from amiwarp.calib.settings import Settings
 from amiwarp.events.device_events import NAMES, DeviceEvents
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.votes import UploadedEvents, upload_events
+from amiwarp.events.recording import Events, MemoryEvents, Recording
+from amiwarp.imaging.iwe import UploadedEvents, upload_events
 from amiwarp.kernels.launch import pool
 
 SlopeOf = Callable[[NDArray[np.int64]], NDArray[np.float64]]

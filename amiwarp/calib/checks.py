@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from amiwarp.calib.bad_pixels import BadPixelSummary
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.imaging.sharpness import edge_coherence
-from amiwarp.imaging.votes import Image
+from amiwarp.imaging.iwe import Image
+from amiwarp.imaging.metrics import edge_coherence
 from amiwarp.optics.models import MODELS
 from amiwarp.optics.prism import Prism
 

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.optics.camera import Camera
 
 # Speed of the prism from the events alone: the events of a still scene repeat in every turn.

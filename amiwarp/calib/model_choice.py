@@ -27,10 +27,9 @@ from amiwarp.calib.sharpness import STEP_PX, HalfSharpness, Quadratic, gradient,
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
-from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.imaging.votes import CanvasShape, Votes
+from amiwarp.events.recording import Events, MemoryEvents, Recording
+from amiwarp.imaging.iwe import CanvasShape, Votes
+from amiwarp.imaging.metrics import SharpnessMeter
 from amiwarp.optics.models import MODELS, ExactModel, Model, compensate_by_each, predicted_error, rms, rungs, wrap_angle
 from amiwarp.optics.prism import UnsizedPrism
 from amiwarp.validation import real

@@ -19,8 +19,7 @@ from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.settings import STAGES, Settings
 from amiwarp.calib.sharpness import Search
 from amiwarp.choices import Sharpness
-from amiwarp.events.events import MemoryEvents
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.progress import Progress
 
 WINDOW_US = 2_000_000

@@ -14,9 +14,8 @@ from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.parameters import values_of
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.atomic_output import write_text
+from amiwarp.io.files import errors_name, write_text
 from amiwarp.io.formats import check_ending
-from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import fields_of, read_json
 from amiwarp.optics.models import MODELS, Model, rungs
 from amiwarp.validation import check_names, one_of, shown

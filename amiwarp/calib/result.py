@@ -18,11 +18,10 @@ from amiwarp.calib.parameters import MOTION, build_model, rotation_from_values, 
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.io.atomic_output import write_text
-from amiwarp.io.camera_files import camera_from_json, camera_to_json
+from amiwarp.io.files import errors_name, write_text
 from amiwarp.io.formats import check_ending
-from amiwarp.io.input_files import errors_name
 from amiwarp.io.json_files import build, fields_of, read_json
+from amiwarp.io.rig_files import camera_from_json, camera_to_json
 from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.optics.models import MODELS, ExactModel, Model
 from amiwarp.optics.prism import Prism

@@ -20,9 +20,9 @@ from amiwarp.calib.parameters import MOTION, ParameterSpace, build_model, like_s
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.settings import Settings, stage_share
 from amiwarp.choices import Sharpness
-from amiwarp.events.events import Events
-from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.imaging.votes import CanvasShape, Image, TileVotes, UploadedEvents, Votes, upload_events
+from amiwarp.events.recording import Events
+from amiwarp.imaging.iwe import CanvasShape, Image, TileVotes, UploadedEvents, Votes, upload_events
+from amiwarp.imaging.metrics import SharpnessMeter
 from amiwarp.optics.camera import Camera, border
 from amiwarp.optics.models import MODELS, Model, points_on_host
 from amiwarp.progress import Progress

@@ -5,9 +5,9 @@ import importlib
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -21,58 +21,138 @@ _UsageError: Any = typer.BadParameter.__base__
 """Class ``UsageError`` of click, taken from Typer, because newer versions of Typer contain their own copy of click."""
 
 
-SUMMARIES = {
-    "demo": "Simulate a recording, calibrate it without an initial guess, compensate it and reconstruct the picture.",
-    "info": "Show a recording's format, events, encoder, camera, prism, IMU, frames, ground truth and repairs.",
-    "view": "Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand.",
-    "convert": "Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.",
-    "simulate": (
-        "Simulate the recording of a picture or a world by an event camera behind the prism, with its ground truth."
+class Command(NamedTuple):
+    """Entry of the list of commands. Its texts are here so that ``amiwarp --help`` need not load the command."""
+
+    file: str
+    """Module of ``amiwarp.cli`` whose function ``run_NAME`` is the command."""
+    summary: str
+    """First sentence of the help."""
+    example: str
+    """Example in the help."""
+
+
+COMMANDS = {
+    "demo": Command(
+        "studies",
+        "Simulate a recording, calibrate it without an initial guess, compensate it and reconstruct the picture.",
+        "amiwarp demo --out amiwarp-demo",
     ),
-    "translate": (
-        "Simulate the recording of an event camera behind the prism from a video, pictures, or a plain event recording."
+    "info": Command(
+        "recordings",
+        "Show a recording's format, events, encoder, camera, prism, IMU, frames, ground truth and repairs.",
+        "amiwarp info recording.h5",
     ),
-    "dataset": "Make thousands of simulated recordings from a specification, with labels, splits and a manifest.",
-    "calibrate": (
-        "Find the prism's parameters by contrast maximisation: those that make the image of warped events sharpest."
+    "view": Command(
+        "view",
+        "Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand.",
+        "amiwarp view recording.h5 --calibration calibration.json",
     ),
-    "compensate": "Compensate the prism's motion: move every event to its position without the prism.",
-    "reconstruct": "Reconstruct a picture of the scene from the events of a window, or a video from a sliding window.",
-    "chart": "Measure speed and error of the settings on a recording with ground truth, and draw both Pareto fronts.",
-    "design": "Compare prisms and speeds for a camera, and recommend one with the reasons.",
-    "stability": (
-        "Calibrate simulated recordings under growing disturbances, and draw where calibration works and fails."
+    "convert": Command(
+        "recordings",
+        "Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.",
+        "amiwarp convert events.raw recording.h5 --encoder encoder.csv --counts-per-turn 4096 --fov-deg 60",
     ),
-    "evaluate": (
-        "Check the AMI-EV paper's results: compare with a plain event camera on simulated worlds, and write a report."
+    "simulate": Command(
+        "simulation",
+        "Simulate the recording of a picture or a world by an event camera behind the prism, with its ground truth.",
+        "amiwarp simulate recording.h5 --picture photo.jpg --duration 0.5 --apex-deg 1 --rpm 720",
     ),
-    "truth": (
-        "Export the ground truth of a simulated world: optical flow in the DSEC or MVSEC format, poses as TUM files."
+    "translate": Command(
+        "simulation",
+        "Simulate the recording of an event camera behind the prism from a video, pictures, or a plain event "
+        "recording.",
+        "amiwarp translate video.mp4 recording.h5 --apex-deg 1 --rpm 720",
     ),
-    "motor": "Set the speed of the prism's motor, stop it, or print the controller's status.",
-    "record": "Record events and prism angles until the source ends, --seconds have passed, or Ctrl-C.",
-    "live": "Compensate the events of a live stream and show rate, latency, coverage and sharpness on one line.",
-    "emulate": "Emulate a prism controller with motor, encoder and index pulse, and inject faults on request.",
+    "dataset": Command(
+        "studies",
+        "Make thousands of simulated recordings from a specification, with labels, splits and a manifest.",
+        "amiwarp dataset shapes.toml shapes --dry-run",
+    ),
+    "calibrate": Command(
+        "calibration",
+        "Find the prism's parameters by contrast maximisation: those that make the image of warped events sharpest.",
+        "amiwarp calibrate recording.h5 calibration.json --figure calibration.png",
+    ),
+    "compensate": Command(
+        "calibration",
+        "Compensate the prism's motion: move every event to its position without the prism.",
+        "amiwarp compensate recording.h5 compensated.h5 --calibration calibration.json --iwe iwe.png",
+    ),
+    "reconstruct": Command(
+        "calibration",
+        "Reconstruct a picture of the scene from the events of a window, or a video from a sliding window.",
+        "amiwarp reconstruct recording.h5 picture.png --calibration calibration.json --turns 1",
+    ),
+    "chart": Command(
+        "studies",
+        "Measure speed and error of the settings on a recording with ground truth, and draw both Pareto fronts.",
+        "amiwarp chart --out amiwarp-chart --budget-px 0.3",
+    ),
+    "design": Command(
+        "studies",
+        "Compare prisms and speeds for a camera, and recommend one with the reasons.",
+        "amiwarp design --size 640x480 --fov-deg 60 --tolerance-px 0.5 --out amiwarp-design",
+    ),
+    "stability": Command(
+        "studies",
+        "Calibrate simulated recordings under growing disturbances, and draw where calibration works and fails.",
+        "amiwarp stability --quick --out amiwarp-atlas",
+    ),
+    "evaluate": Command(
+        "studies",
+        "Check the AMI-EV paper's results: compare with a plain event camera on simulated worlds, and write a report.",
+        "amiwarp evaluate --out evaluation --only texture",
+    ),
+    "truth": Command(
+        "recordings",
+        "Export the ground truth of a simulated world: optical flow in the DSEC or MVSEC format, poses as TUM files.",
+        "amiwarp truth recording.h5 exported --flow dsec --poses tum",
+    ),
+    "motor": Command(
+        "rig",
+        "Set the speed of the prism's motor, stop it, or print the controller's status.",
+        "amiwarp motor set --port /dev/ttyACM0 --rpm 720",
+    ),
+    "record": Command(
+        "rig",
+        "Record events and prism angles until the source ends, --seconds have passed, or Ctrl-C.",
+        "amiwarp record dv recording.h5 --port find --seconds 10",
+    ),
+    "live": Command(
+        "rig",
+        "Compensate the events of a live stream and show rate, latency, coverage and sharpness on one line.",
+        "amiwarp live dv --port find --calibration calibration.json --out compensated.h5",
+    ),
+    "emulate": Command(
+        "rig",
+        "Emulate a prism controller with motor, encoder and index pulse, and inject faults on request.",
+        "amiwarp emulate --link ./prism --rpm 720 --fault slip@5 --fault unplug@10+2",
+    ),
 }
-"""First sentence of each command's help, in the order of the list of commands.
-
-They are written here too, so that ``amiwarp --help`` need not load the commands.
-"""
+"""Every command, in the order of the list of commands."""
 
 
-class _Commands(Mapping[str, Any]):
+def function_of(name: str) -> Callable[..., None]:
+    """Load the module of a command and return the command's function."""
+    module = importlib.import_module(f"amiwarp.cli.{COMMANDS[name].file}")
+    function: Callable[..., None] = getattr(module, f"run_{name}")
+    return function
+
+
+class _LoadedCommands(Mapping[str, Any]):
     """All commands by name. The module of a command is loaded when the command is taken from here."""
 
     def __getitem__(self, name: str) -> Any:
-        if name not in SUMMARIES:
+        if name not in COMMANDS:
             raise KeyError(name)
         return _loaded(name)
 
     def __iter__(self) -> Iterator[str]:
-        return iter(SUMMARIES)
+        return iter(COMMANDS)
 
     def __len__(self) -> int:
-        return len(SUMMARIES)
+        return len(COMMANDS)
 
 
 @cache
@@ -80,9 +160,8 @@ def _loaded(name: str) -> Any:
     """Load the module of a command and return the command."""
     from amiwarp.cli.options import command  # NumPy is loaded with it
 
-    module = importlib.import_module(f"amiwarp.cli.{name}")
     one = typer.Typer(rich_markup_mode="rich", add_completion=False)
-    command(one, module.run, name=name, example=module.EXAMPLE)
+    command(one, function_of(name), name=name, example=COMMANDS[name].example)
     return typer.main.get_command(one)
 
 
@@ -91,18 +170,18 @@ class _Group(TyperGroup):
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
-        self.commands: Any = _Commands()
+        self.commands: Any = _LoadedCommands()
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return list(SUMMARIES)
+        return list(COMMANDS)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help with the summaries, without loading the commands."""
-        self.commands = {name: TyperCommand(name, help=text) for name, text in SUMMARIES.items()}
+        self.commands = {name: TyperCommand(name, help=one.summary) for name, one in COMMANDS.items()}
         try:
             super().format_help(ctx, formatter)
         finally:
-            self.commands = _Commands()
+            self.commands = _LoadedCommands()
 
     def main(self, *args: Any, **extra: Any) -> Any:
         extra["standalone_mode"] = False

@@ -1,4 +1,4 @@
-"""Groups of command line options as dataclasses: each group is defined once and used by any number of commands."""
+"""Groups of command line options that several commands use, as dataclasses: each group is defined once."""
 
 from __future__ import annotations
 
@@ -9,29 +9,19 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from amiwarp.choices import Seeing
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io import atomic_output as output
-from amiwarp.io.camera_files import camera_from_json
-from amiwarp.io.formats import check_ending
-from amiwarp.io.input_files import check_regular, errors_name, text_lines
+from amiwarp.io import files as output
+from amiwarp.io.files import check_regular, errors_name
 from amiwarp.io.json_files import read_json
-from amiwarp.io.text import read_calib
+from amiwarp.io.plain_files import read_calib
+from amiwarp.io.rig_files import camera_from_json
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
-from amiwarp.simulation.description import EncoderModel, PrismMotion, SensorModel
-from amiwarp.simulation.worlds.world import WorldScene
-
-if TYPE_CHECKING:
-    from amiwarp.simulation.simulator import Simulation
-
-
-# Options and texts of the command line, converted to cameras, prisms and numbers with units.
+from amiwarp.optics.prism import FlatSide, NominalPrism, UnsizedPrism
 
 Topic = Annotated[
     str | None, typer.Option(help="Topic of a ROS bag, or camera of an HDF5 file, if the file holds several.")
@@ -41,8 +31,6 @@ Topic = Annotated[
 _in_common = partial(typer.Option, rich_help_panel="Common")
 _in_camera = partial(typer.Option, rich_help_panel="Camera")
 _in_prism = partial(typer.Option, rich_help_panel="Prism")
-_in_sensor = partial(typer.Option, rich_help_panel="Sensor")
-_in_encoder = partial(typer.Option, rich_help_panel="Encoder")
 
 
 @dataclass(frozen=True)
@@ -194,6 +182,14 @@ def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
     return values
 
 
+def parse_size(text: str) -> tuple[int, int]:
+    """Convert a size such as ``640x480``. Raises :class:`AmiwarpError` if the text is not a size."""
+    width, x, height = text.partition("x")
+    if not (x and width.isdigit() and height.isdigit()):
+        raise AmiwarpError(f"--size {text!r} is not a size; write it like 640x480")
+    return int(width), int(height)
+
+
 def span(text: str, first: int, last: int) -> tuple[int, int]:
     """Convert ``START:END`` [s after ``first``] to times on the clock of ``first`` and ``last`` [us].
 
@@ -291,261 +287,3 @@ def _option_parameters(group: type) -> list[inspect.Parameter]:
         )
         for f in fields(group)
     ]
-
-
-# Options for simulated recordings: camera, prism, motion of the prism, encoder and sensor.
-
-MOST_SPEEDS = 1_000_000
-"""Largest number of rows of a table of speeds."""
-
-
-@dataclass(frozen=True)
-class RigOptions:
-    """Options for the camera and the prism of a simulation."""
-
-    size: Annotated[
-        str | None,
-        _in_camera(
-            help="Size of the camera's image (px). Default: 640x480; for 'amiwarp translate', its pictures' size.",
-            metavar="WIDTHxHEIGHT",
-        ),
-    ] = None
-    fov_deg: Annotated[
-        float | None, _in_camera(help="Horizontal field of view (deg). Default: 60 if --camera is not given.")
-    ] = None
-    camera: Annotated[Path | None, _in_camera(help="Camera intrinsics: JSON (including the size) or calib.txt.")] = None
-    apex_deg: Annotated[float, _in_prism(help="True apex angle of the prism (deg).")] = 1.0
-    nominal_apex_deg: Annotated[
-        float | None, _in_prism(help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.")
-    ] = None
-    index: Annotated[float, _in_prism(help="Refractive index of the prism.")] = 1.5168
-    flat_side: Annotated[FlatSide, _in_prism(help="Side that the prism's flat face is on.")] = FlatSide.SCENE
-    rpm: Annotated[float, _in_prism(help="Speed of the prism (turns/min); negative: backwards.")] = 720.0
-    speed: Annotated[
-        Path | None, _in_prism(help="Speed over time, instead of --rpm: CSV with 'seconds,rpm' on each line.")
-    ] = None
-    phase_deg: Annotated[float, _in_prism(help="Azimuth of the prism at encoder angle 0 (deg).")] = 0.0
-    tilt_deg: Annotated[
-        str, _in_prism(help="Tilt of the prism's rotation axis about the camera's x and y axes (deg).", metavar="X,Y")
-    ] = "0,0"
-
-    def build_camera(self, default: tuple[int, int] = (640, 480)) -> Camera:
-        """Return the camera. ``default`` is the size of its image [px] if no option gives one."""
-        width, height = default if self.size is None else parse_size(self.size)
-        if self.camera is None:
-            return Camera.from_fov(width, height, math.radians(60.0 if self.fov_deg is None else self.fov_deg))
-        if self.fov_deg is not None:
-            raise AmiwarpError("--fov-deg and --camera both describe the camera; give one of them")
-        return read_camera(self.camera, width, height)
-
-    def build_prism(self) -> Prism:
-        """Return the prism with its true parameters."""
-        return Prism(math.radians(self.apex_deg), self.index, self.flat_side)
-
-    def build_nominal(self) -> Prism:
-        """Return the nominal prism that is stored with the recording."""
-        nominal = self.apex_deg if self.nominal_apex_deg is None else self.nominal_apex_deg
-        return replace(self.build_prism(), apex=math.radians(nominal))
-
-    def build_motion(self) -> PrismMotion:
-        """Return the prism's motion: speed, phase and tilt."""
-        x, y = (math.radians(v) for v in numbers(self.tilt_deg, 2, "--tilt-deg"))
-        rpm: Any = self.rpm if self.speed is None else _read_speed(self.speed)
-        return PrismMotion(rpm, math.radians(self.phase_deg), (x, y))
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """Convert a size such as ``640x480``. Raises :class:`AmiwarpError` if the text is not a size."""
-    width, x, height = text.partition("x")
-    if not (x and width.isdigit() and height.isdigit()):
-        raise AmiwarpError(f"--size {text!r} is not a size; write it like 640x480")
-    return int(width), int(height)
-
-
-def _read_speed(path: Path) -> list[tuple[float, ...]]:
-    rows = []
-    for number, line in text_lines(path):
-        if line.strip() and not line.startswith("#"):
-            rows.append(numbers(line, 2, f"{path}: line {number}"))
-        if len(rows) > MOST_SPEEDS:
-            raise AmiwarpError(f"{path}: has over {MOST_SPEEDS} speeds; give fewer, which are interpolated")
-    return rows
-
-
-@dataclass(frozen=True)
-class SensorOptions:
-    """Options for the sensor's imperfections. Defaults are those of ``amiwarp.SensorModel``."""
-
-    ideal: Annotated[bool, _in_sensor("--ideal", help="Simulate a sensor without noise, mismatch and latency.")] = False
-    sensor: Annotated[
-        str | None,
-        _in_sensor(
-            help="Known camera whose sensor is simulated: dvxplorer, davis346 or gen4. Other options change it."
-        ),
-    ] = None
-    contrast_on: Annotated[float | None, _in_sensor(help="ON threshold: rise of log intensity.")] = None
-    contrast_off: Annotated[float | None, _in_sensor(help="OFF threshold: fall of log intensity.")] = None
-    mismatch: Annotated[
-        float | None, _in_sensor(help="Relative standard deviation of the thresholds between pixels.")
-    ] = None
-    refractory_us: Annotated[float | None, _in_sensor(help="Refractory period (us).")] = None
-    latency_us: Annotated[float | None, _in_sensor(help="Mean latency of the time stamps (us).")] = None
-    latency_jitter_us: Annotated[float | None, _in_sensor(help="Standard deviation of the latency (us).")] = None
-    leak_hz: Annotated[float | None, _in_sensor(help="Rate of leak events per pixel (1/s).")] = None
-    shot_noise_hz: Annotated[float | None, _in_sensor(help="Rate of random events per pixel (1/s).")] = None
-    hot_fraction: Annotated[float | None, _in_sensor(help="Fraction of hot pixels (0 to 1).")] = None
-    hot_hz: Annotated[float | None, _in_sensor(help="Additional event rate of a hot pixel (1/s).")] = None
-    cutoff_hz: Annotated[
-        float | None,
-        _in_sensor(help="Bandwidth of the photoreceptor at white (Hz), proportional to the light; 0: unlimited."),
-    ] = None
-    shot_noise_dark: Annotated[
-        float | None, _in_sensor(help="Rate of random events in the dark, relative to that at white (1 or more).")
-    ] = None
-    leak_jitter_fraction: Annotated[
-        float | None, _in_sensor(help="Relative standard deviation of the time between leak events.")
-    ] = None
-    noise_rate_cov_decades: Annotated[
-        float | None,
-        _in_sensor(help="Spread of leak and random-event rates between pixels (standard deviation of log10)."),
-    ] = None
-    row_us: Annotated[
-        float | None,
-        _in_sensor(help="Time to read out a row (us), one row after the other; 0: events are read out at once."),
-    ] = None
-    bus_rate_mev_s: Annotated[
-        float | None, _in_sensor(help="Largest rate that the bus transmits (million events/s); 0: unlimited.")
-    ] = None
-    bus_queue: Annotated[
-        float | None, _in_sensor(help="Number of events that wait for the bus; further events are lost.")
-    ] = None
-
-    def build(self) -> SensorModel:
-        """Return the sensor model that the options describe."""
-        from amiwarp.simulation.description import SensorModel
-
-        if self.ideal and self.sensor is not None:
-            raise AmiwarpError("--ideal and --sensor both describe the sensor; give one of them")
-        given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
-        ideal, preset = given.pop("ideal"), given.pop("sensor", None)
-        sensor = SensorModel.preset(preset) if preset is not None else SensorModel()
-        return replace(SensorModel.ideal() if ideal else sensor, **given)
-
-
-@dataclass(frozen=True)
-class EncoderModelOptions:
-    """Options for the encoder's imperfections. Defaults are those of ``amiwarp.EncoderModel``."""
-
-    counts_per_turn: Annotated[int | None, _in_encoder(help="Counts per turn; 0: no rounding to counts.")] = None
-    rate_hz: Annotated[float | None, _in_encoder(help="Sample rate (Hz).")] = None
-    jitter_us: Annotated[float | None, _in_encoder(help="Standard deviation of the sample times (us).")] = None
-    clock_offset_us: Annotated[
-        float | None, _in_encoder(help="Encoder clock minus camera clock (us); stored in the ground truth only.")
-    ] = None
-    dropouts_hz: Annotated[float | None, _in_encoder(help="Rate of drop-outs (1/s).")] = None
-    dropout_us: Annotated[
-        float | None, _in_encoder(help="Length of a drop-out, during which all samples are lost (us).")
-    ] = None
-
-    def build(self) -> EncoderModel:
-        """Return the encoder model that the options describe."""
-        given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
-        if self.counts_per_turn == 0:
-            given["counts_per_turn"] = None
-        return EncoderModel(**given)
-
-
-# Command-line options for simulated worlds: world, camera trajectory, and ground truth to record and draw.
-
-_in_world = partial(typer.Option, rich_help_panel="World")
-
-
-@dataclass(frozen=True)
-class WorldOptions:
-    """Options of a simulation in a three-dimensional world instead of a picture."""
-
-    world: Annotated[
-        str | None,
-        _in_world(
-            help="Simulate a 3-D world instead of a picture: room, desk, corridor, street, ball, person, or a world "
-            "file (.toml, .json).",
-            metavar="NAME|FILE",
-        ),
-    ] = None
-    trajectory: Annotated[
-        str | None,
-        _in_world(
-            help="Camera motion in the world: still, handheld, fast, or a file of poses (.txt in TUM format, .csv). "
-            "Default: the trajectory in the world file, or handheld for a named world.",
-            metavar="NAME|FILE",
-        ),
-    ] = None
-    no_prism: Annotated[
-        bool,
-        _in_world(
-            "--no-prism",
-            help="Simulate the same scene, sensor and seed with a plain event camera without a prism. The recording "
-            "then has no encoder.",
-        ),
-    ] = False
-    seeing: Annotated[
-        Seeing | None,
-        _in_world(
-            help="How the light of each pixel is computed: maps (look-up in pre-rendered pictures of the world) or "
-            "rays (ray casting through the prism: exact, but slow on a CPU). Default: maps."
-        ),
-    ] = None
-    motion_px: Annotated[
-        float | None,
-        _in_world(
-            help="Largest motion of the image between two renderings of the world, 0.01 to 2 (px). A smaller value is "
-            "more accurate and slower. Default: 0.5."
-        ),
-    ] = None
-    truth_hz: Annotated[
-        float | None,
-        _in_world(
-            help="Rate at which depth, normals, instances, optical flow and intensity of all pixels are recorded "
-            "(1/s). Default: not recorded."
-        ),
-    ] = None
-    preview: Annotated[
-        Path | None,
-        _in_world(
-            help="Figure to write (.png): the view of the camera in the middle of the recording, with and without the "
-            "prism, with depth and optical flow.",
-            metavar="<path>",
-        ),
-        OUTPUT,
-    ] = None
-
-    def check(self) -> None:
-        """Raise :class:`AmiwarpError` if a given option does not apply, or two options are incompatible."""
-        given = {"--trajectory": self.trajectory, "--seeing": self.seeing, "--motion-px": self.motion_px,
-                 "--truth-hz": self.truth_hz, "--preview": self.preview}  # fmt: skip
-        if self.world is None:
-            for name, value in given.items():
-                if value is not None:
-                    raise AmiwarpError(f"{name} applies to a world; give --world, or remove {name}")
-        if self.motion_px is not None and self.seeing is Seeing.RAYS:
-            raise AmiwarpError("--motion-px applies to maps; give --seeing maps, or remove --motion-px")
-        if self.preview is not None:
-            check_ending(self.preview, "previews are written", [".png"])
-
-    def build_scene(self, duration_s: float, *, seed: int, blur: float) -> WorldScene:
-        """Return the world and the camera's trajectory. ``blur``: standard deviation of the optical blur [px]."""
-        from amiwarp.simulation.worlds.world import WorldScene
-        from amiwarp.simulation.worlds.world_files import open_world
-
-        world, trajectory = open_world(self.world or "", self.trajectory, seed=seed, duration_s=duration_s)
-        given = {name: value for name in ("seeing", "motion_px") if (value := getattr(self, name)) is not None}
-        return WorldScene(world, trajectory, blur=blur, **given)
-
-    def draw_preview(self, simulation: Simulation) -> None:
-        """Write the preview figure if ``--preview`` is given."""
-        if self.preview is None:
-            return
-        from amiwarp.plotting.figures import draw_preview
-        from amiwarp.simulation.simulator import TruthRenderer
-
-        draw_preview(self.preview, TruthRenderer(simulation).at(simulation.duration_us // 2))

@@ -14,8 +14,8 @@ import typer
 from amiwarp.choices import OPTICAL_MODELS, Axis, Colour, View
 from amiwarp.cli import say
 from amiwarp.cli.console import choose_device, report
-from amiwarp.cli.live import SourceOptions, check_angles
 from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, parse_size, span
+from amiwarp.cli.rig import SourceOptions, check_angles
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
@@ -24,8 +24,6 @@ from amiwarp.viewer.serve import warning
 
 if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector, Library
-
-EXAMPLE = "amiwarp view recording.h5 --calibration calibration.json"
 
 _PICTURE, _SERVER = "Picture", "Server"
 RETURN_S = 3600.0
@@ -71,10 +69,10 @@ class ScreenshotOptions:
 
         Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
         """
-        from amiwarp.viewer.app import save_screenshot
-        from amiwarp.viewer.clouds import Look
+        from amiwarp.viewer.drawing import Look
         from amiwarp.viewer.jobs import estimate_phase
         from amiwarp.viewer.layout import notes
+        from amiwarp.viewer.panel import save_screenshot
 
         check_ending(path, "pictures are written", [".png"])
         third = self.axis or (Axis.ANGLE if inspector.has_encoder or inspector.knobs.rpm else Axis.TIME)
@@ -114,7 +112,7 @@ class StreamOptions:
         if not self.live:
             yield None
             return
-        from amiwarp.live.stream.recent_events import RecentEvents, followed
+        from amiwarp.live.stream.session import RecentEvents, followed
         from amiwarp.live.stream.sources import SOCKETS, open_source
         from amiwarp.viewer.jobs import LiveSource
 
@@ -158,7 +156,7 @@ class PageOptions:
 
         ``library``: other recordings that the page may open; ``name``: name of the recording.
         """
-        from amiwarp.viewer.app import has_display, open_window, serve_panel
+        from amiwarp.viewer.panel import has_display, open_window, serve_panel
 
         in_browser = self.web or not has_display()
 
@@ -215,7 +213,7 @@ class StartOptions:
         return inspector
 
 
-def run(
+def run_view(
     recording: Annotated[
         Path, typer.Argument(help="Recording in any supported format. With --live: a source as for 'amiwarp live'.")
     ],

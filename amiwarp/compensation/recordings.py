@@ -17,33 +17,87 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.calib.result import Calibration
-from amiwarp.compensation.launch_plan import LaunchPlan
+from amiwarp.cpu_threads import in_order
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import (
-    DeviceEvents,
-    check_order,
-    check_sensor,
-    device_for,
-    encoder_params,
-    limits,
-    wait,
-)
+from amiwarp.events import device_events
+from amiwarp.events.device_events import DeviceEvents, azimuths, device_for, limits, wait
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, EventSource
-from amiwarp.events.recording import MetadataValue, Recording
+from amiwarp.events.recording import Events, EventSource, MetadataValue, Recording
 from amiwarp.io import RecordingWriter
-from amiwarp.io.atomic_output import check_output
-from amiwarp.io.chunks import CHUNK, compile_checksums, in_order
 from amiwarp.io.export import bag_of, export, left_out
+from amiwarp.io.files import check_output
 from amiwarp.io.formats import Codec, OutputFormat, Rounding, check_codec, check_rounding, output_format
-from amiwarp.io.hdf5_reader import NativeEvents
+from amiwarp.io.hdf5_files import CHUNK, NativeEvents, compile_checksums
 from amiwarp.io.native_writer import FlaggedEvents
+from amiwarp.kernels import compensation as kernels
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import join_columns
-from amiwarp.kernels.launch import RecordedLaunch, launch, page_locked
+from amiwarp.kernels.launch import RecordedLaunch, launch, load, page_locked, specialised
+from amiwarp.optics.camera import camera_params, pinhole_params
 from amiwarp.optics.models import Model
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded
+
+# Choice of the compensation kernel, and its launch arguments.
+
+
+class LaunchPlan:
+    """Kernel and arguments that compensate events by one model on one device."""
+
+    def __init__(self, model: Model, device: Any) -> None:
+        """Load the kernel, so that threads that use the plan do not each try to. ``device``: a ``wp.Device``."""
+        name = str(device)
+        self.size = model.camera.width, model.camera.height
+        """Sensor width and height [px]."""
+        self.kernel = kernels.compensate_blocks if device.is_cpu else kernels.compensate_events
+        self.block = int(kernels.BLOCK) if device.is_cpu else 1
+        """Number of events per thread of the kernel; columns are padded to a multiple of this number."""
+        self._camera = camera_params(model.camera, name)
+        self._pinhole = pinhole_params(model.camera) or self._camera
+        self._model, self._limits, self._azimuths = model.params(name), wp.vec2(*self.size), azimuths(name)
+        load(specialised(self.kernel, [self._model, self._pinhole]), device)
+
+    def padded(self, n: int) -> int:
+        """Return the padded length of a column of ``n`` events."""
+        return -(-n // self.block) * self.block
+
+    def any_outside(self, max_x: int, max_y: int) -> bool:
+        """Return whether any event can lie outside the sensor, given the largest coordinates of the events [px]."""
+        return max_x >= self.size[0] or max_y >= self.size[1]
+
+    def device_columns(self, events: DeviceEvents) -> list[wp.array]:
+        """Return x, y and t of events on the device, padded, without a copy if they need no padding."""
+        columns: list[wp.array] = []
+        for values in (events.x, events.y, events.t):
+            padded = self.padded(len(events))
+            column = values if padded == len(events) else wp.zeros(padded, dtype=values.dtype, device=values.device)
+            if column is not values:
+                wp.copy(column, values)
+            columns.append(column)
+        return columns
+
+    def run(self, columns: list[wp.array], encoder: Any, max_x: int, max_y: int, *, all_cores: bool = True) -> Any:
+        """Compensate padded columns x, y, t, with these largest coordinates [px]; return new ``Columns``."""
+        padded, device = len(columns[0]), columns[0].device
+        c = kernels.Columns()
+        c.x, c.y, c.t = columns
+        c.out_x, c.out_y = (wp.empty(padded, dtype=float, device=device) for _ in range(2))
+        c.inside = wp.empty(padded, dtype=wp.uint8, device=device)
+        inputs = self.inputs(encoder, c, outside=self.any_outside(max_x, max_y))
+        blocks = padded // self.block
+        launch(self.kernel, blocks, inputs, [], device=device, smallest=512 if all_cores else blocks)
+        return c
+
+    def inputs(self, encoder: Any, columns: Any, *, outside: bool) -> list[Any]:
+        """Return the kernel's inputs, except the first block.
+
+        ``encoder``: ``EncoderParams``. ``columns``: ``Columns``. ``outside``: whether events may lie outside the
+        sensor. If none does and the lens has no distortion, the faster kernel for a pinhole camera is used, which reads
+        the ellipse model's per-pixel table without a bounds check.
+        """
+        camera = self._camera if outside else self._pinhole
+        return [self._model, camera, self._limits, encoder, self._azimuths, columns]
+
 
 # Compensation of pieces of events on a GPU, through page-locked buffers that threads share.
 
@@ -178,12 +232,12 @@ class BlockCompensator:
         """
         self._device = wp.get_device(device)
         self._plan = LaunchPlan(model, self._device)
-        self._encoder = encoder_params(encoder, t_first, t_last, str(self._device))
+        self._encoder = device_events.encoder_params(encoder, t_first, t_last, str(self._device))
         self._pieces = None if self._device.is_cpu else GpuPieces(self._plan, self._encoder, self._device)
 
     def __call__(self, events: Events, *, all_cores: bool = False) -> tuple[Events, NDArray[np.uint8]]:
         """Return compensated events (NaN without coordinates), and 1 for each inside the image, shape ``(n,)``."""
-        check_sensor(events)
+        device_events.check_sensor(events)
         if not len(events):
             return Events(np.zeros(0, np.float32), np.zeros(0, np.float32), events.t, events.p), np.zeros(0, np.uint8)
         x, y, inside = self._compensate(events, all_cores) if self._pieces is None else self._pieces(events)
@@ -191,7 +245,7 @@ class BlockCompensator:
 
     def on_device(self, events: DeviceEvents) -> tuple[wp.array, wp.array]:
         """Return compensated x and y of at least one event, as Warp arrays of shape ``(n,)``."""
-        check_sensor(events)
+        device_events.check_sensor(events)
         _, _, max_x, max_y, _, _ = limits(events)
         with self._pieces.one_thread if self._pieces else contextlib.nullcontext():
             c = self._plan.run(self._plan.device_columns(events), self._encoder, max_x, max_y)
@@ -256,7 +310,7 @@ def compensate_events(
     (2, 2)
     """
     device = device_for(events, device)
-    check_order(events)
+    device_events.check_order(events)
     if isinstance(events, DeviceEvents):
         return _compensate_on_device(events, model, encoder)
     first, last = (int(events.t.min()), int(events.t.max())) if len(events) else encoder.coverage
@@ -266,7 +320,7 @@ def compensate_events(
 
 def _compensate_on_device(events: DeviceEvents, model: Model, encoder: Encoder) -> wp.array:
     """Return finished coordinates without the prism [px], shape (n, 2)."""
-    check_sensor(events)
+    device_events.check_sensor(events)
     xy = wp.empty((len(events), 2), dtype=float, device=events.device)
     if len(events):
         compensator = BlockCompensator(model, encoder, events.t_first, events.t_last, events.device)

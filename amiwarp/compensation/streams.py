@@ -15,20 +15,19 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.compensation.launch_plan import LaunchPlan
+from amiwarp.compensation.recordings import LaunchPlan
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, check_sensor, encoder_pieces, limits, wait
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import TIME_LIMIT, Events, held_bytes
-from amiwarp.imaging.votes import CanvasShape, Votes
+from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.recording import Events, held_bytes
+from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import flag_events
 from amiwarp.kernels.launch import PageLockedPool, RecordedLaunch, background_worker, launch, pool
 from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
 from amiwarp.kernels.prism_angle import EncoderParams
 from amiwarp.optics.models import Model
-from amiwarp.validation import guarded, whole
+from amiwarp.validation import TIME_LIMIT, guarded, whole
 
 # Copying of packets into the columns of a batch: by NumPy, or by several threads of native code if the batch is long.
 

@@ -13,36 +13,23 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from amiwarp import validation
 from amiwarp.errors import AmiwarpError
-from amiwarp.events import events as checks
+from amiwarp.events import recording as checks
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import (
-    COARSE_TIMES,
-    DEFAULT_BLOCK,
-    FRACTION_OF_US,
-    TIME_LIMIT,
-    TIME_UNITS,
-    Events,
-    EventSource,
-    as_coordinate,
-    as_polarity,
-    as_times,
-    check_events,
-    largest_exact_time,
-    regroup,
-)
+from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, regroup
 from amiwarp.kernels import events as kernels
 from amiwarp.kernels.prism_angle import EncoderParams
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import guarded, instance, on_gpu, one_of, whole
+from amiwarp.validation import TIME_LIMIT, as_times, guarded, instance, on_gpu, one_of, whole
 
 # Arrays of any library as Warp arrays, through DLPack: without a copy if the type allows, else with a checked copy.
 
 HOST: dict[str, Callable[[str, Any, str], Any]] = {
-    "x": lambda name, values, _: as_coordinate(name, values),
-    "y": lambda name, values, _: as_coordinate(name, values),
+    "x": lambda name, values, _: checks.as_coordinate(name, values),
+    "y": lambda name, values, _: checks.as_coordinate(name, values),
     "t": lambda _, values, unit: as_times(values, unit=unit),
-    "p": lambda _, values, __: as_polarity(values),
+    "p": lambda _, values, __: checks.as_polarity(values),
 }
 """Conversion of each column of events in host memory, from its name, its values and the unit of times."""
 
@@ -81,7 +68,7 @@ def converted(name: str, values: Any, t_unit: str = "us") -> Any:
     """Return a column in the type that events need, as a checked copy if it has another type."""
     integers = wp.types.type_is_int(values.dtype)
     if name == "t":
-        return _times(values, TIME_UNITS[one_of(t_unit, TIME_UNITS, "t_unit")], integers)
+        return _times(values, validation.TIME_UNITS[one_of(t_unit, validation.TIME_UNITS, "t_unit")], integers)
     if name == "p":
         if values.dtype is wp.uint8:
             return values  # the caller checks that it is 0 or 1
@@ -101,7 +88,7 @@ def positive(values: Any) -> Any:
 
 
 def _times(values: Any, scale: float, integers: bool) -> Any:
-    """Return times as int64 [us], checked as by :func:`amiwarp.events.events.as_times`."""
+    """Return times as int64 [us], checked as by :func:`amiwarp.events.recording.as_times`."""
     if scale == 1.0 and integers:
         if values.dtype is wp.uint64:
             return _checked(kernels.narrow_times, values, wp.uint64, wp.int64, "t is beyond 2**62 us of 0")
@@ -109,10 +96,10 @@ def _times(values: Any, scale: float, integers: bool) -> Any:
     dtype = np.dtype(wp.dtype_to_numpy(values.dtype))
     what = {
         3: "t is not finite or beyond 2**62 us of 0",
-        2: f"t holds fractions: {FRACTION_OF_US}",
-        1: f"t reaches beyond {largest_exact_time(dtype):g} us, and {dtype} {COARSE_TIMES}",
+        2: f"t holds fractions: {validation.FRACTION_OF_US}",
+        1: f"t reaches beyond {validation.largest_exact_time(dtype):g} us, and {dtype} {validation.COARSE_TIMES}",
     }
-    inputs = [scale, largest_exact_time(dtype)]
+    inputs = [scale, validation.largest_exact_time(dtype)]
     return _checked(kernels.round_times, values, wp.float64, wp.int64, what, inputs)
 
 
@@ -480,7 +467,7 @@ class DeviceMemoryEvents(EventSource):
         if len(events):
             _, _, right, bottom, _, decreases = limits(events)
             if right >= width or bottom >= height or decreases:  # the check on the host names the event
-                check_events(events.to_host(), width, height, where="events on a device", allow_nan=True)
+                checks.check_events(events.to_host(), width, height, where="events on a device", allow_nan=True)
         self._events = events
         self._size = (width, height)
 

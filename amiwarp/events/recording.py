@@ -1,30 +1,473 @@
-"""A recording: events with their encoder, camera, prism, the records of other sensors and, if simulated, the truth."""
+"""Events and their sources, and the recording that holds them with encoder, camera, prism and ground truth.
+
+Times are int64 microseconds. Pixel coordinates are defined in :class:`amiwarp.Camera`. A source returns events in
+blocks, so that recordings of any length are processed in constant memory.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias
+from functools import partial
+from typing import Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import EventSource, as_times
-from amiwarp.events.truth import (
-    EventTruth,
-    EventValues,
-    FrameStore,
-    KnownStore,
-    PointStore,
-    PoseStore,
-    StoredInstants,
-    WorldLabels,
-)
-from amiwarp.optics.camera import Camera
+from amiwarp.events.truth import StoredInstants, Truth
+from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import NominalPrism
-from amiwarp.validation import array, guarded
+from amiwarp.validation import TIME_LIMIT, as_times, guarded, instance, whole
+from amiwarp.validation import array as as_numbers
+
+# Conversion and checks of event arrays: types, time limits, frame and order.
+
+
+SENSOR_DTYPE = np.dtype(np.uint16)
+"""Data type of pixel coordinates from a sensor. Compensated events have float32 coordinates instead."""
+
+
+def as_coordinate(name: str, values: ArrayLike) -> NDArray[Any]:
+    """Return coordinates [px] as uint16 if they are integers, as float32 if they are floating."""
+    array = as_numbers(values, f"events' {name}")
+    if not array.size:
+        return array.astype(array.dtype if array.dtype in (np.uint16, np.float32) else np.uint16)
+    if array.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            short = array.astype(np.float32, copy=False)
+        if np.isinf(short).any():
+            raise AmiwarpError(f"events' {name} holds a coordinate that is too large for float32; drop that event")
+        return short
+    if array.dtype == np.uint16:
+        return array
+    if array.size and not (array.min() >= 0 and array.max() < LARGEST_SIZE):
+        given = f"events' {name} spans {array.min()} .. {array.max()}"
+        raise AmiwarpError(f"{given}; expected pixels in 0 .. {LARGEST_SIZE - 1}")
+    return array.astype(np.uint16)
+
+
+def as_polarity(values: ArrayLike) -> NDArray[np.uint8]:
+    """Return polarities as uint8: 1 if positive or true, else 0. Truth values, and 0 and 1 as uint8, are not copied."""
+    array = as_numbers(values, "events' p", "iufb")
+    if array.dtype == np.bool_:
+        return array.view(np.uint8)
+    if array.dtype == np.uint8 and array.size and array.max() <= 1:
+        return array
+    if array.dtype.kind == "f" and np.isnan(array).any():
+        raise AmiwarpError("events' p holds NaN; expected 1 for ON, 0 or -1 for OFF")
+    return (array > 0).astype(np.uint8)
+
+
+def check_order(events: Events, *, where: str, first_index: int = 0) -> None:
+    """Raise :class:`AmiwarpError` if an event is earlier than the one before."""
+    falls = events.t[1:] < events.t[:-1]
+    if falls.any():
+        falls = np.concatenate([[False], falls])
+        _fail(events, where, first_index, falls, "is earlier than the one before; sort by time")
+
+
+def check_events(
+    events: Events,
+    width: int,
+    height: int,
+    *,
+    where: str,
+    first_index: int = 0,
+    allow_nan: bool = False,
+    after_t: int | None = None,
+) -> None:
+    """Check one block of events: coordinates, as :func:`check_coordinates`, order, time limits and polarities.
+
+    ``after_t`` is the time of the last event before the block [us].
+    """
+    if not len(events):
+        return
+    check_coordinates(events, width, height, where=where, first_index=first_index, allow_nan=allow_nan)
+    fail = partial(_fail, events, where, first_index)
+    check_order(events, where=where, first_index=first_index)
+    if after_t is not None and events.t[0] < after_t:
+        fail(np.ones(1, np.bool_), f"is earlier than the one before ({after_t} us); sort by time")
+    if not (events.t[0] > -TIME_LIMIT and events.t[-1] < TIME_LIMIT):  # the times are sorted here
+        fail(np.abs(events.t.astype(np.float64)) >= TIME_LIMIT, f"has a time beyond {TIME_LIMIT} us; drop this event")
+    if int(events.p.max()) > 1:
+        fail(events.p > 1, "has a polarity that is neither 0 nor 1")
+
+
+def check_coordinates(
+    events: Events, width: int, height: int, *, where: str, first_index: int = 0, allow_nan: bool = False
+) -> None:
+    """Check the coordinates of one block of at least one event.
+
+    Sensor coordinates (uint16) must lie in the frame. Compensated coordinates (float32) may lie outside it, but must be
+    finite. With ``allow_nan``, NaN is allowed too: it marks a compensated event without a position. Raises
+    :class:`AmiwarpError`, which gives ``where`` and the index of the first bad event, counted from ``first_index``.
+    """
+    fail = partial(_fail, events, where, first_index)
+    if events.x.dtype == np.uint16:
+        if int(events.x.max()) >= width or int(events.y.max()) >= height:
+            fail((events.x >= width) | (events.y >= height), f"lies outside the {width}x{height} frame; check the size")
+    elif allow_nan and bool(np.isinf(events.x).any() or np.isinf(events.y).any()):
+        fail(np.isinf(events.x) | np.isinf(events.y), "has an infinite coordinate; drop it")
+    elif not allow_nan and not bool(np.isfinite(events.x).all() and np.isfinite(events.y).all()):
+        fail(~(np.isfinite(events.x) & np.isfinite(events.y)), "has a coordinate that is not finite; drop it")
+
+
+def inside_image(x: NDArray[Any], y: NDArray[Any], width: int, height: int) -> NDArray[np.bool_]:
+    """Return which points lie on a pixel of the image; NaN does not."""
+    return np.asarray((x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5))
+
+
+def _fail(events: Events, where: str, first_index: int, bad: NDArray[np.bool_], what: str) -> None:
+    index = int(np.argmax(bad))
+    x, y, t = events.x[index], events.y[index], events.t[index]
+    raise AmiwarpError(f"{where}: event {first_index + index} (x={x}, y={y}, t={t} us) {what}")
+
+
+DEFAULT_BLOCK = 1 << 20
+"""Default number of events per block."""
+
+
+@guarded
+@dataclass(frozen=True, slots=True, eq=False)
+class Events:
+    """A block of events as four arrays.
+
+    Raises
+    ------
+    AmiwarpError
+        If the arrays differ in length, or have other types than those below.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[10, 11], y=[5, 5], t=[0, 100], p=[1, -1])
+    >>> len(events), events.p.tolist()
+    (2, [1, 0])
+    """
+
+    x: NDArray[Any]
+    """Column [px], shape ``(n,)``: uint16 from a sensor, float32 once compensated."""
+    y: NDArray[Any]
+    """Row [px], shape ``(n,)``, of the type of ``x``."""
+    t: NDArray[np.int64]
+    """Time of each event [us], shape ``(n,)``."""
+    p: NDArray[np.uint8]
+    """Polarity, shape ``(n,)``: 1 is ON, 0 is OFF."""
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "t", "p"):
+            instance(getattr(self, name), np.ndarray, f"events' {name}")
+        shapes = {name: getattr(self, name).shape for name in ("x", "y", "t", "p")}
+        if any(shape != (self.t.size,) for shape in shapes.values()):
+            raise AmiwarpError(f"event arrays have shapes {shapes}; expected one length (n,)")
+        if self.t.dtype != np.int64 or self.p.dtype != np.uint8:
+            raise AmiwarpError(f"events' t is {self.t.dtype}, p is {self.p.dtype}; expected int64 and uint8")
+        if self.x.dtype != self.y.dtype or self.x.dtype not in (np.dtype(np.uint16), np.dtype(np.float32)):
+            raise AmiwarpError(
+                f"events' x is {self.x.dtype}, y is {self.y.dtype}; expected both uint16 or both float32"
+            )
+
+    @classmethod
+    def from_arrays(
+        cls, x: ArrayLike, y: ArrayLike, t: ArrayLike, p: ArrayLike, *, t_unit: Literal["us", "s"] = "us"
+    ) -> Events:
+        """Create events from arrays of any numeric type, of any library, in host memory.
+
+        Arrays of NumPy, Warp, PyTorch, JAX and others with DLPack are used without a copy if they have the types of
+        :class:`Events`, or truth values as ``p``, and no gaps between their values. Others are copied. For arrays on a
+        GPU, use :class:`amiwarp.DeviceEvents`.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Pixel coordinates [px], shape (n,). Integers become uint16. Floating values become float32 and mark
+            compensated events; NaN marks a compensated event without a position.
+        t : array_like
+            Times [us], shape (n,), in ascending order. Floating times must be whole.
+        p : array_like
+            Polarities, shape (n,): ON if above 0 or true, else OFF. Both 0/1 and -1/1 are understood.
+        t_unit : {"us", "s"}, default "us"
+            Unit of ``t``. Times in seconds are rounded to microseconds.
+
+        Returns
+        -------
+        Events
+            The events.
+
+        Raises
+        ------
+        AmiwarpError
+            If a coordinate does not fit its type; if a time has a fraction of a microsecond, is not finite, beyond
+            2**62 us, earlier than the one before, or floating and too late for its type to resolve 1 us; if a polarity
+            is NaN; or if an array has masked values.
+
+        Examples
+        --------
+        >>> amiwarp.Events.from_arrays(x=[10, 11], y=[5, 5], t=[0.5, 0.6], p=[1, 0], t_unit="s").t.tolist()
+        [500000, 600000]
+        """
+        columns = as_coordinate("x", x), as_coordinate("y", y), as_times(t, unit=t_unit), as_polarity(p)
+        events = cls(*(np.require(column, requirements=["C", "A"]) for column in columns))
+        check_order(events, where="events")
+        return events
+
+    @classmethod
+    def empty(cls) -> Events:
+        """Return a block without events, with the types of a sensor.
+
+        Returns
+        -------
+        Events
+            Zero events.
+        """
+        none = np.zeros(0, np.uint16)
+        return cls(none, none, np.zeros(0, np.int64), np.zeros(0, np.uint8))
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Events]) -> Events:
+        """Join blocks of events in the given order.
+
+        Parameters
+        ----------
+        blocks : sequence of Events
+            The blocks. A single block is returned without a copy.
+
+        Returns
+        -------
+        Events
+            All events.
+        """
+        if len(blocks) == 1:
+            return blocks[0]
+        if not blocks:
+            return cls.empty()
+        x, y, t, p = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("x", "y", "t", "p"))
+        return cls(x, y, t, p)
+
+    @property
+    def whole_pixels(self) -> bool:
+        """Whether the coordinates are those of a sensor, not compensated."""
+        return bool(self.x.dtype == SENSOR_DTYPE)
+
+    def __len__(self) -> int:
+        return int(self.t.size)
+
+    def __getitem__(self, which: slice | NDArray[Any]) -> Events:
+        """Return the events at a slice (views), or at an index or boolean array (copies)."""
+        return Events(self.x[which], self.y[which], self.t[which], self.p[which])
+
+
+@runtime_checkable
+class EventSource(Protocol):
+    """Source of sorted events: arrays in memory, an indexed file, or a file that is read from its start."""
+
+    def __len__(self) -> int: ...
+
+    @property
+    def t_first(self) -> int:
+        """Time of the first event [us]. Raises :class:`AmiwarpError` if there are no events."""
+
+    @property
+    def t_last(self) -> int:
+        """Time of the last event [us]. Raises :class:`AmiwarpError` if there are no events."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Size of the sensor (width, height) [px]."""
+
+    def slice(self, start: int, stop: int) -> Events:
+        """Return the events with ``start <= index < stop``.
+
+        Parameters
+        ----------
+        start, stop : int
+            First index, and index after the last. Both are clipped to the existing events.
+
+        Returns
+        -------
+        Events
+            The events.
+        """
+
+    def find(self, t: int) -> int:
+        """Return the index of the first event at or after a time.
+
+        Parameters
+        ----------
+        t : int
+            Time [us].
+
+        Returns
+        -------
+        int
+            The index, or the number of events if none is that late.
+        """
+
+    def between(self, t_start: int, t_end: int) -> Events:
+        """Return the events with ``t_start <= t < t_end``.
+
+        Parameters
+        ----------
+        t_start, t_end : int
+            Start and end of the window [us].
+
+        Returns
+        -------
+        Events
+            The events.
+        """
+
+    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+        """Return all events in order, in blocks of equal count or equal duration.
+
+        Parameters
+        ----------
+        count : int, optional
+            Events per block; ``1 << 20`` by default.
+        duration_us : int, optional
+            Length of a block's window [us]. Windows start at ``t_first + k * duration_us``. Empty windows are left out.
+
+        Returns
+        -------
+        iterator of Events
+            The blocks.
+        """
+
+
+@guarded
+class MemoryEvents(EventSource):
+    """Source of events that are held in memory. Its methods return views where they can.
+
+    Parameters
+    ----------
+    events : Events
+        The events, sorted by time.
+    width, height : int
+        Sensor size [px].
+
+    Raises
+    ------
+    AmiwarpError
+        If an event lies outside the frame, is out of order or has an unusable value, or if the size is not in
+        1 .. 65536 px.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays(x=[1, 2, 3], y=[0, 0, 0], t=[0, 10, 20], p=[1, 0, 1])
+    >>> source = amiwarp.MemoryEvents(events, width=4, height=4)
+    >>> source.between(5, 20).x.tolist()
+    [2]
+    """
+
+    def __init__(self, events: Events, width: int, height: int) -> None:
+        instance(events, Events, "events in memory")
+        width, height = (whole(size, "frame size", 1, LARGEST_SIZE, " pixels") for size in (width, height))
+        # NaN marks compensated events without a position. Only compensated events are float32.
+        check_events(events, width, height, where="events in memory", allow_nan=True)
+        self._events = events
+        self._size = (width, height)
+
+    def __len__(self) -> int:
+        return len(self._events)
+
+    @property
+    def t_first(self) -> int:
+        return int(self._nonempty().t[0])
+
+    @property
+    def t_last(self) -> int:
+        return int(self._nonempty().t[-1])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self._size
+
+    def slice(self, start: int, stop: int) -> Events:
+        return self._events[max(start, 0) : max(stop, 0)]
+
+    def find(self, t: int) -> int:
+        return int(np.searchsorted(self._events.t, t))
+
+    def between(self, t_start: int, t_end: int) -> Events:
+        start, stop = np.searchsorted(self._events.t, [t_start, t_end])
+        return self._events[start:stop]
+
+    def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+        return regroup([self._events], count=count, duration_us=duration_us)
+
+    def _nonempty(self) -> Events:
+        if not len(self._events):
+            raise AmiwarpError("the recording holds no events, so it has no first or last time; check len() first")
+        return self._events
+
+
+def regroup(chunks: Iterable[Events], *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
+    """Regroup successive chunks of events into blocks of equal count or equal duration.
+
+    At most one block is in memory. Raises :class:`AmiwarpError` if both ``count`` and ``duration_us`` are given or one
+    is below 1.
+    """
+    if count is not None and duration_us is not None:
+        raise AmiwarpError("blocks have both count and duration_us; give one of them")
+    if duration_us is not None:
+        return _by_duration(chunks, whole(duration_us, "duration_us", 1, TIME_LIMIT, " us per block"))
+    count = DEFAULT_BLOCK if count is None else count
+    return _by_count(chunks, whole(count, "count", 1, TIME_LIMIT, " events per block"))
+
+
+def _by_count(chunks: Iterable[Events], count: int) -> Iterator[Events]:
+    held: list[Events] = []
+    missing = count
+    for chunk in chunks:
+        start = 0
+        while len(chunk) - start >= missing:
+            held.append(chunk[start : start + missing])
+            start += missing
+            yield Events.concatenate(held)
+            held, missing = [], count
+        if start < len(chunk):
+            held.append(chunk[start:])
+            missing -= len(chunk) - start
+    if held:
+        yield Events.concatenate(held)
+
+
+def _by_duration(chunks: Iterable[Events], duration_us: int) -> Iterator[Events]:
+    held: list[Events] = []
+    held_window = 0
+    origin: int | None = None
+    for chunk in chunks:
+        if not len(chunk):
+            continue
+        origin = int(chunk.t[0]) if origin is None else origin
+        window = (chunk.t - origin) // duration_us
+        edges = [0, *(np.flatnonzero(window[1:] != window[:-1]) + 1).tolist(), len(chunk)]
+        for start, stop in itertools.pairwise(edges):
+            if held and window[start] != held_window:
+                yield Events.concatenate(held)
+                held = []
+            held.append(chunk[start:stop])
+            held_window = int(window[start])
+    if held:
+        yield Events.concatenate(held)
+
+
+EVENT_BYTES = 13
+"""Memory of an event from a sensor [bytes]."""
+
+
+OVERHEAD = 1024
+"""Memory of a packet's Python objects in addition to its arrays [bytes]."""
+
+
+def held_bytes(events: Events | Sized) -> int:
+    """Return the memory of a waiting packet of events [bytes], including its Python objects."""
+    if not isinstance(events, Events):  # on a device
+        return OVERHEAD + EVENT_BYTES * len(events)
+    return OVERHEAD + events.x.nbytes + events.y.nbytes + events.t.nbytes + events.p.nbytes
+
 
 # Records of other sensors in a recording: samples of an inertial measurement unit (IMU), and frames.
 
@@ -168,108 +611,6 @@ def check_image(image: NDArray[Any], shape: tuple[int, ...], dtype: np.dtype[Any
 
 MetadataValue: TypeAlias = str | int | float | bool
 """Type of a value in a recording's metadata."""
-
-
-@guarded
-@dataclass(frozen=True, slots=True, eq=False)
-class Truth:
-    """Ground truth of a simulated recording.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> truth = amiwarp.Truth({"apex": 0.03, "phase": 0.5}, stored_causes=np.array([0, 1, 0], np.uint8))
-    >>> truth.points(0, 10) is None
-    True
-    >>> truth.of_events(1, 3).cause.tolist()
-    [1, 0]
-    """
-
-    parameters: dict[str, float] = field(default_factory=dict)
-    """True parameters by name: apex, phase, tilt_x, tilt_y [rad], index, clock_offset_us [us], and others."""
-    stored_points: PointStore | None = None
-    """Pixel without the prism of each event's scene point [px], shape ``(n, 2)``, float32, or None."""
-    stored_causes: EventValues | None = None
-    """Code of the cause of each event, see :class:`amiwarp.Cause`, shape ``(n,)``, uint8, or None."""
-    stored_instances: EventValues | None = None
-    """Instance number of the surface that each event saw, shape ``(n,)``, uint16, or None."""
-    stored_depths: EventValues | None = None
-    """Depth of the surface that each event saw [m], shape ``(n,)``, float32, or None."""
-    stored_places: EventValues | None = None
-    """Point in the world that each event saw [m], shape ``(n, 3)``, float32, or None."""
-    labels: WorldLabels | None = None
-    """Names of the world's instances and their classes, or None."""
-    frames: FrameStore | None = None
-    """Ground truth of all pixels at chosen instants, or None."""
-    poses: PoseStore | None = None
-    """Poses of the camera, the moving bodies and the joints over time, or None."""
-    known: KnownStore | None = None
-    """Pixels without the prism whose scene the source of a translated recording determines, over time; None for all."""
-
-    def points(self, start: int, stop: int) -> NDArray[np.float32] | None:
-        """Return the true points of the events with ``start <= index < stop``.
-
-        Parameters
-        ----------
-        start, stop : int
-            First index, and index after the last.
-
-        Returns
-        -------
-        numpy.ndarray or None
-            Pixels without the prism [px], shape (n, 2), or None if they are not stored.
-        """
-        return None if self.stored_points is None else self.stored_points[max(start, 0) : max(stop, 0)]
-
-    def known_at(self, t_us: ArrayLike, xy: ArrayLike) -> NDArray[np.bool_]:
-        """Return whether the scene is known at pixels without the prism.
-
-        The times and :meth:`points` of events tell which events the source of a translated recording determines.
-
-        Parameters
-        ----------
-        t_us : array_like
-            Times [us], shape ``(n,)``.
-        xy : array_like
-            Pixels without the prism [px], shape ``(n, 2)``.
-
-        Returns
-        -------
-        numpy.ndarray
-            Whether each pixel is known at its time, shape ``(n,)``. Pixels outside the image, NaN and times before the
-            first mask are unknown. Everything is known if no masks are stored.
-        """
-        times, pixels = as_times(t_us), array(xy, "xy").astype(np.float64)
-        if times.ndim != 1 or pixels.shape != (len(times), 2):
-            raise AmiwarpError(f"t_us has shape {times.shape}, xy {pixels.shape}; expected (n,) and (n, 2)")
-        if self.known is None:
-            return np.ones(len(times), np.bool_)
-        row = np.searchsorted(self.known.t, times, side="right") - 1
-        found = np.zeros(len(times), np.bool_)
-        for index in np.unique(row[row >= 0]).tolist():
-            mask, which = self.known[index], np.flatnonzero(row == index)
-            inside = np.isfinite(pixels[which].sum(axis=1))
-            x, y = np.rint(np.where(inside[:, None], pixels[which], -1.0)).astype(np.int64).T
-            inside &= (x >= 0) & (x < mask.shape[1]) & (y >= 0) & (y < mask.shape[0])
-            found[which[inside]] = mask[y[inside], x[inside]]
-        return found
-
-    def of_events(self, start: int, stop: int) -> EventTruth:
-        """Return all ground truth of the events with ``start <= index < stop``.
-
-        Parameters
-        ----------
-        start, stop : int
-            First index, and index after the last, as in the ``slice`` method of event sources.
-
-        Returns
-        -------
-        EventTruth
-            The arrays that are stored, with one row per event.
-        """
-        which = slice(max(start, 0), max(stop, 0))
-        stores = self.stored_causes, self.stored_instances, self.stored_depths, self.stored_places
-        return EventTruth(self.points(start, stop), *(None if store is None else store[which] for store in stores))
 
 
 @guarded

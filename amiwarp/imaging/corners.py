@@ -12,12 +12,12 @@ from amiwarp.choices import CornerMethod
 from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, check_sensor, device_for, limits, wait
-from amiwarp.events.events import TIME_LIMIT, Events, check_events
+from amiwarp.events.recording import Events, check_events
 from amiwarp.kernels import corners as kernels
 from amiwarp.kernels import events as event_kernels
 from amiwarp.kernels.launch import launch, load
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import choice, guarded, instance, vector, whole
+from amiwarp.validation import TIME_LIMIT, choice, guarded, instance, vector, whole
 
 REDUNDANT_US = 50_000
 """Time after which an event of Arc* is no longer redundant [us], from the paper."""

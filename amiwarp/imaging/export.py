@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from amiwarp.choices import Layers
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, EventSource
-from amiwarp.imaging.iwe import PIECE
+from amiwarp.events.recording import Events, EventSource
+from amiwarp.imaging.iwe import PIECE, CanvasShape, Votes
 from amiwarp.imaging.palette import OFF_ON_BLACK, ON_ON_BLACK
-from amiwarp.imaging.votes import CanvasShape, Votes
-from amiwarp.io.atomic_output import NewFile, allocate, check_output
+from amiwarp.io.files import NewFile, allocate, check_output
 from amiwarp.io.formats import check_ending
 from amiwarp.validation import choice
 

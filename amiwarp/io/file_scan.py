@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import DEFAULT_BLOCK, Events, as_coordinate, regroup, rounded_times
-from amiwarp.events.recording import ImuSamples, MetadataValue
-from amiwarp.io.input_files import errors_name, open_input, register_reader
+from amiwarp.events.recording import DEFAULT_BLOCK, Events, ImuSamples, MetadataValue, as_coordinate, regroup
+from amiwarp.io.files import errors_name, open_input, register_reader
 from amiwarp.io.reading_process import packets
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
+from amiwarp.validation import rounded_times
 
 Packet: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 """Packet of events: arrays x, y [px], t [us] and p (ON if positive) as stored in the file: integers or booleans of one

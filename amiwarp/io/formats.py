@@ -8,17 +8,21 @@ from __future__ import annotations
 import enum
 import importlib
 import os
-from collections.abc import Callable, Collection
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.input_files import check_regular, errors_name, name_kind, open_input
-from amiwarp.io.nmnist import looks_like_bin
+from amiwarp.io.files import check_regular, errors_name, name_kind, open_input
+from amiwarp.io.json_files import read_json
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import choice, guarded
+from amiwarp.validation import choice, guarded, instance, shown, whole
 
 # Formats that are read.
 
@@ -70,23 +74,30 @@ FOLDERS = (("metadata.yaml", Format.ROSBAG), ("dataset_events_t.npy", Format.EVI
 
 
 OPENERS = {
-    Format.HDF5: "hdf5_reader:open_hdf5",
+    Format.HDF5: "hdf5_files:open_hdf5",
     Format.EVT: "prophesee:open_evt",
     Format.DAT: "prophesee:open_dat",
-    Format.AEDAT4: "aedat4:open_aedat4",
-    Format.AEDAT3: "aedat3:open_aedat3",
-    Format.AEDAT2: "aedat2:open_aedat2",
+    Format.AEDAT4: "aedat:open_aedat4",
+    Format.AEDAT3: "aedat:open_aedat3",
+    Format.AEDAT2: "aedat:open_aedat2",
     Format.ROSBAG: "ros:open_rosbag",
-    Format.ES: "event_stream:open_es",
-    Format.TEXT: "text:open_text",
-    Format.NPZ: "npz:open_npz",
-    Format.EVIMO: "npz:open_evimo",
-    Format.BIN: "nmnist:open_bin",
+    Format.ES: "prophesee:open_es",
+    Format.TEXT: "plain_files:open_text",
+    Format.NPZ: "plain_files:open_npz",
+    Format.EVIMO: "plain_files:open_evimo",
+    Format.BIN: "plain_files:open_bin",
 }
 """Function that opens each format, see :func:`io_function`."""
 
-TRIGGERS = (Format.EVT, Format.AEDAT4, Format.AEDAT3, Format.AEDAT2, Format.ROSBAG, Format.HDF5)
-"""Formats that hold triggers. Their modules have a function ``trigger_packets``, which reads the edges."""
+TRIGGERS = {
+    Format.EVT: "prophesee:trigger_packets",
+    Format.AEDAT4: "aedat:aedat4_triggers",
+    Format.AEDAT3: "aedat:aedat3_triggers",
+    Format.AEDAT2: "aedat:aedat2_triggers",
+    Format.ROSBAG: "ros:trigger_packets",
+    Format.HDF5: "hdf5_files:trigger_packets",
+}
+"""Function that reads the edges of each format that holds triggers, see :func:`io_function`."""
 
 TOPICS = (Format.HDF5, Format.ROSBAG)
 """Formats whose files may hold several streams of events."""
@@ -134,6 +145,32 @@ def detect_format(path: Path) -> Format:
         raise AmiwarpError(f"{path}: {kind}")
     known = ", ".join(member.value for member in Format)
     raise AmiwarpError(f"{path}: content is of no known format; expected one of {known}")
+
+
+BIN_EVENT_BYTES = 5
+"""Size of an event in the ``.bin`` files of N-MNIST [bytes]."""
+BIN_MARK_ROW = 240
+"""Row of the marks in these files."""
+
+
+def looks_like_bin(head: bytes, size: int) -> bool:
+    """Return whether a file of ``size`` bytes that begins with ``head`` holds events of 5 bytes.
+
+    Without a header, the content decides: whole events, rows of the cameras, and times that rise, except at marks.
+    """
+    if size % BIN_EVENT_BYTES or len(head) < 8 * BIN_EVENT_BYTES:
+        return False
+    _, y, t, _ = bin_columns(np.frombuffer(head, np.uint8, len(head) // BIN_EVENT_BYTES * BIN_EVENT_BYTES))
+    mark = y == BIN_MARK_ROW
+    step = np.diff(t[~mark])
+    late, rising = np.count_nonzero(step < 0), np.count_nonzero(step > 0)
+    return bool((y <= BIN_MARK_ROW).all() and late <= np.count_nonzero(mark) + t.size // 100 and 2 * rising > t.size)
+
+
+def bin_columns(data: NDArray[np.uint8]) -> tuple[NDArray[np.int64], ...]:
+    """Return x, y, time since the last mark [us] and polarity of events of 5 bytes."""
+    rows = data.reshape(-1, BIN_EVENT_BYTES).astype(np.int64)
+    return rows[:, 0], rows[:, 1], (rows[:, 2] & 0x7F) << 16 | rows[:, 3] << 8 | rows[:, 4], rows[:, 2] >> 7
 
 
 def _is_evt(head: bytes) -> bool:
@@ -354,9 +391,9 @@ LIMITS = {
 WRITERS = {
     OutputFormat.DSEC: "native_writer:write_dsec",
     OutputFormat.EVT3: "prophesee:write_evt3",
-    OutputFormat.AEDAT4: "aedat4:write_aedat4",
-    OutputFormat.NPZ: "npz:write_npz",
-    OutputFormat.TEXT: "text:write_text",
+    OutputFormat.AEDAT4: "aedat:write_aedat4",
+    OutputFormat.NPZ: "plain_files:write_npz",
+    OutputFormat.TEXT: "plain_files:write_text",
     OutputFormat.ROS2: "ros:write_ros2",
 }
 """Function that writes all events in each format other than the native one, see :func:`io_function`."""
@@ -410,10 +447,17 @@ def check_ending(path: Path, what: str, endings: Collection[str], remedy: str | 
     return ending
 
 
-def check_folder(path: Path) -> None:
-    """Raise :class:`AmiwarpError` if the name of a folder for outputs ends in the extension of a file."""
-    if path.suffix.lower() in FILE_ENDINGS:
-        raise AmiwarpError(f"{path}: is for a folder, but ends in {path.suffix}; give the name of a folder")
+def make_folder(path: Path) -> None:
+    """Create a folder and its parents. Raises :class:`AmiwarpError` if that fails, or for the name of a file."""
+    for new in (path, *path.parents):
+        if not os.path.lexists(new) and new.suffix.lower() in FILE_ENDINGS:
+            raise AmiwarpError(f"{new}: is for a folder, but ends in {new.suffix}; give the name of a folder")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AmiwarpError(
+            f"{path}: cannot be made a folder: {error.strerror or error}; choose another --out"
+        ) from error
 
 
 def check_rounding(path: Path, given: Rounding | str | None, chosen: OutputFormat) -> Rounding | None:
@@ -432,3 +476,132 @@ def check_codec(path: Path, given: Codec | str, chosen: OutputFormat) -> Codec:
     if codec is not Codec.BLOSC and chosen not in (OutputFormat.NATIVE, OutputFormat.DSEC):
         raise AmiwarpError(f"{path}: codec is {codec.value}, which is for HDF5 (.h5); leave it out for {chosen.value}")
     return codec
+
+
+# Data sets of recordings in a folder with a manifest, as ``amiwarp dataset`` writes them.
+
+FORMAT, VERSION = "amiwarp-dataset", 1
+"""Values of the manifest's fields ``format`` and ``version``."""
+MANIFEST = "manifest.json"
+MOST_BYTES = 1 << 30
+"""Largest manifest that is read [bytes]: about a million recordings."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Item:
+    """Entry of one recording in the manifest."""
+
+    file: str
+    split: str
+    labels: Mapping[str, Any]
+    events: int
+
+
+@guarded
+class RecordedDataset:
+    """Recordings of a data set with their labels, for PyTorch's ``DataLoader`` or any other loop.
+
+    It has a length and an index, as the data sets of PyTorch, but does not need PyTorch. Only the manifest is held in
+    memory, so that the processes of a ``DataLoader`` share the object however they are started.
+
+    Parameters
+    ----------
+    folder : str or os.PathLike
+        Folder of the data set, with ``manifest.json``.
+    split : str, optional
+        Name of the part to use, such as "train"; by default all parts.
+    transform : callable, optional
+        Called with the :class:`Recording` and the dict of its labels. Its return value is the item. Without it, an item
+        is the tuple of all events and the labels. Worker processes that are spawned need a function of a module.
+
+    Raises
+    ------
+    AmiwarpError
+        If the folder has no manifest, the manifest is damaged or of a newer version, or no recording is in the split.
+
+    Examples
+    --------
+    >>> import json, pathlib
+    >>> events = amiwarp.Events.from_arrays([1, 2], [0, 0], [0, 10], [1, 0])
+    >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, 4, 4))
+    >>> amiwarp.save_recording("000000.h5", recording)
+    >>> item = {"file": "000000.h5", "split": "train", "labels": {"shape": "disc"}, "events": 2}
+    >>> manifest = {"format": "amiwarp-dataset", "version": 1, "items": [item]}
+    >>> _ = pathlib.Path("manifest.json").write_text(json.dumps(manifest))
+    >>> dataset = amiwarp.RecordedDataset(".", split="train")
+    >>> events, labels = dataset[0]
+    >>> len(dataset), len(events), labels
+    (1, 2, {'shape': 'disc'})
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        split: str | None = None,
+        *,
+        transform: Callable[[Recording, dict[str, Any]], Any] | None = None,
+    ) -> None:
+        self.folder = Path(folder)
+        items = _read_manifest(self.folder / MANIFEST)
+        self._items = [item for item in items if split is None or item.split == split]
+        if not self._items:
+            counts = ", ".join(f"{name} ({n})" for name, n in sorted(Counter(item.split for item in items).items()))
+            raise AmiwarpError(
+                f"{self.folder}: no recording is in the split {shown(split)}; it has {counts or 'no recordings'}"
+            )
+        self.transform = transform
+
+    @property
+    def labels(self) -> list[dict[str, Any]]:
+        """Labels of all items in order. The recordings are not opened for it."""
+        return [dict(item.labels) for item in self._items]
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __getitem__(self, index: int) -> Any:
+        """Return an item: the value that ``transform`` returns, or its events and labels.
+
+        Raises IndexError after the last item, and :class:`AmiwarpError` if the file is missing or is not the one that
+        the manifest describes.
+        """
+        item = self._items[index]
+        path = self.folder / item.file
+        recording = open_recording(path)
+        n = len(recording.events)
+        if n != item.events:
+            given = f"{path}: holds {n} events, the manifest says {item.events}"
+            raise AmiwarpError(f"{given}; make this recording again, or correct the manifest")
+        if self.transform is not None:
+            return self.transform(recording, dict(item.labels))
+        return recording.events.slice(0, n), dict(item.labels)
+
+
+def _read_manifest(path: Path) -> list[_Item]:
+    """Return the items of a manifest."""
+    if not path.is_file():
+        raise AmiwarpError(f"{path.parent}: has no {MANIFEST}; give the folder that 'amiwarp dataset' wrote")
+    data = read_json(path, "a manifest of a data set", most_bytes=MOST_BYTES)
+    with errors_name(path, lambda: "reading the manifest"):
+        if data.get("format") != FORMAT:
+            raise AmiwarpError(f"field format is {shown(data.get('format'))}; expected {shown(FORMAT)}")
+        version = whole(data.get("version"), "field version", 1, 1 << 30)
+        if version > VERSION:
+            raise AmiwarpError(f"field version is {version}, newer than {VERSION}; update amiwarp")
+        items = instance(data.get("items"), list, "field items")
+        return [_item(entry, f"items[{k}]") for k, entry in enumerate(items)]
+
+
+def _item(entry: Any, where: str) -> _Item:
+    """Return one item of a manifest, checked."""
+    fields = instance(entry, dict, f"field {where}")
+    file = instance(fields.get("file"), str, f"field {where}.file")
+    path = PurePosixPath(file)
+    if path.is_absolute() or ".." in path.parts or "\\" in file or not path.parts:
+        raise AmiwarpError(f"field {where}.file is {shown(file)}; expected a path below the folder of the manifest")
+    return _Item(
+        file,
+        instance(fields.get("split"), str, f"field {where}.split"),
+        instance(fields.get("labels"), dict, f"field {where}.labels"),
+        whole(fields.get("events"), f"field {where}.events", 0, 1 << 62),
+    )

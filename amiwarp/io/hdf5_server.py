@@ -1,7 +1,7 @@
 """Part of the HDF5 reader that runs in the reading process. It checks every group, attribute and dataset before use.
 
 HDF5 allows links, external storage and virtual datasets that refer to other files. They are refused. Sizes that exceed
-the file are refused too. :mod:`amiwarp.io.hdf5_reader` receives the description of a file as JSON.
+the file are refused too. :mod:`amiwarp.io.hdf5_files` receives the description of a file as JSON.
 """
 
 import contextlib
@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.chunks import BLOSC, CHUNK, FLETCHER32
 from amiwarp.io.file_scan import microseconds, whole_pixels
-from amiwarp.io.native_writer import FORMAT
+from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32, FORMAT
 from amiwarp.io.prophesee import Columns
 from amiwarp.io.reading_process import Reply, keep, kept
 

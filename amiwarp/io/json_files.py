@@ -1,8 +1,9 @@
-"""Reader of untrusted JSON and TOML files: limited in size, strict, and converted to dataclasses field by field."""
+"""Untrusted JSON and TOML files, read strictly and into dataclasses, and finished work that JSON files keep."""
 
 import dataclasses
 import difflib
 import enum
+import hashlib
 import json
 import math
 import os
@@ -10,13 +11,15 @@ import re
 import tomllib
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeVar, get_args, get_origin, get_type_hints
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name, open_input
-from amiwarp.validation import choice, one_of, real, shown, whole
+from amiwarp.io.files import check_output, errors_name, open_input, write_text
+from amiwarp.validation import choice, instance, one_of, real, shown, whole
+
+# Reader of untrusted JSON and TOML files: limited in size, strict, and converted to dataclasses field by field.
 
 Made = TypeVar("Made")
 
@@ -33,7 +36,7 @@ _TOO_DOTTED = re.compile(
 )
 """Pattern of dotted keys with more parts. Its quantifiers are possessive, so that the time is that of the length."""
 LARGEST_INTEGER = 2**62
-"""Largest accepted magnitude of a whole number, equal to :data:`amiwarp.events.events.TIME_LIMIT`."""
+"""Largest accepted magnitude of a whole number, equal to :data:`amiwarp.events.recording.TIME_LIMIT`."""
 
 
 def read_json(
@@ -216,3 +219,115 @@ def _container(kind: Any, value: Any, where: str) -> Any:
         raise AmiwarpError(f"field {where} has {len(value)} entries; expected {len(inner)}")
     kinds = inner if fixed else (inner[0],) * len(value)
     return origin(value_of(k, entry, f"{where}[{i}]") for i, (k, entry) in enumerate(zip(kinds, value, strict=True)))
+
+
+# Finished work that a later run continues from, as JSON with a checksum: folders of cells, and journals.
+#
+# The checksum shows damage. Anybody can compute it, so that the values are checked as well before they are used.
+
+SEAL = "checksum"
+"""Field with the SHA-256 of the canonical JSON of all other fields, in hexadecimal."""
+MOST_CELL_BYTES = 8 << 20
+"""Largest file of a cell that is read [bytes]."""
+MOST_JOURNAL_BYTES = 1 << 30
+"""Largest journal that is read [bytes]."""
+MOST_LINE_BYTES = 1 << 16
+"""Longest line of a journal that is read [bytes]."""
+
+
+def sealed(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a JSON object with its checksum."""
+    return {SEAL: _digest(data), **data}
+
+
+def unsealed(data: Any) -> dict[str, Any]:
+    """Return a JSON object without its checksum, in place. Raises :class:`AmiwarpError` if the two do not match."""
+    given = instance(data, dict, "the content").pop(SEAL, None)
+    if given != _digest(data):
+        raise AmiwarpError(f"field {SEAL} is {'missing' if given is None else f'{shown(given)}, not of this content'}")
+    return dict(data)
+
+
+def _digest(data: Mapping[str, Any]) -> str:
+    canonical = json.dumps(data, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+class CellStore:
+    """Folder of cells, that is of results of single runs. Each is a file with a checksum.
+
+    A file that is damaged counts as missing: it is noted in ``damaged``, and replaced when the cell is written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.damaged: list[str] = []
+        """What is wrong with each damaged file that was read."""
+
+    def read(self, name: str, make: Callable[[dict[str, Any]], Made]) -> Made | None:
+        """Return what ``make`` makes of the fields of a cell; None if its file is missing or damaged.
+
+        ``make`` raises :class:`AmiwarpError` for fields that a run does not write. So does this method for a folder.
+        """
+        path = self.folder / name
+        if not os.path.lexists(path):
+            return None
+        if path.is_dir():
+            raise AmiwarpError(f"{path}: is a folder, where the file of a cell belongs; remove it")
+        try:
+            with errors_name(path, lambda: "is damaged"):
+                return make(unsealed(read_json(path, "a cell", most_bytes=MOST_CELL_BYTES, noted=False)))
+        except AmiwarpError as error:
+            self.damaged.append(str(error))
+            return None
+
+    def write(self, name: str, data: Mapping[str, Any]) -> None:
+        """Write the fields of a cell. A pipe or a device of its name is replaced too."""
+        path = self.folder / name
+        if os.path.lexists(path) and not path.is_file():
+            path.unlink()
+        write_text(path, json.dumps(sealed(data), separators=(",", ":"), allow_nan=False) + "\n", overwrite=True)
+
+
+def create_journal(path: Path) -> None:
+    """Create an empty journal unless it exists. Raises :class:`AmiwarpError` if that fails."""
+    check_output(path, overwrite=True)
+    with errors_name(path, lambda: "cannot be written"):
+        path.touch()
+
+
+def append_line(path: Path, data: Mapping[str, Any]) -> None:
+    """Append an object with its checksum to a journal. Raises :class:`AmiwarpError` if that fails."""
+    check_output(path, overwrite=True)
+    with errors_name(path, lambda: "cannot be written"), path.open("ab+") as file:
+        size = file.seek(0, 2)
+        if size:
+            file.seek(size - 1)
+        cut_off = size and file.read(1) != b"\n"
+        file.write(b"\n" * bool(cut_off) + json.dumps(sealed(data), allow_nan=False).encode() + b"\n")
+
+
+def read_journal(path: Path, make: Callable[[dict[str, Any]], Made], damaged: list[str]) -> Iterator[Made]:
+    """Yield what ``make`` makes of the fields of each line of a journal; nothing if it does not exist.
+
+    Lines that are damaged, or of which ``make`` raises :class:`AmiwarpError`, are left out, and noted together in
+    ``damaged``. Raises :class:`AmiwarpError` for a journal that is not a regular file or is too large.
+    """
+    if not os.path.lexists(path):
+        return
+    bad, first = 0, ""
+    with errors_name(path, lambda: "cannot be read as a journal"), open_input(path, noted=False) as file:
+        if os.fstat(file.fileno()).st_size > MOST_JOURNAL_BYTES:
+            raise AmiwarpError(f"is larger than {MOST_JOURNAL_BYTES >> 20} MiB, so it is no journal; remove it")
+        for number, line in enumerate(iter(lambda: file.readline(MOST_LINE_BYTES), b""), 1):
+            while not line.endswith(b"\n") and (rest := file.readline(MOST_LINE_BYTES)):
+                line = rest[-1:]  # too long for a line of a journal
+            try:
+                with errors_name(path, lambda number=number: f"line {number}"):  # type: ignore[misc]
+                    made = make(unsealed(parse_json(line)))
+            except AmiwarpError as error:
+                bad, first = bad + 1, first or str(error)
+                continue
+            yield made
+    if bad:
+        damaged.append(f"{first}; {bad:,} lines are damaged" if bad > 1 else first)

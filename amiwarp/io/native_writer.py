@@ -1,4 +1,4 @@
-"""Writer of native HDF5 recordings: streams events in constant memory, and writes a whole file or none.
+"""Writers of native HDF5 recordings: of a whole file or none, and of live recordings, readable at any time.
 
 The format is described in ``docs/reference/recording-format.md``.
 """
@@ -6,8 +6,10 @@ The format is described in ``docs/reference/recording-format.md``.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 import os
+import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -18,28 +20,25 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from amiwarp.cpu_threads import in_order
 from amiwarp.errors import AmiwarpError
+from amiwarp.events import recording as checks
+from amiwarp.events import truth as ground_truth
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, check_coordinates, check_events, inside_image, regroup
-from amiwarp.events.recording import ImuSamples, MetadataValue, Recording, Truth, check_image
-from amiwarp.events.truth import EVENT_COLUMNS, MAPS, EventTruth, FrameTruth, Poses, WorldLabels, as_poses, check_truth
-from amiwarp.io.atomic_output import NewFile
-from amiwarp.io.camera_files import camera_attributes, prism_attributes
-from amiwarp.io.chunks import CHUNK, ChunkFile, EncodedChunk, append_values, encode_parts, in_order, make_dataset
+from amiwarp.events.recording import Events, ImuSamples, MetadataValue, Recording, regroup
+from amiwarp.events.truth import EventTruth, FrameTruth, Poses, Truth, WorldLabels
+from amiwarp.io import hdf5_files
+from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
-from amiwarp.io.input_files import errors_name
+from amiwarp.io.hdf5_files import CHUNK, ChunkFile, EncodedChunk, open_hdf5
+from amiwarp.io.rig_files import camera_attributes, prism_attributes
 from amiwarp.optics.camera import Camera, check_size
 from amiwarp.optics.prism import NominalPrism
 from amiwarp.progress import Progress
-from amiwarp.validation import choice, guarded, shown
+from amiwarp.validation import as_times, choice, guarded, shown
 
 # Layout of the file: header, datasets, chunks and the millisecond index.
 
-FORMAT = "amiwarp-recording"
-"""Value of the attribute ``format`` of native recordings."""
-
-FORMAT_VERSION = 1
-"""Newest version of the format that is read, and the version that is written."""
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """Arrays of a block of events, by the names of their datasets in the file."""
@@ -87,8 +86,8 @@ def write_header(
     metadata: Mapping[str, MetadataValue],
 ) -> None:
     """Write the parts of a file that are known before the first event: format, size, camera, prism and metadata."""
-    file.attrs["format"] = FORMAT
-    file.attrs["format_version"] = FORMAT_VERSION
+    file.attrs["format"] = hdf5_files.FORMAT
+    file.attrs["format_version"] = hdf5_files.FORMAT_VERSION
     file.attrs["width"], file.attrs["height"] = size
     if camera is not None:
         file.create_group("camera").attrs.update(camera_attributes(camera))
@@ -110,7 +109,7 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
         if points.shape != (count, 2):
             raise AmiwarpError(f"truth points have shape {points.shape}; expected ({count}, 2)")
         columns["truth/x"], columns["truth/y"] = points[:, 0], points[:, 1]
-    for name, (dtype, row) in EVENT_COLUMNS.items():
+    for name, (dtype, row) in ground_truth.EVENT_COLUMNS.items():
         given = getattr(truth, name)
         if given is not None:
             values = np.asarray(given, dtype)
@@ -118,7 +117,7 @@ def event_columns(truth: EventTruth, count: int) -> Columns:
                 raise AmiwarpError(f"truth of {name} has shape {values.shape}; expected {(count, *row)}")
             columns[f"truth/events/{name}"] = values
     for name, values in columns.items():
-        check_truth(name, values)
+        ground_truth.check_truth(name, values)
     return columns
 
 
@@ -155,7 +154,7 @@ class RecordWriter:
         """Append the ground truth of an instant, which must be later than the previous instants."""
         width, height = self._size
         rows: dict[str, NDArray[Any]] = {}
-        for name, (dtype, tail) in MAPS.items():
+        for name, (dtype, tail) in ground_truth.MAPS.items():
             rows[name] = np.asarray(getattr(frame, name), dtype)
             if rows[name].shape != (height, width, *tail):
                 raise AmiwarpError(
@@ -164,7 +163,7 @@ class RecordWriter:
                 )
         self._check_later("truth/frames/t", frame.t_us)
         self._append("truth/frames/t", np.array([frame.t_us], np.int64), ROWS)
-        self._append("truth/frames/pose", as_poses(frame.rotation, frame.position)[None], ROWS)
+        self._append("truth/frames/pose", ground_truth.as_poses(frame.rotation, frame.position)[None], ROWS)
         self._append_joints("truth/frames/joints", {name: at[None] for name, at in frame.joints.items()})
         for name, values in rows.items():
             self._append(f"truth/frames/{name}", values[None], 1)
@@ -225,7 +224,7 @@ class RecordWriter:
         stored = self._datasets.get("frames/image")
         shape, dtype = (image.shape, image.dtype) if stored is None else (stored.shape[1:], stored.dtype)
         try:
-            check_image(image, shape, dtype)
+            checks.check_image(image, shape, dtype)
         except AmiwarpError as error:
             raise AmiwarpError(f"{self._path}: {error}") from error
         self._check_later("frames/t", t_us, equal=True)
@@ -235,9 +234,9 @@ class RecordWriter:
     def _append(self, name: str, values: NDArray[Any], chunk_rows: int) -> None:
         """Append rows to a dataset, which is created at the first call with ``chunk_rows`` rows per chunk."""
         if name.startswith("truth/"):
-            check_truth(name, values)
+            ground_truth.check_truth(name, values)
         if name not in self._datasets:
-            self._datasets[name] = make_dataset(
+            self._datasets[name] = hdf5_files.make_dataset(
                 self._file, name, values.dtype, values.shape[1:], chunk_rows, self._codec
             )
         dataset = self._datasets[name]
@@ -482,7 +481,7 @@ class RecordingWriter:
                 for name, column in columns.items():
                     stored: Sequence[Sequence[bytes]] = [(part,) for part in known.get(name, ())]
                     if len(stored) * CHUNK < len(column):
-                        stored = encode_parts(column, self._codec)
+                        stored = hdf5_files.encode_parts(column, self._codec)
                     chunks += EncodedChunk.of(name, start, column, stored)
                 self._chunks.write(turn, chunks, self._dataset_of, lambda: self._follow(events, start))
         return events, inside
@@ -493,7 +492,7 @@ class RecordingWriter:
         if not {"events/t", "events/p"}.issubset(known):
             self._check(events, start, allow_nan=True)
         elif events.whole_pixels or np.isinf(events.x[outside]).any() or np.isinf(events.y[outside]).any():
-            check_coordinates(events, *self._size, where=str(self.path), first_index=start, allow_nan=True)
+            checks.check_coordinates(events, *self._size, where=str(self.path), first_index=start, allow_nan=True)
 
     def _follow(self, events: Events, start: int) -> None:
         """Check that a piece is not earlier than the one before, and extend the index. Called in turn."""
@@ -501,7 +500,7 @@ class RecordingWriter:
         self._index(events.t, start)
 
     def _check(self, events: Events, first_index: int, **how: Any) -> None:
-        check_events(events, *self._size, where=str(self.path), first_index=first_index, **how)
+        checks.check_events(events, *self._size, where=str(self.path), first_index=first_index, **how)
 
     def append_frame(self, frame: FrameTruth) -> None:
         """Append the ground truth of an instant.
@@ -637,7 +636,7 @@ class RecordingWriter:
     def _write_chunk(self, name: str, start: int, values: NDArray[Any], turn: int) -> None:
         """Encode and write the values of a chunk that begins at element ``start``. Runs in a thread."""
         with self._chunks.stopping():
-            chunks = EncodedChunk.of(name, start, values, encode_parts(values, self._codec))
+            chunks = EncodedChunk.of(name, start, values, hdf5_files.encode_parts(values, self._codec))
             self._chunks.write(turn, chunks, self._dataset_of)
 
     def _dataset_of(self, chunk: EncodedChunk) -> Any:
@@ -652,7 +651,7 @@ class RecordingWriter:
 
     def _dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = ()) -> Any:
         if name not in self._datasets:
-            self._datasets[name] = make_dataset(self._file, name, dtype, row, codec=self._codec)
+            self._datasets[name] = hdf5_files.make_dataset(self._file, name, dtype, row, codec=self._codec)
         return self._datasets[name]
 
     def _finish(self) -> None:
@@ -696,7 +695,7 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
         file = chunks.hdf5
         file.attrs["width"], file.attrs["height"] = about.width, about.height
         file["t_offset"] = np.int64(about.t_first)
-        create = partial(make_dataset, file, codec=about.codec)
+        create = partial(hdf5_files.make_dataset, file, codec=about.codec)
         datasets = {name: create(f"events/{name}", dtype) for name, dtype in COLUMNS.items()}
         index = [np.zeros(0, np.int64)]
         written = ms = 0
@@ -706,13 +705,13 @@ def write_dsec(part: Path, blocks: Iterable[Events], about: Outline) -> None:
                 ms += entries.size
             columns = {"x": events.x, "y": events.y, "t": events.t - about.t_first, "p": events.p}
             for name, dtype in COLUMNS.items():
-                append_values(datasets[name], written, columns[name].astype(dtype), about.codec)
+                hdf5_files.append_values(datasets[name], written, columns[name].astype(dtype), about.codec)
             written += len(events)
             chunks.check()
         stored = create("ms_to_idx", np.uint64)
         found = np.concatenate(index).astype(np.uint64)
         for start in range(0, ms, CHUNK):
-            append_values(stored, start, found[start : start + CHUNK], about.codec)
+            hdf5_files.append_values(stored, start, found[start : start + CHUNK], about.codec)
 
 
 # Copy of a recording into a native file.
@@ -751,7 +750,7 @@ def _copy_events(
         known = None if truth is None else truth.of_events(start, stop)
         marks = {name: None if flag is None else flag(start, stop) for name, flag in flags.items()}
         if marks["inside"] is None and not block.whole_pixels:
-            marks["inside"] = inside_image(block.x, block.y, *size)
+            marks["inside"] = checks.inside_image(block.x, block.y, *size)
         writer.append(block, truth=known, **marks)
         start = stop
         if progress is not None:
@@ -803,3 +802,362 @@ def save_recording(path: str | os.PathLike[str], recording: Recording, *, overwr
     >>> amiwarp.save_recording("short.h5", recording)
     """
     write_recording(path, recording, recording.events.size, overwrite=overwrite)
+
+
+# Writer of a live recording, which stays readable at any time and loses at most its last second in a crash.
+#
+# HDF5's single-writer mode orders all writes so that the file is consistent after each. The last chunk is usually not
+# full. Every flush writes it again at another place, so that the version which a reader or a crashed file refers to
+# stays intact. HDF5 fails badly on a full disk, so the space to finish the file is reserved before events are accepted.
+# The file gets its name after that mode has begun: HDF5 cannot open a file whose creation was cut off.
+
+SMALL_CHUNK = 4096
+"""Number of elements per chunk of the small datasets. They are not compressed, so that they grow in place."""
+
+END_ADDRESS_OFFSET = 28
+"""Offset of the end-of-file address in an HDF5 file's header [bytes]. Bytes after that address are unused."""
+
+FINISH_BYTES = 1 << 19
+"""Disk space that is reserved to finish a file in addition to its data [bytes]: for HDF5's structures and partial
+chunks."""
+
+MOST_WAITING = 1 << 24
+"""Largest amount of encoder samples that wait for the next flush [bytes]. More samples are written immediately."""
+
+MOST_PULSES = 1 << 16
+"""Largest number of index pulses that wait for encoder samples. If there are more, the oldest are dropped."""
+
+MAX_WASTE_BYTES = 1 << 24
+"""Largest size of superseded chunks in a finished file [bytes]. With more, the file is copied without these chunks."""
+
+
+class LiveWriter:
+    """Writer that streams a live recording into ``NAME.part.h5`` next to ``path``, and renames it to ``path``.
+
+    The file is finished and renamed in every case: after an exception and on a full disk it keeps the events appended
+    so far, and the error gives their number. ``compensated`` recordings hold float32 coordinates and flags. All events
+    are in the file after ``flush_s`` [s] at the latest, if :meth:`append` or :meth:`tick` is called that often. Use it
+    in one thread.
+
+    Raises :class:`AmiwarpError` for a path that does not end in .h5 or .hdf5, cannot be written or exists (unless
+    ``overwrite``), for an existing part file, and for events that are unsorted or outside the frame. After bad events
+    the recording can continue.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        width: int,
+        height: int,
+        camera: Camera | None = None,
+        prism: NominalPrism | None = None,
+        metadata: Mapping[str, MetadataValue] | None = None,
+        compensated: bool = False,
+        clock_offset_us: float = 0.0,
+        flush_s: float = 0.5,
+        overwrite: bool = False,
+    ) -> None:
+        """Prepare the writer. The times of written encoder samples are shifted by ``clock_offset_us``."""
+        self.path, self._overwrite = Path(path), overwrite
+        check_native(self.path)
+        check_frame(self.path, width, height, camera)
+        self.part = self.path.resolve().with_name(f"{self.path.stem}.part.h5")
+        self._size = (int(width), int(height))
+        self._camera, self._prism, self._metadata = camera, prism, dict(metadata or {})
+        self._compensated, self._flush_s, self._clock_offset_us = compensated, flush_s, clock_offset_us
+        self._file: Any = None
+        self._columns: dict[str, Any] = {}
+        self._small: dict[str, _GrowingDataset] = {}
+        self._pending: list[Columns] = []
+        self._pending_count = 0
+        self._written = 0  # number of events in full chunks
+        self._stored = 0  # number of events in the file, including those of the last, partial chunk
+        self._flushed_at = 0.0  # [s], monotonic
+        self._reserved = 0  # [bytes]
+        self._t_offset = 0
+        self._t_last: int | None = None
+        self._next_ms = 0
+        self._encoder_span: tuple[int, int] | None = None  # times of the first and the last encoder sample [us]
+        self._pulses = np.zeros(0, np.int64)  # index pulses later than the last encoder sample
+        self._encoder: Encoder | None = None
+
+    def __len__(self) -> int:
+        return self._written + self._pending_count
+
+    def __enter__(self) -> LiveWriter:
+        import h5py
+
+        check_output(self.path, overwrite=self._overwrite)
+        if os.path.lexists(self.part):
+            raise self._part_exists()
+        new = NewFile(self.part)
+        try:
+            try:
+                with open(new.part, "xb") as file:
+                    allocate(file.fileno(), 0, self._to_finish())
+            except OSError as error:
+                what = f"cannot be created: {error.strerror}; choose another place"
+                raise AmiwarpError(f"{self.path}: {what}") from error
+            with errors_name(self.path, lambda: "making the file"):
+                self._file = h5py.File(new.part, "w", libver=("v110", "v110"))
+                self._allocate()
+                self._create_datasets()
+                self._file.swmr_mode = True
+                self._file.flush()
+                try:
+                    link_new(new.part, self.part)
+                except FileExistsError as error:
+                    raise self._part_exists() from error
+        except BaseException:
+            self._close()
+            raise
+        finally:
+            new.discard()
+        self._flushed_at = time.monotonic()
+        return self
+
+    def _part_exists(self) -> AmiwarpError:
+        what = "is being written, or was left by an interrupted recording; it can be opened like any recording"
+        return AmiwarpError(f"{self.part}: {what}; rename or delete this file")
+
+    def _create_datasets(self) -> None:
+        """Create all datasets, because none can be added in single-writer mode."""
+        file, coordinate = self._file, np.float32 if self._compensated else np.uint16
+        write_header(file, self._size, self._camera, self._prism, self._metadata)
+        dtypes = {"x": coordinate, "y": coordinate, "p": np.uint8, "t": np.int64}
+        if self._compensated:
+            dtypes |= {"inside": np.uint8, "extrapolated": np.uint8}
+        self._columns = {
+            f"events/{name}": hdf5_files.make_dataset(file, f"events/{name}", dtype) for name, dtype in dtypes.items()
+        }
+        file["t_offset"] = np.int64(0)
+        small = {"ms_to_idx": np.int64, "encoder/t": np.int64, "encoder/angle": np.float64, "encoder/index_t": np.int64}
+        for name, kind in small.items():
+            dataset = file.create_dataset(name, shape=(0,), maxshape=(None,), chunks=(SMALL_CHUNK,), dtype=kind)
+            self._small[name] = _GrowingDataset(dataset)
+        file["encoder"].attrs["clock_offset_us"] = self._clock_offset_us
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._file is None:  # writing failed before, and the file is finished
+            return
+        self._finish(tidy=True)
+        if error is not None:
+            error.add_note(f"{self.path}: holds the {len(self)} events before the error")
+
+    def append(self, events: Events, *, inside: ArrayLike | None = None, extrapolated: ArrayLike | None = None) -> None:
+        """Append events. Compensated events need the flags ``inside`` and may have ``extrapolated``, shape ``(n,)``."""
+        self._check_open("append")
+        with errors_name(self.path, lambda: f"after {len(self)} events"):
+            columns = self._as_columns(events, inside, extrapolated)
+            checks.check_events(events, *self._size, where=str(self.path), first_index=len(self),
+                                allow_nan=self._compensated, after_t=self._t_last)  # fmt: skip
+            if len(events) and not len(self):
+                self._file["t_offset"][()] = self._t_offset = int(events.t[0])
+            columns["events/t"] = events.t
+            start = 0
+            while start < len(events):
+                self._reserve()
+                stop = min(start + CHUNK - self._pending_count, len(events))
+                self._accept({name: column[start:stop] for name, column in columns.items()})
+                start = stop
+        self.tick()
+
+    def _accept(self, columns: Columns) -> None:
+        """Add events to the current chunk, and write it if it is full."""
+        t = columns["events/t"]
+        for entries in ms_entries(t, self._t_offset, self._next_ms, len(self)):
+            self._small["ms_to_idx"].add(entries)
+            self._next_ms += entries.size
+        self._pending.append({**columns, "events/t": t - self._t_offset})
+        self._pending_count += t.size
+        self._t_last = int(t[-1])
+        if self._pending_count == CHUNK:
+            self._write()
+
+    def append_encoder(self, t_us: ArrayLike, angle: ArrayLike, index_t_us: ArrayLike = ()) -> None:
+        """Append encoder samples: times on the events' clock [us], unwrapped angles [rad], and index pulses [us].
+
+        Pulses before the first sample are dropped. Raises :class:`AmiwarpError` for samples that are not later than
+        those before, or not finite.
+        """
+        self._check_open("append_encoder")
+        offset = round(self._clock_offset_us)
+        t, angles = np.atleast_1d(as_times(t_us)) + offset, np.atleast_1d(np.asarray(angle, np.float64))
+        if t.shape != angles.shape or t.ndim != 1 or not np.isfinite(angles).all():
+            shapes = f"t {t.shape}, angle {angles.shape}"
+            raise AmiwarpError(
+                f"{self.path}: encoder samples have shapes {shapes}; expected one length and finite angles"
+            )
+        if t.size:
+            first, last = self._encoder_span or (int(t[0]), int(t[0]) - 1)
+            if t[0] <= last or (t[1:] <= t[:-1]).any():
+                raise AmiwarpError(
+                    f"{self.path}: encoder samples {t[0]} .. {t[-1]} us do not follow {last} us; append samples in "
+                    "order of time"
+                )
+            self._reserve(2 * t.nbytes)
+            self._small["encoder/t"].add(t)
+            self._small["encoder/angle"].add(angles)
+            self._encoder_span = first, int(t[-1])
+        if self._encoder_span is not None:
+            first, last = self._encoder_span
+            pulses = np.append(self._pulses, as_times(index_t_us) + offset)
+            self._small["encoder/index_t"].add(pulses[(pulses >= first) & (pulses <= last)])
+            self._pulses = pulses[pulses > last][-MOST_PULSES:]
+        if sum(small.waiting_bytes for small in self._small.values()) > MOST_WAITING:
+            with errors_name(self.path, lambda: f"after {len(self)} events"):
+                self._flush()
+        self.tick()
+
+    def set_encoder(self, encoder: Encoder) -> None:
+        """Set the encoder data that the finished file holds instead of the appended encoder samples."""
+        self._encoder = encoder
+
+    def tick(self) -> None:
+        """Flush if the flush interval has passed. Call this method while no events arrive."""
+        if self._file is not None and time.monotonic() - self._flushed_at >= self._flush_s:
+            with errors_name(self.path, lambda: f"after {len(self)} events"):
+                self._flush()
+
+    def _check_open(self, what: str) -> None:
+        if self._file is None:
+            given = f"{what}() was called outside the writer's 'with' block, or after it failed"
+            raise AmiwarpError(f"{self.path}: {given}; use a new writer")
+
+    def _as_columns(self, events: Events, inside: ArrayLike | None, extrapolated: ArrayLike | None) -> Columns:
+        if len(events) and events.x.dtype != self._columns["events/x"].dtype:
+            wanted = self._columns["events/x"].dtype
+            raise AmiwarpError(f"{self.path}: events come with {events.x.dtype} coordinates; expected {wanted}")
+        if (inside is not None) != self._compensated or (extrapolated is not None and not self._compensated):
+            raise AmiwarpError(
+                f"{self.path}: compensated events need the flags inside, events from a sensor take no flags"
+            )
+        columns: Columns = {"events/x": events.x, "events/y": events.y, "events/p": events.p}
+        if self._compensated:
+            columns["events/inside"] = np.asarray(inside).astype(np.uint8)
+            flags = np.zeros(len(events)) if extrapolated is None else np.asarray(extrapolated)
+            columns["events/extrapolated"] = flags.astype(np.uint8)
+        check_lengths(columns, len(events))
+        return columns
+
+    def _to_finish(self) -> int:
+        """Return the space that finishing the file may take [bytes]: one whole chunk and the waiting samples."""
+        event = 19 if self._compensated else 13
+        return (
+            FINISH_BYTES
+            + event * CHUNK
+            + event * CHUNK // 64
+            + sum(small.waiting_bytes for small in self._small.values())
+        )
+
+    def _reserve(self, extra: int = 0) -> None:
+        """Reserve disk space to finish the file, and ``extra`` bytes.
+
+        If the disk is full, finish the file and raise :class:`AmiwarpError`.
+        """
+        try:
+            self._allocate(extra)
+        except OSError as error:
+            self._finish(tidy=False)
+            what = f"{error.strerror} after {len(self)} events, which the file holds"
+            raise AmiwarpError(f"{self.path}: {what}; make room, or write to another disk") from error
+
+    def _allocate(self, extra: int = 0) -> None:
+        """Reserve disk space to finish the file, and ``extra`` bytes. Raises OSError if the disk is full."""
+        end = self._file.id.get_filesize() + self._to_finish() + extra
+        if end > self._reserved:
+            allocate(self._file.id.get_vfd_handle(), self._reserved, end - self._reserved)
+            self._reserved = end
+
+    def _write(self) -> None:
+        """Write the pending events of the current chunk. Start a new chunk if the chunk is full."""
+        count = self._pending_count
+        joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
+        with contextlib.closing(
+            in_order(partial(hdf5_files.encode, column[:count]) for column in joined.values())
+        ) as encoded:
+            for name, stored in zip(joined, encoded, strict=True):
+                hdf5_files.append_chunk(self._columns[name], self._written, stored, count)
+        # One statement, so that Ctrl-C cannot interrupt it halfway.
+        if count == CHUNK:
+            self._written, self._pending, self._pending_count = self._written + count, [], 0
+        self._pending = [joined] if self._pending_count else []
+        self._stored = len(self)
+
+    def _flush(self) -> None:
+        if self._stored < len(self):
+            self._write()
+        for small in self._small.values():
+            small.write()
+        self._file.flush()
+        self._flushed_at = time.monotonic()
+
+    def _finish(self, *, tidy: bool) -> None:
+        """Write the remaining data and rename the part file to ``path``.
+
+        If the part file has many superseded chunks, it is copied to ``path`` without them instead.
+        """
+        with errors_name(self.path, lambda: f"finishing after {len(self)} events; {self.part} holds all but the last"):
+            if tidy and self._encoder is not None:
+                self._replace_encoder(self._encoder)
+            self._small["ms_to_idx"].add(np.array([len(self)], np.int64))
+            self._flush()
+            stored = sum(int(dataset.id.get_storage_size()) for dataset in self._columns.values())
+            stored += sum(small.stored_bytes for small in self._small.values())
+            self._close()
+            with open(self.part, "r+b") as file:
+                file.seek(END_ADDRESS_OFFSET)
+                file.truncate(int.from_bytes(file.read(8), "little"))
+            if tidy and os.path.getsize(self.part) > 2 * stored + MAX_WASTE_BYTES:
+                with contextlib.suppress(AmiwarpError):  # if the disk is full, the part itself is renamed
+                    tidied = dataclasses.replace(open_hdf5(self.part), metadata=self._metadata)
+                    save_recording(self.path, tidied, overwrite=self._overwrite)
+                    self.part.unlink()
+                    return
+            put_in_place(self.part, self.path, overwrite=self._overwrite)
+
+    def _replace_encoder(self, encoder: Encoder) -> None:
+        self._reserve(2 * (encoder.t.nbytes + encoder.angle.nbytes))
+        self._file["encoder"].attrs["clock_offset_us"] = float(encoder.clock_offset_us)
+        for name in ("t", "angle", "index_t"):
+            values = getattr(encoder, name)
+            self._small[f"encoder/{name}"].replace(np.zeros(0, np.int64) if values is None else values)
+
+    def _close(self) -> None:
+        file, self._file = self._file, None
+        self._columns, self._small = {}, {}
+        if file is not None:
+            file.close()
+
+
+class _GrowingDataset:
+    """Small dataset whose new values wait in memory until they are written."""
+
+    def __init__(self, dataset: Any) -> None:
+        self._dataset = dataset
+        self._waiting: list[NDArray[Any]] = []
+        self._written = 0
+        self.waiting_bytes = 0
+
+    def add(self, values: NDArray[Any]) -> None:
+        self._waiting.append(values)
+        self.waiting_bytes += values.nbytes
+
+    def replace(self, values: NDArray[Any]) -> None:
+        self._dataset.resize(0, axis=0)
+        self._waiting, self._written, self.waiting_bytes = [values], 0, values.nbytes
+
+    @property
+    def stored_bytes(self) -> int:
+        return int(self._dataset.id.get_storage_size())
+
+    def write(self) -> None:
+        if self._waiting:
+            values = np.concatenate(self._waiting)
+            end = self._written + values.size
+            self._dataset.resize(end, axis=0)
+            self._dataset[self._written : end] = values
+            self._waiting, self._written, self.waiting_bytes = [], end, 0

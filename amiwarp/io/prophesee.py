@@ -1,4 +1,4 @@
-"""Prophesee's files and words: RAW (EVT 2.0, 2.1, 3.0) is read and written, DAT is read."""
+"""Prophesee's files and words: RAW (EVT 2.0, 2.1, 3.0) is read and written; DAT and Event Stream files are read."""
 
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import DEFAULT_BLOCK, Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import DEFAULT_BLOCK, Events, Recording
 from amiwarp.io.file_scan import FileEvents, Packet, last_word, nearest, read_pieces, read_words, unwrapped
+from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.formats import LONGEST_US, Outline
-from amiwarp.io.input_files import errors_name, open_input
-from amiwarp.io.reading_process import noting_progress, packets
+from amiwarp.io.reading_process import Reply, noting_progress, packets, run
 
 # Decoders of Prophesee's EVT words with NumPy: EVT 2.0, 2.1 and 3.0, for streams that arrive in pieces.
 #
@@ -404,3 +403,40 @@ def write_evt3(part: Path, blocks: Iterable[Events], about: Outline) -> None:
         file.write("".join(f"% {line}\n" for line in header).encode())
         for events in blocks:
             file.write(encoder.encode(events).astype("<u2").data)
+
+
+# Reader of Event Stream files (.es), with faery: events of DVS files, and change detections of ATIS files.
+
+
+def open_es(path: Path) -> Recording:
+    """Open an Event Stream file. Its rows are counted from the bottom, so they are flipped."""
+    with errors_name(path, lambda: "reading the header"):
+        width, height = run(read_es_head, path.absolute())
+    source = partial(packets, read_es_packets, path.absolute(), height)
+    events = FileEvents(path, source, size=(width, height))
+    return Recording(events=events, metadata={"format": "es", **events.metadata}, name=path.stem)
+
+
+def _es_decoder(path: str) -> Any:
+    """Open a file with faery, which loads slowly. Called in the reading process."""
+    from faery.extension import es
+
+    return es.Decoder(path, 0)
+
+
+def read_es_head(path: str) -> Reply:
+    """Return width and height of the sensor. Called in the reading process."""
+    with _es_decoder(path) as decoder:
+        kind, size = decoder.event_type, decoder.dimensions
+        if kind not in ("dvs", "atis") or size is None:
+            raise AmiwarpError(f"holds {kind} events; expected dvs or atis")
+        return (int(size[0]), int(size[1])), []
+
+
+def read_es_packets(notes: dict[str, int], path: str, height: int) -> Iterator[Packet]:
+    """Yield packets of events. Called in the reading process."""
+    with _es_decoder(path) as decoder:
+        atis = decoder.event_type == "atis"
+        for packet in noting_progress(decoder, path, notes):
+            events = packet[~packet["exposure"].astype(bool)] if atis else packet
+            yield events["x"], height - 1 - events["y"], events["t"], events["polarity" if atis else "p"]

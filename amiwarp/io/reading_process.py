@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import input_folder, input_path
+from amiwarp.io.files import input_folder, input_path
 
 CPU_SECONDS = 30
 """Limit of the processor time of one request [s]. Unlike elapsed time, it does not depend on the machine's load."""

@@ -15,12 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, regroup
-from amiwarp.events.recording import Recording
-from amiwarp.io.atomic_output import scratch_folder
+from amiwarp.events.recording import Events, Recording, regroup
 from amiwarp.io.file_scan import FileEvents, Packet, read_sensors
+from amiwarp.io.files import errors_name, scratch_folder
 from amiwarp.io.formats import Bag, Outline
-from amiwarp.io.input_files import errors_name
 from amiwarp.io.prophesee import Columns, Evt2Decoder, Evt3Decoder, Evt3Encoder, origin_of, swap_halves, words_of
 from amiwarp.io.reading_process import Reply, packets, run
 

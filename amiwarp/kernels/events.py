@@ -7,7 +7,7 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 BEYOND = wp.constant(1 << 16)  # stands for an infinite coordinate among the largest coordinates
-TIME_LIMIT = wp.constant(wp.float64(2.0**62))  # amiwarp.events.events.TIME_LIMIT [us]
+TIME_LIMIT = wp.constant(wp.float64(2.0**62))  # amiwarp.events.recording.TIME_LIMIT [us]
 
 
 @wp.func

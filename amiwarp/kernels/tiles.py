@@ -2,7 +2,7 @@
 
 A block of threads takes a chunk of one tile's events and a few candidates (parameter sets): it reads each event once
 for all of them. Votes outside the window around the tile go directly to the image. Used by
-:mod:`amiwarp.imaging.votes`.
+:mod:`amiwarp.imaging.iwe`.
 """
 
 from typing import Any

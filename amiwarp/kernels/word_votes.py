@@ -6,7 +6,7 @@ sums fx, fy and b of x, y and x y in the cell [1/256]. They give the sums of the
 bit-identical on every run.
 
 A word overflows after 1,023 events. Either each carry out of a field is added exactly to 64-bit totals at once; or,
-faster, words are emptied in time and checked afterwards: see :mod:`amiwarp.imaging.votes`.
+faster, words are emptied in time and checked afterwards: see :mod:`amiwarp.imaging.iwe`.
 """
 
 from typing import Any

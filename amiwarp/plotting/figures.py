@@ -17,14 +17,13 @@ from amiwarp.calib.calibration_events import thin
 from amiwarp.calib.result import cost_surface
 from amiwarp.choices import Tone
 from amiwarp.compensation.recordings import compensate_events
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.metrics import PictureQuality
 from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
-from amiwarp.io.atomic_output import write_text
+from amiwarp.io.files import write_text
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import MODELS
 from amiwarp.plotting import clouds

@@ -27,16 +27,15 @@ from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceMemoryEvents, device_of, read_between, wait
 from amiwarp.events.encoder import TWO_PI, Encoder, turn_between
-from amiwarp.events.events import TIME_LIMIT, EventSource
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import EventSource, Recording
 from amiwarp.imaging.export import encode_image
-from amiwarp.io.atomic_output import NewFile, check_output
+from amiwarp.io.files import NewFile, check_output
 from amiwarp.io.formats import check_ending
 from amiwarp.kernels import known_nodes as kernels
 from amiwarp.kernels.launch import launch, load, start_read
 from amiwarp.optics.camera import CameraRotation, border
 from amiwarp.optics.models import Model
-from amiwarp.validation import choice, guarded, real, whole
+from amiwarp.validation import TIME_LIMIT, choice, guarded, real, whole
 
 # Decision which nodes of a brightness map the events determine.
 

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import TIME_LIMIT
-from amiwarp.io.input_files import errors_name, input_path, open_input, register_reader
+from amiwarp.io.files import errors_name, input_path, open_input, register_reader
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import guarded, real, shown, vector, whole
+from amiwarp.validation import TIME_LIMIT, guarded, real, shown, vector, whole
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear red, green and blue in the luminance (ITU-R BT.709)."""

@@ -18,9 +18,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events import truth
 from amiwarp.events.device_events import NAMES, DeviceEvents, DeviceMemoryEvents, DeviceValues, join, wait
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import TIME_LIMIT, Events, EventSource, MemoryEvents
-from amiwarp.events.recording import MetadataValue, Recording, Truth
-from amiwarp.events.truth import EventTruth, EventValues, FrameTruth, Poses
+from amiwarp.events.recording import Events, EventSource, MemoryEvents, MetadataValue, Recording
+from amiwarp.events.truth import EventTruth, EventValues, FrameTruth, Poses, Truth
 from amiwarp.io import RecordingWriter
 from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.optics.camera import Camera, camera_params
@@ -32,7 +31,7 @@ from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMoti
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.scenery import DeviceWorld, MapRing, WorldMapRing, WorldSight
 from amiwarp.simulation.worlds.world import WorldScene
-from amiwarp.validation import array, guarded, real, shown
+from amiwarp.validation import TIME_LIMIT, array, guarded, real, shown
 
 # Ground truth of a simulated world at an instant: depth, normals, instances, optical flow and luminance.
 

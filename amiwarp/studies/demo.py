@@ -19,9 +19,10 @@ from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.events.recording import Recording
 from amiwarp.imaging import metrics
-from amiwarp.imaging.sharpness import gaussian
+from amiwarp.imaging.metrics import gaussian
 from amiwarp.io import open_recording
-from amiwarp.io.atomic_output import check_output, make_folder
+from amiwarp.io.files import check_output
+from amiwarp.io.formats import make_folder
 from amiwarp.kernels.camera import PinholeParams
 from amiwarp.kernels.checksum import compute_checksums
 from amiwarp.kernels.compensation import compensate_blocks

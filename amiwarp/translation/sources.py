@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from amiwarp.choices import CONTRAST
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, EventSource
-from amiwarp.io.input_files import errors_name, input_path
+from amiwarp.events.recording import Events, EventSource
+from amiwarp.io.files import errors_name, input_path
 from amiwarp.optics.camera import Camera
 from amiwarp.simulation.description import CameraMotion
 from amiwarp.simulation.pictures import DARK, Pictures, linear_luminance

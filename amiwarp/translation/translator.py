@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from amiwarp.choices import CONTRAST, Sharpness, Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.events.recording import MetadataValue, Recording
-from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.imaging.votes import CanvasShape, Votes, upload_events
+from amiwarp.events.recording import Events, MetadataValue, Recording
+from amiwarp.imaging.iwe import CanvasShape, Votes, upload_events
+from amiwarp.imaging.metrics import SharpnessMeter
 from amiwarp.io.formats import detect_format, open_recording
 from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.optics.models import ExactModel

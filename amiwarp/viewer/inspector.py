@@ -1,8 +1,12 @@
-"""State of the inspector without any user interface: recording, prism parameters, time window and its images."""
+"""State of the inspector without a user interface: recording, parameters, time window and its images, event rates."""
 
+from __future__ import annotations
+
+import enum
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
@@ -12,22 +16,539 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.calib.bad_pixels import strange_pixels, stretch
-from amiwarp.calib.parameters import build_model, nominal
+from amiwarp.calib.parameters import build_model, nominal, optical_parameters
 from amiwarp.calib.result import Calibration, constant_speed
-from amiwarp.choices import Sharpness
+from amiwarp.choices import Colour, Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, turn_between
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, EventSource, Recording
+from amiwarp.events.truth import Cause, EventValues, Truth
+from amiwarp.imaging.corners import find_background_activity
 from amiwarp.imaging.export import PERCENTILE
-from amiwarp.imaging.sharpness import random_variance
-from amiwarp.imaging.votes import UploadedEvents, upload_events
+from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, upload_events
+from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_variance
+from amiwarp.io.file_scan import FileEvents
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, Model, size_names
-from amiwarp.reconstruction.picture import border_displacements
-from amiwarp.viewer import window
-from amiwarp.viewer.timeline import Span, read_span
-from amiwarp.viewer.window import Knobs, Selection, Source, WindowImager
+from amiwarp.optics.models import MODELS, PHASE, Model, size_names
+from amiwarp.reconstruction.picture import Picture, border_displacements
+
+# Rates of ON and OFF events over a recording at any zoom, counted once in bounded memory.
+
+MOST_BINS = 1 << 19
+"""Largest number of time bins in which the events of the whole recording are counted."""
+MOST_EXACT = 1_000_000
+"""Largest number of events that are read to count them in bins finer than those of the whole recording."""
+
+
+@dataclass(frozen=True, eq=False)
+class RateCurve:
+    """Rates of ON and OFF events in time bins of equal length, or nearly so."""
+
+    edges_us: NDArray[np.int64]
+    """Edges of the bins on the events' clock [us], shape ``(n + 1,)``."""
+    on: NDArray[np.float64]
+    """Rate of ON events [1/s], shape ``(n,)``; NaN where the recording is not read yet."""
+    off: NDArray[np.float64]
+    """Rate of OFF events [1/s], shape ``(n,)``; NaN where the recording is not read yet."""
+
+
+class EventRates:
+    """Counts of a recording's events over time. Call :meth:`fill` until it returns True, in one thread.
+
+    Another thread may call :meth:`curve` meanwhile.
+    """
+
+    def __init__(self, source: EventSource) -> None:
+        self._source = source
+        self._first, self._stop = source.t_first, source.t_last + 1
+        bins = min(MOST_BINS, self._stop - self._first)
+        share = np.arange(bins + 1, dtype=np.float64) / bins
+        self._edges = self._first + np.rint(share * (self._stop - self._first)).astype(np.int64)
+        self._counts = np.zeros((2, bins), np.int64)
+        self._blocks: Iterator[Events] = iter(source.blocks())
+        self._read = (np.zeros((2, bins + 1), np.int64), self._first)  # number of events before each edge; time read
+
+    @property
+    def share(self) -> float:
+        """Share of the recording's duration that is counted, 0 to 1."""
+        return (self._read[1] - self._first) / (self._stop - self._first)
+
+    def fill(self, seconds: float) -> bool:
+        """Count events for about ``seconds`` [s], at least one block. Return whether all events are counted."""
+        until, read_us = time.perf_counter() + seconds, self._read[1]
+        while read_us < self._stop:
+            block = next(self._blocks, None)
+            if block is None:
+                read_us = self._stop
+                break
+            if len(block):
+                self._count(block)
+                read_us = int(block.t[-1])
+            if time.perf_counter() >= until:
+                break
+        sums = np.zeros((2, len(self._edges)), np.int64)
+        np.cumsum(self._counts, axis=1, out=sums[:, 1:])
+        self._read = sums, read_us
+        return read_us == self._stop
+
+    def curve(self, start_us: int, end_us: int, bins: int) -> RateCurve:
+        """Return the rates between two times in about ``bins`` bins.
+
+        Bins finer than those of the whole recording are counted if the time between holds few events. Otherwise, the
+        curve has fewer bins. Times outside the recording have rate 0.
+        """
+        start_us, end_us = int(start_us), max(int(end_us), int(start_us) + 1)
+        edges = start_us + (end_us - start_us) * np.arange(bins + 1, dtype=np.int64) // bins
+        edges = np.unique(edges)
+        finest = (self._stop - self._first) / (len(self._edges) - 1)
+        if edges[1] - edges[0] < 4.0 * finest and finest > 1.0:
+            exact = self._exact(edges)
+            if exact is not None:
+                return _curve(edges, exact)
+            within = (self._edges > start_us) & (self._edges < end_us)
+            edges = np.concatenate([[start_us], self._edges[within], [end_us]])
+            edges = edges[np.unique(np.r_[0 : len(edges) - 1 : max(1, len(edges) // bins), len(edges) - 1])]
+        sums, read_us = self._read
+        before = np.searchsorted(self._edges, edges)  # a bin of the recording belongs to where it begins
+        counts = np.diff(sums[:, np.minimum(before, sums.shape[1] - 1)], axis=1).astype(np.float64)
+        if read_us < self._stop:
+            counts[:, edges[1:] > read_us] = np.nan
+        return _curve(edges, counts)
+
+    def _count(self, block: Events) -> None:
+        low, high = np.searchsorted(self._edges, (block.t[0], block.t[-1]), side="right") - 1
+        edges = np.searchsorted(block.t, self._edges[low + 1 : high + 1])
+        on = np.concatenate([[0], np.cumsum(block.p, dtype=np.int64)])
+        at = np.concatenate([[0], edges, [len(block)]])
+        ons = np.diff(on[at])
+        self._counts[1, low : high + 1] += ons
+        self._counts[0, low : high + 1] += np.diff(at) - ons
+
+    def _exact(self, edges: NDArray[np.int64]) -> NDArray[np.float64] | None:
+        """Return the numbers of OFF and ON events in bins, read from the source; None if there are too many."""
+        if isinstance(self._source, FileEvents):  # would be read from its start
+            return None
+        first, stop = (self._source.find(int(t)) for t in (edges[0], edges[-1]))
+        if stop - first > MOST_EXACT:
+            return None
+        events = self._source.slice(first, stop)
+        return np.array([np.diff(np.searchsorted(events.t[events.p == p], edges)) for p in (0, 1)], np.float64)
+
+
+def _curve(edges: NDArray[np.int64], counts: NDArray[np.float64]) -> RateCurve:
+    rates = counts / np.diff(edges) * 1e6
+    return RateCurve(edges, rates[1], rates[0])
+
+
+# Events of a time window, read without loading the other events.
+
+RUNS = 64
+"""Number of evenly spaced runs of events that are read from a window with too many events."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """Events of a time window."""
+
+    first_us: int
+    """Time of the recording's first event, from which all shown times count [us]."""
+    start_us: int
+    """Start of the time window on the events' clock [us]."""
+    length_us: int
+    """Length of the time window [us]."""
+    count: int
+    """Number of events in the time window, including those that are not read."""
+    events: Events
+    """All events of the window, or evenly spaced runs of them."""
+    runs: tuple[slice, ...]
+    """Indices of these events in the recording."""
+
+    @property
+    def start_ms(self) -> float:
+        """Start of the time window after the recording's first event [ms]."""
+        return (self.start_us - self.first_us) * 1e-3
+
+    def rows(self, values: EventValues) -> NDArray[Any]:
+        """Return the rows of ``values`` for :attr:`events`; ``values`` has one row per event of the recording."""
+        return np.concatenate([values[run] for run in self.runs])
+
+
+def read_span(source: EventSource, start_us: int, length_us: int, *, most_events: int) -> Span:
+    """Read the events with ``start_us <= t < start_us + length_us``.
+
+    If the window holds more than ``most_events``, read about this number in evenly spaced runs.
+    """
+    first, stop = (source.find(t) for t in (start_us, start_us + length_us))
+    count = stop - first
+    if count <= most_events:
+        return Span(source.t_first, start_us, length_us, count, source.slice(first, stop), (slice(first, stop),))
+    starts, length = (first + np.arange(RUNS) * count // RUNS).tolist(), most_events // RUNS
+    runs = tuple(slice(k, k + length) for k in starts)
+    events = Events.concatenate(list(_runs(source, starts, length)))
+    return Span(source.t_first, start_us, length_us, count, events, runs)
+
+
+def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Events]:
+    """Yield runs of ``length`` events. A file that can only be read from its start is read in one pass."""
+    if not isinstance(source, FileEvents):
+        yield from (source.slice(k, k + length) for k in starts)
+        return
+    seen = 0
+    for block in source.blocks():
+        yield from (block[max(k - seen, 0) : max(k + length - seen, 0)] for k in starts if k < seen + len(block))
+        seen += len(block)
+        starts = [k for k in starts if k + length > seen]
+        if not starts:
+            return
+
+
+# Ground truth of the events that the inspector draws, read from the recording on first use.
+
+STORES = {Colour.CAUSE: "stored_causes", Colour.INSTANCE: "stored_instances", Colour.DEPTH: "stored_depths"}
+"""Attribute of :class:`amiwarp.Truth` that each colour choice based on ground truth shows."""
+
+
+def colours_on_offer(truth: Truth | None) -> list[Colour]:
+    """Return the colour choices that are possible for a recording with this ground truth."""
+    return [c for c in Colour if c not in STORES or getattr(truth, STORES[c], None) is not None]
+
+
+def truth_text(truth: Truth | None) -> str:
+    """Return a one-line summary of the content of a ground truth; empty without ground truth."""
+    if truth is None:
+        return ""
+    stores = {"point": truth.stored_points, **{c.value: getattr(truth, name) for c, name in STORES.items()},
+              "place": truth.stored_places}  # fmt: skip
+    per_event = ", ".join(name for name, store in stores.items() if store is not None)
+    parts = [f"per event: {per_event}"] if per_event else ["prism"] if truth.parameters else []
+    parts += [f"{len(truth.labels.instances)} instances"] if truth.labels is not None else []
+    parts += [f"{len(truth.frames.t):,} instants"] if truth.frames is not None else []
+    parts += [f"{len(truth.poses):,} poses"] if truth.poses is not None else []
+    return "; ".join(parts)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnTruth:
+    """Ground truth of the events that the inspector draws."""
+
+    truth: Truth | None
+    """Ground truth of the whole recording; None if the recording has none."""
+    span: Span
+    """Time span from which the drawn events are a selection."""
+    positions: NDArray[np.int64]
+    """Indices of the drawn events in ``span.events``, shape ``(n,)``."""
+    _read: dict[Colour, NDArray[Any]] = field(default_factory=dict)
+
+    def values(self, colour: Colour) -> NDArray[Any]:
+        """Return the values of the drawn events that a colour shows, shape ``(n,)``.
+
+        The values are codes of causes, instance numbers, or depths [m]. Raises :class:`AmiwarpError` if the recording
+        does not hold this ground truth.
+        """
+        if colour not in self._read:
+            store = getattr(self.truth, STORES[colour], None)
+            if store is None:
+                given = ", ".join(c.value for c in colours_on_offer(self.truth))
+                raise AmiwarpError(
+                    f"colour {colour.value!r} needs ground truth that the recording does not hold; choose among {given}"
+                )
+            self._read[colour] = self.span.rows(store)[self.positions]
+        return self._read[colour]
+
+    def name(self, colour: Colour, number: int) -> str:
+        """Return the name of the cause with the code ``number``, or of the instance with this number."""
+        if colour is Colour.CAUSE:
+            return list(Cause)[number].value.replace("_", " ") if number < len(Cause) else f"cause {number}"
+        labels = () if self.truth is None or self.truth.labels is None else self.truth.labels.instances
+        return "sky" if number == 0 else labels[number - 1] if number <= len(labels) else f"instance {number}"
+
+    def text(self, k: int) -> str:
+        """Return the known ground truth of the drawn event ``k`` as text: cause, instance and depth."""
+        known = [c for c in colours_on_offer(self.truth) if c in STORES]
+        return "; ".join(
+            f"depth {self.values(c)[k]:.3f} m" if c is Colour.DEPTH else f"{c.value} {self.name(c, self.values(c)[k])}"
+            for c in known
+        )
+
+
+# Images of warped events and their sharpness for the inspector, on the device.
+
+SMOOTHING_PX = 1.0
+"""Standard deviation of the Gaussian that smooths the image before its sharpness is measured, as in calibration [px].
+"""
+
+Region = tuple[int, int, int, int]
+"""Part of the image: left, top, right and bottom [px]; right and bottom are exclusive."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredImage:
+    """Image of warped events with its sharpness in a region."""
+
+    image: NDArray[np.float32]
+    """The whole image [events per pixel], shape ``(height, width)``."""
+    variance: float
+    """Variance over mean of the smoothed region, as :attr:`amiwarp.Sharpness.VARIANCE`. It grows with the number of
+    events."""
+    sharpness: float
+    """Relative variance of the smoothed region, see
+    :func:`amiwarp.imaging.metrics.relative_variance`. It does not depend on the number of events."""
+
+
+class WindowImager:
+    """Makes images of warped events and measures their sharpness.
+
+    An imager owns its buffers, so only one thread may use it.
+    """
+
+    def __init__(self, size: tuple[int, int], device: Any) -> None:
+        self._votes, self._device = Votes(CanvasShape(*size, dither=True), device), device
+        self._meters: dict[tuple[int, int], SharpnessMeter] = {}
+
+    def measure(self, model: Model, events: UploadedEvents, offset_us: float, region: Region) -> MeasuredImage:
+        """Return the image, and its sharpness in the region.
+
+        ``offset_us`` is added to the encoder's clock offset [us].
+        """
+        self._votes.clear()
+        self._votes.add_events(model, events, drift=offset_us)
+        left, top, right, bottom = region
+        meter = self._meter(right - left, bottom - top)
+        if meter.image.shape == self._votes.canvas.shape:
+            self._votes.read(meter.image)
+            image = part = meter.image.numpy()[0]
+        else:
+            image = self._votes.take()[0]
+            part = image[top:bottom, left:right]
+            meter.image.write(part[None])
+        variance, mean = meter.measure(), float(part.mean())
+        return MeasuredImage(image, variance, relative_variance(variance, mean, SMOOTHING_PX) if mean > 0.0 else 0.0)
+
+    def _meter(self, width: int, height: int) -> SharpnessMeter:
+        """Return the meter of images of this size. Only the last one is kept."""
+        if (width, height) not in self._meters:
+            canvas = CanvasShape(width, height, dither=True)
+            meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
+            self._meters = {(width, height): meter}
+        return self._meters[width, height]
+
+
+# Parameters of the prism and selection of events under which the inspector shows a recording.
+
+
+class Source(enum.StrEnum):
+    """Where the value of a parameter comes from. The value of a member is the text that the page shows."""
+
+    ASSUMED = "assumed"
+    ESTIMATED = "estimated"
+    FILE = "from the file"
+    CALIBRATED = "calibrated"
+    HAND = "set by hand"
+    TRUTH = "known truth"
+
+
+@dataclass(frozen=True)
+class Knobs:
+    """Parameters of the prism that the page's sliders set."""
+
+    model: str = "exact"
+    """Name of the optical model."""
+    apex: float = 0.0
+    """Apex angle of the prism [rad]."""
+    phase: float = 0.0
+    """Phase θ_b of the prism [rad]."""
+    clock_offset: float = 0.0
+    """Offset between the clocks of encoder and camera, as in :class:`Encoder` [us]."""
+    rpm: float = 0.0
+    """Speed of the prism if the recording has no encoder [1/min]."""
+    focal_length: float | None = None
+    """Calibrated focal length [px]; None: that of the camera."""
+    others: tuple[tuple[str, float], ...] = ()
+    """Names and values of other parameters of optical models that are not 0, sorted by name."""
+
+    @classmethod
+    def given(cls, values: Mapping[str, float], **known: Any) -> Knobs:
+        """Return parameters with ``known`` fields, and the other parameters of optical models among the ``values``."""
+        return cls(**known).with_values({name: values[name] for name in OTHERS if name in values})
+
+    def value(self, name: str) -> float | None:
+        """Return the value of a parameter; None if it is not known and has no slider."""
+        if name not in OTHERS:
+            known: float | None = getattr(self, name)
+            return known
+        return dict(self.others).get(name, 0.0 if name in SLIDING else None)
+
+    def with_values(self, values: Mapping[str, float]) -> Knobs:
+        """Return the parameters with other values of some of them."""
+        others = dict(self.others) | {name: value for name, value in values.items() if name in OTHERS}
+        fields: dict[str, Any] = {name: value for name, value in values.items() if name not in OTHERS}
+        return replace(self, **fields, others=tuple(sorted((n, v) for n, v in others.items() if v)))
+
+    @property
+    def calibrated_only(self) -> dict[str, float]:
+        """Parameters by name that the page cannot change, and that a calibration or the known truth gave."""
+        found = {name: self.value(name) for name in (*(n for n in OTHERS if n not in SLIDING), "focal_length")}
+        return {name: value for name, value in found.items() if value is not None}
+
+
+OTHERS = {name: p for name, p in optical_parameters().items() if name not in (*size_names(), PHASE.name)}
+"""Parameters of the optical models but for sizes and phase, by name."""
+SLIDING = {name: p for name, p in OTHERS.items() if p.label}
+"""Those among :data:`OTHERS` that have a slider."""
+CURVE_HALF_WIDTH = {
+    "apex": math.radians(0.4), "phase": math.radians(30.0), "clock_offset": 5000.0, "rpm": 6.0,
+    **{name: p.half_range for name, p in SLIDING.items()},
+}  # fmt: skip
+"""Half width of the range of each parameter over which its sharpness curve is drawn, in the parameter's unit."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Conditions for the events that are shown."""
+
+    polarity: int | None = None
+    """Polarity of the shown events: 1 for only ON, 0 for only OFF, None for both."""
+    region: Region | None = None
+    """Region of the image: left, top, right and bottom [px], right and bottom exclusive. None: the whole image."""
+    hide_hot: bool = False
+    """Whether the events of hot pixels are left out."""
+    noise_us: int | None = None
+    """Time within which an earlier event at a neighbouring pixel must support an event [us]; None: no noise filter."""
+
+
+# Time windows of the inspector: their selected events, and what the page shows of them.
+
+
+@dataclass(frozen=True, eq=False)
+class WindowAngles:
+    """Prism angles of a window's events, without the clock offset that is set on the page."""
+
+    on_device: UploadedEvents
+    """Events of the images, on the device."""
+    theta: NDArray[np.float64]
+    """Prism angles of the drawn events [rad], shape ``(n,)``."""
+    speed: NDArray[np.float64]
+    """Speed of the prism at the drawn events [rad/us], shape ``(n,)``."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedWindow:
+    """Selected events of a window, in memory and on the device, and their image without compensation."""
+
+    span: Span
+    """Time window, with all events that were read from it."""
+    region: Region
+    """Part of the image that is shown."""
+    selected: int
+    """Number of events of the selection."""
+    drawn: Events
+    """Selected events that are drawn as points."""
+    truth: DrawnTruth
+    """Ground truth of the drawn events."""
+    xy: NDArray[np.float32]
+    """Pixels of the drawn events [px], shape ``(n, 2)``."""
+    events: Events
+    """Events of the images: the selected events, and those near the region that compensation may move into it."""
+    curve_events: Events
+    """Part of these events from which the sharpness curve is computed."""
+    angles: dict[float, WindowAngles] = field(default_factory=dict)
+    """Prism angles by the speed of a prism without encoder [1/min]; with an encoder, the only key is 0."""
+    unmoved: list[MeasuredImage] = field(default_factory=list)
+    """Image of the events as recorded, once it is measured."""
+    chosen: list[Picture] = field(default_factory=list)
+    """Reconstructed picture for which the weight of the smoothness prior was chosen last."""
+
+
+@dataclass(frozen=True, eq=False)
+class DisplayedWindow:
+    """Time window shown with the current parameters: images of all events, and points of evenly spaced events."""
+
+    span: Span
+    """Time window, with all events that were read from it."""
+    region: Region
+    """Part of the image that is shown: left, top, right and bottom [px]; right and bottom are exclusive."""
+    selected: int
+    """Number of selected events, which are all in the images."""
+    events: Events
+    """Events that are drawn as points."""
+    truth: DrawnTruth
+    """Ground truth of these events."""
+    before: NDArray[np.float32]
+    """Pixels of the drawn events as recorded [px], shape ``(n, 2)``."""
+    after: NDArray[np.float32]
+    """Compensated positions of the drawn events [px], shape ``(n, 2)``; NaN if the model has no solution."""
+    theta: NDArray[np.float64]
+    """Prism angles of the drawn events [rad], from 0 to 2π, shape ``(n,)``."""
+    image_before: NDArray[np.float32]
+    """Image of the events as recorded [events per pixel], shape ``(height, width)``."""
+    image_after: NDArray[np.float32]
+    """Image of the compensated events [events per pixel], shape ``(height, width)``."""
+    sharpness_before: float
+    """Sharpness of ``image_before`` in the region: 0 for events at random, whatever their number."""
+    sharpness_after: float
+    """Sharpness of ``image_after`` in the region."""
+
+
+# Selected events of a time window, on the host and with their prism angles on the device.
+
+MOST_POINTS = 100_000
+"""Largest number of points in each event cloud."""
+CURVE_EVENTS = 200_000
+"""Largest number of events that a sharpness curve uses."""
+
+
+def load_window(
+    recording: Recording, span: Span, selection: Selection, *, margin_px: int, hot: NDArray[np.bool_] | None
+) -> LoadedWindow:
+    """Select the events of a time window.
+
+    ``margin_px``: how far outside the region events belong to its images. ``hot``: the hot pixels to leave out.
+    Raises :class:`AmiwarpError` if no event meets the selection.
+    """
+    region = selection.region or (0, 0, *recording.events.size)
+    left, top, right, bottom = region
+    wide = (left - margin_px, top - margin_px, right + margin_px, bottom + margin_px)
+    keep = kept(recording, span.events, selection, wide, hot)
+    near = None if keep.all() else np.flatnonzero(keep)  # None stands for all
+    events = span.events if near is None else span.events[near]
+    within = np.flatnonzero(inside(events, region)) if selection.region else None
+    n = len(events) if within is None else len(within)
+    if not n:
+        what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
+        raise AmiwarpError(f"{what} from {(span.start_us - recording.events.t_first) * 1e-3:.3f} ms on for "
+                           f"{span.length_us * 1e-3:.3f} ms; take another window")  # fmt: skip
+    thin = np.arange(min(n, MOST_POINTS)) * n // min(n, MOST_POINTS)
+    thin = thin if within is None else within[thin]
+    drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
+    xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
+    curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
+    return LoadedWindow(span, region, n, drawn, truth, xy, events, curve_events)
+
+
+def kept(
+    recording: Recording, events: Events, selection: Selection, region: Region, hot: NDArray[np.bool_] | None
+) -> NDArray[np.bool_]:
+    """Return whether each event meets the selection, with another region, shape ``(n,)``."""
+    keep = np.ones(len(events), np.bool_)
+    if recording.encoder is not None:
+        first, last = recording.encoder.coverage
+        keep &= (events.t >= first) & (events.t <= last)
+    if selection.polarity is not None:
+        keep &= events.p == selection.polarity
+    if selection.region is not None:
+        keep &= inside(events, region)
+    if hot is not None:
+        keep &= ~hot[events.y, events.x]
+    if selection.noise_us is not None:
+        keep &= ~find_background_activity(events, recording.events.size, window_us=selection.noise_us)
+    return keep
+
+
+def inside(events: Events, region: Region) -> NDArray[np.bool_]:
+    """Return whether each event lies in a region, shape ``(n,)``."""
+    left, top, right, bottom = region
+    return (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
+
 
 # Region of the image that the inspector shows first: where compensation gains most sharpness.
 
@@ -52,7 +573,7 @@ from outside."""
 class Suggestion:
     """Suggested region of the image."""
 
-    region: window.Region
+    region: Region
     """Left, top, right and bottom [px]; right and bottom are exclusive."""
     gains: bool
     """Whether compensation with the current parameters sharpens the region. Otherwise, the region has most structure.
@@ -84,7 +605,7 @@ def _best_box(
     """Return left and top of the best box of a size, and whether compensation sharpens it."""
     mean, over_mean = _of_boxes(before, width, height)
     mean_after, over_mean_after = _of_boxes(after, width, height)
-    noise = random_variance(window.SMOOTHING_PX)
+    noise = random_variance(SMOOTHING_PX)
     # the variance of random events stays in the divisor, so that a region without structure has no arbitrary factor
     factor = (over_mean_after - noise) / mean_after / (np.maximum(over_mean, noise) / mean)
     variance = mean_after * over_mean_after - mean * over_mean
@@ -114,7 +635,7 @@ def _of_boxes(image: NDArray[np.float32], width: int, height: int) -> tuple[NDAr
 
     positive = image[image > 0.0]
     limit = float(np.percentile(positive, PERCENTILE)) if positive.size else 1.0
-    smoothed = gaussian_filter(np.minimum(image, limit).astype(np.float64), window.SMOOTHING_PX, mode="constant")
+    smoothed = gaussian_filter(np.minimum(image, limit).astype(np.float64), SMOOTHING_PX, mode="constant")
     mean, square = (_box_means(values, width, height) for values in (smoothed, smoothed**2))
     mean = np.maximum(mean, 1e-6)
     return mean, np.maximum(square / mean - mean, 0.0)
@@ -171,7 +692,7 @@ class Inspector:
         self.sources = {
             "camera": Source.ASSUMED if recording.camera is None else Source.FILE,
             "apex": Source.ASSUMED if getattr(recording.prism, "apex", None) is None else Source.FILE,
-            **dict.fromkeys(("model", "phase", *window.SLIDING), Source.ASSUMED),
+            **dict.fromkeys(("model", "phase", *SLIDING), Source.ASSUMED),
             **({"rpm": Source.ASSUMED} if recording.encoder is None else {"clock_offset": Source.FILE}),
         }
         """Where the value of each parameter that the page shows, and the camera, come from."""
@@ -187,7 +708,7 @@ class Inspector:
         """Start and length of the time window [us]; None: that of :meth:`first_window`."""
         self.selection = Selection()
         self._found: tuple[Knobs, Calibration] | None = None
-        self._window: window.LoadedWindow | None = None
+        self._window: LoadedWindow | None = None
         self._span: Span | None = None
         self.lock = Lock()
         """Lock for the events on the device and the buffers of their images."""
@@ -325,7 +846,7 @@ class Inspector:
             return self._found[1]
         k, w, values = self.knobs, self.loaded, self._values(self.knobs)
         kind = MODELS[k.model]
-        others = [name for name in kind.FREE if name in window.SLIDING]
+        others = [name for name in kind.FREE if name in SLIDING]
         time = {"clock_offset": k.clock_offset} if self.has_encoder else {"rpm": k.rpm}
         kept = {name: values[name] for name in (kind.SIZE, *others, "phase", *k.calibrated_only)} | time
         before, after = self._unmoved(w), self._measured(w, k)
@@ -361,7 +882,7 @@ class Inspector:
         orbit_px = np.abs(border_displacements(self.model)).max(initial=0.0)
         return suggest_region(before, after, margin=math.ceil(orbit_px))
 
-    def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> window.DisplayedWindow:
+    def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:
         """Return the time window's images and points.
 
         ``knobs``: parameters to show, by default the current ones. ``against``: parameters to compare with; they
@@ -371,7 +892,7 @@ class Inspector:
         first = self._unmoved(w) if against is None else self._measured(w, against)
         xy = w.xy if against is None else self._moved(w, against)
         second, theta = self._measured(w, knobs), np.mod(self._theta(w, knobs), math.tau)
-        return window.DisplayedWindow(
+        return DisplayedWindow(
             w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), theta, first.image, second.image,
             first.sharpness, second.sharpness,
         )  # fmt: skip
@@ -379,7 +900,7 @@ class Inspector:
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return values of a parameter around its current one, in its unit, and the sharpness at each of them."""
         current = self.knobs
-        half = window.CURVE_HALF_WIDTH[name]
+        half = CURVE_HALF_WIDTH[name]
         values = (current.value(name) or 0.0) + np.linspace(-half, half, CURVE_POINTS)
         if name == "apex":
             values = values[values >= 0.0]
@@ -422,7 +943,7 @@ class Inspector:
         return 0.0 if self.recording.encoder is None else self.recording.encoder.clock_offset_us
 
     @property
-    def loaded(self) -> window.LoadedWindow:
+    def loaded(self) -> LoadedWindow:
         """Selected events of the time window. They are read first if necessary."""
         if self._window is None:
             self.open(*(self.window or self.first_window()))
@@ -437,7 +958,7 @@ class Inspector:
         apex, more = knobs.apex if self.has_encoder or knobs.rpm else 0.0, knobs.calibrated_only
         prism = replace(self.prism, apex=apex, index=more.get("index", self.prism.index))
         kind = MODELS[knobs.model]
-        others = {name: knobs.value(name) or 0.0 for name in window.SLIDING}
+        others = {name: knobs.value(name) or 0.0 for name in SLIDING}
         return {**more, **others, kind.SIZE: kind.size_from_apex(apex, prism), "phase": knobs.phase}
 
     def model_of(self, knobs: Knobs, camera: Camera | None = None) -> Model:
@@ -454,7 +975,7 @@ class Inspector:
         """Parameters that leave all events where they were recorded."""
         return replace(self.knobs, model="exact", apex=0.0)
 
-    def warped(self, w: window.LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
+    def warped(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
         """Return the model, the events on the device and their drift [us], to vote the events of a window.
 
         ``knobs``: the parameters; None for the events as recorded.
@@ -468,7 +989,7 @@ class Inspector:
         theta = self.encoder_of(knobs).angle_at(events.t).astype(np.float32)
         return np.asarray(self.model_of(knobs).compensate_points(xy, theta), np.float32)
 
-    def _load(self, start_us: int, length_us: int, selection: Selection) -> window.LoadedWindow:
+    def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:
         """Read and select the events of a time window. The events of the last one are not read again."""
         if self._span is None or (self._span.start_us, self._span.length_us) != (start_us, length_us):
             self._span = read_span(self.recording.events, start_us, length_us, most_events=MOST_EVENTS)
@@ -478,15 +999,15 @@ class Inspector:
         """Return the events of a time window that meet the selection."""
         return self._select(span, self.selection).events
 
-    def _select(self, span: Span, selection: Selection) -> window.LoadedWindow:
+    def _select(self, span: Span, selection: Selection) -> LoadedWindow:
         hot = self.hot if selection.hide_hot else None
-        return window.load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot)
+        return load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot)
 
     def _drift_us(self, knobs: Knobs) -> float:
         """Return how far the clock offset is from that of the recording's own encoder [us]."""
         return knobs.clock_offset - self._recorded_offset_us
 
-    def _angles(self, w: window.LoadedWindow, knobs: Knobs) -> window.WindowAngles:
+    def _angles(self, w: LoadedWindow, knobs: Knobs) -> WindowAngles:
         """Return the prism angles of a window; those of the two last speeds are kept."""
         rpm = 0.0 if self.has_encoder else knobs.rpm
         if rpm not in w.angles:
@@ -494,7 +1015,7 @@ class Inspector:
             for old in list(w.angles)[:-1]:
                 del w.angles[old]
             angle, speed = encoder.angle_at(t), encoder.speed_at(t) * 1e-6
-            w.angles[rpm] = window.WindowAngles(self._upload(w.events, rpm), angle, speed)
+            w.angles[rpm] = WindowAngles(self._upload(w.events, rpm), angle, speed)
         return w.angles[rpm]
 
     def _upload(self, events: Events, rpm: float) -> UploadedEvents:
@@ -503,22 +1024,22 @@ class Inspector:
         slope = encoder.speed_at(events.t) * 1e-6 if self.has_encoder else None
         return upload_events(events, encoder, self.device, slope=slope)
 
-    def _theta(self, w: window.LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
+    def _theta(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
         """Return the prism angles of the drawn events [rad], shape ``(n,)``."""
         angles = self._angles(w, knobs)
         return angles.theta + angles.speed * self._drift_us(knobs)
 
-    def _moved(self, w: window.LoadedWindow, knobs: Knobs) -> NDArray[np.float32]:
+    def _moved(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float32]:
         """Return the compensated positions of the drawn events [px], shape ``(n, 2)``."""
         theta = self._theta(w, knobs).astype(np.float32)
         return np.asarray(self.model_of(knobs).compensate_points(w.xy, theta), np.float32)
 
-    def _measured(self, w: window.LoadedWindow, knobs: Knobs | None) -> window.MeasuredImage:
+    def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> MeasuredImage:
         """Return the image of a window with these parameters; as recorded if ``knobs`` is None."""
         with self.lock:
             return self._imager.measure(*self.warped(w, knobs), w.region)
 
-    def _unmoved(self, w: window.LoadedWindow) -> window.MeasuredImage:
+    def _unmoved(self, w: LoadedWindow) -> MeasuredImage:
         """Return the image of a window as recorded."""
         if not w.unmoved:
             w.unmoved.append(self._measured(w, None))

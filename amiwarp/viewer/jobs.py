@@ -1,22 +1,218 @@
-"""Jobs of the inspector: estimate of the phase, calibration on what is shown, and a live stream as a recording."""
+"""Work of the inspector's page in threads: phase, calibration, live stream as a recording, and downloads."""
 
+import asyncio
+import contextlib
+import itertools
+import logging
 import math
-from collections.abc import Sequence
+import re
+import tempfile
+import weakref
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.calib import Calibration, Settings, calibrate
+from amiwarp.choices import View
+from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import rpm_between
-from amiwarp.events.recording import Recording
-from amiwarp.live.stream.recent_events import RecentEvents
+from amiwarp.events.encoder import Encoder, rpm_between
+from amiwarp.events.recording import Events, Recording
+from amiwarp.imaging.export import encode_image, encode_png
+from amiwarp.io import RecordingWriter
+from amiwarp.io.file_scan import FileEvents
+from amiwarp.io.files import NewFile
+from amiwarp.io.formats import check_ending
+from amiwarp.live.stream.session import RecentEvents
 from amiwarp.progress import Progress, silent
-from amiwarp.viewer.images import SelectedPart, select_part
-from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.window import CURVE_HALF_WIDTH, Source
+from amiwarp.reconstruction.picture import save_film
+from amiwarp.viewer.drawing import Look, Scene, SelectedPart, ShownImages, orbit_lines, select_part
+from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, Inspector, Knobs, Source, kept
+
+# Work of one page: its threads, jobs and updates, and the messages about their errors.
+
+MOST_IN_FLIGHT = 8
+"""Largest number of messages to the page that are unsent; while more are waiting, nothing is computed."""
+WAIT_S = 0.02
+"""Interval between two checks of the number of unsent messages [s]."""
+PROGRESS_S = 0.1
+"""Shortest interval between two progress messages of a job [s].
+
+The calibration of a small recording causes eighty per second, and the page would draw each of them.
+"""
+_CUDA_LOCK = asyncio.Lock()
+"""Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""
+QUICK = {**dict.fromkeys(("window", "suggestion", "state", "knobs"), ("clouds", "images")), "look": ("clouds",)}
+SLOW = ("curve", "picture")
+"""Updates that are made at once, with the parts of the page that wait for them, and updates that take longer."""
+
+
+class JobCancelled(Exception):
+    """Raised to stop work whose result is no longer needed."""
+
+
+class JobProgress:
+    """Progress callback of a job in a thread. It stops the job once ``cancelled`` is set.
+
+    It holds the page by a weak reference, because NLopt never releases its callbacks.
+    """
+
+    def __init__(self, show: Callable[[str, float], None]) -> None:
+        """``show``: method of the page that shows the name of a step and the finished share, 0 to 1."""
+        self.cancelled = False
+        self._show, self._loop, self._last_s = weakref.WeakMethod(show), asyncio.get_running_loop(), -math.inf
+
+    def __call__(self, what: str, share: float) -> None:
+        if self.cancelled or self._show() is None:
+            raise JobCancelled
+        if (now := self._loop.time()) >= self._last_s + PROGRESS_S:
+            self._last_s = now
+            self._loop.call_soon_threadsafe(self._pass_on, what, share)
+
+    def _pass_on(self, what: str, share: float) -> None:
+        if (show := self._show()) is not None and not self.cancelled:
+            show(what, share)
+
+
+class PageWork:
+    """What is computed for one page, in threads, and the messages about it.
+
+    Updates run one after the other. If a slider moves several times meanwhile, only its last position is used. What
+    waits for an update is marked on the page. Nothing is computed while the page does not keep up with the messages.
+    """
+
+    def __init__(
+        self, server: Any, device: Any, make: Callable[[set[str]], Awaitable[None]],
+        make_slow: Callable[[str], Awaitable[None]],
+    ) -> None:  # fmt: skip
+        """``make`` makes a set of quick updates, and ``make_slow`` one slow update."""
+        self._server, self._state = server, server.state
+        self._make, self._make_slow = make, make_slow
+        self.buffers_lock = asyncio.Lock()
+        """Lock of the inspector's buffers on the device, which only one thread may use at a time."""
+        self.device_lock: Any = _CUDA_LOCK if "cuda" in str(device) else contextlib.nullcontext()
+        self._quick_requests: set[str] = set()
+        self._slow_requests: set[str] = set()
+        self._doing: set[str] = set()
+        self._quick: asyncio.Task[None] | None = None
+        self._slow: asyncio.Task[None] | None = None
+        self._jobs: set[asyncio.Task[None]] = set()
+        self._error_source = ""
+        # A tab's own pool, which ends with the tab: calibration or film; curve or picture; quick updates.
+        self._threads = ThreadPoolExecutor(3, "amiwarp-tab")
+
+    def close(self) -> None:
+        """Stop all work. A thread ends when its current work is done."""
+        for task in [*self._jobs, *filter(None, [self._quick, self._slow])]:
+            task.cancel()
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    def request(self, *what: str) -> None:
+        """Request quick updates: "window", "knobs", "look", "suggestion" or "state"."""
+        self._quick_requests.update(what)
+        self._show_pending()
+        if self._quick is None:
+            self._quick = self._task(self._update())
+
+    def request_slow(self, *what: str) -> None:
+        """Request updates that run in a thread after all quick updates: "curve", "picture" or "preparation"."""
+        self._slow_requests.update(what)
+        self._show_pending()
+        if self._slow is None:
+            self._slow = self._task(self._update_slowly())
+
+    async def until_drawn(self) -> None:
+        """Wait until no quick update is pending."""
+        while self._quick is not None:
+            await asyncio.sleep(0.005)
+
+    def start_job(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run a job until it ends or the browser tab is closed."""
+        self._jobs.add(task := self._task(work))
+        task.add_done_callback(self._jobs.discard)
+
+    async def in_thread(self, work: Callable[..., Any], *args: Any, **options: Any) -> Any:
+        """Call ``work`` in one of the browser tab's threads, and return its result."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads, partial(work, *args, **options))
+
+    def show_message(self, text: str, severity: str) -> None:
+        with self._state:
+            self._state.update({"message": text, "severity": severity})
+
+    @contextlib.contextmanager
+    def errors_shown(self, what: str) -> Iterator[None]:
+        """Show errors of the enclosed code as a message, until the same kind of action (``what``) succeeds."""
+        try:
+            yield
+        except (AmiwarpError, OSError) as error:
+            self._error_source = what
+            self._state.update({"message": str(error), "severity": "error"})
+        else:
+            if self._state.severity == "error" and self._error_source == what:
+                self._state.update({"message": "", "severity": "info"})
+
+    def _show_pending(self) -> None:
+        """Show which parts of the page wait for an update."""
+        quick = self._quick_requests | self._doing
+        parts = {part for what in quick for part in QUICK.get(what, ())} | (self._slow_requests | self._doing) & {*SLOW}
+        self._state.updating = sorted(parts)
+
+    def _task(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(work)
+        task.add_done_callback(self._ended)
+        return task
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        if not task.cancelled() and (error := task.exception()) is not None:
+            logging.getLogger(__name__).error("the page's work failed", exc_info=error)
+            text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
+            self.show_message(text, "error")
+
+    async def _update(self) -> None:
+        try:
+            while self._quick_requests:
+                while self._in_flight() > MOST_IN_FLIGHT:
+                    await asyncio.sleep(WAIT_S)
+                todo, self._quick_requests = self._quick_requests, set()
+                async with self._done(todo), self.device_lock, self.buffers_lock:
+                    await self._make(todo)
+                await asyncio.sleep(0)
+        finally:
+            self._quick = None
+
+    def _in_flight(self) -> int:
+        """Return the number of unsent messages to the page."""
+        return 0 if self._server.protocol is None else int(self._server.protocol.network_monitor.pending)
+
+    async def _update_slowly(self) -> None:
+        try:
+            while self._slow_requests:
+                await self.until_drawn()
+                name = min(self._slow_requests)  # in alphabetical order: the curve first, the preparation last
+                self._slow_requests.discard(name)
+                async with self._done({name}), self.device_lock:
+                    with self.errors_shown(name):
+                        await self._make_slow(name)
+        finally:
+            self._slow = None
+
+    @contextlib.asynccontextmanager
+    async def _done(self, todo: set[str]) -> Any:
+        """Mark updates as being made, and send the state to the browser when they are made."""
+        self._doing |= todo
+        try:
+            yield
+        finally:
+            self._doing -= todo
+            with self._state:
+                self._show_pending()
+
 
 # Estimate of the prism's phase at first sight, so that the page opens with compensated events.
 
@@ -227,3 +423,174 @@ class LiveSource:
             1e3 * recent.age_s, recent.turn_share, status.dropped, status.late, rpm,
             self._messages[-1] if self._messages else "",
         )  # fmt: skip
+
+
+# Files that the page offers as downloads: images, events and films.
+
+BLOCK = 1 << 20
+"""Number of events that are written at a time."""
+IMAGE_SUFFIXES = (".png", ".tif", ".npy")
+"""Suffixes of image files: colours as on the page, values as float32, values as an array."""
+
+
+def as_bytes(suffix: str, write: Callable[[Path], object]) -> bytes:
+    """Return the content of a file that ``write`` writes to the path that it is given, which ends in ``suffix``."""
+    with tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True) as folder:
+        path = Path(folder) / f"download{suffix}"
+        write(path)
+        return path.read_bytes()
+
+
+def write_events(inspector: Inspector, path: Path, *, compensated: bool) -> int:
+    """Write all selected events of the window to a new native file, and return their number.
+
+    Compensated events get sub-pixel coordinates, with the parameters set on the page. A window with more events than
+    the page reads is written completely. Raises :class:`AmiwarpError` if the file exists.
+    """
+    recording, span, encoder = inspector.recording, inspector.loaded.span, inspector.adjusted_encoder
+    width, height = recording.events.size
+    first_us = max(span.start_us, encoder.coverage[0])
+    last_us = min(span.start_us + span.length_us, encoder.coverage[1])
+    metadata = {**recording.metadata, **({"compensated_with": inspector.knobs.model} if compensated else {})}
+    with RecordingWriter(
+        path, width=width, height=height, camera=inspector.camera, prism=recording.prism, metadata=metadata,
+        encoder=_cut(encoder, first_us, last_us) if inspector.has_encoder else None,
+    ) as writer:  # fmt: skip
+        compensator = BlockCompensator(inspector.model, encoder, first_us, last_us, inspector.device)
+        for block in _selected_blocks(inspector):
+            if compensated:
+                moved, inside = compensator(block, all_cores=True)
+                writer.append(moved, inside=inside)
+            else:
+                writer.append(block)
+        return len(writer)
+
+
+def write_image(images: ShownImages, path: Path, *, before: bool = False) -> None:
+    """Write one of the images to a new file: .png with the page's colours, .tif or .npy with its values.
+
+    ``before``: write the first image instead of the second. A .tif of two polarities has two pages, OFF and ON. Raises
+    :class:`AmiwarpError` for another suffix, if the file exists, or if there is no such image.
+    """
+    from PIL import Image
+
+    values = images.before if before else images.after
+    if values is None:
+        raise AmiwarpError(f"there is no image of {images.kind.value} before compensation; export the compensated one")
+    ending = check_ending(path, "images are written", IMAGE_SUFFIXES)
+    with NewFile(path) as new:
+        if ending == ".png":
+            encode_png(new.part, images.scale.rgb(values))
+        elif ending == ".npy":
+            with open(new.part, "wb") as file:
+                np.save(file, np.asarray(values, np.float32))
+        else:
+            pages = values if values.ndim == 3 else values[None]
+            first, *more = (Image.fromarray(np.asarray(page, np.float32)) for page in pages)
+            encode_image(new.part, first, "TIFF", save_all=bool(more), append_images=more)
+
+
+def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
+    """Yield all selected events of the window, in blocks.
+
+    The noise filter of a block sees the last events of the block before it.
+    """
+    window, hot = inspector.loaded, inspector.hot if inspector.selection.hide_hot else None
+    noise_us, last = inspector.selection.noise_us or 0, None
+    for block in filter(len, _blocks(inspector)):
+        events = block if last is None else Events.concatenate([last, block])
+        chosen = kept(inspector.recording, events, inspector.selection, window.region, hot)[-len(block) :]
+        yield block if chosen.all() else block[chosen]
+        last = events[int(np.searchsorted(events.t, block.t[-1] - noise_us)) :] if noise_us else None
+
+
+def _blocks(inspector: Inspector) -> Iterator[Events]:
+    """Yield all events of the window, in blocks."""
+    source, span = inspector.recording.events, inspector.loaded.span
+    end_us = span.start_us + span.length_us
+    if span.count == len(span.events):
+        yield span.events
+    elif isinstance(source, FileEvents):  # can only be read from its start
+        for block in source.blocks():
+            first, stop = np.searchsorted(block.t, (span.start_us, end_us))
+            yield block[first:stop]
+            if stop < len(block):
+                return
+    else:
+        stop = source.find(end_us)
+        for start in range(source.find(span.start_us), stop, BLOCK):
+            yield source.slice(start, min(start + BLOCK, stop))
+
+
+def _cut(encoder: Encoder, first_us: int, last_us: int) -> Encoder:
+    """Return the samples of an encoder that cover a time span, with one more on each side."""
+    first = max(int(np.searchsorted(encoder.t, first_us + encoder.clock_offset_us)) - 2, 0)
+    stop = int(np.searchsorted(encoder.t, last_us + encoder.clock_offset_us)) + 2
+    t, pulses = encoder.t[first:stop], encoder.index_t
+    if pulses is not None:
+        pulses = pulses[(pulses >= t[0]) & (pulses <= t[-1])]
+    return Encoder(t, encoder.angle[first:stop], encoder.clock_offset_us, pulses)
+
+
+# Films of the clouds, and the downloads that a page offers. No file is written on the server.
+
+FRAMES, FPS = 90, 25.0
+"""Number of pictures of a film, and pictures per second."""
+FILM_SIZE = (1280, 560)
+"""Width and height of a film [px]."""
+EXPORTS = {
+    "picture": ("picture", ".png", "image/png"), "image": ("image", ".png", "image/png"),
+    "values": ("image values", ".tif", "image/tiff"), "events": ("events", ".h5", "application/x-hdf5"),
+    "compensated": ("compensated events", ".h5", "application/x-hdf5"),
+    "calibration": ("calibration", ".json", "application/json"), "turntable": ("film, turning", ".mp4", "video/mp4"),
+    "film": ("film from here", ".mp4", "video/mp4"),
+}  # fmt: skip
+"""Downloads by name: text of the button, suffix and media type."""
+FILMS = ("turntable", "film")
+"""Downloads that take long."""
+
+
+def download_name(recording: str, what: str) -> str:
+    """Return the file name of a download. ``recording``: name of the recording, which may be that of a stream."""
+    name = re.sub(r"[^\w.+=@-]+", "_", recording)[:60].strip("._-~ ") or "recording"
+    return f"{name}.{what}{EXPORTS[what][1]}"
+
+
+def write_film(
+    path: Path, inspector: Inspector, look: Look, view: View, progress: Progress, *, what: str,
+    against: Knobs | None, with_orbit: bool, speed: float,
+) -> None:  # fmt: skip
+    """Write a film of the clouds to a new file.
+
+    ``what``: "turntable" for a camera that moves once around the clouds of the inspector's window, or "film" for a time
+    window that moves on from there with ``speed`` times real time. ``against``: parameters of the left cloud; None for
+    the recorded events. ``progress`` may raise an error to stop the film.
+    """
+
+    def draw(scene: Scene) -> None:
+        shown = inspector.show(against=against)
+        orbit, column = orbit_lines(inspector, shown)
+        lines = (orbit if against is None else column, column)
+        scene.show(shown, look, lines if with_orbit else ())
+
+    def pictures() -> Iterator[NDArray[np.uint8]]:
+        with contextlib.closing(Scene(FILM_SIZE)) as scene:
+            draw(scene)
+            scene.look_from(view, look)
+            if what == "turntable":
+                yield from scene.turntable(FRAMES)
+                return
+            span = inspector.loaded.span
+            start_us, last_us = float(span.start_us), inspector.recording.events.t_last + 1 - span.length_us
+            while (start_us := start_us + 1e6 / FPS * speed) <= last_us:
+                yield scene.picture()
+                inspector.open(round(start_us), span.length_us)
+                draw(scene)
+            yield scene.picture()
+
+    def counted() -> Iterator[NDArray[np.uint8]]:
+        for k, picture in enumerate(itertools.islice(pictures(), FRAMES)):
+            progress(f"making the {EXPORTS[what][0]}", k / FRAMES)
+            yield picture
+
+    save_film(counted(), path, fps=FPS)

@@ -1,12 +1,19 @@
-"""Page of the inspector: passes input from the browser to the inspector, and the inspector's results to the browser."""
+"""Page of the inspector: passes input from the browser to the inspector, and results back; ways to open the page."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import math
+import os
+import secrets
+import shutil
+import subprocess
+import sys
+import tempfile
 import traceback
 import weakref
+import webbrowser
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -18,16 +25,15 @@ import numpy as np
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
+from amiwarp.io.files import check_output, interrupts_later
 from amiwarp.progress import Progress
-from amiwarp.viewer import clouds, exports, images, jobs, layout
-from amiwarp.viewer.images import ImageKind
-from amiwarp.viewer.inspector import Inspector, Library
-from amiwarp.viewer.layout import NAMES, UNITS
-from amiwarp.viewer.serve import finite, use_page
-from amiwarp.viewer.timeline import EventRates
-from amiwarp.viewer.view_state import History, ViewState, apply_state, current_state, decode_state, encode_state
-from amiwarp.viewer.window import DisplayedWindow, Knobs, Selection
-from amiwarp.viewer.work import SLOW, JobCancelled, JobProgress, PageWork
+from amiwarp.validation import guarded
+from amiwarp.viewer import drawing, jobs, layout
+from amiwarp.viewer.drawing import ImageKind, Look, Scene
+from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection
+from amiwarp.viewer.jobs import SLOW, JobCancelled, JobProgress, PageWork
+from amiwarp.viewer.serve import finite, serve, use_page
 
 RECORDED = "events as recorded"
 """Title of the only cloud, if there is no motion to compensate."""
@@ -60,8 +66,8 @@ class Panel:
         """Whether the playback runs; after a stop it runs until it notices the stop."""
         self._picked = -1
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
-        self._history: History | None = None
-        self._wanted: ViewState | str | None = None
+        self._history: layout.History | None = None
+        self._wanted: layout.ViewState | str | None = None
         self._rates: EventRates
         self._progress: JobProgress | None = None
         use_page(server, layout.template())
@@ -122,7 +128,7 @@ class Panel:
         def follow(names: tuple[str, ...], call: Callable[..., None], *given: str) -> None:
             self.state.change(*names)(lambda **_: call(*given))  # trame gives the whole state
 
-        for name in NAMES:
+        for name in layout.NAMES:
             follow((name,), self._dragged, name)
         follow(("polarity", "hide_hot", "noise_filter"), self.request, "window")
         follow(("colour", "axis", "dark", "orbit_shown"), self.request, "look")
@@ -146,13 +152,13 @@ class Panel:
 
     def choose(self, name: str) -> None:
         """Select the parameter over which the sharpness curve is drawn."""
-        if name in NAMES and name != self.state.knob:
+        if name in layout.NAMES and name != self.state.knob:
             self.state.knob = name
             self.work.request_slow("curve")
 
     def typed(self, name: str, text: str) -> None:
         """Set the value that a user typed into a number field."""
-        if name not in (*NAMES, *layout.EDITABLE):
+        if name not in (*layout.NAMES, *layout.EDITABLE):
             return
         try:
             value = finite(text)
@@ -162,9 +168,9 @@ class Panel:
         if name == "turns":
             name, value = "length_ms", value * float(self.state.turn_ms)
         self.state[name] = round(value, 4)
-        if name in NAMES:
+        if name in layout.NAMES:
             self.state.knob = name
-        self.request("knobs" if name in NAMES else "window")
+        self.request("knobs" if name in layout.NAMES else "window")
         self.released()
 
     def toggle(self, name: str) -> None:
@@ -344,7 +350,7 @@ class Panel:
         start_ms, end_ms = self.state.rate_span
         curve, share = self._rates.curve(self._clock_us(start_ms), self._clock_us(end_ms), BINS), self._rates.share
         note = "" if share >= 1.0 else f"counting events: {100.0 * share:.0f} %"
-        on, off = map(clouds.float_bytes, (curve.on, curve.off))
+        on, off = map(drawing.float_bytes, (curve.on, curve.off))
         self.state.update({"rate_on": on, "rate_off": off, "rate_note": note})
 
     # Parameters of the prism, and those to compare with
@@ -393,7 +399,7 @@ class Panel:
     def set_knobs(self) -> None:
         """Give the inspector the parameters that the page shows, where they differ from the inspector's."""
         known, shown = layout.knob_values(self.inspector), self.state
-        values = {name: float(shown[name]) * UNITS[name] for name in NAMES if shown[name] != known[name]}
+        values = {name: float(shown[name]) * layout.UNITS[name] for name in layout.NAMES if shown[name] != known[name]}
         self.inspector.set(replace(self.inspector.knobs.with_values(values), model=shown.model))
 
     def show_knobs(self) -> None:
@@ -490,24 +496,24 @@ class Panel:
     # Downloads
 
     def export(self, what: str) -> None:
-        """Give the browser a file; ``what`` is a name in :data:`amiwarp.viewer.exports.EXPORTS`."""
+        """Give the browser a file; ``what`` is a name in :data:`amiwarp.viewer.jobs.EXPORTS`."""
         s = self.state
         if what == "picture":
             words = [s.name, s.events, f"sharpness {s.sharpness}"]
-            self._server.js_call("page", "picture", exports.download_name(self.inspector.recording.name, what), words)
-        elif what in exports.EXPORTS and not (what in exports.FILMS and s.busy):
-            self.work.start_job(self._film(what) if what in exports.FILMS else self._write(what))
+            self._server.js_call("page", "picture", jobs.download_name(self.inspector.recording.name, what), words)
+        elif what in jobs.EXPORTS and not (what in jobs.FILMS and s.busy):
+            self.work.start_job(self._film(what) if what in jobs.FILMS else self._write(what))
 
     async def _write(self, what: str) -> None:
         inspector, kind, against = self.inspector, ImageKind(self.state.kind), self._against
 
         def write_image(path: Path) -> None:
-            exports.write_image(images.make_images(inspector, kind, against=against), path)
+            jobs.write_image(drawing.make_images(inspector, kind, against=against), path)
 
         write: dict[str, Callable[[Path], object]] = {
             "image": write_image, "values": write_image,
-            "events": partial(exports.write_events, inspector, compensated=False),
-            "compensated": partial(exports.write_events, inspector, compensated=True),
+            "events": partial(jobs.write_events, inspector, compensated=False),
+            "compensated": partial(jobs.write_events, inspector, compensated=True),
             "calibration": lambda path: inspector.as_calibration().save(path),
         }  # fmt: skip
         async with self.work.device_lock, self.work.buffers_lock:
@@ -517,15 +523,15 @@ class Panel:
         s, inspector = self.state, Inspector(self.inspector.recording, device=self.inspector.device)
         inspector.set(self.inspector.knobs)
         inspector.window, inspector.selection = self.inspector.window, self.inspector.selection
-        look = clouds.Look(Colour(s.colour), Axis(s.axis), float(s.point_size), float(s.opacity), dark=bool(s.dark),
+        look = drawing.Look(Colour(s.colour), Axis(s.axis), float(s.point_size), float(s.opacity), dark=bool(s.dark),
                            overlaid=bool(s.overlaid)).for_clouds([title for _, title in s.titles])  # fmt: skip
         self._progress = progress = JobProgress(self._show_progress)
         film = partial(
-            exports.write_film, inspector=inspector, look=look, view=View(s.view[0]), progress=progress, what=what,
+            jobs.write_film, inspector=inspector, look=look, view=View(s.view[0]), progress=progress, what=what,
             against=self._against, with_orbit=self._orbit_drawn, speed=float(s.speed),
         )  # fmt: skip
         with s:
-            s.update({"busy": f"making the {exports.EXPORTS[what][0]}", "progress": 0})
+            s.update({"busy": f"making the {jobs.EXPORTS[what][0]}", "progress": 0})
         try:
             with contextlib.suppress(JobCancelled):
                 async with self.work.device_lock:
@@ -536,9 +542,9 @@ class Panel:
 
     async def _download(self, what: str, write: Callable[[Path], object]) -> None:
         """Write a file in a thread, and give it to the browser."""
-        name, (_, suffix, kind) = exports.download_name(self.inspector.recording.name, what), exports.EXPORTS[what]
+        name, (_, suffix, kind) = jobs.download_name(self.inspector.recording.name, what), jobs.EXPORTS[what]
         with self.work.errors_shown("export"):
-            content = await self.work.in_thread(exports.as_bytes, suffix, write)
+            content = await self.work.in_thread(jobs.as_bytes, suffix, write)
             self._server.js_call("page", "download", name, content, kind)
             size = f"{len(content) / 1e3:,.0f} kB"
             self.work.show_message(f"{name}: {size}, in the browser's downloads", "success")
@@ -548,15 +554,15 @@ class Panel:
 
     def undo(self) -> None:
         """Go back by one step."""
-        self._travel(History.undo)
+        self._travel(layout.History.undo)
 
     def redo(self) -> None:
         """Go forward by one step that was undone."""
-        self._travel(History.redo)
+        self._travel(layout.History.redo)
 
     def reset(self) -> None:
         """Show the first state again."""
-        self._travel(History.reset)
+        self._travel(layout.History.reset)
 
     def restore(self, address: str) -> None:
         """Show the state that an address describes."""
@@ -564,7 +570,7 @@ class Panel:
         self.request("state")
         self.released()
 
-    def _travel(self, step: Callable[[History], ViewState]) -> None:
+    def _travel(self, step: Callable[[layout.History], layout.ViewState]) -> None:
         if self._history is not None:
             self._wanted = step(self._history)
             self.request("state")
@@ -574,12 +580,12 @@ class Panel:
         """Add what the page shows now to the history. Equal ``change`` of successive states make one step."""
         s = self.state
         now = replace(
-            current_state(self.inspector), against=self._against, image=ImageKind(s.kind), axis=Axis(s.axis),
+            layout.current_state(self.inspector), against=self._against, image=ImageKind(s.kind), axis=Axis(s.axis),
             colour=Colour(s.colour), view=View(s.view[0]), overlaid=bool(s.overlaid),
         )  # fmt: skip
-        self._history = history = self._history or History(now)
+        self._history = history = self._history or layout.History(now)
         history.add(now, change)
-        address = encode_state(history.state, history.first)
+        address = layout.encode_state(history.state, history.first)
         s.update({"can_undo": history.can_undo, "can_redo": history.can_redo, "address": address})
 
     async def _apply_wanted(self) -> None:
@@ -590,10 +596,10 @@ class Panel:
         if isinstance(wanted, str):
             source = self.inspector.recording.events
             duration_us = source.t_last - source.t_first + 1
-            wanted, wrong = decode_state(wanted, self._history.first, size=source.size, duration_us=duration_us)
+            wanted, wrong = layout.decode_state(wanted, self._history.first, size=source.size, duration_us=duration_us)
             if wrong:
                 self.work.show_message("; ".join(wrong), "error")
-        await self.work.in_thread(apply_state, self.inspector, wanted)
+        await self.work.in_thread(layout.apply_state, self.inspector, wanted)
         s, selection = self.state, wanted.selection
         region = list(selection.region or (0, 0, *s.size))
         kind = s.region_kind if region == s.region_wanted else "whole" if selection.region is None else "drawn"
@@ -638,7 +644,7 @@ class Panel:
     async def make_slow(self, name: str) -> None:
         """Make a slow update: "curve", "picture", or "preparation" of the first picture."""
         if name == "preparation":
-            await self.work.in_thread(images.prepare, self.inspector)
+            await self.work.in_thread(drawing.prepare, self.inspector)
         else:
             await (self._curve() if name == "curve" else self._picture())
 
@@ -677,16 +683,16 @@ class Panel:
         """Return what is to be shown, and the state variables that show it."""
         s, before, against = self.state, self.shown, self._against
         shown = self.inspector.show(against=against)
-        values = clouds.cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
+        values = drawing.cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
         values |= self._images(shown) | self._orbit(shown)
         if before is None or shown.span is not before.span:
-            values["overview"] = clouds.whole_image(shown.span.events, self.inspector.recording.events.size)
+            values["overview"] = drawing.whole_image(shown.span.events, self.inspector.recording.events.size)
         left = layout.AGAINST["recorded" if against is None else s.against]
         pair = [[0, left], [1, "compensated" if s.against == "recorded" else "compensated with A"]]
         return shown, {
             **values, "titles": pair if self.compensates else [[0, RECORDED]], "events": layout.events_text(shown),
             "sharpness": layout.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
-            "picked_text": "" if self._picked < 0 else clouds.event_text(shown, self._picked),
+            "picked_text": "" if self._picked < 0 else drawing.event_text(shown, self._picked),
             "against_title": left, "against_choices": self._against_choices(),
         }  # fmt: skip
 
@@ -697,14 +703,14 @@ class Panel:
             return {"image_slow": True}
         if kind is not ImageKind.COUNT:
             return {"image_slow": False, **self._other_images()}
-        pair = images.count_images(shown)
+        pair = drawing.count_images(shown)
         values = {"image_slow": False, **_image_state(pair)}
         if self.state.difference and pair.before is not None:
-            values |= clouds.difference_state(pair.before, pair.after)
+            values |= drawing.difference_state(pair.before, pair.after)
         return values
 
     def _other_images(self) -> dict[str, Any]:
-        return _image_state(images.make_images(self.inspector, ImageKind(self.state.kind), against=self._against))
+        return _image_state(drawing.make_images(self.inspector, ImageKind(self.state.kind), against=self._against))
 
     @property
     def _orbit_drawn(self) -> bool:
@@ -713,8 +719,8 @@ class Panel:
     def _orbit(self, shown: DisplayedWindow) -> dict[str, Any]:
         """Return the orbit of the scene point of the picked event, or of the middle of the region."""
         if not self._orbit_drawn:
-            return clouds.NO_ORBIT
-        orbit, column = map(clouds.float_bytes, clouds.orbit_lines(self.inspector, shown, self._picked))
+            return drawing.NO_ORBIT
+        orbit, column = map(drawing.float_bytes, drawing.orbit_lines(self.inspector, shown, self._picked))
         recorded = self._against is None  # otherwise, both clouds are compensated
         return {"orbit": orbit if recorded else column, "column": column, "has_orbit": True}
 
@@ -724,7 +730,7 @@ class Panel:
         if not self.compensates:
             return
         values, scores = await self.work.in_thread(self.inspector.curve, name)
-        x: list[float] = (values / UNITS[name]).tolist()
+        x: list[float] = (values / layout.UNITS[name]).tolist()
         if not x:
             return
         label, unit, *_ = layout.SLIDERS[name]
@@ -745,10 +751,12 @@ class Panel:
             s.update({"before": "", "after": "", "image_note": str(error)})
 
 
-def _image_state(pair: images.ShownImages) -> dict[str, Any]:
+def _image_state(pair: drawing.ShownImages) -> dict[str, Any]:
     """Return the state variables of the images of the region."""
-    scale = clouds.scale_state(pair.scale)
-    before, after = ("" if image is None else clouds.jpeg(pair.scale.rgb(image)) for image in (pair.before, pair.after))
+    scale = drawing.scale_state(pair.scale)
+    before, after = (
+        "" if image is None else drawing.jpeg(pair.scale.rgb(image)) for image in (pair.before, pair.after)
+    )
     return {"before": before, "after": after, "image_scale": scale, "after_scale": scale, "image_note": pair.note}
 
 
@@ -765,3 +773,181 @@ def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progre
         return str(error)
     finally:
         known = None
+
+
+# Ways to open the inspector: in a browser, in a window, in a notebook, or as a picture file.
+#
+# The window is a browser window without tabs or address bar that shows the same page. So there is only one user
+# interface to maintain, nothing extra to install, and the inspector works in the same way over SSH.
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge", "brave-browser")
+"""Commands of the browsers that can show a page in a window without tabs (``--app``), in order of preference."""
+LOCALHOST = "127.0.0.1"
+
+
+def has_display() -> bool:
+    """Return whether this machine has a display on which a window can be opened."""
+    return not sys.platform.startswith("linux") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def serve_panel(
+    make_inspector: Callable[[], Inspector],
+    library: Library | None = None,
+    *,
+    host: str = LOCALHOST,
+    port: int = 0,
+    ready: Callable[[str], None],
+) -> None:
+    """Serve the inspector's page until interrupted; each browser tab gets its own inspector.
+
+    ``library``: other recordings that the page may open. ``ready`` is called with the page's address as soon as it can
+    be opened.
+    Raises :class:`AmiwarpError` if the host or the port cannot be used.
+    """
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(_serve(make_inspector, library, host, port, ready))
+
+
+async def _serve(
+    make_inspector: Callable[[], Inspector], library: Library | None, host: str, port: int, ready: Callable[[str], None]
+) -> None:
+    def build(server: Any) -> Callable[[], None]:
+        return Panel(server, make_inspector(), library).close
+
+    await serve(build, settable=layout.SETTABLE, host=host, port=port, token=secrets.token_urlsafe(16), ready=ready)
+
+
+def open_window(make_inspector: Callable[[], Inspector], library: Library | None, ready: Callable[[str], None]) -> None:
+    """Open the page in a window and serve it until the window is closed.
+
+    If none of :data:`BROWSERS` is installed, open a tab of the default browser and serve until interrupted.
+    """
+
+    async def serve_and_show() -> None:
+        address: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+        serving: asyncio.Future[Any] = asyncio.create_task(
+            _serve(make_inspector, library, LOCALHOST, 0, address.set_result)
+        )
+        await asyncio.wait([serving, address], return_when=asyncio.FIRST_COMPLETED)
+        if serving.done():
+            serving.result()
+        url = address.result()
+        ready(url)
+        browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+        if browser is None:
+            webbrowser.open(url)
+            await serving
+            return
+        with tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True) as profile:
+            options = [f"--app={url}", f"--user-data-dir={profile}", "--no-first-run", "--window-size=1366,768"]
+            if hasattr(os, "geteuid") and os.geteuid() == 0:
+                options.append("--no-sandbox")  # browsers refuse to run as root otherwise
+            window = await asyncio.create_subprocess_exec(browser, *options, stderr=subprocess.DEVNULL)
+            await window.wait()
+        serving.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await serving
+
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(serve_and_show())
+
+
+@guarded
+class NotebookPage:
+    """The inspector's page below a notebook cell.
+
+    Parameters
+    ----------
+    serving : asyncio.Task
+        Task that serves the page.
+
+    Examples
+    --------
+    >>> page = amiwarp.view(amiwarp.open_recording("recording.h5"))  # doctest: +SKIP
+    >>> page.close()  # doctest: +SKIP
+    """
+
+    def __init__(self, serving: asyncio.Task[None]) -> None:
+        self._serving = serving
+
+    def close(self) -> None:
+        """Stop serving the page.
+
+        Examples
+        --------
+        >>> page.close()  # doctest: +SKIP
+        """
+        self._serving.cancel()
+
+    def _ipython_display_(self) -> None:
+        """Show nothing more than the page, which is already shown."""
+
+
+@guarded
+def view(
+    recording: Recording,
+    calibration: Calibration | None = None,
+    *,
+    device: Any = "cpu",
+    height: int = 700,
+) -> NotebookPage:
+    """Show the inspector below a notebook cell. Warp's messages are switched off, so that the cell shows only the page.
+
+    Parameters
+    ----------
+    recording : Recording
+        Events to show. Encoder, camera and prism may be missing.
+    calibration : Calibration or None
+        Parameters of the prism at the start. Without it, the page starts with the nominal prism.
+    device : str or warp.Device
+        Device that compensates the events.
+    height : int
+        Height of the page in the notebook [px].
+
+    Returns
+    -------
+    NotebookPage
+        The page, which is served until the kernel ends or its ``close`` is called.
+
+    Raises
+    ------
+    AmiwarpError
+        If the recording holds no events, or the calibration belongs to a camera of another size.
+
+    Examples
+    --------
+    >>> amiwarp.view(amiwarp.open_recording("recording.h5"))  # doctest: +SKIP
+    """
+    try:
+        loop = asyncio.get_running_loop()
+        from IPython.display import IFrame, display
+    except (ImportError, RuntimeError) as error:  # no IPython, or no running loop
+        given = f"{recording.name}: view shows a recording in a notebook"
+        raise AmiwarpError(f"{given}; elsewhere, run in a shell: amiwarp view FILE") from error
+
+    from amiwarp.kernels.launch import start_quietly
+
+    start_quietly()
+    Inspector(recording, calibration, device=device)  # raises errors in the cell, before the page is served
+    make_inspector = partial(Inspector, recording, calibration, device=device)
+    serving = _serve(make_inspector, None, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
+    return NotebookPage(loop.create_task(serving))
+
+
+def save_screenshot(
+    inspector: Inspector, path: Path, *, view: View = View.FREE, look: Look | None = None, size: tuple[int, int]
+) -> None:
+    """Write a picture of both event clouds as PNG; ``size`` is its width and height [px]."""
+
+    check_output(path)
+    look = look or Look()
+    if not math.isfinite(inspector.turn_us):
+        look = look.for_clouds([RECORDED])
+    clouds = inspector.show()
+    with (
+        interrupts_later(),
+        contextlib.closing(Scene(size)) as scene,
+    ):  # VTK crashes if an exception leaves it half-drawn
+        scene.show(clouds, look)
+        scene.look_from(view, look)
+        scene.save(path)

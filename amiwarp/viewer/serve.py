@@ -428,16 +428,7 @@ def _refuse_tab(_: Any) -> Closing:
 
 
 def _application(tabs: Tabs, token: str, names: HostNames) -> web.Application:
-    from aiohttp import web
-
-    application = web.Application(middlewares=[_guard(names)], client_max_size=MOST_BYTES)
-    application.add_routes([web.get("/{path:.*}", partial(_answer, tabs, token))])
-    application.on_shutdown.append(tabs.close)
-    return application
-
-
-def _guard(names: HostNames) -> Any:
-    """Return HTTP middleware that refuses unknown host names and requests with a body, and sets the headers."""
+    """Return the application. It refuses unknown host names and requests with a body, and sets the headers."""
     from aiohttp import web
 
     @web.middleware
@@ -456,7 +447,10 @@ def _guard(names: HostNames) -> Any:
             response.headers.update(HEADERS)
         return response
 
-    return guard
+    application = web.Application(middlewares=[guard], client_max_size=MOST_BYTES)
+    application.add_routes([web.get("/{path:.*}", partial(_answer, tabs, token))])
+    application.on_shutdown.append(tabs.close)
+    return application
 
 
 async def _answer(tabs: Tabs, token: str, request: web.Request) -> web.StreamResponse:

@@ -18,10 +18,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.calib.parameters import DRIFTS, LENS, RATES, ParameterSpace, widened
-from amiwarp.calib.photometric.cost import (
-    place_arguments,
-    size_and_phase_directions,
-)
+from amiwarp.calib.photometric.cost import place_arguments, size_and_phase_directions
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.equations import multiply
 from amiwarp.kernels.launch import launch

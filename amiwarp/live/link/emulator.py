@@ -9,7 +9,6 @@ import os
 import random
 import re
 import select
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.live.link import protocol
 from amiwarp.live.link.clocks import WRAP, monotonic_us
+from amiwarp.live.queues import BackgroundLoop
 
 # Rotation of the emulated prism: by a simulated motor, or as in a recording.
 
@@ -449,7 +449,7 @@ RETRY_S = 0.2
 """Interval between attempts to open a pseudo-terminal after a failure [s]."""
 
 
-class PseudoTerminal:
+class PseudoTerminal(BackgroundLoop):
     """Pseudo-terminal that runs an emulated controller in real time, in a background thread, until closed.
 
     ``path``: symbolic link to the port. It exists while the emulated cable is plugged in, and points to the new port
@@ -473,28 +473,21 @@ class PseudoTerminal:
         origin = monotonic_us()
         self._now_us = now_us or (lambda: monotonic_us() - origin)
         self._controller = controller
-        self._ended = threading.Event()
         self._master: int | None = None
         self._open()
-        self._thread = threading.Thread(target=self._run, name="amiwarp-emulator", daemon=True)
-        self._thread.start()
+        self._start_thread("amiwarp-emulator")
 
     @property
     def name(self) -> str:
         """Name under which programs open the port: the symbolic link if there is one, else the pseudo-terminal."""
         return self._port if self._path is None else str(self._path)
 
-    def __enter__(self) -> PseudoTerminal:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def close(self) -> None:
         """Stop the background thread, and remove the port and the symbolic link."""
-        self._ended.set()
-        self._thread.join()
-        self._close()
+        try:
+            super().close()
+        finally:
+            self._close()
 
     def _run(self) -> None:
         while not self._ended.is_set():

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events, held_bytes
+from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.recording import Events, held_bytes
 
 if TYPE_CHECKING:
     from amiwarp.compensation.streams import Compensated
@@ -404,7 +403,7 @@ class SpeedKeeper:
         self.held_bytes = 0
         """Memory of the packets of the unfinished window [bytes]."""
         self._window_start_us: int | None = None
-        self._command_thread: threading.Thread | None = None
+        self._command_thread: threading.Thread | None = None  # a daemon: no exit waits for an answer that never comes
         self._commanded_rpm = controller.rpm
         self.coverage: float | None = None
         """Share of the scene's edges that the last window showed, 0 to 1; None before the first window."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events, held_bytes
-from amiwarp.io.camera_files import camera_attributes, prism_attributes, read_camera, read_prism
+from amiwarp.events.recording import Events, held_bytes
+from amiwarp.io.rig_files import camera_attributes, prism_attributes, read_camera, read_prism
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import NominalPrism
 
@@ -160,7 +160,7 @@ class Packet:
 
     @property
     def held_bytes(self) -> int:
-        """Memory of the packet [bytes], see :func:`~amiwarp.events.events.held_bytes`."""
+        """Memory of the packet [bytes], see :func:`~amiwarp.events.recording.held_bytes`."""
         samples = self.triggers.nbytes + self.encoder_t.nbytes + self.encoder_angle.nbytes
         return held_bytes(self.events) + samples
 

@@ -1,33 +1,181 @@
-"""Live session: takes events from a source, compensates them, and gives them to files, servers and callbacks."""
+"""Live session: takes events from a source, compensates them, and gives them to files, servers and callbacks.
 
+It checks the prism's phase meanwhile; :class:`RecentEvents` keeps the last seconds of a stream.
+"""
+
+import contextlib
 import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.calib import calibrate
 from amiwarp.calib.result import Calibration
 from amiwarp.choices import Sharpness
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
-from amiwarp.events.encoder_stream import EncoderStream
-from amiwarp.events.events import Events, held_bytes
-from amiwarp.imaging.sharpness import SharpnessMeter
-from amiwarp.imaging.votes import CanvasShape
-from amiwarp.io.live_writer import LiveWriter
-from amiwarp.live.link.clocks import ClockMap, monotonic_us
-from amiwarp.live.link.follower import LinkUpdate
-from amiwarp.live.link.link import Link
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import TWO_PI, Encoder, EncoderStream, start_of_last_run
+from amiwarp.events.recording import OVERHEAD, Events, MemoryEvents, Recording, held_bytes
+from amiwarp.imaging.iwe import CanvasShape
+from amiwarp.imaging.metrics import SharpnessMeter
+from amiwarp.io.native_writer import LiveWriter
+from amiwarp.live.link.clocks import CameraClock, ClockMap, monotonic_us
+from amiwarp.live.link.link import Link, LinkUpdate
+from amiwarp.live.queues import BackgroundWorker, EventSorter, PacketQueue, Policy
 from amiwarp.live.stream.adaptive import SpeedKeeper
-from amiwarp.live.stream.camera_clock import CameraClock, clock_offset
 from amiwarp.live.stream.packets import NO_TIMES, Packet, Source
-from amiwarp.live.stream.phase_check import PhaseCheck
-from amiwarp.live.stream.queues import BackgroundWorker, EventSorter, PacketQueue, Policy
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import NominalPrism
+
+# Check during a stream that the prism's phase has not changed since the calibration.
+
+SEARCH_RAD = math.radians(20.0)
+"""Half width of the search about the calibrated phase [rad]. A phase outside is found at the edge of this range, and
+reported."""
+CHANGE_RAD, OFFSET_RAD = math.radians(1.5), math.radians(5.0)
+"""Smallest reported change of the phase since the first estimate, and smallest reported offset from the calibrated
+phase [rad].
+
+The bias of the estimate is up to 3 deg.
+"""
+FEWEST_EVENTS = 20_000
+"""Smallest number of events for an estimate of the phase. The events must also cover half a turn."""
+MOST_CHECK_BYTES = 1 << 24
+"""Memory limit of the latest events, from which the phase is estimated [bytes]: about a million events."""
+EVALUATIONS = 40
+"""Number of evaluations of the sharpness per estimate of the phase."""
+
+
+@dataclass(frozen=True, slots=True)
+class PhaseEstimate:
+    """Estimate of the prism's phase by sharpness."""
+
+    offset: float
+    """Difference between the estimated and the calibrated phase [rad]."""
+    std: float
+    """Standard deviation of the estimated phase [rad]."""
+
+
+class PhaseCheck:
+    """Estimates the prism's phase repeatedly by sharpness, on the CPU in a background thread.
+
+    The check needs the events that the compensator gets. The sharpness has a bias that depends on the sensor. Therefore
+    the change since the first estimate is judged.
+    """
+
+    def __init__(self, calibration: Calibration, every_s: float, say: Callable[[str], None]) -> None:
+        """Set up the check.
+
+        ``every_s``: interval between estimates [s]; ``say`` is called with a message if the phase changed.
+        """
+        self._calibration, self._every_s, self._say = calibration, every_s, say
+        self._due, self._closed = 0.0, False
+        self._recent: deque[Events] = deque()
+        self.held_bytes = 0
+        """Memory of the latest events that are kept for an estimate [bytes]."""
+        self._thread: threading.Thread | None = None  # a daemon: the process may end while an estimate runs
+        self._estimated: PhaseEstimate | None = None
+        self._first_estimate: PhaseEstimate | None = None
+        self._offset: float | None = None
+        self._reported: float | None = None
+
+    def update(self, encoder: EncoderStream) -> float | None:
+        """Start an estimate if one is due; return the latest offset from the calibrated phase [rad], at first None."""
+        estimate = self.result()
+        if estimate is not None:
+            self._first_estimate = self._first_estimate or estimate
+            self._offset = estimate.offset
+            self._report(estimate, self._first_estimate)
+        if time.monotonic() >= self._due and self.start_check(encoder):
+            self._due = time.monotonic() + self._every_s
+        return self._offset
+
+    def _report(self, estimate: PhaseEstimate, first: PhaseEstimate) -> None:
+        """Report a large offset from the calibrated phase, or a significant change since the first estimate."""
+        changed = estimate.offset - first.offset
+        if self._reported is not None and abs(estimate.offset - self._reported) < CHANGE_RAD:
+            return
+        self._reported = None
+        if abs(estimate.offset) > OFFSET_RAD:
+            self._reported = estimate.offset
+            offset = f"{math.degrees(estimate.offset):+.1f} deg"
+            self._say(f"the phase differs from the calibrated one by {offset}: calibrate again")
+        elif abs(changed) > max(CHANGE_RAD, 4.0 * math.hypot(estimate.std, first.std)):
+            self._reported = estimate.offset
+            since = f"since the first check, to {math.degrees(estimate.offset):+.1f} deg from the calibrated one"
+            self._say(f"the phase has moved by {math.degrees(changed):+.1f} deg {since}: has the index pulse slipped?")
+
+    def put(self, events: Events) -> None:
+        """Add events of the sensor, from which the next estimate is made."""
+        self._recent.append(events)
+        self.held_bytes += held_bytes(events)
+        while self.held_bytes - held_bytes(self._recent[0]) > MOST_CHECK_BYTES:
+            self.held_bytes -= held_bytes(self._recent.popleft())
+
+    def start_check(self, encoder: EncoderStream) -> bool:
+        """Start an estimate from the events of the last turn.
+
+        Returns False if an estimate is running or the data do not suffice.
+        """
+        last = encoder.last
+        if self._closed or self._thread is not None or last is None or not self._recent:
+            return False
+        events = Events.concatenate(list(self._recent))
+        events = events[: int(events.t.searchsorted(last, side="right"))]
+        if len(events) < FEWEST_EVENTS:
+            return False
+        samples = encoder.over(int(events.t[0]), int(events.t[-1]))
+        speed = abs(samples.rpm) * TWO_PI / 60e6
+        begin = int(events.t[-1]) - round(1.2 * TWO_PI / speed) if speed else int(events.t[0])
+        events = events[int(events.t.searchsorted(begin)) :]
+        swept = speed * float(events.t[-1] - events.t[0]) if len(events) else 0.0
+        if len(events) < FEWEST_EVENTS or swept < TWO_PI / 2.0 or encoder.guessed(events.t).any():
+            return False
+        self._thread = threading.Thread(
+            target=self._estimate, args=(events, samples), name="amiwarp-phase-check", daemon=True
+        )
+        self._thread.start()
+        return True
+
+    def result(self) -> PhaseEstimate | None:
+        """Return each new estimate once; None if there is no new one."""
+        if self._thread is None or self._thread.is_alive():
+            return None
+        self._thread.join()
+        self._thread = None
+        estimate, self._estimated = self._estimated, None
+        return estimate
+
+    def close(self) -> None:
+        """Wait for a running estimate, and start no further one."""
+        self._closed = True
+        if self._thread is not None:
+            self._thread.join()
+
+    def _estimate(self, events: Events, encoder: Encoder) -> None:
+        """Estimate the phase by a calibration in which all other parameters are fixed."""
+        known = self._calibration
+        phase = known.parameters["phase"]
+        recording = Recording(MemoryEvents(events, known.camera.width, known.camera.height), known.camera, encoder,
+                              known.prism, name="the stream")  # fmt: skip
+        start = {n: x for n, x in known.parameters.items() if n not in ("clock_offset", "rpm")}
+        try:
+            found = calibrate(
+                recording, model=known.model_name, free=("phase",), start=start, stages=("sharpness",), events=100_000,
+                bounds={"phase": (phase - SEARCH_RAD, phase + SEARCH_RAD)}, global_evaluations=EVALUATIONS,
+                local_algorithm="LN_SBPLX", device="cpu",
+            )  # fmt: skip
+        except AmiwarpError:
+            return  # for example without texture: a later estimate may succeed
+        self._estimated = PhaseEstimate(found.parameters["phase"] - phase, found.uncertainty["phase"])
+
 
 # Consumers of a session's data: files and servers, each served by a background thread.
 
@@ -291,6 +439,7 @@ class Session:
         consumer, after everything received before it was processed. KeyboardInterrupt ends the session at once and
         drops all waiting data.
         """
+        # No BackgroundLoop: the source may never return, then the session ends without it.
         reader = threading.Thread(target=self._read, args=(stop,), name="amiwarp-source", daemon=True)
         self._stop = stop
         reader.start()
@@ -527,3 +676,164 @@ class EncoderFeed:
 
 def _size(update: LinkUpdate) -> int:
     return len(update.t_us) + len(update.index_t_us)
+
+
+def clock_offset(source: Source, link: Link | None) -> float:
+    """Return the clock offset of a file's own encoder [us], which a new recording of it shall keep; 0 with a link."""
+    return 0.0 if link is not None else float(getattr(source, "clock_offset_us", 0.0))
+
+
+# The last seconds of a stream in memory, available as a recording at any time.
+
+SECONDS, MOST_BYTES = 2.0, 1 << 27
+"""Limits of the latest events that are kept: their duration [s] and their memory [bytes], about eight million events.
+
+Encoder samples have a memory limit of the same size.
+"""
+SILENT_S = 1.0
+"""Time without events or encoder samples after which they count as interrupted [s]."""
+FIRST_S = 15.0
+"""Longest wait for the first turn of the prism when a stream starts [s]."""
+
+
+class RecentEvents:
+    """Keeps the latest events and encoder samples. One thread may append while others call :meth:`recording`."""
+
+    def __init__(self, source: Source, camera: Camera | None = None, prism: NominalPrism | None = None) -> None:
+        self._size, self._name = source.size, source.name
+        self._camera, self._prism = camera or source.camera, prism or source.prism
+        self._events: deque[Events] = deque()
+        self._samples: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
+        self.event_bytes = self.sample_bytes = 0
+        """Memory of the kept events and of the kept encoder samples [bytes]."""
+        self.turn_share = 0.0
+        """Share of a turn of the prism that the kept events cover, 0 to 1, at the last call of :meth:`recording`."""
+        self.status = SessionStatus()
+        """Rate, losses and speed of the stream, from its last report."""
+        self.ended = ""
+        """Why the stream has ended; empty while it runs."""
+        self.link: Link | None = None
+        """Link to the controller that sends the encoder samples; None if they come with the events."""
+        self._arrived_s = self._sampled_s = time.monotonic()
+        self._lock = threading.Lock()
+
+    def append(self, events: Events) -> None:
+        """Append events, in order of time."""
+        with self._lock:
+            self._arrived_s = time.monotonic()
+            self._events.append(events)
+            self.event_bytes += held_bytes(events)
+            since = int(events.t[-1]) - round(SECONDS * 1e6)
+            while len(self._events) > 1 and (self.event_bytes > MOST_BYTES or self._events[0].t[-1] < since):
+                self.event_bytes -= held_bytes(self._events.popleft())
+
+    def append_encoder(self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None) -> None:
+        """Append encoder samples in order of time, on the events' clock.
+
+        The angles already include the index pulses.
+        """
+        if len(t_us):
+            with self._lock:
+                self._sampled_s = time.monotonic()
+                self._samples.append((t_us, angle))
+                self.sample_bytes += OVERHEAD + t_us.nbytes + angle.nbytes
+                since = int(t_us[-1]) - round(2e6 * SECONDS)
+                while len(self._samples) > 1 and (self.sample_bytes > MOST_BYTES or self._samples[0][0][-1] < since):
+                    t_us, angle = self._samples.popleft()
+                    self.sample_bytes -= OVERHEAD + t_us.nbytes + angle.nbytes
+
+    @property
+    def age_s(self) -> float:
+        """Time since the latest events arrived [s]."""
+        return time.monotonic() - self._arrived_s
+
+    @property
+    def silence(self) -> str:
+        """Why no events arrive; empty if they do."""
+        return self.ended or _silence("events", self.age_s)
+
+    @property
+    def encoder_silence(self) -> str:
+        """Why no encoder samples arrive; empty if they do."""
+        if self.link is not None and not self.link.connected:
+            return f"the port {self.link.name} of the controller is gone"
+        return _silence("encoder samples", time.monotonic() - self._sampled_s)
+
+    def tick(self) -> None:
+        """Do nothing, because no data wait to be written."""
+
+    def recording(self) -> Recording | None:
+        """Return the kept events that the encoder covers, as a recording; None if they are shorter than one turn.
+
+        Events before a gap or a restart of the encoder samples are left out, because their angles do not continue.
+        """
+        with self._lock:
+            events, samples = list(self._events), list(self._samples)
+        if not samples or not events:
+            return None
+        t, angle = (np.concatenate(column) for column in zip(*samples, strict=True))
+        run = start_of_last_run(t)
+        t, angle = t[run:], angle[run:]
+        if len(t) < 2:
+            return None
+        joined = Events.concatenate(events)
+        since = max(min(int(np.searchsorted(t, joined.t[0])) - 2, len(t) - 2), 0)
+        encoder = Encoder(t[since:], angle[since:])
+        first, last = np.searchsorted(joined.t, encoder.coverage)
+        covered = joined[first:last]
+        self.turn_share = (
+            min(float(np.ptp(encoder.angle_at(covered.t[[0, -1]]))) / TWO_PI, 1.0) if len(covered) else 0.0
+        )
+        if self.turn_share < 1.0:
+            return None
+        return Recording(MemoryEvents(covered, *self._size), self._camera, encoder, self._prism, name=self._name)
+
+
+def _silence(what: str, seconds: float) -> str:
+    return f"no {what} for {seconds:.0f} s" if seconds > SILENT_S else ""
+
+
+@contextlib.contextmanager
+def followed(source: Source, link: Link | None, recent: RecentEvents, say: Callable[[str], None]) -> Iterator[None]:
+    """Fill ``recent`` from a source, in a background thread, while the ``with`` block runs.
+
+    Waits for the first turn of the prism. Raises :class:`AmiwarpError` if it does not come in time, or the error of the
+    source.
+    """
+    stop, failures, recent.link = threading.Event(), [], link
+
+    def report(status: SessionStatus) -> None:
+        recent.status = replace(status)
+
+    def end(text: str) -> None:
+        recent.ended = text
+        say(text)
+
+    def run() -> None:
+        session = Session(source, link=link, raw=[recent], policy=Policy.DROP_OLDEST, say=say)
+        try:
+            ended = session.run(stop, report)
+            problem = getattr(source, "problem", None)
+            how = "has ended" if problem is None else f"broke off: {problem}"
+            end(f"{source.name}: the stream {how}; the last of its {ended.events:,} events are shown")
+        except Exception as error:
+            failures.append(error)
+            end(str(error))
+
+    # No BackgroundLoop: the session has its own stop event, and its end is shown as text while the block runs.
+    thread = threading.Thread(target=run, name="amiwarp-follow", daemon=True)
+    thread.start()
+    try:
+        until = time.monotonic() + FIRST_S
+        while recent.recording() is None:
+            if not thread.is_alive() or time.monotonic() > until:
+                how = f"in {FIRST_S:g} s" if thread.is_alive() else "before the stream ended"
+                problem = getattr(source, "problem", None)
+                why = "" if problem is None else f": it broke off, {problem}"
+                what = f"{source.name}: delivered less than one full turn {how}{why}"
+                raise failures[0] if failures else AmiwarpError(what)
+            time.sleep(0.05)
+        yield
+    finally:
+        stop.set()
+        thread.join()

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
+from amiwarp.events.recording import Events
 from amiwarp.live.stream.packets import encode_encoder, encode_end, encode_events
 
 # Connections over TCP and Unix sockets: connecting, listening, accepting.

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.choices import Seeing
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.atomic_output import write_text
+from amiwarp.io.files import text_lines, write_text
 from amiwarp.io.formats import POSE_ENDINGS, check_ending
-from amiwarp.io.input_files import text_lines
 from amiwarp.validation import array, choice, guarded, instance, one_of, real, shown, vector
 
 if TYPE_CHECKING:

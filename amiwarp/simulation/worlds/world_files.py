@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from trimesh import Trimesh
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name, note_input, open_input
+from amiwarp.io.files import errors_name, note_input, open_input
 from amiwarp.io.json_files import at_field, build, fields_of, read_json, read_toml
 from amiwarp.io.reading_process import borrow, give_back
 from amiwarp.simulation.pictures import BAND, LUMINANCE, MOST_PIXELS, PICTURE_FORMATS, read_picture, srgb_to_linear

@@ -18,10 +18,10 @@ import numpy as np
 from amiwarp.calib.presets import Preset
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
+from amiwarp.imaging.iwe import TURNS
 from amiwarp.imaging.palette import BLACK, BLUE, GREEN, MODEL_COLOURS, ORANGE, PINK, SKY_BLUE, VERMILION
-from amiwarp.imaging.votes import TURNS
-from amiwarp.io.atomic_output import check_output, make_folder, write_text
-from amiwarp.io.input_files import read_text
+from amiwarp.io.files import check_output, read_text, write_text
+from amiwarp.io.formats import make_folder
 from amiwarp.optics.models import MODELS, rungs
 from amiwarp.plotting import figures
 from amiwarp.progress import Progress, part, silent

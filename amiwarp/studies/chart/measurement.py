@@ -25,12 +25,11 @@ from amiwarp.choices import Vote
 from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, MemoryEvents, Recording
+from amiwarp.imaging.iwe import TURNS, CanvasShape, Image, UploadedEvents, Votes, upload_events
 from amiwarp.imaging.metrics import model_error, truth_model
-from amiwarp.imaging.votes import TURNS, CanvasShape, Image, UploadedEvents, Votes, upload_events
 from amiwarp.io import open_recording, save_recording
-from amiwarp.io.atomic_output import scratch_folder
+from amiwarp.io.files import scratch_folder
 from amiwarp.memory import only_new_garbage, release_memory
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel, Model, axis_rotation, rungs, wrap_angle

@@ -28,10 +28,9 @@ from amiwarp._version import __version__
 from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import convert, open_recording
-from amiwarp.io.atomic_output import NewFile, make_folder, put_in_place, scratch_folder, write_text
-from amiwarp.io.json_files import LARGEST_INTEGER, build
-from amiwarp.io.recorded_dataset import FORMAT, MANIFEST, VERSION
-from amiwarp.io.sealed_json import append_line, create_journal, read_journal
+from amiwarp.io.files import NewFile, put_in_place, scratch_folder, write_text
+from amiwarp.io.formats import FORMAT, MANIFEST, VERSION, make_folder
+from amiwarp.io.json_files import LARGEST_INTEGER, append_line, build, create_journal, read_journal
 from amiwarp.kernels import launch
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.progress import Progress, silent

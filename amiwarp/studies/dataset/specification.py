@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.input_files import errors_name, open_input
+from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.json_files import LARGEST_INTEGER, at_field, build, fields_of, read_json, read_toml
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism

@@ -22,9 +22,9 @@ from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import BLACK, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, VERMILION
 from amiwarp.io import open_recording
-from amiwarp.io.atomic_output import NewFile, check_output, make_folder, own_folder, write_text
-from amiwarp.io.json_files import fields_of, value_of
-from amiwarp.io.sealed_json import CellStore
+from amiwarp.io.files import NewFile, check_output, own_folder, write_text
+from amiwarp.io.formats import make_folder
+from amiwarp.io.json_files import CellStore, fields_of, value_of
 from amiwarp.kernels.launch import load_all, load_kernels
 from amiwarp.progress import Progress, silent
 from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs, start_workers, versions, worker_count
@@ -37,7 +37,6 @@ from amiwarp.validation import guarded, real, whole
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
 
 # Evaluations by name. A new one needs its module in this folder and its name in :data:`EVALUATIONS`.
 

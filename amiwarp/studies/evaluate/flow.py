@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
+from amiwarp.events.recording import Events
 from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.iwe import iwe
 from amiwarp.optics.camera import Camera, CameraRotation

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.optics.camera import CameraRotation
 from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism

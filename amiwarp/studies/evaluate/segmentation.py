@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
+from amiwarp.events.recording import Events
 from amiwarp.optics.camera import Camera
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.flow import moving_instances

@@ -25,11 +25,10 @@ from amiwarp.calib import Settings as CalibrationSettings
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import Events
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.events.truth import EventTruth, FrameTruth
+from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.metrics import TRUTH_PERCENTILES, picture_quality
-from amiwarp.imaging.votes import CanvasShape, Votes
 from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.optics.models import ExactModel, Model
 from amiwarp.optics.prism import Prism

@@ -7,7 +7,7 @@ from typing import Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.events.events import Events
+from amiwarp.events.recording import Events
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Table
 

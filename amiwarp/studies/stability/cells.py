@@ -25,11 +25,9 @@ from amiwarp.calib.settings import AUTO, STAGES
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.events.events import Events, MemoryEvents
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.metrics import model_error
-from amiwarp.io.json_files import build, fields_of, value_of
-from amiwarp.io.sealed_json import CellStore
+from amiwarp.io.json_files import CellStore, build, fields_of, value_of
 from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.models import ExactModel, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism
@@ -199,7 +197,7 @@ class Lamp(_ChangingStill):
     """Still picture with a flickering square.
 
     The square's luminance falls by ``depth`` and rises again :data:`LAMP_HZ` times per second. Satisfies
-    :class:`amiwarp.simulation.simulator.Frames`.
+    :class:`amiwarp.Frames`.
     """
 
     share: float

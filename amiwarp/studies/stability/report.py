@@ -18,7 +18,7 @@ from scipy.stats import binomtest
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import BLACK, BLUE, PINK, SKY_BLUE
-from amiwarp.io.atomic_output import NewFile, write_text
+from amiwarp.io.files import NewFile, write_text
 from amiwarp.plotting.figures import blank, save
 from amiwarp.studies.stability import cells as study
 from amiwarp.studies.stability.cells import Axis, Cell, Condition, Method, Outcome, Result, Store, Stored, identity

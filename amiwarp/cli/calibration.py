@@ -1,31 +1,50 @@
-"""``amiwarp calibrate``: estimation of the prism's parameters from a recording."""
+"""Calibration and its use: ``amiwarp calibrate``, ``amiwarp compensate`` and ``amiwarp reconstruct``."""
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import math
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.choices import OPTICAL_MODELS, Sharpness
+from amiwarp.choices import CONTRAST, OPTICAL_MODELS, Fill, Layers, Sharpness, Tone
 from amiwarp.cli.console import choose_device, progress, report, table
-from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, interval, number, span
+from amiwarp.cli.options import (
+    OUTPUT,
+    CameraOptions,
+    Common,
+    NominalPrismOptions,
+    Topic,
+    complete,
+    interval,
+    number,
+    numbers,
+    span,
+)
+from amiwarp.cli.recordings import EncoderOptions, Format, HdfCodec, Round, format_notes
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.events import MemoryEvents
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.io import open_recording
-from amiwarp.io.atomic_output import check_output
-from amiwarp.io.formats import check_ending
+from amiwarp.io.files import check_output
+from amiwarp.io.formats import COMPENSATED_HELP, Codec, check_ending
+from amiwarp.optics.camera import CameraRotation
+from amiwarp.progress import Progress
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
     from amiwarp.calib.result import ModelCandidate, ModelChoice
     from amiwarp.calib.settings import PhotometricSettings
+    from amiwarp.imaging.export import IweFiles
+    from amiwarp.reconstruction.picture import Picture, Reconstruction
 
-EXAMPLE = "amiwarp calibrate recording.h5 calibration.json --figure calibration.png"
+# ``amiwarp calibrate``: estimation of the prism's parameters from a recording.
 
 _SEARCH, _PARAMETERS = "Search", "Parameters"
 
@@ -206,7 +225,7 @@ def _named(text: str) -> tuple[str, str, str]:
     return name, known[name], value
 
 
-def run(
+def run_calibrate(
     recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     out: Annotated[
         Path | None,
@@ -270,8 +289,12 @@ def run(
         from amiwarp.plotting.figures import draw_calibration
 
         draw_calibration(figure, opened, found, device=device)
-    data = summary(found) | {"file": str(out), "figure": None if figure is None else str(figure), "device": device}
-    report(common, data, lines(found, data))
+    data = calibration_summary(found) | {
+        "file": str(out),
+        "figure": None if figure is None else str(figure),
+        "device": device,
+    }
+    report(common, data, calibration_lines(found, data))
 
 
 def check_paper(search: SearchOptions, parameters: ParameterOptions, preset: Path | None) -> None:
@@ -295,14 +318,14 @@ def cut(recording: Recording, window: str) -> Recording:
     return replace(recording, events=MemoryEvents(events, *recording.events.size))
 
 
-def summary(c: Calibration) -> dict[str, Any]:
+def calibration_summary(c: Calibration) -> dict[str, Any]:
     """Return the calibration as JSON, with angles in radians and degrees, but without the points of the search."""
     data = c.to_json()
     data["stages"] = [{k: v for k, v in stage.items() if k != "points"} for stage in data["stages"]]
     return data
 
 
-def lines(c: Calibration, data: dict[str, Any]) -> list[Any]:
+def calibration_lines(c: Calibration, data: dict[str, Any]) -> list[Any]:
     """Return the calibration as tables and lines of text."""
     rows = [(name, *_shown(entry)) for name, entry in data["parameters"].items()]
     stages = [
@@ -378,3 +401,282 @@ def _shown(entry: dict[str, Any]) -> tuple[str, str, str]:
         whole_turn = entry["unit"] == "rad" and entry["std"] > math.pi
         std = "undetermined" if whole_turn else f"{entry['std'] * scale:.2g}"
     return f"{entry['value'] * scale:.6g}", std, entry["unit"].replace("rad", "deg")
+
+
+# ``amiwarp compensate``: motion compensation of a recording with its calibration.
+
+_in_iwe = partial(typer.Option, rich_help_panel="Image of warped events")
+
+
+@dataclass(frozen=True)
+class IweOptions:
+    """Options for images of warped events (IWE) that are written during the compensation."""
+
+    iwe: Annotated[
+        list[Path] | None,
+        _in_iwe(
+            help="Image of warped events (IWE) to write: .png for viewing, .npy with the counts. Can be given twice.",
+            metavar="<path>",
+        ),
+        OUTPUT,
+    ] = None
+    iwe_window_ms: Annotated[
+        float | None,
+        _in_iwe(
+            min=0.001,
+            help="Write one image per time window of this length (ms): NAME_00000.png ..., or one stack in .npy.",
+        ),
+    ] = None
+    iwe_layers: Annotated[
+        Layers,
+        _in_iwe(
+            help="Use of polarity. merged: ignored; signed: ON minus OFF; polarity: ON and OFF in separate layers."
+        ),
+    ] = Layers.MERGED
+
+    def build(self, recording: Recording, device: str) -> IweFiles | None:
+        """Return the writer of the images, or None if no image is requested."""
+        if not self.iwe:
+            if self.iwe_window_ms is not None or self.iwe_layers is not Layers.MERGED:
+                raise AmiwarpError("--iwe-window-ms and --iwe-layers apply to --iwe; give --iwe too")
+            return None
+        from amiwarp.imaging.export import IweFiles
+
+        window_us = None if self.iwe_window_ms is None else max(1, round(self.iwe_window_ms * 1000.0))
+        return IweFiles(self.iwe, recording.events, window_us=window_us, layers=self.iwe_layers, device=device)
+
+
+def run_compensate(
+    recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
+    out: Annotated[
+        Path,
+        typer.Argument(help=f"Compensated recording to write. Its extension gives the format: {COMPENSATED_HELP}."),
+        OUTPUT,
+    ],
+    *,
+    calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
+    preset: Annotated[
+        Path | None,
+        typer.Option(help="Preset from 'amiwarp chart': sets the prism model to use. Default: the calibrated model."),
+    ] = None,
+    format: Format = None,
+    codec: HdfCodec = Codec.BLOSC,
+    round: Round = None,
+    encoder: EncoderOptions,
+    topic: Topic = None,
+    iwe: IweOptions,
+    common: Common,
+) -> None:
+    """Compensate the prism's motion: move every event to its position without the prism.
+
+    Positions are sub-pixel, and all events are kept, in order; --round gives whole pixels and drops events outside the
+    image. Memory use does not depend on the length of the recording. From a ROS 2 bag to a ROS 2 bag, all other topics
+    are copied.
+
+    A PNG shows counts from 0 (black) to their 99.5th percentile over pixels with events (white), with gamma 0.5.
+    """
+    from amiwarp.calib import Calibration
+    from amiwarp.calib.presets import Preset, simplified
+    from amiwarp.compensation.recordings import compensate
+
+    device = choose_device(common.device)
+    found = Calibration.load(calibration)
+    if preset is not None:
+        found = simplified(found, Preset.load(preset, "compensation").settings["model"])
+    log = encoder.build(recording, topic)
+    opened = open_recording(recording, topic=topic)
+    opened = opened if log is None else replace(opened, encoder=log)
+    files = iwe.build(opened, device)
+    with progress("compensating") as advance, files or contextlib.nullcontext():
+        done = compensate(
+            opened, found, out, device=device, progress=advance, on_block=None if files is None else files.add,
+            format=format, codec=codec, rounding=round, seed=common.seed,
+        )  # fmt: skip
+    data: dict[str, Any] = {
+        "file": str(out),
+        "model": found.model_name,
+        "events": done.events,
+        "outside": done.outside,
+        "format": done.format,
+        "rounding": done.rounding,
+        "dropped": done.dropped,
+        "left_out": list(done.left_out),
+        "seconds": done.seconds,
+        "mev_per_s": done.mev_per_s,
+        "device": device,
+        "iwe": [] if files is None else [str(path) for path in files.written],
+    }
+    report(common, data, _compensated_lines(data))
+
+
+def _compensated_lines(d: dict[str, Any]) -> list[str]:
+    images = d["iwe"] if len(d["iwe"]) <= 3 else [f"{d['iwe'][0]} .. {d['iwe'][-1]} ({len(d['iwe'])} files)"]
+    speed = f"{d['seconds']:.2f} s, {d['mev_per_s']:.3g} Mev/s by the {d['model']} model on {d['device']}"
+    return [
+        f"{d['file']}: {d['events']:,} events ({d['outside']:,} outside the image), {speed}",
+        *format_notes(d),
+        *images,
+    ]
+
+
+# ``amiwarp reconstruct``: reconstruction of a picture or a video of the scene from events.
+
+_in_window = partial(typer.Option, rich_help_panel="Window")
+_in_picture = partial(typer.Option, rich_help_panel="Picture")
+
+
+@dataclass(frozen=True)
+class WindowOptions:
+    """Options for the time window whose events are used."""
+
+    start: Annotated[
+        float | None,
+        _in_window(
+            help="Start of the window (s from the first event). Default: one turn, less in short recordings; 0 for a "
+            "video."
+        ),
+    ] = None
+    length: Annotated[float | None, _in_window(min=1e-6, help="Length of the window (s).")] = None
+    turns: Annotated[
+        float | None, _in_window(min=0.01, help="Length of the window (turns of the prism), at least 0.25. Default: 1.")
+    ] = None
+    fps: Annotated[
+        float | None, _in_window(min=0.01, max=100_000.0, help="Frames per second of a video. Default: 25.")
+    ] = None
+    omega: Annotated[
+        str | None,
+        _in_window(
+            help="Angular velocity of the camera about its x, y and z axes (rad/s), such as 0,0.6,0. "
+            "Default: from the calibration.",
+            metavar="X,Y,Z",
+        ),
+    ] = None
+
+    def span(self, work: Reconstruction, *, video: bool) -> tuple[int, int]:
+        """Return the start and the length of the time window [us]. A video begins with the recording."""
+        after = 0.0 if self.start is None and video else self.start
+        start = None if after is None else work.recording.events.t_first + round(after * 1e6)
+        return work.span(start, None if self.length is None else max(1, round(self.length * 1e6)), self.turns)
+
+    def camera_rotation(self) -> CameraRotation | None:
+        """Return the camera's rotation given by an option, or None."""
+        if self.omega is None:
+            return None
+        x, y, z = numbers(self.omega, 3, "--omega")
+        return CameraRotation((x, y, z))
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """Options for the content and the format of the picture."""
+
+    fill: Annotated[
+        Fill,
+        _in_picture(
+            help="Filling of pixels that no event determines. none: black; smooth: smooth surface; edge: flat areas "
+            "with sharp edges."
+        ),
+    ] = Fill.SMOOTH
+    tone: Annotated[
+        Tone, _in_picture(help="Grey values. mapped: contrast stretched, gamma 2.2; linear: proportional to intensity.")
+    ] = Tone.MAPPED
+    bits: Annotated[int, _in_picture(help="Bits per pixel of a .png: 8 or 16. A .tif has 16.")] = 8
+    contrast: Annotated[
+        float,
+        _in_picture(
+            min=0.01, max=10.0, help="ON threshold of the sensor (log intensity), which scales the brightness."
+        ),
+    ] = CONTRAST
+    mask: Annotated[
+        Path | None,
+        _in_picture(help="Mask of the pixels that events determine, to write (.png).", metavar="<path>"),
+        OUTPUT,
+    ] = None
+
+
+def run_reconstruct(
+    recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
+    out: Annotated[
+        Path, typer.Argument(help="File to write: .png, .tif (16 bit), .npy (log intensity) or .mp4."), OUTPUT
+    ],
+    *,
+    calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
+    window: WindowOptions,
+    picture: PictureOptions,
+    common: Common,
+) -> None:
+    """Reconstruct a picture of the scene from the events of a window, or a video from a sliding window.
+
+    A window needs at least a quarter turn of the prism. Intensity is relative, because events do not hold absolute
+    brightness.
+    """
+    from amiwarp.calib import Calibration
+    from amiwarp.reconstruction.picture import MASK_SUFFIXES, VIDEO, Reconstruction, check_path
+
+    check_path(out)
+    if picture.mask is not None:
+        check_path(picture.mask, MASK_SUFFIXES)
+    video = out.suffix.lower() == VIDEO
+    if video and (picture.mask is not None or picture.bits != 8):
+        raise AmiwarpError("--mask and --bits apply to a single picture; leave them out for a video")
+    if not video and window.fps is not None:
+        raise AmiwarpError(f"{out}: --fps applies to a video; give a name that ends in {VIDEO}")
+    device = choose_device(common.device)
+    work = Reconstruction(
+        open_recording(recording), Calibration.load(calibration), camera_rotation=window.camera_rotation(),
+        fill=picture.fill, device=device,
+    )  # fmt: skip
+    start, length = window.span(work, video=video)
+    began = time.perf_counter()
+    with progress("reconstructing") as advance:
+        if video:
+            data = _video(work, out, (start, length), window.fps or 25.0, picture, advance)
+        else:
+            data = _still(work.window(start, length), out, picture)
+    seconds = time.perf_counter() - began
+    data = {"file": str(out), "start_us": start, "length_us": length, **data, "seconds": seconds, "device": device}
+    report(common, data, [_reconstructed_line(data)])
+
+
+def _still(found: Picture, out: Path, options: PictureOptions) -> dict[str, Any]:
+    from amiwarp.reconstruction.picture import save_mask, save_picture
+
+    save_picture(found, out, tone=options.tone, bits=options.bits, contrast=options.contrast)
+    if options.mask is not None:
+        save_mask(found, options.mask)
+    return {
+        "frames": 1,
+        "pairs": found.pairs,
+        "known": float(found.known.mean()),
+        "residual": found.residual,
+        "smoothness": found.smoothness,
+        "off_excess": found.off_excess,
+        "hot_pixels": found.hot,
+    }
+
+
+def _video(
+    work: Reconstruction, out: Path, span: tuple[int, int], fps: float, options: PictureOptions, advance: Progress
+) -> dict[str, Any]:
+    from amiwarp.reconstruction.picture import save_video
+
+    step = 1e6 / fps
+    count = work.count(*span, step_us=step)
+    pairs: list[int] = []
+
+    def pictures() -> Iterator[Picture]:
+        for found in work.windows(*span, step_us=step):
+            yield found
+            pairs.append(found.pairs)
+            advance("reconstructing", len(pairs) / count)
+
+    frames = save_video(pictures(), out, fps=fps, tone=options.tone, contrast=options.contrast)
+    return {"frames": frames, "fps": fps, "pairs": sum(pairs)}
+
+
+def _reconstructed_line(d: dict[str, Any]) -> str:
+    speed = f"{d['pairs'] / 1e6:.2f} million pairs of events in {d['seconds']:.2f} s on {d['device']}"
+    window = f"{d['length_us'] / 1e3:.1f} ms"
+    if "fps" in d:
+        return f"{d['file']}: {d['frames']} frames of {window} at {d['fps']:g}/s, {speed}"
+    return f"{d['file']}: {window}, {speed}; {100.0 * d['known']:.0f} % of the picture determined by events"

@@ -1,39 +1,42 @@
-"""Command ``amiwarp info``: description of the content of a recording."""
+"""Content and files of recordings: ``amiwarp info``, ``amiwarp convert`` and ``amiwarp truth``."""
 
 import contextlib
 import math
+import re
+import time
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
 from amiwarp.cli.console import progress, report, table
-from amiwarp.cli.options import Common, Topic
+from amiwarp.cli.options import OUTPUT, OUTPUT_FOLDER, CameraOptions, Common, NominalPrismOptions, Topic
+from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, rpm_between
-from amiwarp.events.events import DEFAULT_BLOCK, EventSource
-from amiwarp.events.recording import ImageStore, ImuSamples, Recording, Truth, mean_rate
-from amiwarp.events.truth import Cause
-from amiwarp.io import open_recording
-from amiwarp.io.camera_files import camera_to_json
-from amiwarp.io.export import GAP_INTERVALS
+from amiwarp.events.recording import DEFAULT_BLOCK, EventSource, ImageStore, ImuSamples, Recording, mean_rate
+from amiwarp.events.truth import Cause, Truth
+from amiwarp.io import convert, open_recording, read_encoder_csv, read_encoder_triggers
+from amiwarp.io.export import GAP_INTERVALS, save_flow_dsec, save_flow_mvsec, save_poses_tum
 from amiwarp.io.file_scan import head_only
+from amiwarp.io.formats import EXTENSION_HELP, LIMITS, Codec, OutputFormat, Rounding, make_folder
+from amiwarp.io.rig_files import camera_to_json
 from amiwarp.optics.prism import Prism
 
-EXAMPLE = "amiwarp info recording.h5"
+# ``amiwarp info``: description of the content of a recording.
+
 MOST_NAMES = 16
 """Largest number of instances, bodies or joints whose names are printed. ``--json`` prints all names."""
-
-
 LARGE_BYTES = 1 << 28
 """Size from which on files are read only in part, unless --count is given [bytes]."""
-
 HEAD_EVENTS = 1 << 22
 """Number of events that are read of a large file."""
 
 
-def run(
+def run_info(
     file: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     *,
     count: Annotated[
@@ -231,7 +234,7 @@ def _world_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     if d["name"] is not None:
         categories = f" of the classes {', '.join(d['categories'])}" if d["categories"] else ""
         rows.append(("world", f"{d['name']}: {len(d['instances'])} instances{categories}"))
-        rows.append(("instances", _list(d["instances"])))
+        rows.append(("instances", _listed(d["instances"])))
     surfaces = [name for name in d["per_event"] if name != "cause"]
     if surfaces:
         rows.append(("per event", ", ".join(surfaces)))
@@ -240,11 +243,11 @@ def _world_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     if d["poses"]:
         moving = [f"{len(d[name])} {name.replace('_', ' ')}" for name in ("moving_bodies", "joints") if d[name]]
         rows.append(("poses", f"{d['poses']:,} of the camera" + (f", {', '.join(moving)}" if moving else "")))
-        rows += [(name.replace("_", " "), _list(d[name])) for name in ("moving_bodies", "joints") if d[name]]
+        rows += [(name.replace("_", " "), _listed(d[name])) for name in ("moving_bodies", "joints") if d[name]]
     return rows
 
 
-def _list(names: list[str]) -> str:
+def _listed(names: list[str]) -> str:
     """Return the first :data:`MOST_NAMES` names as text, and the number of further names."""
     more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
     return ", ".join(names[:MOST_NAMES]) + more
@@ -308,3 +311,220 @@ def _encoder_text(e: dict[str, Any] | None) -> str:
     if e["index_pulses"]:
         parts.append(f"{e['index_pulses']} index pulses, slip {e['slip_deg']:.3g} deg")
     return "; ".join(parts)
+
+
+# ``amiwarp convert``: conversion of recordings to the native format and to others.
+
+Format = Annotated[
+    OutputFormat | None, typer.Option(help="Format to write, if not that of the extension: dsec.", show_default=False)
+]
+"""Option that chooses a format whose extension means another one."""
+HdfCodec = Annotated[Codec, typer.Option(help="Compression of HDF5. Programs without HDF5's Blosc filter read gzip.")]
+"""Option for the compression of HDF5."""
+Round = Annotated[
+    Rounding | None,
+    typer.Option(
+        help="Round compensated events to whole pixels, as RAW, AEDAT 4, DSEC and ROS 2 need. nearest: to the nearest "
+        "pixel; dithered: up or down at random (--seed), unbiased. Events outside the image are dropped.",
+        show_default=False,
+    ),
+]
+"""Option for the rounding of compensated events."""
+
+_in_panel = partial(typer.Option, rich_help_panel="Encoder")
+
+
+@dataclass(frozen=True)
+class EncoderOptions:
+    """Options for a log of the prism's encoder."""
+
+    encoder: Annotated[
+        Path | None,
+        _in_panel(help="Encoder log: CSV with the header t_us,angle_deg or t_us,count, and optionally index (0 or 1)."),
+    ] = None
+    encoder_from: Annotated[
+        str | None,
+        _in_panel(
+            help="Take the encoder from the trigger edges in the recording: triggers:CHANNEL. Each rising edge is one "
+            "count; by default it is the index pulse, one per turn.",
+            metavar="triggers:CHANNEL",
+        ),
+    ] = None
+    counts_per_turn: Annotated[int | None, _in_panel(min=1, help="Encoder counts per turn.")] = None
+    counter_bits: Annotated[
+        int | None,
+        _in_panel(
+            min=0,
+            max=64,
+            help="Width of the encoder's counter (bits); 0: the counter restarts at every turn. "
+            "Default: inferred from the counts.",
+        ),
+    ] = None
+    direction: Annotated[Literal["1", "-1"], _in_panel(help="Counting direction; -1: backwards.")] = "1"
+
+    def build(self, source: Path, topic: str | None) -> Encoder | None:
+        """Return the encoder of the log or of the recording's triggers, or None if neither is given."""
+        if self.encoder_from is not None:
+            return self._from_triggers(self.encoder_from, source, topic)
+        if self.encoder is None:
+            if self != EncoderOptions():
+                what = "--counts-per-turn, --counter-bits and --direction describe an encoder log"
+                raise AmiwarpError(f"{what}; give --encoder or --encoder-from too")
+            return None
+        return read_encoder_csv(
+            self.encoder,
+            counts_per_turn=self.counts_per_turn,
+            counter_bits=self.counter_bits,
+            direction=int(self.direction),
+        )
+
+    def _from_triggers(self, text: str, source: Path, topic: str | None) -> Encoder:
+        kind, colon, channel = text.partition(":")
+        if kind != "triggers" or (colon and not channel.isdecimal()):
+            raise AmiwarpError(f"--encoder-from {text!r} is unknown; write triggers:CHANNEL, for example triggers:0")
+        if self.encoder is not None or self.counter_bits is not None:
+            raise AmiwarpError("--encoder and --counter-bits describe an encoder log; leave them or --encoder-from out")
+        return read_encoder_triggers(
+            source, int(channel or 0), counts_per_turn=self.counts_per_turn or 1, direction=int(self.direction),
+            topic=topic,
+        )  # fmt: skip
+
+
+def run_convert(
+    source: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
+    out: Annotated[
+        Path, typer.Argument(help=f"File to write. Its extension gives the format: {EXTENSION_HELP}."), OUTPUT
+    ],
+    *,
+    format: Format = None,
+    codec: HdfCodec = Codec.BLOSC,
+    round: Round = None,
+    encoder: EncoderOptions,
+    camera: CameraOptions,
+    prism: NominalPrismOptions,
+    topic: Topic = None,
+    common: Common,
+) -> None:
+    """Convert a recording to amiwarp's HDF5 format, and add the encoder, camera and prism given by options.
+
+    Other formats hold the events only; the command lists what it leaves out. From a ROS 2 bag to a ROS 2 bag, all other
+    topics are copied. Memory use does not depend on the length of the recording.
+    """
+    began = time.perf_counter()
+    log = encoder.build(source, topic)
+    lens = wedge = None
+    if camera != CameraOptions() or prism != NominalPrismOptions():  # opening may read the whole file
+        recording = open_recording(source, topic=topic)
+        # If the file does not hold the sensor's size, the camera's size is used.
+        lens = camera.build(*recording.events.size, fixed=getattr(recording.events, "size_is_known", True))
+        wedge = prism.build(recording.prism)
+    with progress("converting") as advance:
+        summary = convert(
+            source, out, encoder=log, camera=lens, prism=wedge, topic=topic, format=format, codec=codec,
+            progress=advance, rounding=round, seed=common.seed,
+        )  # fmt: skip
+    seconds = time.perf_counter() - began
+    data: dict[str, Any] = {"file": str(out), **asdict(summary), "seconds": seconds}
+    data |= {f"{name}_us": data.pop(name) for name in ("t_first", "t_last")}
+    slip = data.pop("index_slip")
+    data["slip_deg"] = None if slip is None else math.degrees(slip)
+    report(common, data, _convert_lines(data))
+
+
+def format_notes(d: dict[str, Any]) -> list[str]:
+    """Return what the format of the output has changed and left out."""
+    lines = []
+    if d["rounding"] is not None:
+        lines.append(f"note: rounded to whole pixels ({d['rounding']}); {d['dropped']:,} events outside are dropped")
+    if d["left_out"]:
+        lines.append(f"note: {LIMITS[d['format']].label} does not hold, and leaves out: {', '.join(d['left_out'])}")
+    return lines
+
+
+def _convert_lines(d: dict[str, Any]) -> list[str]:
+    rate = d["events"] / max(d["seconds"], 1e-9) / 1e6
+    lines = [
+        f"{d['file']}: {d['events']:,} events, {d['width']} x {d['height']}, {d['seconds']:.2f} s, {rate:.3g} Mev/s"
+    ]
+    lines += [f"note: {name}: {count:,}" for name, count in d["repairs"].items()]
+    if d["encoder_covers"] is False:
+        lines.append("warning: the encoder samples do not cover all events")
+    if d["encoder_gaps"]:
+        first = d["encoder_gaps"][0]
+        lines.append(
+            f"warning: the encoder has {len(d['encoder_gaps'])} gaps, the first at {first[0]} .. {first[1]} us"
+        )
+    lines += format_notes(d)
+    if d["slip_deg"] is not None:
+        lines.append(f"encoder slips up to {d['slip_deg']:.3g} deg at its index pulses")
+    return lines
+
+
+# ``amiwarp truth``: export of a simulated world's ground truth to the formats of public data sets.
+
+
+def run_truth(
+    recording: Annotated[Path, typer.Argument(help="Recording of a simulated world, in amiwarp's format (.h5).")],
+    out: Annotated[Path, typer.Argument(help="Folder for the exported files."), OUTPUT_FOLDER],
+    *,
+    flow: Annotated[
+        Literal["dsec", "mvsec"] | None,
+        typer.Option(
+            help="Export optical flow between the recorded instants. dsec: writes 16-bit flow/forward/*.png and "
+            "flow/forward_timestamps.txt; mvsec: writes NAME_gt_flow_dist.npz."
+        ),
+    ] = None,
+    with_prism: Annotated[
+        bool, typer.Option("--with-prism", help="Export the optical flow as seen through the turning prism.")
+    ] = False,
+    poses: Annotated[
+        Literal["tum"] | None,
+        typer.Option(
+            help="Export the poses of the camera and the moving bodies. tum: writes poses/camera.txt and "
+            "poses/body_NAME.txt."
+        ),
+    ] = None,
+    common: Common,
+) -> None:
+    """Export the ground truth of a simulated world: optical flow in the DSEC or MVSEC format, poses as TUM files.
+
+    Flow requires a recording that was simulated with --truth-hz.
+    """
+    began = time.perf_counter()
+    if flow is None and poses is None:
+        raise AmiwarpError("nothing is chosen to export; give --flow dsec, --flow mvsec or --poses tum")
+    source = open_recording(recording)
+    truth = source.truth
+    if truth is None or (truth.frames is None and truth.poses is None):
+        raise AmiwarpError(f"{recording}: holds no ground truth of a world; simulate a recording with --world")
+    if flow is not None and truth.frames is None:
+        raise AmiwarpError(f"{recording}: holds no optical flow; simulate the recording with --truth-hz")
+    make_folder(out)
+    data: dict[str, Any] = {"folder": str(out), "flow_maps": 0, "pose_files": 0}
+    with progress("writing flow") as advance:
+        if truth.frames is not None and flow == "dsec":
+            data["flow_maps"] = save_flow_dsec(out / "flow", truth.frames, with_prism=with_prism, progress=advance)
+        elif truth.frames is not None and flow == "mvsec":
+            path = out / f"{source.name}_gt_flow_dist.npz"
+            data["flow_maps"] = save_flow_mvsec(path, truth.frames, with_prism=with_prism, progress=advance)
+    if poses is not None:
+        data["pose_files"] = _save_poses(out / "poses", truth)
+    data["seconds"] = time.perf_counter() - began
+    line = f"{out}: {data['flow_maps']} maps of flow, {data['pose_files']} files of poses, {data['seconds']:.2f} s"
+    report(common, data, [line])
+
+
+def _save_poses(folder: Path, truth: Truth) -> int:
+    """Write the poses of the camera and of each moving body; return the number of files."""
+    if truth.poses is None:
+        raise AmiwarpError("the recording holds no poses; simulate a recording with --world")
+    make_folder(folder)
+    save_poses_tum(folder / "camera.txt", truth.poses)
+    names: dict[str, str] = {}
+    for body in truth.poses[:0].bodies:
+        plain = re.sub(r"[^A-Za-z0-9_.-]", "_", body)[:80]
+        name = f"body_{plain}.txt" if f"body_{plain}.txt" not in names else f"body_{plain}_{len(names)}.txt"
+        names[name] = body
+    for name, body in names.items():
+        save_poses_tum(folder / name, truth.poses, body=body)
+    return 1 + len(names)

@@ -1,4 +1,4 @@
-"""Queues of packets between a source and its consumers, and the threads that empty them."""
+"""Background threads: a loop until closed, and jobs in order; queues of packets between a source and its consumers."""
 
 from __future__ import annotations
 
@@ -7,18 +7,54 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from amiwarp.events.events import OVERHEAD, Events
+from amiwarp.events.recording import OVERHEAD, Events
 from amiwarp.validation import choice, whole
 
 if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Packet
 
 
-# Background thread that runs a session's jobs for a file, server or other consumer.
+class BackgroundLoop:
+    """Base of what runs :meth:`_run` in a daemon thread, from :meth:`_start_thread` until closed; a context manager."""
+
+    def _start_thread(self, name: str) -> None:
+        """Start the thread. ``name``: the thread's name."""
+        self._ended = threading.Event()
+        """Event on which the loop waits instead of sleeping; it ends soon after the event is set."""
+        self._failure: Exception | None = None
+        self._thread = threading.Thread(target=self._guarded_run, name=name, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the loop and wait for it. Raises the error that ended it, once."""
+        self._ended.set()
+        self._thread.join()
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+
+    def _guarded_run(self) -> None:
+        try:
+            self._run()
+        except Exception as error:
+            self._failure = error
+
+    def _run(self) -> None:
+        raise NotImplementedError
+
+
+# Background thread that runs a session's jobs for a file, server or other consumer. Not the pool of
+# ``kernels/launch.py``: it waits while its jobs hold too much memory, and can drop the waiting ones.
 
 QUEUE_BYTES = 1 << 27
 """Memory limit of the queue before the compensator, and of each consumer's queue [bytes]: about 8 million events."""
@@ -29,7 +65,7 @@ LAST_JOB_S = 5.0
 class BackgroundWorker:
     """Runs jobs in order in a background thread. :meth:`put` blocks while the jobs hold ``most_bytes`` of memory.
 
-    A job's memory is the given number plus :data:`~amiwarp.events.events.OVERHEAD`, so that the number of jobs
+    A job's memory is the given number plus :data:`~amiwarp.events.recording.OVERHEAD`, so that the number of jobs
     without events is limited too. A single job larger than the limit runs alone.
     """
 

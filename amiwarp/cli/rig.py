@@ -1,10 +1,13 @@
-"""``amiwarp live``: motion compensation of a live stream."""
+"""Camera, motor and encoder: ``amiwarp live``, ``record``, ``motor`` and ``emulate``, the rig's emulator."""
 
 from __future__ import annotations
 
 import contextlib
+import enum
+import math
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,14 +21,18 @@ from rich.live import Live
 from rich.text import Text
 
 from amiwarp.cli import say
-from amiwarp.cli.console import choose_device, report
-from amiwarp.cli.options import OUTPUT, Common
+from amiwarp.cli.console import choose_device, report, table
+from amiwarp.cli.options import NO_FILE, OUTPUT, CameraOptions, Common, NominalPrismOptions
 from amiwarp.errors import AmiwarpError, printable
-from amiwarp.io.live_writer import LiveWriter
+from amiwarp.events.recording import Recording
+from amiwarp.io import open_recording
+from amiwarp.io.native_writer import LiveWriter
+from amiwarp.live.link.clocks import monotonic_us
+from amiwarp.live.link.emulator import Controller, EmulatedFault, Motor, Played, PseudoTerminal, Rotor
 from amiwarp.live.link.link import Link
+from amiwarp.live.link.protocol import FAULTS, STATES
+from amiwarp.live.queues import Policy
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orbit
-from amiwarp.live.stream.camera_clock import clock_offset
-from amiwarp.live.stream.queues import Policy
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
@@ -33,8 +40,8 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.packets import Source
     from amiwarp.live.stream.session import RawConsumer, Session, SessionStatus
     from amiwarp.live.stream.sockets import PipeSink, SocketSink
+    from amiwarp.live.stream.sources import EmulatedCamera
     from amiwarp.optics.models import Model
-
 
 # Functions that ``record`` and ``live`` share: event source, link to the controller, status line, end of session.
 
@@ -176,7 +183,7 @@ def check_whole(source: Source, status: SessionStatus) -> None:
     raise AmiwarpError(f"{source.name}: the stream broke off: {problem}; {kept}{hint}")
 
 
-def summary(s: SessionStatus, source: Source) -> dict[str, Any]:
+def session_summary(s: SessionStatus, source: Source) -> dict[str, Any]:
     """Return the counts of a session for ``--json``."""
     return {
         "seconds": s.seconds, "events": s.events, "mev_per_s": s.events / max(s.seconds, 1e-9) / 1e6,
@@ -186,7 +193,7 @@ def summary(s: SessionStatus, source: Source) -> dict[str, Any]:
     }  # fmt: skip
 
 
-EXAMPLE = "amiwarp live dv --port find --calibration calibration.json --out compensated.h5"
+# ``amiwarp live``: motion compensation of a live stream.
 
 _in_adaptive = partial(typer.Option, rich_help_panel="Adaptive speed")
 _in_outputs = partial(typer.Option, rich_help_panel="Outputs")
@@ -209,7 +216,6 @@ class AdaptiveOptions:
 
     def build(self, model: Model, link: Link | None, say: Callable[[str], None]) -> SpeedKeeper | None:
         """Set the motor's first speed and return the speed control; None without ``--adaptive``."""
-        from amiwarp.live.stream.adaptive import SpeedKeeper
 
         if not self.adaptive:
             return None
@@ -276,7 +282,7 @@ class ProcessingOptions:
     ] = 10.0
 
 
-def run(
+def run_live(
     source: Annotated[
         str,
         typer.Argument(
@@ -299,6 +305,7 @@ def run(
     """
     from amiwarp.calib import Calibration
     from amiwarp.compensation.recordings import check_size
+    from amiwarp.live.stream.session import clock_offset
 
     device = choose_device(common.device)
     found = Calibration.load(calibration)
@@ -318,7 +325,7 @@ def run(
         status = _follow(session, stop, line, receivers)
     data: dict[str, Any] = {
         "files": outputs.files,
-        **summary(status, opened),
+        **session_summary(status, opened),
         "latency_ms": status.latency_ms,
         "model": found.model_name,
         "device": device,
@@ -387,9 +394,9 @@ def _follow(session: Session, stop: threading.Event, line: StatusLine, receivers
 def _print_result(data: dict[str, Any], common: Common, *, to_stderr: bool) -> None:
     """Print the result. If packets use standard output, print it as text on stderr."""
     if not to_stderr:
-        report(common, data, _lines(data))
+        report(common, data, _live_lines(data))
         return
-    for text in _lines(data):
+    for text in _live_lines(data):
         say(text)
 
 
@@ -421,7 +428,7 @@ def _writer(path: Path, source: Source, found: Calibration, *, compensated: bool
                       metadata=metadata, compensated=compensated, clock_offset_us=offset_us)  # fmt: skip
 
 
-def _lines(d: dict[str, Any]) -> list[str]:
+def _live_lines(d: dict[str, Any]) -> list[str]:
     marked = [f"{d[key]:,} {what}" for key, what in (
         ("outside", "outside the image"), ("extrapolated", "with an extrapolated angle"),
         ("without_angle", "without an angle"), ("dropped", "dropped"), ("late", "late"),
@@ -431,3 +438,308 @@ def _lines(d: dict[str, Any]) -> list[str]:
         f"{d['compensated']:,} events ({', '.join(marked) or 'all inside the image with a measured angle'}), {speed}",
         *d["files"],
     ]
+
+
+# ``amiwarp record``: recording of a live camera and encoder to a file that survives crashes.
+
+
+def run_record(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
+        ),
+    ],
+    out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
+    *,
+    stream: SourceOptions,
+    camera: CameraOptions,
+    prism: NominalPrismOptions,
+    common: Common,
+) -> None:
+    """Record events and prism angles until the source ends, --seconds have passed, or Ctrl-C.
+
+    If the stream breaks off, the command exits with code 1 and keeps the events received so far.
+
+    During recording the file is called NAME.part.h5. It can be read at any time; after a crash it lacks at most the
+    last second.
+    """
+    from amiwarp.live.stream.session import Session, clock_offset
+
+    stop = threading.Event()
+    with StatusLine(stop, stream.seconds) as line, stream.link() as link:
+        opened = stream.open(source, line.say)
+        check_angles(opened, link)
+        width, height = opened.size
+        writer = LiveWriter(
+            out, width=width, height=height, camera=camera.build(width, height) or opened.camera,
+            prism=prism.build(opened.prism), metadata={"recorded_from": opened.name},
+            clock_offset_us=clock_offset(opened, link),
+        )  # fmt: skip
+        with stopped_by_interrupt(stop), writer:  # in this order, so that Ctrl-C leaves no unfinished file
+            status = Session(opened, link=link, raw=[writer], say=line.say).run(stop, line.update)
+    data = {"file": str(out), **session_summary(status, opened), "messages": list(line.messages)}
+    text = f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s"
+    report(
+        common,
+        data,
+        [text, *([f"{status.late:,} events arrived too late to be sorted by time"] if status.late else [])],
+    )
+    check_whole(opened, status)
+
+
+# ``amiwarp motor``: status and speed of the prism's motor.
+
+LIMIT_RPM = 3000.0
+"""Default of ``--limit-rpm``, the largest accepted speed [turns/min]."""
+WAIT_S = 2.5
+"""Longest wait for the controller's status, which is sent once a second, and for its clock [s]."""
+POLL_S = 0.02
+"""Interval between two readings of the data that the controller has sent [s]."""
+
+
+class Action(enum.StrEnum):
+    """Action of ``amiwarp motor``: print the status, set the speed, or stop."""
+
+    STATUS = "status"
+    SET = "set"
+    STOP = "stop"
+
+
+def run_motor(
+    action: Annotated[
+        Action, typer.Argument(help="status: print the status; set: turn at --rpm; stop: stop the motor.")
+    ],
+    *,
+    port: Annotated[
+        str | None,
+        typer.Option(
+            help="Serial port of the controller: name, USB id VID:PID or URL (socket://host:port). "
+            "Default: the port that sends encoder samples."
+        ),
+    ] = None,
+    rpm: Annotated[float | None, typer.Option(help="Speed to set (turns/min); negative: backwards.")] = None,
+    ramp_rpm_s: Annotated[
+        float, typer.Option(min=0.001, help="Largest change of the speed (turns/min per second).")
+    ] = 500.0,
+    limit_rpm: Annotated[
+        float,
+        typer.Option(min=0.0, help="Largest accepted speed (turns/min): what prism, mount and bearing withstand."),
+    ] = LIMIT_RPM,
+    common: Common,
+) -> None:
+    """Set the speed of the prism's motor, stop it, or print the controller's status.
+
+    The motor keeps its last commanded speed after this command exits.
+    """
+    if (rpm is None) == (action is Action.SET):
+        raise AmiwarpError("'amiwarp motor set' needs --rpm, the speed to set; status and stop do not accept it")
+    if rpm is not None and not abs(rpm) <= limit_rpm:
+        raise AmiwarpError(
+            f"--rpm {rpm:g} is beyond the limit of {limit_rpm:g} rpm; raise --limit-rpm only if prism and mount "
+            "withstand it"
+        )
+    with Link(port) as link:
+        messages: list[str] = []
+        _wait(link, messages)
+        if rpm is not None:
+            link.set_speed(rpm, ramp_rpm_s)
+            _wait(link, messages, rpm)
+        elif action is Action.STOP:
+            link.stop()
+            _wait(link, messages, 0.0)
+        data = _described(link, messages)
+    report(common, data, [table(_motor_rows(data)), *data["messages"], *_hint(data)])
+
+
+def _wait(link: Link, messages: list[str], target: float | None = None) -> None:
+    """Wait until the status reports the target speed and the controller's clock is known, or :data:`WAIT_S` passed."""
+    end = time.monotonic() + WAIT_S
+    while time.monotonic() < end:
+        messages += link.poll().messages
+        status = link.status
+        reported = status is not None and (target is None or math.isclose(status.target_rpm, target, rel_tol=1e-6))
+        if reported and link.clock() is not None:
+            return
+        time.sleep(POLL_S)
+
+
+def _described(link: Link, messages: list[str]) -> dict[str, Any]:
+    status = link.status
+    if status is None:
+        details = "; ".join([*messages, "docs/reference/link-protocol.md describes the messages it must send"])
+        raise AmiwarpError(f"{link.name}: no status in {WAIT_S:g} s; {details}")
+    return {
+        "port": link.name,
+        "state": STATES[status.state] if status.state < len(STATES) else f"unknown ({status.state})",
+        "rpm": status.rpm,
+        "target_rpm": status.target_rpm,
+        "counts_per_turn": status.counts_per_turn,
+        "faults": [name for bit, name in enumerate(FAULTS) if status.faults >> bit & 1],
+        "answers": link.clock() is not None,
+        "messages": messages,
+    }
+
+
+def _motor_rows(d: dict[str, Any]) -> list[tuple[str, str]]:
+    return [
+        ("port", d["port"] + ("" if d["answers"] else " (sends data, but does not answer commands)")),
+        ("state", d["state"]),
+        ("speed", f"{d['rpm']:.1f} rpm, set to {d['target_rpm']:g} rpm"),
+        ("encoder", f"{d['counts_per_turn']:,} counts per turn"),
+        ("faults", ", ".join(d["faults"]) or "none"),
+    ]
+
+
+def _hint(d: dict[str, Any]) -> list[str]:
+    """Return a line that tells how to stop the motor, if it keeps turning."""
+    return [f"the motor keeps turning; to stop it: amiwarp motor stop --port {d['port']}"] if d["target_rpm"] else []
+
+
+# ``amiwarp emulate``: emulated prism controller behind a serial port that other programs can open.
+
+STEP_S = 0.05
+"""Interval between two checks whether the emulation shall end [s]."""
+AFTER_S = 1.0
+"""Time for which the controller continues after the camera's last event [s]."""
+LATE_US = 100_000
+"""Delay of the camera's events above which a message is printed [us]."""
+
+_in_controller = partial(typer.Option, rich_help_panel="Controller")
+_in_playback = partial(typer.Option, rich_help_panel="Playback")
+
+
+@dataclass(frozen=True)
+class ControllerOptions:
+    """Options for the emulated controller."""
+
+    counts_per_turn: Annotated[int, _in_controller(min=1, max=1 << 24, help="Encoder counts per turn.")] = 4096
+    rpm: Annotated[
+        float, _in_controller(min=-6000.0, max=6000.0, help="Speed at the start (turns/min); negative: backwards.")
+    ] = 0.0
+    drift_ppm: Annotated[
+        float,
+        _in_controller(min=-1e5, max=1e5, help="Frequency error of the controller's clock (ppm); positive: fast."),
+    ] = 0.0
+    fault: Annotated[
+        list[str] | None,
+        _in_controller(
+            help="Fault with its start and duration (s): garbage, truncate, crc, drop (bytes), missed-index, stall, "
+            "slip, reverse, reset, clock-jump or unplug. Can be repeated.",
+            metavar="NAME@SECONDS[+DURATION]",
+        ),
+    ] = None
+
+    def build(self, rotor: Rotor, seed: int) -> Controller:
+        """Return an emulated controller, with the options' settings, that drives ``rotor``."""
+        return Controller(
+            rotor,
+            counts_per_turn=self.counts_per_turn,
+            drift_ppm=self.drift_ppm,
+            faults=[EmulatedFault.parse(text) for text in self.fault or ()],
+            seed=seed,
+        )
+
+
+@dataclass(frozen=True)
+class PlaybackOptions:
+    """Options for playing a recording instead of emulating a motor."""
+
+    recording: Annotated[
+        Path | None,
+        _in_playback(
+            help="Recording to play: its prism rotation replaces the motor, its events are served at --camera."
+        ),
+    ] = None
+    camera: Annotated[
+        str | None,
+        _in_playback(
+            help="Address of an emulated camera that serves the recording's events: tcp:HOST:PORT or unix:PATH. "
+            "Playing starts when the first client connects.",
+            metavar="ADDRESS",
+        ),
+    ] = None
+
+    def open(self) -> _Playback | None:
+        """Open the recording. Return None if none is given."""
+        if self.recording is None and self.camera is None:
+            return None
+        if self.recording is None or self.camera is None:
+            raise AmiwarpError("--recording and --camera belong together; give both or neither")
+        recording = open_recording(self.recording)
+        if recording.encoder is None:
+            raise AmiwarpError(f"{self.recording}: has no encoder samples; give a recording with an encoder")
+        return _Playback(recording, Played(recording.encoder), self.camera)
+
+
+@dataclass(frozen=True)
+class _Playback:
+    """Recording to play, its prism rotation, and the address that serves its events."""
+
+    recording: Recording
+    rotor: Played
+    address: str
+
+    def camera(self, controller: Controller, now_us: Callable[[], int]) -> EmulatedCamera:
+        from amiwarp.live.stream.sources import EmulatedCamera
+
+        return EmulatedCamera(self.recording, self.rotor, controller, self.address, now_us)
+
+
+def run_emulate(
+    *,
+    link: Annotated[
+        Path | None,
+        typer.Option(help="Symbolic link to create for the port; valid again after a fault 'unplug'. Default: none."),
+        NO_FILE,
+    ] = None,
+    options: ControllerOptions,
+    playback: PlaybackOptions,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop after this time (s). Default: at Ctrl-C.")
+    ] = None,
+    common: Common,
+) -> None:
+    """Emulate a prism controller with motor, encoder and index pulse, and inject faults on request.
+
+    Programs can be tried out against it without hardware.
+    """
+    played = playback.open()
+    rotor = Motor(options.rpm, seed=common.seed) if played is None else played.rotor
+    controller = options.build(rotor, common.seed)
+    origin = monotonic_us()
+
+    def now_us() -> int:
+        return monotonic_us() - origin
+
+    with contextlib.ExitStack() as resources:
+        stop = threading.Event()
+        resources.enter_context(stopped_by_interrupt(stop))
+        terminal = resources.enter_context(PseudoTerminal(controller, link, now_us=now_us))
+        camera = None if played is None else resources.enter_context(played.camera(controller, now_us))
+        _print_names(terminal, camera, common)
+        _wait_for_end(stop, seconds, camera)
+        if camera is not None and camera.late_us > LATE_US:
+            late = f"events were sent up to {camera.late_us * 1e-6:.1f} s late, none was lost"
+            say(f"{late}: this machine or a receiver is slower than the recording")
+
+
+def _print_names(terminal: PseudoTerminal, camera: EmulatedCamera | None, common: Common) -> None:
+    """Print the port, the camera's address and a command to try next."""
+    if camera is None:
+        hint = f"amiwarp motor status --port {terminal.name}"
+        data, lines = {"port": terminal.name, "try": hint}, [terminal.name, f"try: {hint}", "stop with Ctrl-C"]
+    else:
+        hint = f"amiwarp live {camera.address} --port {terminal.name} --calibration CALIBRATION"
+        data = {"port": terminal.name, "try": hint, "camera": camera.address}
+        lines = [terminal.name, camera.address, f"try: {hint}"]
+    report(common, data, lines)
+
+
+def _wait_for_end(stop: threading.Event, seconds: float | None, camera: EmulatedCamera | None) -> None:
+    """Wait until ``stop`` is set, ``seconds`` have passed, or :data:`AFTER_S` after the camera's last event."""
+    end = math.inf if seconds is None else time.monotonic() + seconds
+    while not stop.wait(STEP_S) and time.monotonic() < end:
+        if camera is not None and camera.done.is_set():
+            stop.wait(AFTER_S)
+            return

@@ -1,0 +1,747 @@
+"""Studies: ``amiwarp demo``, ``dataset``, ``chart``, ``design``, ``stability`` and ``evaluate``."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from amiwarp.cli import say
+from amiwarp.cli.console import choose_device, made_again, plain, progress, report, table
+from amiwarp.cli.options import OUTPUT_FOLDER, CameraOptions, Common, numbers, parse_size
+from amiwarp.cpu_threads import cpu_threads
+from amiwarp.errors import AmiwarpError
+from amiwarp.io import open_recording
+from amiwarp.io.files import check_output, own_folder, write_text
+from amiwarp.io.formats import make_folder
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.progress import part
+
+if TYPE_CHECKING:
+    from amiwarp.studies.chart import Charts
+    from amiwarp.studies.chart.measurement import Row
+    from amiwarp.studies.dataset.making import DatasetPlan, DatasetSummary
+    from amiwarp.studies.design import Choice, Design, Limits, Timing
+    from amiwarp.studies.evaluate.evaluation import EvaluationSummary
+    from amiwarp.studies.stability.cells import Axis, Method, Store, Stored
+    from amiwarp.studies.stability.report import Atlas
+
+
+# ``amiwarp demo``: simulation, calibration, compensation and reconstruction of one picture.
+
+OWN_FOLDER = Path("amiwarp-demo")
+"""Default folder for the demo's files. Files of an earlier demo in it are replaced."""
+
+
+def run_demo(
+    *,
+    out: Annotated[
+        Path, typer.Option(help="Folder for the recording, calibration, picture and figure."), OUTPUT_FOLDER
+    ] = OWN_FOLDER,
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture to use as the scene. Default: a map of the earth.")
+    ] = None,
+    size: Annotated[str, typer.Option(help="Size of the camera's image (px).", metavar="WIDTHxHEIGHT")] = "640x480",
+    duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 0.5,
+    common: Common,
+) -> None:
+    """Simulate a recording, calibrate it without an initial guess, compensate it and reconstruct the picture.
+
+    Takes about 15 s on two idle CPU cores, longer the first time, when kernels are compiled, and on a busy machine.
+    """
+    began = time.perf_counter()
+    device = choose_device(common.device)
+    with progress("starting") as advance:
+        from amiwarp.studies import demo
+
+        width, height = parse_size(size)
+        scene = demo.Demo(out, picture, width, height, duration, common.seed, device)
+        with own_folder(out) if out == OWN_FOLDER else contextlib.nullcontext():
+            outcome = demo.run_demo(scene, advance)
+    data = asdict(outcome) | {"seconds": time.perf_counter() - began, "device": device}
+    report(common, data, demo_lines(data))
+
+
+def demo_lines(d: dict[str, Any]) -> list[Any]:
+    """Return the results of the demo as lines of text."""
+    rows = [
+        ("apex", f"{d['apex_deg']:.4f} deg found, {d['apex_true_deg']:.4f} deg true"),
+        ("model error", f"{d['model_error_px']:.4f} px rms over image and turn, "
+                        f"{d['sharpness_model_error_px']:.4f} px by sharpness alone"),
+        ("phase error", f"{d['phase_error_deg']:+.3f} deg"),
+        ("blur", f"{d['blur_before_px']:.2f} px before, {d['blur_after_px']:.2f} px after, "
+                 f"{d['blur_with_truth_px']:.2f} px with the true prism"),
+        ("picture", f"correlation {d['picture_correlation']:.3f} with the original, "
+                    f"PSNR {d['picture_psnr_db']:.1f} dB, from one turn"),
+        ("speed", f"simulated in {d['simulate_s']:.1f} s, calibrated in {d['calibrate_s']:.1f} s, "
+                  f"reconstructed in {d['reconstruct_s']:.1f} s, compensated at {d['compensate_mev_per_s']:.1f} Mev/s"),
+        *((f"{name} file", path) for name, path in d["files"].items()),
+    ]  # fmt: skip
+    notes = [f"note: {note}" for note in d["notes"]]
+    return [table(rows), *notes, f"{d['events']:,} events, {d['seconds']:.1f} s in all on {d['device']}"]
+
+
+# ``amiwarp dataset``: thousands of simulated recordings from a specification, with a manifest.
+
+AVERAGE_S = 600.0
+"""Time over which the speed is averaged [s]; recordings differ in length."""
+SHOWN = 5
+"""Number of failures that are printed; the manifest lists all."""
+
+
+def run_dataset(
+    specification: Annotated[Path, typer.Argument(help="Specification of the data set (.toml).")],
+    out: Annotated[Path, typer.Argument(help="Folder of the data set. An existing one is continued."), OUTPUT_FOLDER],
+    *,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Only estimate the number of recordings, their size and the time; make none."),
+    ] = False,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler. Default: processes of this machine.")
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Number of local processes. Default: one for each GPU, or for each core without GPU."),
+    ] = None,
+    common: Common,
+) -> None:
+    """Make thousands of simulated recordings from a specification, with labels, splits and a manifest.
+
+    Every combination of source, prism, speed, sensor, seed and trajectory is one recording. Finished recordings are
+    kept: the same command continues a stopped run. A recording that fails is reported and does not stop the others.
+    --device cuda uses all GPUs, and is the default if there is one.
+    """
+    from amiwarp.studies.dataset import making
+
+    device = common.device or _default_device()
+    if dry_run:
+        if scheduler is not None:
+            raise AmiwarpError("--dry-run samples on this machine; leave --scheduler out, and give --workers instead")
+        with progress("sampling") as advance:
+            plan = making.plan_dataset(specification, out, workers=workers, device=device, progress=advance)
+        report(common, asdict(plan) | {"seconds": plan.seconds}, _plan_lines(plan))
+        return
+    try:
+        with progress("starting workers", average_s=AVERAGE_S) as advance:
+            done = making.make_dataset(
+                specification, out, scheduler=scheduler, workers=workers, device=device, progress=advance
+            )
+    except KeyboardInterrupt:
+        say(f"amiwarp: finished recordings are kept in {out}; run the same command again to continue")
+        raise
+    report(common, asdict(done) | {"folder": str(out), "device": device}, _dataset_lines(done, out))
+    if done.failed:
+        raise typer.Exit(1)
+
+
+def _default_device() -> str:
+    """Return all GPUs, or the CPU."""
+    from amiwarp.kernels.launch import start_quietly
+    from amiwarp.studies.cluster import ANY_GPU, gpu_count
+
+    return ANY_GPU if gpu_count(start_quietly()) else "cpu"
+
+
+def _plan_lines(plan: DatasetPlan) -> list[str]:
+    from amiwarp.studies.dataset.making import duration_text
+
+    by = ", ".join(f"{count:,} of {kind}" for kind, count in plan.sources.items())
+    lines = [
+        f"{plan.recordings:,} recordings ({by}), {plan.missing:,} of them missing",
+        "splits: " + ", ".join(f"{name} {count:,}" for name, count in plan.splits.items()),
+    ]
+    if plan.missing:
+        lines += [
+            f"about {plan.events:.3g} events and {plan.size_bytes / 1e9:.3g} GB to write",
+            f"about {duration_text(plan.seconds)} (± {100 * plan.uncertainty:.0f} %) with {plan.workers} workers on "
+            f"{plan.device} once the workers have started, estimated from {plan.samples} samples",
+        ]
+    return lines
+
+
+def _dataset_lines(done: DatasetSummary, out: Path) -> list[str]:
+    lines = [f"failed: {file}: {error}" for file, error in list(done.failed.items())[:SHOWN]]
+    if len(done.failed) > SHOWN:
+        lines.append(f"... and {len(done.failed) - SHOWN:,} more failures, in {out / 'manifest.json'}")
+    lines += made_again(done.damaged)
+    if done.not_in_specification:
+        lines.append(
+            f"{len(done.not_in_specification):,} recordings in {out} are not in the specification, such as "
+            f"{done.not_in_specification[0]}; they are kept, and left out of the manifest"
+        )
+    splits = ", ".join(f"{name} {count:,}" for name, count in done.splits.items())
+    lines.append(
+        f"{out}: {done.made + done.kept:,} of {done.recordings:,} recordings ({splits}), {done.kept:,} of them kept"
+    )
+    if done.made:
+        lines.append(_dataset_speed(done))
+    return lines
+
+
+def _dataset_speed(done: DatasetSummary) -> str:
+    per_s = done.made / done.seconds
+    return (
+        f"{done.made:,} made in {done.seconds:,.1f} s: {per_s:.3g} per second, {done.events / done.seconds / 1e6:.3g} "
+        f"Mev/s, {done.size_bytes / 1e9:.3g} GB, {done.workers} workers"
+    )
+
+
+# ``amiwarp chart``: charts of speed against error on this machine, and settings for a budget.
+
+
+def run_chart(
+    recording: Annotated[
+        Path | None, typer.Argument(help="Recording with ground truth. Default: simulated, 10 million events.")
+    ] = None,
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for charts, tables and presets."), OUTPUT_FOLDER] = Path(
+        "amiwarp-chart"
+    ),
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture of the simulated scene. Default: a map of the earth.")
+    ] = None,
+    budget_px: Annotated[
+        float | None, typer.Option(min=0.0, help="Error limit (px): choose the fastest settings within it.")
+    ] = None,
+    budget_ms: Annotated[
+        float | None, typer.Option(min=0.0, help="Time limit (ms): choose the most accurate calibration within it.")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Measure a few settings once each, as a short trial.")] = False,
+    common: Common,
+) -> None:
+    """Measure speed and error of the settings on a recording with ground truth, and draw both Pareto fronts.
+
+    With a budget, the chosen settings are written to preset_calibration.json and preset_compensation.json. Pass these
+    files to calibrate and compensate with --preset.
+    """
+    if budget_px is not None and budget_ms is not None:
+        raise AmiwarpError("--budget-px and --budget-ms are two budgets; give one of them")
+    if recording is not None and picture is not None:
+        raise AmiwarpError("a recording and --picture both provide the events to measure on; give one of them")
+    device = choose_device(common.device)
+    from amiwarp.studies.chart import make, simulated
+
+    if budget_px is not None or budget_ms is not None:
+        for kind in ("calibration", "compensation"):
+            if out.is_dir():
+                check_output(out / f"preset_{kind}.json")
+
+    with progress("starting") as advance:
+        if recording is not None:
+            opened = open_recording(recording)
+        else:
+            opened = simulated(picture, seed=common.seed, device=device, quick=quick,
+                               progress=part(advance, 0.0, 0.0))  # fmt: skip
+        charts = make(opened, out, device=device, seed=common.seed, quick=quick,
+                      progress=advance)  # fmt: skip
+    answers = charts.answer(out, budget_px=budget_px, budget_ms=budget_ms)
+    report(common, chart_summary(charts, answers, out) | {"device": device}, chart_lines(charts, answers, out))
+
+
+def chart_summary(charts: Charts, answers: dict[str, Row | None], out: Path) -> dict[str, Any]:
+    """Return the Pareto fronts, the default settings and the chosen settings for JSON.
+
+    The full tables are in the files.
+    """
+    from amiwarp.studies.chart.measurement import fronts
+
+    def fields(row: Row) -> dict[str, Any]:
+        return {"label": row.label, "job": row.job, "mev_per_s": row.mev_per_s, "ms": row.seconds * 1e3,
+                "error_px": row.error_px, "settings": dict(row.settings)}  # fmt: skip
+
+    rows = {"compensation": charts.compensation, "calibration": charts.calibration}
+    return {
+        "fronts": {name: {job: [fields(r) for r in chosen] for job, chosen in fronts(all_)}
+                   for name, all_ in rows.items()},
+        "defaults": {name: [fields(r) for r in all_ if r.default] for name, all_ in rows.items()},
+        "answers": {kind: None if row is None else {**fields(row), "file": str(out / f"preset_{kind}.json")}
+                    for kind, row in answers.items()},
+        "files": {name: str(path) for name, path in charts.files.items()},
+        "notes": list(charts.notes),
+    }  # fmt: skip
+
+
+def chart_lines(charts: Charts, answers: dict[str, Row | None], out: Path) -> list[Any]:
+    """Return the results as tables and lines of text."""
+    from amiwarp.studies.chart.measurement import beaten_by, fronts, told_apart
+
+    shown: list[Any] = []
+    for rows in (charts.compensation, charts.calibration):
+        for job, chosen in fronts(rows):
+            default = [r for r in rows if r.default and r.job == job and r not in chosen]
+            listed = [(_setting(r), *_setting_speed(r)) for r in [*told_apart(chosen), *default]]
+            shown += [table(listed, f"front, {job}", "speed", "error"), ""]
+            shown += [f"faster or more accurate than the default: {', '.join(b.label for b in better)}"
+                      for r in rows if r.default and r.job == job and (better := beaten_by(r, rows))]  # fmt: skip
+    shown += [f"note: {note}" for note in charts.notes]
+    for kind, row in answers.items():
+        if row is None:
+            shown.append(f"{kind}: no measured setting is within the budget; see the front above")
+        else:
+            speed, error = _setting_speed(row)
+            file = out / f"preset_{kind}.json"
+            shown.append(
+                f"{kind} within the budget: {row.label}, {speed}, {error} measured; use it with --preset {file}"
+            )
+    return [*shown, *(f"{name}: {path}" for name, path in charts.files.items())]
+
+
+def _setting(row: Row) -> str:
+    return f"{row.label} (default)" if row.default and row.label != "default" else row.label
+
+
+def _setting_speed(row: Row) -> tuple[str, str]:
+    speed = f"{row.seconds * 1e3:,.0f} ms" if row.chart == "calibration" else f"{row.mev_per_s:.3g} Mev/s"
+    return speed, f"{row.error_px:.3g} px"
+
+
+# ``amiwarp design``: comparison of prisms and speeds for a camera, with a recommendation.
+
+FOV_DEG = 60.0
+"""Horizontal field of view that is assumed if no option describes the camera [deg]."""
+_in_camera = partial(typer.Option, rich_help_panel="Camera")
+_in_limits = partial(typer.Option, rich_help_panel="Limits")
+_in_faults = partial(typer.Option, rich_help_panel="Faults")
+_in_prism = partial(typer.Option, rich_help_panel="Prism")
+
+
+@dataclass(frozen=True)
+class GridOptions:
+    """Options for the prisms and speeds to compare."""
+
+    apex_deg: Annotated[str, _in_prism(help="Apex angles to compare (deg).", metavar="A,B,...")] = "0.25,0.5,1,2,4"
+    rpm: Annotated[str, _in_prism(help="Speeds to compare (turns/min).", metavar="A,B,...")] = "180,360,720,1440,2880"
+    index: Annotated[float, _in_prism(help="Refractive index of the prism.")] = 1.5168
+    flat_side: Annotated[FlatSide, _in_prism(help="Direction that the prism's flat face points to.")] = FlatSide.SCENE
+
+    @property
+    def apexes(self) -> list[float]:
+        """Apex angles to compare [rad]."""
+        return [math.radians(v) for v in _list(self.apex_deg, "--apex-deg")]
+
+    @property
+    def rpms(self) -> list[float]:
+        """Speeds to compare [turns/min]."""
+        return list(_list(self.rpm, "--rpm"))
+
+
+@dataclass(frozen=True)
+class LimitOptions:
+    """Options for the limits that prism and speed must meet."""
+
+    tolerance_px: Annotated[
+        float, _in_limits(help="Largest standard deviation across an edge after compensation (px).")
+    ] = 0.5
+    window_ms: Annotated[float, _in_limits(help="Time within which edges of every direction must be seen (ms).")] = 33.4
+    bandwidth_mev_s: Annotated[
+        float | None, _in_limits(help="Largest event rate of sensor and cable (million events/s). Default: any.")
+    ] = None
+    budget_px: Annotated[
+        float | None,
+        _in_limits(
+            help="Largest error of the prism model (px rms). Default: a tenth of the blur from pixels, clock and "
+            "encoder."
+        ),
+    ] = None
+
+    def build(self) -> Limits:
+        """Return the limits that the options set for the study."""
+        from amiwarp.studies.design import Limits
+
+        most = None if self.bandwidth_mev_s is None else self.bandwidth_mev_s * 1e6
+        return Limits(self.tolerance_px, self.window_ms, most, self.budget_px)
+
+
+@dataclass(frozen=True)
+class FaultOptions:
+    """Options for the errors of event times and encoder angles."""
+
+    clock_us: Annotated[
+        float, _in_faults(help="Standard deviation of the event times, from readout and jitter (us).")
+    ] = 60.0
+    encoder_deg: Annotated[float, _in_faults(help="Standard deviation of the encoder's angle (deg).")] = 0.1
+    contrast: Annotated[float, _in_faults(help="Contrast threshold (log intensity).")] = 0.25
+
+    def timing(self) -> Timing:
+        """Return the errors of event times and encoder angles."""
+        from amiwarp.studies.design import Timing
+
+        return Timing(self.clock_us, math.radians(self.encoder_deg))
+
+
+def run_design(
+    *,
+    out: Annotated[Path, typer.Option(help="Folder for the chart and the tables."), OUTPUT_FOLDER] = Path(
+        "amiwarp-design"
+    ),
+    size: Annotated[
+        str | None,
+        _in_camera(
+            help="Size of the camera's image (px). Default: 640x480, or the size in --camera.", metavar="WIDTHxHEIGHT"
+        ),
+    ] = None,
+    camera: CameraOptions,
+    grid: GridOptions,
+    limits: LimitOptions,
+    faults: FaultOptions,
+    picture: Annotated[Path | None, typer.Option(help="Picture of the scene. Default: a map of the earth.")] = None,
+    common: Common,
+) -> None:  # fmt: skip
+    """Compare prisms and speeds for a camera, and recommend one with the reasons.
+
+    Event rates are predicted from simulations of small parts of the image. Blur, window and models are predicted from
+    the optics.
+    """
+    seen = _camera_of_design(camera, size)
+    glass = Prism(0.0, grid.index, grid.flat_side)
+    device = choose_device(common.device)
+    from amiwarp.simulation.description import Scene, SensorModel
+    from amiwarp.studies.demo import earth
+    from amiwarp.studies.design import design, draw
+
+    make_folder(out)
+    files = {kind: str(out / f"design.{kind}") for kind in ("png", "svg", "json", "csv")}
+    for path in files.values():
+        check_output(Path(path))
+    sensor = SensorModel(contrast_on=faults.contrast, contrast_off=faults.contrast)
+    scene = Scene.from_picture(picture or earth())
+    with progress("starting") as advance:
+        made = design(
+            seen, scene, glass, apexes=grid.apexes, rpms=grid.rpms, timing=faults.timing(), limits=limits.build(),
+            sensor=sensor, seed=common.seed, device=device, progress=advance,
+        )  # fmt: skip
+    data = design_summary(made)
+    write_text(Path(files["json"]), json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+    write_text(Path(files["csv"]), _csv(data["choices"]))
+    draw(out / "design", made)
+    report(common, {**data, "files": files, "device": device}, design_lines(made, files))
+
+
+def _camera_of_design(options: CameraOptions, size: str | None) -> Camera:
+    width, height = parse_size(size or "640x480")
+    found = options.build(width, height, fixed=size is not None)
+    return found or Camera.from_fov(width, height, math.radians(FOV_DEG))
+
+
+def _list(text: str, name: str) -> tuple[float, ...]:
+    return numbers(text, text.count(",") + 1, name)
+
+
+def design_summary(design: Design) -> dict[str, Any]:
+    """Return all results of the study for JSON, with angles in degrees."""
+    from amiwarp.studies.design import headline, reasons
+
+    camera, volume = design.camera, design.volume
+    return {
+        "format": "amiwarp-design",
+        "version": 1,
+        "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
+        "prism": {"index": design.glass.index, "flat_side": design.glass.flat_side.value},
+        "limits": {
+            "tolerance_px": design.limits.tolerance_px,
+            "window_ms": design.limits.window_ms,
+            "bandwidth_mev_s": None if design.limits.bandwidth is None else design.limits.bandwidth / 1e6,
+            "budget_px": design.limits.budget_px,
+        },
+        "faults": {"clock_us": design.timing.clock_us, "encoder_deg": math.degrees(design.timing.encoder)},
+        "volume": {
+            "apex_deg": [math.degrees(apex) for apex in volume.apexes],
+            "rpm": volume.rpms.tolist(),
+            "yields": volume.yields.tolist(),
+            "uncertainty": volume.uncertainty,
+            "texture_per_px": volume.texture,
+            "contrast": volume.contrast,
+            "noise_hz": volume.noise_hz,
+            "simulated_pixels": volume.simulated,
+        },
+        "choices": [_fields(c) for c in design.choices],
+        "recommended": None if design.chosen is None else _fields(design.chosen),
+        "headline": headline(design),
+        "reasons": reasons(design),
+    }
+
+
+def _fields(c: Choice) -> dict[str, Any]:
+    return {
+        "apex_deg": math.degrees(c.orbit.apex),
+        "rpm": c.rpm,
+        "deflection_deg": math.degrees(c.orbit.deflection),
+        "radius_px": c.orbit.radius,
+        "smallest_radius_px": c.orbit.smallest,
+        "swing_px": c.orbit.swing,
+        "events_per_s": c.events_per_s,
+        "window_ms": c.window_ms,
+        "clock_px": c.clock_px,
+        "encoder_px": c.encoder_px,
+        "blur_px": c.blur_px,
+        "budget_px": c.budget_px,
+        "model": c.model,
+        "error_px": c.error_px,
+        **{f"{name}_error_px": error for name, error in c.orbit.errors.items()},
+        "misses": list(c.misses),
+    }
+
+
+def _csv(rows: list[dict[str, Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({**row, "misses": "+".join(row["misses"])} for row in rows)
+    return text.getvalue()
+
+
+def design_lines(design: Design, files: dict[str, str]) -> list[Any]:
+    """Return the results as tables and lines of text."""
+    from amiwarp.studies.design import degrees, headline, rate, reasons
+
+    rows = [
+        (degrees(c.orbit.apex), f"{c.rpm:g}", rate(c.events_per_s), f"{c.orbit.radius:.1f} px", f"{c.error_px:.3f} px",
+         c.model, f"{c.window_ms:.1f} ms", "recommended" if c is design.chosen else ", ".join(c.misses))
+        for c in design.choices
+    ]  # fmt: skip
+    shown = table(rows, "apex", "rpm", "events", "orbit", "error", "model", "window", "misses")
+    said = [tuple(line.split(": ", 1)) for line in reasons(design)]
+    return [shown, "", headline(design), table(said), "", *files.values()]
+
+
+# ``amiwarp stability``: limits and failures of the calibration, on simulated recordings with ground truth.
+
+SEEDS, QUICK_SEEDS = 20, 1
+"""Number of recordings per value of an axis, by default and with ``--quick``."""
+QUICK_MINUTES = 9.0
+"""Time limit of a run with ``--quick`` [min]."""
+
+
+def run_stability(
+    *,
+    out: Annotated[
+        Path, typer.Option(help="Folder for the results of single runs (cells), figures and tables."), OUTPUT_FOLDER
+    ] = Path("amiwarp-atlas"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Use three values per axis, three methods and one seed: within ten minutes.")
+    ] = False,
+    axes: Annotated[
+        list[str] | None, typer.Option(help="Axis to vary. Can be repeated. Default: all axes.", metavar="NAME")
+    ] = None,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Method to run in addition to 'default' and 'paper'. Can be repeated. "
+            "Default: all methods; with --quick, only 'sharpness'.",
+            metavar="NAME",
+        ),
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help=f"Recordings per value. Default: {SEEDS}, with --quick {QUICK_SEEDS}.")
+    ] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Time limit (min). The same command continues later. "
+            f"Default: none, with --quick {QUICK_MINUTES:.0f}.",
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler. Default: one local process per core.")
+    ] = None,
+    redraw: Annotated[
+        bool, typer.Option("--redraw", help="Only draw figures and tables from the existing cells; run nothing.")
+    ] = False,
+    common: Common,
+) -> None:
+    """Calibrate simulated recordings under growing disturbances, and draw where calibration works and fails.
+
+    Each axis varies one disturbance, such as noise. A cell holds one recording and the results of all methods on it.
+    Finished cells are saved in OUT/cells: the same command continues a stopped run and skips finished cells.
+    """
+    device = choose_device(common.device)
+    from amiwarp.studies.stability.cells import Store, identity
+    from amiwarp.studies.stability.report import aggregate, draw, load
+
+    chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
+    cells_in = out / "cells"
+    make_folder(cells_in)
+    earlier = any(cells_in.iterdir())  # existing figures were drawn from the cells in this folder and may be replaced
+    began = time.perf_counter()
+    new = left = 0
+    store = Store(cells_in)
+    if redraw:
+        cells = load(store)
+    else:
+        of_each = seeds or (QUICK_SEEDS if quick else SEEDS)
+        limit = QUICK_MINUTES if quick and minutes is None else minutes
+        cells, new = _run_cells(chosen_axes, of_each, chosen_methods, store, device, scheduler, limit, common.seed)
+        left = sum(not {identity(m) for m in chosen_methods} <= c.results.keys() for c in cells)
+    took = time.perf_counter() - began
+    atlas = aggregate(cells, chosen_axes, chosen_methods, _about(cells))
+    with progress("drawing"), own_folder(out) if earlier else contextlib.nullcontext():
+        files = atlas.write(out) | draw(atlas, out)
+    speed = {"cells": atlas.cells, "new_cells": new, "cells_left": left, "seconds": took, "cells_per_s": new / took}
+    data = {"aims": atlas.aims.to_json(), "files": {name: str(path) for name, path in files.items()}, **speed}
+    damaged = [f"damaged, and left out: {what}" for what in store.damaged] if redraw else made_again(store.damaged)
+    shown = [*damaged, *stability_lines(atlas, files, new, left, took)]
+    report(common, data | {"device": device, "damaged": store.damaged}, shown)
+
+
+def _axes(names: Sequence[str], quick: bool) -> tuple[Axis, ...]:
+    from amiwarp.studies.stability.cells import AXES, quick_axes
+
+    known = quick_axes() if quick else AXES
+    _check_known("axis", names, [a.name for a in known])
+    return tuple(a for a in known if not names or a.name in names)
+
+
+def _methods(names: Sequence[str], quick: bool) -> tuple[Method, ...]:
+    from amiwarp.studies.stability.cells import METHODS, QUICK_METHODS, chosen
+
+    _check_known("method", names, [m.name for m in METHODS])
+    return chosen(QUICK_METHODS if quick and not names else names)
+
+
+def _check_known(what: str, names: Sequence[str], known: Sequence[str]) -> None:
+    """Raise :class:`AmiwarpError` for a name that is not known."""
+    for name in names:
+        if name not in known:
+            raise AmiwarpError(f"unknown {what} {name!r}; choose among {', '.join(known)}")
+
+
+def _run_cells(
+    axes: Sequence[Axis], seeds: int, methods: Sequence[Method], store: Store, device: str, scheduler: str | None,
+    minutes: float | None, first: int,
+) -> tuple[list[Stored], int]:  # fmt: skip
+    """Run all missing cells (single recordings). Return all cells and the number of new cells."""
+    from amiwarp.studies.cluster import start_workers
+    from amiwarp.studies.stability.cells import run
+
+    end = None if minutes is None else time.monotonic() + 60.0 * minutes
+    new = 0
+
+    def count(what: str, share: float) -> None:
+        nonlocal new
+        new += 1
+        advance(what, share)
+
+    try:
+        with (
+            progress("starting workers") as advance,
+            start_workers("amiwarp stability", "cluster", scheduler, cpu_threads(), device) as workers,
+        ):
+            cells = run(axes, seeds, methods, store, workers, device=device, first=first, progress=count,
+                        until=None if end is None else lambda: time.monotonic() > end)  # fmt: skip
+    except KeyboardInterrupt:
+        say(f"amiwarp: finished cells are kept in {store.folder}; run the same command again to continue")
+        raise
+    return cells, new
+
+
+def _about(cells: Sequence[Stored]) -> dict[str, Any]:
+    from amiwarp.studies.cluster import versions
+
+    machines = sorted({r.machine for c in cells for r in c.results.values() if r.machine})
+    return {"date": time.strftime("%Y-%m-%d"), "machine": ", ".join(machines), "versions": versions(())}
+
+
+def stability_lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, took: float) -> list[Any]:
+    """Return the results as tables and lines of text: where each method works, the aims, the files and the speed."""
+    from amiwarp.studies.stability.report import summary
+
+    shown: list[Any] = [table(summary(atlas), "works at", *atlas.methods), "", *atlas.aims.lines(), ""]
+    listed = ("overview", "pages", "summary", "data", "table")
+    shown += [f"{name}: {files[name]}" for name in listed]
+    speed = f"{new:,} cells in {took:,.0f} s, {new / took:.3g} per second; " if new else ""
+    if left:
+        shown.append(f"{left:,} cells remain after the time limit; run the same command again to continue")
+    return [*shown, f"{speed}{atlas.cells:,} cells in all, in {files['data'].parent / 'cells'}"]
+
+
+# ``amiwarp evaluate``: the AMI-EV against a plain event camera, as its paper evaluates it, on simulated worlds.
+
+"""Time over which the speed is averaged [s]; recordings differ in length."""
+
+
+def run_evaluate(
+    *,
+    out: Annotated[
+        Path, typer.Option(help="Folder for the report. An existing one is continued."), OUTPUT_FOLDER
+    ] = Path("amiwarp-evaluation"),
+    only: Annotated[
+        str | None,
+        typer.Option(
+            help="Evaluations to run, such as texture,flow. Default: with --full all, with --quick the short ones.",
+            metavar="NAME,...",
+        ),
+    ] = None,
+    full: Annotated[
+        bool,
+        typer.Option(
+            "--full/--quick",
+            help="Full study: 320x240, ten seeds, all values; or quick: 240x180, two seeds, within ten minutes on two "
+            "cores.",
+        ),
+    ] = False,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds instead.")] = None,
+    recording: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Recording of your own, for the evaluations that need no ground truth: texture and event rate. Can be "
+            "repeated. Simulated worlds are then left out, unless --only is given."
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler. Default: processes of this machine.")
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Number of local processes. Default: one for each GPU, or for each core without GPU."),
+    ] = None,
+    common: Common,
+) -> None:
+    """Check the AMI-EV paper's results: compare with a plain event camera on simulated worlds, and write a report.
+
+    The report is OUT/report.html, with its tables and figures next to it. Finished cells are saved in OUT/cells: the
+    same command continues a stopped run. --device cuda uses all GPUs.
+    """
+    from amiwarp.studies.cluster import ANY_GPU
+    from amiwarp.studies.evaluate.evaluation import evaluate
+
+    device = common.device if common.device == ANY_GPU else choose_device(common.device)
+
+    names = tuple(name.strip() for name in only.split(",") if name.strip()) if only else ()
+    try:
+        with progress("starting workers", average_s=AVERAGE_S) as advance:
+            done = evaluate(
+                out, only=names, full=full, seeds=seeds, recordings=recording or (), scheduler=scheduler,
+                workers=workers, device=device, seed=common.seed, progress=advance,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        say(f"amiwarp: finished cells are kept in {out}; run the same command again to continue")
+        raise
+    files = {name: str(path) for name, path in done.files.items()}
+    report(common, asdict(done) | {"files": files, "device": device}, _evaluate_lines(done))
+
+
+def _evaluate_lines(done: EvaluationSummary) -> list[str]:
+    verdicts = ", ".join(f"{count} {verdict}" for verdict, count in done.verdicts.items())
+    lines = [f"claims: {verdicts or 'none'}"]
+    if done.failed:
+        lines.append(f"{done.failed:,} cells failed; the report says why")
+    lines += made_again(done.damaged)
+    lines += [f"{name}: {path}" for name, path in done.files.items()]
+    return [
+        *lines,
+        f"{done.new_cells:,} of {done.cells:,} cells in {done.seconds:,.0f} s, {done.processor_seconds:,.0f} s of "
+        "processor time",
+    ]

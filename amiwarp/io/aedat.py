@@ -1,0 +1,533 @@
+"""Readers of AEDAT files: 2.0 of jAER, 3.1 of cAER, and 4.0 of iniVation, which is written too."""
+
+import re
+import shutil
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import DEFAULT_BLOCK, Events, ImuSamples, MetadataValue, Recording
+from amiwarp.io import file_scan
+from amiwarp.io.file_scan import GRAVITY, FileEvents, Packet, only_counted, read_sensors
+from amiwarp.io.files import errors_name, open_input
+from amiwarp.io.formats import Outline
+from amiwarp.io.reading_process import Reply, noting_progress, packets, run
+
+# Reader of AEDAT 2.0 files of jAER: DVS128 and the DAVIS cameras.
+#
+# After a header of lines that begin with ``#``, each record has a 32-bit address and a 32-bit time [us], both
+# big-endian. The address holds an event, a sample of a frame (APS) or of the inertial unit (IMU), or an edge at the
+# external input. Pixels count from the bottom right, as jAER decodes them, and are turned into columns from the left,
+# rows from the top.
+
+# IMU samples of the DAVIS cameras in AEDAT 2.0 files.
+#
+# A sample consists of seven records with the numbers 0 to 6: acceleration x, y, z, temperature, angular velocity x, y,
+# z. The values are 16-bit numbers of the IMU (InvenSense MPU-6100). Its ranges stand among the settings in the header.
+
+STEPS_PER_G = {2: 16384.0, 4: 8192.0, 8: 4096.0, 16: 2048.0}
+"""Steps of the accelerometer per g, by its range [g]; from the data sheet of the MPU-6100."""
+
+STEPS_PER_DEG_S = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
+"""Steps of the gyroscope per degree per second, by its range [deg/s]; from the same data sheet."""
+
+RANGES = 8, 1000
+"""Ranges [g] and [deg/s] that jAER sets by default, for files whose header does not state them."""
+
+RECORDS_OF_SAMPLE = 7
+"""Number of records of a sample."""
+
+Records = Iterator[tuple[NDArray[Any], NDArray[np.int64]]]
+"""Blocks of addresses and times [us]."""
+
+
+def read_ranges(path: Path, offset: int) -> tuple[int, int] | None:
+    """Return the ranges of accelerometer [g] and gyroscope [deg/s] in the header's settings, or None if not there."""
+    with open_input(path) as file:
+        header = file.read(offset)
+    camera = re.search(rb"#\s*AEChip:\s*(\S+)", header)
+    short = camera[1].rpartition(b".")[2] if camera else b""
+    found = []
+    for name, old, value, known in (
+        (b"IMU.AccelScale", b"ImuAccelScale", rb"ImuAccelScaleG(\d{1,4})", STEPS_PER_G),
+        (b"IMU.GyroScale", b"ImuGyroScale", rb"GyroFullScaleDegPerSec(\d{1,4})", STEPS_PER_DEG_S),
+    ):
+        # Settings of other cameras may be there too. Those of this camera begin with its name in new versions of jAER.
+        keys = (re.escape(short + b"." + name), old)
+        texts = (re.search(b'key="' + key + b'" value="' + value + b'"', header) for key in keys)
+        stated = next((int(text[1]) for text in texts if text), 0)
+        if stated not in known:
+            return None
+        found.append(stated)
+    return found[0], found[1]
+
+
+def _read_samples(path: Path, records: Records, ranges: tuple[int, int]) -> ImuSamples:
+    """Return all complete samples."""
+    return file_scan.imu_of(path, _sample_columns(records, STEPS_PER_G[ranges[0]], STEPS_PER_DEG_S[ranges[1]]))
+
+
+def _sample_columns(records: Records, steps_per_g: float, steps_per_deg_s: float) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield time [us], angular velocity [rad/s] and acceleration [m/s^2] of the complete samples."""
+    words, t = np.zeros(0, np.int64), np.zeros(0, np.int64)
+    for block, times in records:
+        at = (block >> 31 == 1) & (block >> 10 & 3 == 3)
+        words, t = np.concatenate([words, block[at]]), np.concatenate([t, times[at]])
+        starts = _starts(words >> 28 & 7)
+        values = (words[starts[:, None] + np.arange(RECORDS_OF_SAMPLE)] >> 12 & 0xFFFF).astype(np.uint16).view(np.int16)
+        turning = np.radians(values[:, 4:] / steps_per_deg_s)
+        pulling = values[:, :3] / steps_per_g * file_scan.GRAVITY
+        yield t[starts], *turning.T, *pulling.T
+        # The records of the last sample may continue in the next block.
+        rest = max(0, len(words) - RECORDS_OF_SAMPLE + 1, int(starts[-1]) + RECORDS_OF_SAMPLE if len(starts) else 0)
+        words, t = words[rest:], t[rest:]
+
+
+def _starts(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the indices at which the numbers 0 to 6 follow each other."""
+    if len(numbers) < RECORDS_OF_SAMPLE:
+        return np.zeros(0, np.int64)
+    windows = np.lib.stride_tricks.sliding_window_view(numbers, RECORDS_OF_SAMPLE)
+    return np.flatnonzero((windows == np.arange(RECORDS_OF_SAMPLE)).all(axis=1))
+
+
+HEADER_BYTES = 1 << 24
+"""Longest header that is read [bytes]. It can hold all settings of the camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chip:
+    """Layout of a camera's addresses."""
+
+    width: int
+    height: int
+    davis: bool
+    """Whether the addresses are those of a DAVIS camera, else those of the DVS128."""
+
+
+CHIPS = {
+    "dvs128": Chip(128, 128, False), "davis128": Chip(128, 128, True), "davis208": Chip(208, 192, True),
+    "davis240": Chip(240, 180, True), "davis346": Chip(346, 260, True), "davis640": Chip(640, 480, True),
+    "tmpdiff128": Chip(128, 128, False),
+}  # fmt: skip
+"""Layouts by the name of jAER's class in the header, in lower case and without a suffix."""
+
+
+def open_aedat2(path: Path) -> Recording:
+    """Open the events of an AEDAT 2.0 file."""
+    with errors_name(path, lambda: "reading the header"):
+        chip, offset = _read_aedat2_header(path)
+    read, last = partial(_aedat2_packets, path, chip, offset), partial(file_scan.last_word, path, offset, ">u4")
+    events = FileEvents(path, read, size=(chip.width, chip.height), last_time=last)
+    imu, notes = _imu(path, chip, offset, events)
+    notes |= file_scan.only_counted(events.records, "frames")
+    metadata = {"format": "aedat2", **events.metadata, **notes}
+    return Recording(events=events, metadata=metadata, name=path.stem, imu=imu)
+
+
+def _imu(path: Path, chip: Chip, offset: int, events: FileEvents) -> tuple[ImuSamples | None, dict[str, MetadataValue]]:
+    """Return the IMU samples, unless only the head of the file was read, and notes about them."""
+    if not events.records.get("imu_samples") or file_scan.head_limit() is not None:
+        return None, {}
+    ranges = read_ranges(path, offset)
+    notes: dict[str, MetadataValue] = {}
+    if ranges is None:
+        notes["imu_ranges"] = f"assumed: {RANGES[0]} g and {RANGES[1]} deg/s, the defaults of jAER"
+    return _read_samples(path, _records(path, offset, {}), ranges or RANGES), notes
+
+
+def aedat2_triggers(path: Path) -> Iterator[Packet]:
+    """Yield the edges at the external input, all as rising edges of channel 0."""
+    chip, offset = _read_aedat2_header(path)
+    for words, t in _records(path, offset, {}):
+        at = (words >> 31 == 0) & (words >> 10 & 1 == 1) if chip.davis else words >> 15 & 1 == 1
+        nothing = np.zeros(np.count_nonzero(at), np.int64)
+        yield nothing, nothing, t[at], nothing + 1
+
+
+def _read_aedat2_header(path: Path) -> tuple[Chip, int]:
+    """Return the camera, and the position of the first record."""
+    with open_input(path) as file:
+        name, start = "", 0
+        while (line := file.readline(HEADER_BYTES)).startswith(b"#") and line.endswith(b"\n"):
+            start += len(line)
+            if found := re.match(rb"#\s*AEChip:\s*(\S+)", line):
+                name = found[1].decode("ascii", "replace")
+            if start > HEADER_BYTES:
+                raise AmiwarpError(f"the header is longer than {HEADER_BYTES >> 20} MiB; the file is damaged")
+    short = name.rpartition(".")[2].lower()
+    chip = next((chip for key, chip in CHIPS.items() if short.startswith(key)), None)
+    if chip is None:
+        given = f"camera '{name[:60]}'" if name else "no camera (AEChip)"
+        raise AmiwarpError(f"the header names {given}; expected one of {', '.join(CHIPS)}")
+    return chip, start
+
+
+def _records(path: Path, offset: int, notes: dict[str, int]) -> Iterator[tuple[NDArray[Any], NDArray[np.int64]]]:
+    """Yield addresses and unwrapped times [us]."""
+    last: int | None = None
+    for words in file_scan.read_words(path, offset, ">u4", DEFAULT_BLOCK, notes):
+        t = file_scan.unwrapped(words[:, 1].astype(np.int64), 32, last)
+        last = int(t[-1]) if t.size else last
+        yield words[:, 0].astype(np.int64), t
+
+
+def _aedat2_packets(path: Path, chip: Chip, offset: int, notes: dict[str, int]) -> Iterator[Packet]:
+    for words, t in _records(path, offset, notes):
+        yield _davis(words, t, chip, notes) if chip.davis else _dvs128(words, t, notes)
+
+
+def _davis(words: NDArray[np.int64], t: NDArray[np.int64], chip: Chip, notes: dict[str, int]) -> Packet:
+    other, external = words >> 31 == 1, words >> 10 & 1 == 1
+    kind = words[other] >> 10 & 3
+    # A frame has two samples of each pixel: the type is 0 for the reset level, 1 for the signal. One pixel is counted.
+    frames = np.count_nonzero((kind == 1) & (words[other] >> 12 & 0x7FFFF == 0))
+    # An IMU sample has seven values. The first, of type 0, stands for all.
+    samples = np.count_nonzero((kind == 3) & (words[other] >> 28 & 7 == 0))
+    for name, count in (("frames", frames), ("imu_samples", samples), ("triggers", (external & ~other).sum())):
+        notes[name] = notes.get(name, 0) + int(count)
+    at = ~other & ~external
+    kept = words[at]
+    return chip.width - 1 - (kept >> 12 & 0x3FF), chip.height - 1 - (kept >> 22 & 0x1FF), t[at], kept >> 11 & 1
+
+
+def _dvs128(words: NDArray[np.int64], t: NDArray[np.int64], notes: dict[str, int]) -> Packet:
+    external = words >> 15 & 1 == 1
+    notes["triggers"] = notes.get("triggers", 0) + int(external.sum())
+    kept = words[~external]
+    # In jAER, bit 0 is 0 for an ON event.
+    return 127 - (kept >> 1 & 0x7F), 127 - (kept >> 8 & 0x7F), t[~external], 1 - (kept & 1)
+
+
+# Reader of AEDAT 3.1 files of cAER: packets of one type of event each, little-endian.
+#
+# Pixels count from the upper left. Packets of events of the first source are read. Other packets are counted or
+# skipped.
+
+HEADER_END = b"#!END-HEADER\r\n"
+LONGEST_LINE, MOST_LINES = 4096, 1000
+"""Limits of the header: characters of a line, and lines."""
+
+PACKET_HEADER = struct.Struct("<hhiiiiii")
+"""Header of a packet: type, source, size of an event, offset of its time, overflow of the time, capacity, number, and
+number of valid events."""
+
+SPECIAL, POLARITY = 0, 1
+COUNTED_TYPES = {2: "frames", 3: "imu_samples", 4: "imu_samples"}
+"""Types of packets. Those of type 3 have six axes, of type 4 nine."""
+
+SPECIAL_EDGES = {2: 1, 3: 0, 4: 1}
+"""Types of special events at the external input: rising edge, falling edge, pulse; and whether they count as rising."""
+
+LARGEST_PACKET = 1 << 28
+"""Largest packet that is read [bytes]."""
+
+JOINED = 1 << 17
+"""Number of events from which on packets are joined and decoded."""
+
+SIZES = {"DVS128": (128, 128), "DAVIS128": (128, 128), "DAVIS208": (208, 192), "DAVIS240": (240, 180),
+         "DAVIS346": (346, 260), "DAVIS640": (640, 480), "DVXPLORER": (640, 480)}  # fmt: skip
+"""Sensor sizes [px] by the beginning of the source's name in the header."""
+
+
+def open_aedat3(path: Path) -> Recording:
+    """Open the events of an AEDAT 3.1 file."""
+    with errors_name(path, lambda: "reading the header"):
+        size, offset = _read_aedat3_header(path)
+    events = FileEvents(path, partial(_aedat3_packets, path, offset), size=size)
+    metadata = {"format": "aedat3", **events.metadata, **only_counted(events.records, "imu_samples", "frames")}
+    return Recording(events=events, metadata=metadata, name=path.stem)
+
+
+def _read_aedat3_header(path: Path) -> tuple[tuple[int, int] | None, int]:
+    """Return the sensor size [px], or None if the source is unknown, and the position of the first packet."""
+    with open_input(path) as file:
+        size = None
+        for _ in range(MOST_LINES):
+            line = file.readline(LONGEST_LINE)
+            if line == HEADER_END:
+                return size, file.tell()
+            if not line.startswith(b"#"):
+                break
+            text = line.decode("latin-1").strip()
+            if (found := re.match(r"#Format:\s*(\S+)", text)) and found[1] != "RAW":
+                raise AmiwarpError(f"the packets have the format '{found[1][:40]}'; export the file again as RAW")
+            if size is None and (found := re.match(r"#Source \d+:\s*(\S+)", text)):
+                size = next((sizes for name, sizes in SIZES.items() if found[1].upper().startswith(name)), None)
+        raise AmiwarpError("the header does not end with #!END-HEADER; the file is damaged")
+
+
+def _contents(path: Path, offset: int, notes: dict[str, int]) -> Iterator[tuple[int, int, NDArray[Any], int]]:
+    """Yield type, source, valid events as rows of 32-bit words, and time overflow [us] of the packets."""
+    total = path.stat().st_size
+    notes["total"] = total
+    with open_input(path) as file:
+        file.seek(offset)
+        while head := file.read(PACKET_HEADER.size):
+            at = file.tell() - len(head)
+            if len(head) < PACKET_HEADER.size:
+                notes["truncated_bytes"] = len(head)
+                return
+            kind, source, width, _, overflow, _, count, _ = PACKET_HEADER.unpack(head)
+            length = width * count
+            if min(width, count, overflow, source) < 0 or length > LARGEST_PACKET or kind not in range(256):
+                raise AmiwarpError(f"{path}: byte {at} does not begin the header of a packet; the file is damaged")
+            if at + PACKET_HEADER.size + length > total:
+                notes["truncated_bytes"] = total - at
+                return
+            if kind in COUNTED_TYPES:
+                notes[COUNTED_TYPES[kind]] = notes.get(COUNTED_TYPES[kind], 0) + count
+            if kind not in (SPECIAL, POLARITY):
+                file.seek(length, 1)
+            elif width != 8:
+                raise AmiwarpError(f"{path}: byte {at}: events of {width} bytes in a packet of type {kind}; expected 8")
+            else:
+                words = np.frombuffer(file.read(length), "<i4").reshape(-1, 2).astype(np.int64)
+                yield kind, source, words[words[:, 0] & 1 == 1], overflow << 31
+            notes["read"] = file.tell()
+
+
+def _aedat3_packets(path: Path, offset: int, notes: dict[str, int]) -> Iterator[Packet]:
+    first, parts, count = None, [], 0
+    for kind, source, words, overflow in _contents(path, offset, notes):
+        if kind == SPECIAL:
+            edges = np.isin(words[:, 0] >> 1 & 0x7F, list(SPECIAL_EDGES))
+            notes["triggers"] = notes.get("triggers", 0) + int(np.count_nonzero(edges))
+            continue
+        first = source if first is None else first
+        if source != first:
+            notes["events_of_other_sources"] = notes.get("events_of_other_sources", 0) + len(words)
+            continue
+        words[:, 1] += overflow
+        parts.append(words)
+        count += len(words)
+        if count >= JOINED:  # packets of the camera are small
+            yield _decoded(parts)
+            parts, count = [], 0
+    if parts:
+        yield _decoded(parts)
+
+
+def _decoded(parts: list[NDArray[Any]]) -> Packet:
+    data, t = np.concatenate(parts).T
+    return data >> 17 & 0x7FFF, data >> 2 & 0x7FFF, t, data >> 1 & 1
+
+
+def aedat3_triggers(path: Path) -> Iterator[Packet]:
+    """Yield the edges at the external input, of channel 0."""
+    for kind, _, words, overflow in _contents(path, _read_aedat3_header(path)[1], {}):
+        codes = words[:, 0] >> 1 & 0x7F
+        at = np.isin(codes, list(SPECIAL_EDGES)) & (kind == SPECIAL)
+        rising = (codes[at] != 3).astype(np.int64)
+        yield rising * 0, rising * 0, words[at, 1] + overflow, rising
+
+
+# Reader of iniVation's AEDAT 4.0 files, with faery: the first streams of events, frames and IMU samples.
+#
+# The decoder does not check the file's structure: text that is not UTF-8 ends the process. Therefore the header and the
+# packet sizes are checked first.
+
+COUNTED = {"frame": "frames", "imus": "imu_samples"}
+"""Types of other streams, and the names of their counts."""
+
+RISING, FALLING, PULSE = 1, 2, 3
+EDGES = (RISING, FALLING, PULSE)
+"""Types of triggers at the external input. Others mark the exposure and the reading of frames."""
+
+MAGIC = b"#!AER-DAT4.0\r\n"
+"""First bytes of an AEDAT 4.0 file."""
+
+
+def open_aedat4(path: Path) -> Recording:
+    """Open the first event stream of an AEDAT 4 file."""
+    with errors_name(path, lambda: "reading the header"):
+        with open_input(path) as file:
+            _check_frame(path, file)
+        width, height, number = run(read_head, path.absolute())
+    source = partial(packets, read_packets, path.absolute(), number, False)
+    events = FileEvents(path, source, size=(width, height))
+    imu, frames, notes = read_sensors(path, events.records, __name__)
+    metadata = {"format": "aedat4", **events.metadata, **notes}
+    return Recording(events=events, metadata=metadata, name=path.stem, imu=imu, frames=frames)
+
+
+def _check_frame(path: Path, file: BinaryIO) -> None:
+    """Check the header, and that each packet ends within the file; raise :class:`AmiwarpError` if not."""
+    file_bytes = path.stat().st_size
+    head = file.read(len(MAGIC) + 4)
+    if not head.startswith(MAGIC) or len(head) < len(MAGIC) + 4:
+        raise AmiwarpError(f"{path}: byte 0: is not the header of an AEDAT 4.0 file; give another file")
+    (header_bytes,) = struct.unpack_from("<I", head, len(MAGIC))
+    at = len(head) + header_bytes
+    if at > file_bytes:
+        raise AmiwarpError(f"{path}: byte {len(head)}: the header ends beyond the file, which is truncated")
+    table = _check_header(path, file.read(header_bytes))
+    if table > file_bytes:
+        raise AmiwarpError(
+            f"{path}: its table should be at byte {table}, beyond the end of the file, which is truncated"
+        )
+    end = table if table > 0 else file_bytes
+    while at < end:
+        file.seek(at)
+        packet = file.read(8)
+        size = struct.unpack("<ii", packet)[1] if len(packet) == 8 else -1
+        if size < 0 or at + 8 + size > end:
+            raise AmiwarpError(
+                f"{path}: byte {at}: a packet ends beyond the file or its table; the file is truncated or damaged"
+            )
+        at += 8 + size
+
+
+def _check_header(path: Path, header: bytes) -> int:
+    """Check the header's XML, and return the position of the file's table; 0 or less if there is no table.
+
+    The header is a FlatBuffer with the compression, the position of the table and the XML text.
+    """
+    try:
+        (root,) = struct.unpack_from("<I", header)
+        fields = root - struct.unpack_from("<i", header, root)[0]
+        position, text = struct.unpack_from("<HH", header, fields + 6)
+        start = root + text + struct.unpack_from("<I", header, root + text)[0]
+        (length,) = struct.unpack_from("<I", header, start)
+        if min(fields, text) <= 0 or start + 4 + length > len(header):
+            raise ValueError("its text lies outside the header")
+        ElementTree.fromstring(header[start + 4 : start + 4 + length].decode("utf-8"))
+        return int(struct.unpack_from("<q", header, root + position)[0]) if position else 0
+    except (struct.error, ValueError, ElementTree.ParseError) as error:
+        raise AmiwarpError(f"{path}: the header is damaged: {error}") from error
+
+
+def _decoder(path: str) -> Any:
+    """Open a file with faery, which loads slowly. Called in the reading process."""
+    from faery.extension import aedat
+
+    return aedat.Decoder(path)
+
+
+def read_head(path: str) -> Reply:
+    """Return width, height and number of the first stream of events. Called in the reading process."""
+    with _decoder(path) as decoder:
+        for track in decoder.tracks():
+            if track.data_type == "events" and track.dimensions is not None:
+                return (int(track.dimensions[0]), int(track.dimensions[1]), track.id), []
+    raise AmiwarpError("has no stream of events; give a file with events")
+
+
+def aedat4_triggers(path: Path) -> Iterator[Packet]:
+    """Yield the edges at the external input, of channel 0."""
+    with open_input(path) as file:
+        _check_frame(path, file)
+    return packets(read_packets, path.absolute(), -1, True, {})
+
+
+def read_packets(notes: dict[str, int], path: str, number: int, triggers: bool) -> Iterator[Packet]:
+    """Yield the packets of a stream of events, or the edges at the external input. Runs in the reading process."""
+    with _decoder(path) as decoder:
+        for track, packet in noting_progress(decoder, path, notes):
+            if name := COUNTED.get(track.data_type):
+                notes[name] = notes.get(name, 0) + (1 if name == "frames" else len(packet))
+            elif track.data_type == "triggers":
+                edges = packet[np.isin(packet["source"], EDGES)]
+                notes["triggers"] = notes.get("triggers", 0) + len(edges)
+                if triggers:
+                    channel = np.zeros(len(edges), np.uint8)
+                    yield channel, channel, edges["t"], edges["source"] != FALLING
+            elif track.id == number and track.data_type == "events" and not triggers:
+                yield packet["x"], packet["y"], packet["t"], packet["p"]
+
+
+# Reader of IMU samples and frames of AEDAT 4.0 files, with faery. Runs in the reading process.
+#
+# The file's units are g and degrees per second.
+
+
+def read_imu(notes: dict[str, int], path: str) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield time [us], angular velocity [rad/s] and acceleration [m/s^2] of the first stream of IMU samples."""
+    for samples in _packets_of(path, "imus"):
+        turning = (np.radians(samples[f"gyroscope_{axis}"].astype(np.float64)) for axis in "xyz")
+        pulling = (samples[f"accelerometer_{axis}"].astype(np.float64) * GRAVITY for axis in "xyz")
+        yield samples["t"].astype(np.int64), *turning, *pulling
+
+
+def read_heads(notes: dict[str, int], path: str) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield time [us], width, height and bytes per pixel of each frame. The time is the middle of the exposure."""
+    for frame in _packets_of(path, "frame"):
+        if frame.format != "L" or frame.pixels.ndim != 2:
+            raise AmiwarpError(f"the frames are in colour ('{frame.format}'), not grey")
+        height, width = frame.pixels.shape
+        yield tuple(np.array([value], np.int64) for value in (frame.t, width, height, frame.pixels.itemsize))
+
+
+def read_images(notes: dict[str, int], path: str) -> Iterator[tuple[NDArray[Any], ...]]:
+    """Yield the bytes of each frame."""
+    for frame in _packets_of(path, "frame"):
+        yield (np.ascontiguousarray(frame.pixels).reshape(-1).view(np.uint8),)
+
+
+def _packets_of(path: str, kind: str) -> Iterator[Any]:
+    """Yield the packets of the first stream of a type."""
+    with _decoder(path) as decoder:
+        number = next((track.id for track in decoder.tracks() if track.data_type == kind), None)
+        for track, packet in decoder:
+            if track.id == number:
+                yield packet
+
+
+# Writer of iniVation's AEDAT 4.0 files, with faery: one stream of events, compressed by LZ4.
+
+PACKET_EVENT = np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), (("p", "on"), "?")])
+"""Events as faery takes them."""
+
+
+LAST_BYTES = 1 << 16
+"""Free disk space that is needed when the file is closed [bytes]."""
+
+
+def write_aedat4(part: Path, blocks: Iterable[Events], about: Outline) -> None:
+    """Write all events, then count them in the file."""
+    from faery.extension import aedat
+
+    written = 0
+    with aedat.Encoder(part, _description(about), ("lz4", 1)) as encoder:
+        for events in blocks:
+            packet = np.empty(len(events), PACKET_EVENT)
+            for name in ("t", "x", "y", "p"):
+                packet[name] = getattr(events, name)
+            encoder.write(0, packet)
+            written += len(events)
+    try:
+        count = len(open_aedat4(part).events) if written else 0
+    except AmiwarpError:  # the file is truncated
+        count = 0
+    # The encoder does not report whether it could write its last bytes.
+    if count != written or shutil.disk_usage(part.parent).free < LAST_BYTES:
+        raise AmiwarpError(f"the disk is full: {count} of {written} events could be written; free some space")
+
+
+def _description(about: Outline) -> list[Any]:
+    """Return the description of the stream in the header, as iniVation's recorder writes it."""
+    from faery.extension import aedat
+
+    attribute, node = aedat.DescriptionAttribute, aedat.DescriptionNode
+    size = {"sizeX": about.width, "sizeY": about.height}
+    texts = {
+        "compression": "LZ4",
+        "originalModuleName": "amiwarp",
+        "originalOutputName": "events",
+        "typeDescription": "Array of events (polarity ON/OFF).",
+        "typeIdentifier": "EVTS",
+    }
+    root = "/mainloop/Recorder/outInfo/"
+    attributes = {name: attribute("int", value) for name, value in size.items()}
+    attributes["source"] = attribute("string", "amiwarp")
+    info = node("info", f"{root}0/info/", attributes, [])
+    stream = {name: attribute("string", text) for name, text in texts.items()}
+    return [node("outInfo", root, {}, [node("0", f"{root}0/", stream, [info])])]

@@ -1,0 +1,452 @@
+"""Plain formats of events: text and NumPy arrays, which are read and written, and the .bin files of N-MNIST."""
+
+import contextlib
+import math
+import shutil
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, BinaryIO, TypeAlias
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from amiwarp.cpu_threads import in_order
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import DEFAULT_BLOCK, Events, Recording, regroup
+from amiwarp.io.file_scan import FileEvents, Packet, microseconds, read_pieces, whole_pixels
+from amiwarp.io.files import LONGEST_LINE, errors_name, input_path, open_input, scratch_folder
+from amiwarp.io.formats import BIN_EVENT_BYTES, BIN_MARK_ROW, Outline, bin_columns, looks_like_bin
+from amiwarp.optics.camera import Camera, RadialTangential
+
+# Reader of text in the format of the Event Camera Dataset: one event ``t x y p`` per line, t in seconds, p 1 or 0.
+#
+# A first line ``width height``, which some exporters write, gives the sensor size. Otherwise it is that of the smallest
+# known sensor that holds all events (240x180 for that dataset). A ``calib.txt`` in the same folder gives the camera as
+# ``fx fy cx cy k1 k2 p1 p2 k3``. Empty lines and lines that start with ``#`` are ignored. If most of the first events
+# have fractional x or y, all are compensated, and ``nan`` marks events without coordinates.
+
+READ_BYTES = 1 << 22
+"""Amount of text that is parsed at once [bytes]: about 200,000 events."""
+
+
+def open_text(path: Path) -> Recording:
+    """Open a text recording, with the camera of ``calib.txt`` in the same folder if that file exists."""
+    with errors_name(path, lambda: "line 1"), open_input(path) as file:
+        size, _ = _read_size(path, file)
+    events = FileEvents(path, partial(_text_packets, path), size=size, last_time=partial(_last_time, path))
+    calib = path.with_name("calib.txt")
+    camera = read_calib(calib, *events.size) if calib.exists() and calib != path else None
+    return Recording(events=events, camera=camera, metadata={"format": "text", **events.metadata}, name=path.stem)
+
+
+def read_calib(path: Path, width: int, height: int) -> Camera:
+    """Return the camera of a ``calib.txt``. Raises :class:`AmiwarpError` unless it holds nine finite numbers."""
+    with errors_name(path, lambda: "reading the calibration"):
+        with open_input(path) as file:
+            words = file.read(10_000).decode("utf-8").split()
+        numbers = [float(word) for word in words]
+        if len(numbers) != 9 or not np.isfinite(numbers).all():
+            raise AmiwarpError(f"{path}: has {len(numbers)} numbers; expected finite fx fy cx cy k1 k2 p1 p2 k3")
+        fx, fy, cx, cy = numbers[:4]
+        return Camera(width, height, fx, fy, cx, cy, RadialTangential(*numbers[4:]))
+
+
+def _read_size(path: Path, file: BinaryIO) -> tuple[tuple[int, int] | None, int]:
+    """Return the sensor size from a first line of two numbers, and the number of lines read.
+
+    If the first line is an event, return None and 0.
+    """
+    words = file.readline(LONGEST_LINE).split()
+    if len(words) != 2:
+        file.seek(0)
+        return None, 0
+    if not (words[0].isdigit() and words[1].isdigit()):
+        given = b" ".join(words)[:80].decode("ascii", "replace")
+        raise AmiwarpError(f"{path}: line 1 '{given}' is not a size in pixels; expected 'width height' or 't x y p'")
+    return (int(words[0]), int(words[1])), 1
+
+
+def _last_time(path: Path, estimate: int) -> int | None:
+    """Return the time of the last line [us], or None if it holds none."""
+    with open_input(path) as file:
+        file.seek(max(path.stat().st_size - 2 * LONGEST_LINE, 0))
+        lines = [line for line in file.read().split(b"\n")[1:] if line.strip() and not line.lstrip().startswith(b"#")]
+    with contextlib.suppress(ValueError, IndexError, OverflowError):
+        return round(float(lines[-1].split()[0]) * 1e6)
+    return None
+
+
+def _text_packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
+    fractional: bool | None = None
+    with open_input(path) as file:
+        _, line_number = _read_size(path, file)
+        rest = b""
+        notes["total"] = path.stat().st_size
+        while data := file.read(READ_BYTES):
+            notes["read"] = file.tell()
+            whole, newline, rest = (rest + data).rpartition(b"\n")
+            if len(rest) > LONGEST_LINE:
+                raise AmiwarpError(f"{path}: after line {line_number}: a line is longer than {LONGEST_LINE} characters")
+            if newline:
+                lines = whole.split(b"\n")
+                fractional, events = _parse(path, lines, line_number, fractional)
+                yield events
+                line_number += len(lines)
+        if rest.strip():
+            yield _parse(path, [rest], line_number, fractional)[1]
+
+
+def _parse(path: Path, lines: list[bytes], line_number: int, fractional: bool | None) -> tuple[bool | None, Packet]:
+    """Return whether the events of a file are compensated, and those in lines of text.
+
+    ``line_number`` is the number of the line before them, ``fractional`` what the lines before have shown.
+    """
+    kept = [line for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
+    if not kept:
+        nothing = np.zeros(0, np.int64)
+        return fractional, (nothing, nothing, nothing, nothing)
+    try:
+        table = np.loadtxt(kept, ndmin=2, comments=None, encoding="ascii")
+    except ValueError:
+        table = np.zeros((0, 0))
+    if fractional is None and table.shape[1] == 4:
+        fractional = bool((table[:, 1:3] != np.floor(table[:, 1:3])).any(axis=1).mean() > 0.5)
+    if table.shape != (len(kept), 4) or not _plausible(table, fractional).all():
+        bad = _first_bad_line(lines, line_number, fractional)
+        raise AmiwarpError(f"{path}: {bad}; expected 't x y p' with t in seconds, p 0 or 1")
+    t, x, y, p = table.T
+    t, p = np.rint(t * 1e6).astype(np.int64), p.astype(np.int64)
+    return fractional, (x, y, t, p) if fractional else (x.astype(np.int64), y.astype(np.int64), t, p)
+
+
+def _plausible(table: NDArray[np.float64], fractional: bool | None) -> NDArray[np.bool_]:
+    """Return for each row ``t x y p`` whether its numbers are usable."""
+    t, x, y, p = table.T
+    # Pixels must fit 32 bits. Pixels outside the frame are dropped later. NaN fails every comparison.
+    places: Any = (np.abs(x) < 2**31) & (np.abs(y) < 2**31)
+    if fractional:
+        places |= np.isnan(x) | np.isnan(y)
+    else:
+        places &= (np.floor(x) == x) & (np.floor(y) == y)
+    return np.asarray((np.abs(t) < 2**62 / 1e6) & places & ((p == 0) | (p == 1) | (p == -1)))
+
+
+def _first_bad_line(lines: list[bytes], line_number: int, fractional: bool | None) -> str:
+    """Return a description of the first line that does not hold an event, for error messages."""
+    for number, line in enumerate(lines, line_number + 1):
+        if not line.strip() or line.lstrip().startswith(b"#"):
+            continue
+        try:
+            row = np.array([[float(word) for word in line.split()]])
+        except ValueError:
+            row = np.zeros((1, 0))
+        if row.shape != (1, 4) or not _plausible(row, fractional).all():
+            return f"line {number} is '{line[:80].decode('ascii', 'replace').strip()}'"
+    return f"line {line_number + 1} or after it is malformed"
+
+
+# Writer of text in the format of the Event Camera Dataset: one event ``t x y p`` per line, t in seconds, p 1 or 0.
+#
+# x and y of compensated events have six decimals; ``nan`` marks those without coordinates.
+
+LINES = 1 << 17
+"""Number of events that are formatted at a time."""
+
+FARTHEST = 2.0**31
+"""Coordinates that are read again are less than this [px]. A larger one, of a ray along the image plane, is ``nan``."""
+
+Digits = tuple[NDArray[np.uint8], NDArray[np.bool_]]
+"""Characters by digit and event, and which of them are written."""
+
+
+def write_text(part: Path, blocks: Iterable[Events], about: Outline) -> None:
+    """Write all events, formatted in parallel threads."""
+    jobs = (partial(format_events, events) for events in regroup(blocks, count=LINES))
+    with part.open("xb") as file, contextlib.closing(in_order(jobs)) as lines:
+        for text in lines:
+            file.write(text)
+
+
+def format_events(events: Events) -> bytes:
+    """Return the lines of some events, at least one."""
+    columns = _decimals(events.t)
+    for values in (events.x, events.y, events.p):
+        digits = [_digits(values)] if values.dtype.kind == "u" else _fractional(values)
+        columns += [_mark(" ", len(events)), *digits]
+    columns.append(_mark("\n", len(events)))
+    characters = np.concatenate([column for column, _ in columns])
+    return characters.T[np.concatenate([kept for _, kept in columns]).T].tobytes()
+
+
+def _decimals(millionths: NDArray[np.int64]) -> list[Digits]:
+    """Return integers divided by a million, with six decimals."""
+    whole, rest = np.divmod(np.abs(millionths), 1_000_000)
+    minus = np.full((1, len(whole)), ord("-"), np.uint8), (millionths < 0)[None]
+    return [minus, _digits(whole), _mark(".", len(whole)), _digits(rest.astype(np.uint32), places=6)]
+
+
+def _fractional(values: NDArray[Any]) -> list[Digits]:
+    """Return coordinates with six decimals, or ``nan``."""
+    unknown = ~(np.abs(values) < FARTHEST)
+    columns = _decimals(np.rint(np.where(unknown, 0.0, values.astype(np.float64)) * 1e6).astype(np.int64))
+    if unknown.any():
+        for _, kept in columns:
+            kept[:, unknown] = False
+        columns += [(np.full((1, len(values)), ord(letter), np.uint8), unknown[None]) for letter in "nan"]
+    return columns
+
+
+def _mark(character: str, count: int) -> Digits:
+    return np.full((1, count), ord(character), np.uint8), np.ones((1, count), np.bool_)
+
+
+def _digits(values: NDArray[np.integer], places: int = 0) -> Digits:
+    """Return the decimal digits of values, with leading zeros up to a number of places, and without if that is 0."""
+    width = places or len(str(int(values.max())))
+    characters = np.empty((width, len(values)), np.uint8)
+    kept = np.ones((width, len(values)), np.bool_)
+    for at in range(width - 1, -1, -1):
+        if not places and at < width - 1:
+            np.greater(values, 0, out=kept[at])
+        rest = values // 10
+        characters[at] = values - rest * 10
+        values = rest
+    characters += ord("0")
+    return characters, kept
+
+
+# Reader of NumPy arrays of events: archives (.npz) and the folders of EV-IMO2.
+#
+# An archive holds the integer arrays x, y [px], t [us] and p (1 is ON, 0 or -1 is OFF), with floating x and y for
+# compensated events, or one structured array ``event_data`` with these fields (N-ImageNet), or one array ``events``
+# with the columns t [s], x, y, p (EV-IMO). The optional numbers ``width`` and ``height`` give the sensor size.
+# Otherwise it is the smallest known sensor that holds all events. A folder of EV-IMO2 holds ``dataset_events_t.npy``
+# [s], ``dataset_events_xy.npy`` and ``dataset_events_p.npy``. Arrays are read in pieces, so that memory does not depend
+# on the size that a file declares.
+
+PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Compression methods that NumPy writes. Others are refused, because they may take any amount of memory."""
+
+
+def open_npz(path: Path) -> Recording:
+    """Open an archive of events.
+
+    Arrays are read in pieces, and read again for each use if they are too large to keep in memory.
+    """
+    with errors_name(path, lambda: "reading width and height"), zipfile.ZipFile(input_path(path)) as archive:
+        size = None
+        if {"width.npy", "height.npy"} <= set(archive.namelist()):
+            size = (_number(archive, "width"), _number(archive, "height"))
+    events = FileEvents(path, partial(_npz_packets, path), size=size)
+    return Recording(events=events, metadata={"format": "npz", **events.metadata}, name=path.stem)
+
+
+Array: TypeAlias = tuple[IO[bytes], tuple[int, ...], np.dtype[Any]]
+"""Stream of an array's values, its shape and its type."""
+
+
+@contextlib.contextmanager
+def _array(archive: zipfile.ZipFile, name: str, kinds: str = "iub") -> Iterator[Array]:
+    """Open an array of the archive: its bytes, shape and type. Its header must agree with the archive's directory."""
+    about = archive.getinfo(f"{name}.npy")
+    if about.compress_type not in PACKED:
+        raise AmiwarpError(
+            f"array {name} is compressed by method {about.compress_type}; save the array with numpy.savez"
+        )
+    with archive.open(about) as stream:
+        yield _header(stream, name, about.file_size, kinds)
+
+
+def _header(stream: IO[bytes], name: str, file_bytes: int, kinds: str) -> Array:
+    """Read the header of an array of ``file_bytes`` bytes, and check it."""
+    version = npy.read_magic(stream)
+    read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
+    if read is None:
+        raise AmiwarpError(f"array {name} has a header of version {version}; expected 1.0 or 2.0")
+    shape, by_columns, dtype = read(stream)
+    # Floating times could be in seconds or in microseconds. Object arrays would be unpickled, which is unsafe.
+    if dtype.hasobject or dtype.kind not in kinds:
+        raise AmiwarpError(f"array {name} is {dtype}; expected integers (t in microseconds), no pickled objects")
+    if math.prod(shape) * dtype.itemsize != file_bytes - stream.tell():
+        raise AmiwarpError(f"array {name} declares shape {shape}, which the archive does not hold; copy the file again")
+    if by_columns and len(shape) > 1:
+        raise AmiwarpError(f"array {name} is stored by columns; save numpy.ascontiguousarray of it")
+    return stream, shape, dtype
+
+
+def _number(archive: zipfile.ZipFile, name: str) -> int:
+    """Return the single number in an array of the archive."""
+    with _array(archive, name) as (stream, shape, dtype):
+        if math.prod(shape) != 1:
+            raise AmiwarpError(f"{name} has shape {shape}; expected one number")
+        return int(np.frombuffer(stream.read(dtype.itemsize), dtype)[0])
+
+
+def _npz_packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
+    with contextlib.ExitStack() as opened:
+        archive = opened.enter_context(zipfile.ZipFile(input_path(path)))
+        names = {name.removesuffix(".npy") for name in archive.namelist()}
+        missing = [name for name in "xytp" if name not in names]
+        if not missing:
+            kinds = {"x": "iubf", "y": "iubf", "t": "iub", "p": "iub"}
+            arrays = {name: opened.enter_context(_array(archive, name, kinds[name])) for name in "xytp"}
+            yield from _npz_columns(path, arrays, notes)
+        elif "event_data" in names:
+            array = opened.enter_context(_array(archive, "event_data", "V"))
+            yield from _records(path, array, notes)
+        elif "events" in names:
+            array = opened.enter_context(_array(archive, "events", "iuf"))
+            yield from _rows(path, array, notes)
+        else:
+            raise AmiwarpError(f"{path}: is a ZIP archive without x, y, t and p: no array {', '.join(missing)}; {USED}")
+
+
+USED = "expected x, y, t, p; or event_data (N-ImageNet); or events (EV-IMO)"
+"""Arrays that are read, for messages."""
+
+
+def _npz_columns(path: Path, arrays: Mapping[str, Array], notes: dict[str, int]) -> Iterator[Packet]:
+    """Yield the events of the arrays x, y, t, p."""
+    count = arrays["t"][1]
+    for name, (_, shape, _) in arrays.items():
+        if len(shape) != 1 or shape != count:
+            raise AmiwarpError(f"{path}: array {name} has shape {shape}, t {count}; expected one length (n,)")
+    x_type, y_type = (arrays[name][2] for name in "xy")
+    if (x_type.kind == "f") != (y_type.kind == "f"):
+        given = f"array x is {x_type}, y is {y_type}"
+        raise AmiwarpError(f"{path}: {given}; expected integers, or floating numbers for compensated events")
+    for length in _lengths(count[0], notes):
+        x, y, t, p = (_next(array, length) for array in arrays.values())
+        yield x, y, t, p
+
+
+def _records(path: Path, array: Array, notes: dict[str, int]) -> Iterator[Packet]:
+    """Yield the events of a structured array with the fields x, y, t [us], p."""
+    _, shape, dtype = array
+    fields: Mapping[str, Any] = dtype.fields or {}
+    if len(shape) != 1 or any(name not in fields or fields[name][0].kind not in "iub" for name in "xytp"):
+        raise AmiwarpError(f"{path}: array event_data is {dtype} of shape {shape}; expected integer fields x, y, t, p")
+    for length in _lengths(shape[0], notes):
+        rows = _next(array, length)
+        yield rows["x"], rows["y"], rows["t"], rows["p"]
+
+
+def _rows(path: Path, array: Array, notes: dict[str, int]) -> Iterator[Packet]:
+    """Yield the events of an array with the columns t [s], x, y, p."""
+    _, shape, dtype = array
+    if len(shape) != 2 or shape[1] != 4 or dtype.kind != "f":
+        raise AmiwarpError(f"{path}: array events is {dtype} of shape {shape}; expected float (n, 4): t [s], x, y, p")
+    for length in _lengths(shape[0], notes):
+        t, x, y, p = _next(array, length).T
+        yield whole_pixels(x), whole_pixels(y), microseconds(t), p > 0
+
+
+def _lengths(count: int, notes: dict[str, int]) -> Iterator[int]:
+    """Yield the lengths of the pieces of ``count`` events, and note the progress."""
+    notes["total"] = max(count, 1)
+    for start in range(0, count, DEFAULT_BLOCK):
+        notes["read"] = min(start + DEFAULT_BLOCK, count)
+        yield min(DEFAULT_BLOCK, count - start)
+
+
+def _next(array: Array, length: int) -> NDArray[Any]:
+    """Return the next ``length`` rows of an array."""
+    stream, shape, dtype = array
+    row = math.prod(shape[1:])
+    data = stream.read(length * row * dtype.itemsize)
+    return np.frombuffer(data, dtype, length * row).reshape(length, *shape[1:])
+
+
+EVIMO = ("t", "xy", "p")
+"""Parts of the names of the files in a folder of EV-IMO2."""
+
+
+def open_evimo(path: Path) -> Recording:
+    """Open the events of a folder of EV-IMO2. Its sensor size is taken from the events."""
+    events = FileEvents(path, partial(_evimo_packets, path), size=None)
+    return Recording(events=events, metadata={"format": "evimo2", **events.metadata}, name=path.name)
+
+
+def _evimo_packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
+    with contextlib.ExitStack() as opened:
+        arrays = {}
+        for name, kinds in zip(EVIMO, ("f", "iu", "iub"), strict=True):
+            part = path / f"dataset_events_{name}.npy"
+            stream = opened.enter_context(open_input(part))
+            arrays[name] = _header(stream, part.name, part.stat().st_size, kinds)
+        counts = {name: shape[0] if shape else 0 for name, (_, shape, _) in arrays.items()}
+        sizes = {name: math.prod(shape[1:]) for name, (_, shape, _) in arrays.items()}
+        if len(set(counts.values())) != 1 or sizes != {"t": 1, "xy": 2, "p": 1}:
+            shapes = ", ".join(f"{name} {shape}" for name, (_, shape, _) in arrays.items())
+            raise AmiwarpError(f"{path}: the arrays have the shapes {shapes}; expected (n,), (n, 2), (n,)")
+        for length in _lengths(counts["t"], notes):
+            t, xy, p = (_next(array, length) for array in arrays.values())
+            yield xy[:, 0], xy[:, 1], microseconds(t.reshape(-1)), p.reshape(-1)
+
+
+# Writer of NumPy archives, which :func:`numpy.load` reads: the arrays x, y, t and p, and the numbers width and height.
+#
+# An archive holds one array after the other. The arrays therefore grow in temporary files next to the archive.
+
+COLUMNS = {"x": "<u2", "y": "<u2", "t": "<i8", "p": "|u1"}
+"""Types of the arrays. x and y of compensated events are float32."""
+
+
+def write_npz(part: Path, blocks: Iterable[Events], about: Outline) -> None:
+    """Write all events."""
+    columns, count = COLUMNS, 0
+    with scratch_folder(part.parent) as folder:
+        with contextlib.ExitStack() as opened:
+            files = {name: opened.enter_context((folder / name).open("wb")) for name in COLUMNS}
+            for events in blocks:
+                columns = COLUMNS if events.whole_pixels else {**COLUMNS, "x": "<f4", "y": "<f4"}
+                count += len(events)
+                for name, dtype in columns.items():
+                    files[name].write(np.ascontiguousarray(getattr(events, name), dtype).data)
+        with zipfile.ZipFile(part, "x") as archive:
+            for name, dtype in columns.items():
+                with (
+                    archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member,
+                    (folder / name).open("rb") as column,
+                ):
+                    header = {"descr": dtype, "fortran_order": False, "shape": (count,)}
+                    npy.write_array_header_1_0(member, header)
+                    shutil.copyfileobj(column, member, 1 << 20)
+            for name in ("width", "height"):
+                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w") as member:
+                    npy.write_array(member, np.array(getattr(about, name)))
+
+
+# Reader of the ``.bin`` files of N-MNIST and N-Caltech101: events of 5 bytes, without a header.
+#
+# The bytes are x, y, and 24 bits, big-endian: the polarity (1 is ON) and 23 bits of the time [us]. In some of these
+# files an event with y = 240 is no event but a mark: 2**13 us are added to the times after it. The data sets have 34 or
+# up to 180 rows. Such marks are counted and dropped, as by the data sets' own reader.
+
+MARK_US = 1 << 13
+"""Time between two marks [us]."""
+FRAMES = ((34, 34), (240, 180), (304, 240))
+"""Frames [px]: N-MNIST, N-Caltech101, and the camera of both."""
+
+
+def open_bin(path: Path) -> Recording:
+    """Open a file of 5-byte events."""
+    with errors_name(path, lambda: "opening"), open_input(path) as file:
+        if not looks_like_bin(file.read(4096), path.stat().st_size):
+            raise AmiwarpError("does not hold events of 5 bytes in the order of time; give another file")
+    events = FileEvents(path, partial(_bin_packets, path), size=None, sensors=FRAMES)
+    return Recording(events=events, metadata={"format": "bin", **events.metadata}, name=path.stem)
+
+
+def _bin_packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
+    marks = 0
+    for data in read_pieces(path, 0, BIN_EVENT_BYTES * DEFAULT_BLOCK, notes):
+        x, y, t, p = bin_columns(np.frombuffer(data, np.uint8))
+        is_mark = y == BIN_MARK_ROW
+        t = t + (marks + np.cumsum(is_mark)) * MARK_US
+        marks += int(np.count_nonzero(is_mark))
+        notes["overflow_marks"] = marks
+        yield x[~is_mark], y[~is_mark], t[~is_mark], p[~is_mark]
