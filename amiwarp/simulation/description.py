@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MetadataValue
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.motion import LONGEST_S, CameraMotion, EncoderModel, PrismMotion
 from amiwarp.simulation.pictures import linear_luminance, read_picture
@@ -136,7 +137,7 @@ class SimulationValues:
     duration_s: float
     """Duration of the recording [s]."""
     motion: PrismMotion = field(default_factory=PrismMotion)
-    """Motion of the prism: speed, phase and tilt."""
+    """Motion of the prism: speed, phase, tilt, cylinder power and wobble."""
     camera_motion: CameraMotion = field(default_factory=CameraMotion)
     """Rotation of the camera; by default none."""
     sensor: SensorModel = field(default_factory=SensorModel)
@@ -171,3 +172,9 @@ class SimulationValues:
     def duration_us(self) -> int:
         """Duration of the recording, rounded [us]."""
         return round(self.duration_s * 1e6)
+
+    @property
+    def true_model(self) -> ExactModel:
+        """True optical model of the prism."""
+        motion = self.motion
+        return ExactModel(self.camera, self.prism, motion.phase, motion.tilt, motion.cylinder, motion.wobble)

@@ -19,7 +19,7 @@ from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.kernels import event_keys as readout
 from amiwarp.kernels import launch as launching
 from amiwarp.optics.camera import camera_params
-from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
+from amiwarp.optics.models import axis_rotation, wrap_angle
 from amiwarp.simulation.description import SimulationValues
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.scenery import MapRing, place_scene, seen_bearings, step_us
@@ -293,9 +293,7 @@ class Engine:
         self._sensor = sensor_params(simulation.sensor, self._step)
         self._view = prism_view.View()
         self._view.camera = camera_params(simulation.camera, str(self._device))
-        self._view.prism = ExactModel(simulation.camera, simulation.prism, 0.0, simulation.motion.tilt).params(
-            self._device
-        )
+        self._view.prism = simulation.true_model.params(self._device)
         if self._maps is not None:
             self._view.width, self._view.height = self._maps.placement.width, self._maps.placement.height
         sensor = simulation.sensor

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
-from amiwarp.optics.prism import check_phase, check_tilt
+from amiwarp.optics.prism import check_angles, check_phase
 from amiwarp.validation import INT64, array, guarded, real, whole
 
 ROTATION_INTERVAL = 1e-3
@@ -46,11 +46,16 @@ class PrismMotion:
     """Azimuth of the prism's tilt at encoder angle 0, θ_b [rad]."""
     tilt: tuple[float, float] = (0.0, 0.0)
     """Tilt of the axis of rotation about the camera's x and y axes [rad], as in :class:`amiwarp.ExactModel`."""
+    cylinder: tuple[float, float] = (0.0, 0.0)
+    """Cylinder power of the tilted face, which turns with the prism [rad], as in :class:`amiwarp.ExactModel`."""
+    wobble: tuple[float, float] = (0.0, 0.0)
+    """Wobble of the prism about the axis of rotation [rad], as in :class:`amiwarp.ExactModel`."""
 
     def __post_init__(self) -> None:
         _check_table("prism speed", self._table())
         object.__setattr__(self, "phase", check_phase(self.phase, "prism phase"))
-        object.__setattr__(self, "tilt", check_tilt(self.tilt))
+        for name in ("tilt", "cylinder", "wobble"):
+            object.__setattr__(self, name, check_angles(getattr(self, name), name))
 
     @classmethod
     def from_function(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,7 +13,6 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import prism_view
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import camera_params
-from amiwarp.optics.models import ExactModel
 from amiwarp.simulation.description import Scene, SimulationValues
 from amiwarp.simulation.pictures import Placement, log_map, place_picture
 
@@ -115,7 +114,7 @@ def image_motion(simulation: SimulationValues) -> ImageMotion:
     )
     turns = 72
     theta = np.linspace(0.0, 2.0 * np.pi, turns + 1)
-    model = ExactModel(camera, simulation.prism, 0.0, simulation.motion.tilt)
+    model = replace(simulation.true_model, phase=0.0)
     xy = wp.array(np.repeat(grid, turns + 1, axis=0).astype(np.float32), dtype=wp.vec2, device=device)
     angles = wp.array(np.tile(theta, len(grid)).astype(np.float32), dtype=float, device=device)
     path = model.compensate_points(xy, angles).numpy().reshape(len(grid), turns + 1, 2)
@@ -158,7 +157,7 @@ def seen_bearings(simulation: SimulationValues) -> NDArray[np.float64]:
     xy = wp.array(np.repeat(border, 24, axis=0).astype(np.float32), dtype=wp.vec2, device=device)
     angles = wp.array(np.tile(theta, len(border)).astype(np.float32), dtype=float, device=device)
     out = wp.empty(len(xy), dtype=wp.vec3, device=device)
-    prism = ExactModel(camera, simulation.prism, 0.0, simulation.motion.tilt).params(device)
+    prism = simulation.true_model.params(device)
     inputs = [camera_params(camera, str(wp.get_device(device))), prism, xy, angles]
     launch(prism_view.scene_bearings, len(xy), inputs, [out], device=device)
     bearings = out.numpy().astype(np.float64)

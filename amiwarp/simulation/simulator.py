@@ -46,8 +46,11 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
         "index": simulation.prism.index,
         "phase": simulation.motion.phase,
         **clock,
-        "tilt_x": simulation.motion.tilt[0],
-        "tilt_y": simulation.motion.tilt[1],
+        **{
+            f"{name}_{axis}": angle
+            for name in ("tilt", "cylinder", "wobble")
+            for axis, angle in zip("xy", getattr(simulation.motion, name), strict=True)
+        },
         **{name: value for name, value in omega.items() if math.isfinite(value)},
         **asdict(simulation.sensor),
     }
@@ -111,7 +114,8 @@ class Simulation(SimulationValues):
         Simulation
             The same scene, sensor and seed with an apex angle of 0. Its recording has neither encoder nor prism.
         """
-        return replace(self, prism=replace(self.prism, apex=0.0), nominal_prism=None, encoder_model=None)
+        prism, motion = replace(self.prism, apex=0.0), replace(self.motion, cylinder=(0.0, 0.0))
+        return replace(self, prism=prism, motion=motion, nominal_prism=None, encoder_model=None)
 
     def encoder(self) -> Encoder | None:
         """Sample the prism's encoder.

@@ -89,12 +89,11 @@ class TruthRenderer:
             positions of the joints.
         """
         t = t_us * 1e-6
-        scene, camera, motion = self._scene, self._simulation.camera, self._simulation.motion
+        scene, camera, model = self._scene, self._simulation.camera, self._simulation.true_model
         (rotation,), (position,) = scene.trajectory.poses([t])
         self._world.set_instants(np.array([t]))
-        model = ExactModel(camera, self._simulation.prism, motion.phase, motion.tilt)
         pixels = camera.rays_to_pixels(self._rays)
-        theta = np.full(len(pixels), wrap_angle(motion.angle([t_us]))[0])
+        theta = np.full(len(pixels), wrap_angle(self._simulation.motion.angle([t_us]))[0])
         bare = surfaces_at(self._world, self._rays, rotation, position)
         places = model.compensate_points(pixels, theta)
         through = surfaces_at(self._world, camera.pixels_to_rays(places), rotation, position)
@@ -170,9 +169,11 @@ class TruthRenderer:
     def _intensity(self, t_us: int, *, prism: bool) -> NDArray[np.float32]:
         """Return the luminance of all pixels at a time, through the prism or without the prism, shape (n,)."""
         simulation, device = self._simulation, self._world.device
-        given = simulation.prism if prism else replace(simulation.prism, apex=0.0)
+        model = simulation.true_model
+        if not prism:
+            model = replace(model, prism=replace(model.prism, apex=0.0), cylinder=(0.0, 0.0))
         view = prism_view.View()
-        view.prism = ExactModel(simulation.camera, given, 0.0, simulation.motion.tilt).params(device)
+        view.prism = model.params(device)
         self._sight.set_instants(np.array([float(t_us)]), view)
         angle = simulation.motion.phase + float(simulation.motion.angle([t_us])[0])
         table: NDArray[Any] = np.zeros(1, cast("Any", prism_view.Step).numpy_dtype())
