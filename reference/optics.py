@@ -152,14 +152,48 @@ def through_prism(prism: Prism, rays: Array, phi: Array, *, to_scene: bool) -> A
     ``to_scene``: from the observed bearing to the scene's. Otherwise back, which is the same trace from the other side,
     because light paths are reversible. NaN after total internal reflection or if the ray misses a face.
     """
-    flat = np.tile([0.0, 0.0, 1.0], (len(phi), 1))
     s, c = np.sin(prism.apex), np.cos(prism.apex)
     tilted = np.stack([s * np.cos(phi), s * np.sin(phi), np.full(len(phi), c)], axis=1)
+    return through_faces(prism, rays, tilted, to_scene=to_scene)
+
+
+def through_faces(prism: Prism, rays: Array, tilted: Array, *, to_scene: bool) -> Array:
+    """Trace bearings (n, 3) as :func:`through_prism` does, with the unit normals (n, 3) of the tilted face."""
+    flat = np.tile([0.0, 0.0, 1.0], (len(rays), 1))
     first_is_tilted = (prism.flat_side is FlatSide.SCENE) == to_scene
     faces = (tilted, flat) if first_is_tilted else (flat, tilted)
     inside = refract(np.where(rays[:, 2:] > 0.0, rays, np.nan), faces[0], 1.0 / prism.index)
     out = refract(inside, faces[1], prism.index)
     return np.where(out[:, 2:] > 0.0, out, np.nan)
+
+
+def tipped(towards: tuple[float, float]) -> Array:
+    """Return the smallest rotation (3, 3) that takes z to the direction of (x, y, 1)."""
+    axis = np.array([*towards, 1.0]) / np.linalg.norm([*towards, 1.0])
+    x, y, z = axis
+    cross = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1.0 + z)
+
+
+def through_uneven_prism(
+    prism: Prism, rays: Array, phi: Array, *, to_scene: bool, cylinder: tuple[float, float], wobble: tuple[float, float]
+) -> Array:
+    """Trace bearings (n, 3) as :func:`through_prism` does, in the frame of each angle.
+
+    The prism is tipped by ``wobble``. The slope of its tilted face at the point that a camera's ray meets is that of
+    the apex and the cylinder matrix times the ray's tangents.
+    """
+    c, s, zero = np.cos(phi), np.sin(phi), np.zeros_like(phi)
+    turned = np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1.0]]).transpose(2, 0, 1) @ tipped(wobble)
+    local = np.einsum("nji,nj->ni", turned, rays)
+    power = np.array([[cylinder[0], cylinder[1]], [cylinder[1], -cylinder[0]]])
+    out = local
+    for _ in range(1 if to_scene else 60):
+        tangent = (local if to_scene else out)[:, :2] / (local if to_scene else out)[:, 2:]
+        normal = np.column_stack([np.array([np.tan(prism.apex), 0.0]) + tangent @ power, np.ones(len(rays))])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        out = through_faces(prism, local, normal, to_scene=to_scene)
+    return np.einsum("nij,nj->ni", turned, out)
 
 
 def rotation(tilt: tuple[float, float]) -> Array:
@@ -177,11 +211,16 @@ def move(
     to_scene: bool,
     phase: float = 0.0,
     tilt: tuple[float, float] = (0.0, 0.0),
+    cylinder: tuple[float, float] = (0.0, 0.0),
+    wobble: tuple[float, float] = (0.0, 0.0),
 ) -> Array:
     """Return compensated (``to_scene``) or deflected pixels (n, 2)."""
     axis = rotation(tilt)
-    rays = pixels_to_rays(camera, xy) @ axis
-    out = through_prism(prism, rays, np.asarray(theta, dtype=np.float64) + phase, to_scene=to_scene)
+    rays, phi = pixels_to_rays(camera, xy) @ axis, np.asarray(theta, dtype=np.float64) + phase
+    if any((*cylinder, *wobble)):
+        out = through_uneven_prism(prism, rays, phi, to_scene=to_scene, cylinder=cylinder, wobble=wobble)
+    else:
+        out = through_prism(prism, rays, phi, to_scene=to_scene)
     return rays_to_pixels(camera, out @ axis.T)
 
 

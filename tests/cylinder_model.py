@@ -10,7 +10,7 @@ import warp as wp
 
 from amiwarp import Camera, ExactModel, Model, Parameter, Prism
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
-from amiwarp.kernels.refraction import ExactParams, compensate_direction, deflect, refract_through_prism, trace
+from amiwarp.kernels.refraction import ExactParams, compensate_direction, deflect, deflect_direction
 from amiwarp.optics.models import MODELS, PHASE, phase_values, struct_of
 from amiwarp.validation import guarded
 
@@ -32,42 +32,43 @@ class CylinderParams:
 def compensate_direction(model: CylinderParams, x: float, y: float, z: float, w0: float, w1: float):  # noqa: F811
     """Return the direction without the prism: undo the scale, then the refraction."""
     along = (w0 * x + w1 * y) * (1.0 / model.gain - 1.0)
-    return refract_through_prism(model.prism, x + along * w0, y + along * w1, z, w0, w1, model.prism.flat_to_scene)
+    return compensate_direction(model.prism, x + along * w0, y + along * w1, z, w0, w1)
 
 
 @wp.func
 def deflect(model: CylinderParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:  # noqa: F811
     """Return the observed pixel: refract, then scale."""
-    ray = trace(model.prism, pixel_to_ray(camera, xy), w, 1 - model.prism.flat_to_scene)
-    along = (w[0] * ray[0] + w[1] * ray[1]) * (model.gain - 1.0)
-    return ray_to_pixel(camera, wp.vec3(ray[0] + along * w[0], ray[1] + along * w[1], ray[2]))
+    ray = pixel_to_ray(camera, xy)
+    x, y, z = deflect_direction(model.prism, ray[0], ray[1], ray[2], w[0], w[1])
+    along = (w[0] * x + w[1] * y) * (model.gain - 1.0)
+    return ray_to_pixel(camera, wp.vec3(x + along * w[0], y + along * w[1], z))
 
 
 @guarded
 @dataclass(frozen=True)
 class CylinderModel(Model):
-    """Wedge with cylinder power: the exact model, scaled by 1 + cylinder along the azimuth of the tilt."""
+    """Wedge with cylinder power: the exact model, scaled by 1 + power along the azimuth of the tilt."""
 
     NAME, TEXT, NUMBERS, STRUCT = "cylinder", "wedge with cylinder", "3", CylinderParams
     PARAMETERS = (
         Parameter("apex", "rad"),
         PHASE,
-        Parameter("cylinder", "1", 0.1, limits=(-0.5, 0.5), label="cylinder power", slider=(-0.1, 0.1, 0.001)),
+        Parameter("power", "1", 0.1, limits=(-0.5, 0.5), label="cylinder power", slider=(-0.1, 0.1, 0.001)),
     )
 
     camera: Camera
     prism: Prism
     phase: float = 0.0
-    cylinder: float = 0.0
+    power: float = 0.0
 
     @classmethod
     def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
         wedge = Prism(values["apex"], prism.index, prism.flat_side)
-        return cls(camera, wedge, values["phase"], values.get("cylinder", 0.0))
+        return cls(camera, wedge, values["phase"], values.get("power", 0.0))
 
     def kernel_values(self) -> tuple[Any, ...]:
         exact = ExactModel(self.camera, self.prism, self.phase)
-        return exact.kernel_values(), *phase_values(self.phase), 1.0 + self.cylinder
+        return exact.kernel_values(), *phase_values(self.phase), 1.0 + self.power
 
     def params(self, device: Any) -> Any:
         exact = ExactModel(self.camera, self.prism, self.phase).params(device)

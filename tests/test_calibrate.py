@@ -160,6 +160,21 @@ def test_tilt_is_found(texture: np.ndarray) -> None:
     assert c.parameters["tilt_y"] == pytest.approx(-0.03, abs=0.02)
 
 
+@pytest.mark.parametrize(("name", "x", "y"), [("cylinder", 0.008, -0.005), ("wobble", 0.06, -0.04)])
+def test_an_uneven_prism_is_found(texture: np.ndarray, name: str, x: float, y: float) -> None:
+    camera = Camera.from_fov(200, 150, math.radians(80))
+    motion = replace(PrismMotion(720.0, phase=0.3), **{name: (x, y)})
+    recording = simulate(
+        texture, camera, Prism(math.radians(4)), duration_s=0.17, motion=motion, sensor=SensorModel.ideal(0.25)
+    )
+    c = calib.calibrate(recording, free=("apex", "phase", f"{name}_x", f"{name}_y"), model="exact")
+    assert c.parameters[f"{name}_x"] == pytest.approx(x, rel=0.02)
+    assert c.parameters[f"{name}_y"] == pytest.approx(y, rel=0.02)
+    assert c.warnings == ()
+    assert recording.truth is not None
+    assert model_error(c.model, truth_model(camera, recording.truth, FlatSide.SCENE)).rms < 0.01
+
+
 def test_index_can_be_free_and_is_hardly_determined(recording: Recording) -> None:
     """At equal deflection, another index moves events by hundredths of a pixel only."""
     c = calibrate(recording, free=("apex", "phase", "index"), events=200_000, local_evaluations=300)

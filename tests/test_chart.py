@@ -90,16 +90,17 @@ def charted(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> t
 
 
 @pytest.mark.parametrize("side", list(FlatSide))
+@pytest.mark.parametrize("uneven", [{}, {"cylinder": (0.01, -0.02)}, {"cylinder": (0.0, 0.01), "wobble": (0.05, 0.03)}])
 @pytest.mark.parametrize(
     ("distortion", "bar"), [(None, 1e-9), (RadialTangential(-0.2, 0.05, 1e-3, -5e-4), 1e-3)], ids=["pinhole", "lens"]
 )
-def test_exact_places_are_those_of_the_trace(side: FlatSide, distortion: Any, bar: float) -> None:
+def test_exact_places_are_those_of_the_trace(side: FlatSide, uneven: Any, distortion: Any, bar: float) -> None:
     camera = Camera.from_fov(320, 240, math.radians(70.0), distortion)
-    model = ExactModel(camera, Prism(math.radians(3.0), 1.6, side), 0.7, (0.02, -0.03))
+    model = ExactModel(camera, Prism(math.radians(3.0), 1.6, side), 0.7, (0.02, -0.03), **uneven)
     rng = np.random.default_rng(0)
     xy = np.stack([rng.integers(0, 320, 2000), rng.integers(0, 240, 2000)], axis=1).astype(np.float64)
     theta = rng.uniform(-10.0, 10.0, 2000)
-    expected = oracle.move(camera, model.prism, xy, theta, to_scene=True, phase=model.phase, tilt=model.tilt)
+    expected = oracle.move(camera, model.prism, xy, theta, to_scene=True, phase=model.phase, tilt=model.tilt, **uneven)
     assert np.isfinite(expected).all()
     np.testing.assert_allclose(exact_places(model, xy, theta), expected, rtol=0.0, atol=bar)
 

@@ -174,11 +174,13 @@ def test_simulate_takes_every_fault_of_sensor_and_encoder(place: Path) -> None:
         "simulate", "faulty.h5", "--picture", "photo.jpg", "--size", "64x48", "--duration", "0.1", "--ideal",
         "--contrast-on", "0.3", "--shot-noise-hz", "2", "--counts-per-turn", "0", "--rate-hz", "500",
         "--speed", "speed.csv", "--tilt-deg", "1,-0.5", "--rotate-deg-s", "0,5,0", "--flat-side", "camera",
+        "--cylinder-deg", "0.1,-0.2", "--wobble-deg", "0,1.5",
     )  # fmt: skip
     data = ok("info", "faulty.h5")
     truth = data["truth"]
     assert (truth["contrast_on"], truth["contrast_off"], truth["shot_noise_hz"], truth["leak_hz"]) == (0.3, 0.25, 2, 0)
-    assert truth["tilt_y_deg"] == pytest.approx(-0.5, abs=1e-9)
+    angles = ("tilt_y_deg", "cylinder_x_deg", "cylinder_y_deg", "wobble_x_deg", "wobble_y_deg")
+    assert [truth[name] for name in angles] == pytest.approx([-0.5, 0.1, -0.2, 0.0, 1.5], abs=1e-9)
     assert truth["omega_y"] == pytest.approx(np.radians(5.0), abs=1e-9)
     assert data["prism"]["flat_side"] == "camera"
     assert data["encoder"]["rpm"] == pytest.approx(720.0, abs=3.0)
@@ -363,6 +365,7 @@ BAD = [
     (("simulate", "out.h5", "--picture", "photo.jpg", "--apex-deg", "45"), "apex"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--mismatch", "7"), "mismatch"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--tilt-deg", "1"), "--tilt-deg"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--cylinder-deg", "1"), "--cylinder-deg"),
     (("simulate", "nowhere/out.h5", "--picture", "photo.jpg", "--size", "64x48", "--duration", "0.01"), "nowhere"),
     (("translate", "missing.mp4", "out.h5"), "missing.mp4"),
     (("translate", "notes.txt", "out.h5"), "notes.txt"),

@@ -24,13 +24,13 @@ from tests.conftest import TRUE_PHASE, TRUE_PRISM
 
 CYLINDER = 0.03
 """True cylinder power: 3 px at the image's border."""
-VALUES = {"apex": TRUE_PRISM.apex, "phase": TRUE_PHASE, "cylinder": CYLINDER}
+VALUES = {"apex": TRUE_PRISM.apex, "phase": TRUE_PHASE, "power": CYLINDER}
 MOST_FILES = 6
 """Largest number of files of the package that know a model by name."""
 LOADED = """
 import tests.cylinder_model
 from amiwarp.viewer import layout
-print(layout.SLIDERS["cylinder"], 'name="cylinder"' in layout.template())
+print(layout.SLIDERS["power"], 'name="power"' in layout.template())
 """
 
 
@@ -95,10 +95,10 @@ def test_it_is_calibrated_stored_and_compensated(
 ) -> None:
     given = seen_through_cylinder(recording)
     settings = amiwarp.Settings(
-        model="cylinder", free=("apex", "phase", "cylinder"), events=100_000, stages=("sharpness",)
+        model="cylinder", free=("apex", "phase", "power"), events=100_000, stages=("sharpness",)
     )
     found = amiwarp.calibrate(given, settings, device=device)
-    assert found.parameters["cylinder"] == pytest.approx(CYLINDER, abs=0.004)
+    assert found.parameters["power"] == pytest.approx(CYLINDER, abs=0.004)
     assert found.parameters["apex"] == pytest.approx(TRUE_PRISM.apex, rel=0.03)
     plain = amiwarp.calibrate(given, replace(settings, model="exact", free=None), device=device)
     assert found.sharpness_after > 1.05 * plain.sharpness_after
@@ -114,10 +114,10 @@ def test_it_is_calibrated_stored_and_compensated(
 
 
 def test_programs_list_its_parameter(cylinder: Any, tmp_path: Path) -> None:
-    assert units()["cylinder"] == "1"
+    assert units()["power"] == "1"
     assert "cylinder" not in rungs()
     said = CliRunner().invoke(app, ["calibrate", str(tmp_path / "no.h5"), "--start", "nothing=1"]).stderr
-    assert ", cylinder, " in said
+    assert ", power, " in said
     printed = subprocess.run(
         [sys.executable, "-c", LOADED],
         cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True,
@@ -126,7 +126,8 @@ def test_programs_list_its_parameter(cylinder: Any, tmp_path: Path) -> None:
 
 
 def test_nothing_is_left_of_it() -> None:
-    assert "cylinder" not in {*MODELS, *units()}
+    assert "cylinder" not in MODELS
+    assert "power" not in units()
     with pytest.raises(amiwarp.AmiwarpError, match="model is 'cylinder'; choose among auto, circle, exact"):
         amiwarp.Settings(model="cylinder").check()
 

@@ -115,6 +115,75 @@ def test_exact_model_meets_the_two_interface_trace(device: str, side: FlatSide, 
     assert distance(model.deflect_points(points, angles).numpy(), expected).max() < ATOL
 
 
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("lens", [None, BARREL], ids=str)
+@pytest.mark.parametrize(
+    "uneven",
+    [
+        {"cylinder": (0.01, -0.007)},
+        {"wobble": (0.05, -0.03)},
+        {"cylinder": (0.02, 0.02), "wobble": (-0.04, 0.09), "tilt": (0.02, -0.03)},
+    ],
+    ids=str,
+)
+def test_an_uneven_prism_meets_the_two_interface_trace(device: str, side: FlatSide, lens: Any, uneven: Any) -> None:
+    cam, wedge = camera(70.0, lens), Prism(math.radians(4.0), 1.55, side)
+    model = ExactModel(cam, wedge, 0.7, **uneven)
+    xy, theta = samples(cam)
+    points, angles = on(device, xy, theta)
+    seen = model.compensate_points(points, angles)
+    assert distance(seen.numpy(), oracle.move(cam, wedge, xy, theta, to_scene=True, phase=0.7, **uneven)).max() < ATOL
+    assert distance(model.deflect_points(seen, angles).numpy(), xy).max() < ATOL
+    expected = oracle.move(cam, wedge, xy, theta, to_scene=False, phase=0.7, **uneven)
+    assert distance(model.deflect_points(points, angles).numpy(), expected).max() < ATOL
+
+
+def test_cylinder_power_stretches_along_the_wedge_and_turns_with_it() -> None:
+    """Thin: a ray of tangent t is shifted by (n − 1) C t more, with C in the frame of the wedge."""
+    cam, power, theta = Camera(801, 801, 800.0, 800.0, 400.0, 400.0), 1e-3, 0.6
+    along = np.array([math.cos(theta), math.sin(theta)])
+    across = np.array([-along[1], along[0]])
+    tangent = 0.1
+    for (x, y), shift in (((power, 0.0), along), ((0.0, power), across)):
+        models = [ExactModel(cam, Prism(1e-3, 1.5), cylinder=c) for c in ((x, y), (0.0, 0.0))]
+        xy = [400.0, 400.0] + 800.0 * tangent * along[None]
+        got, even = (m.compensate_points(xy, np.array([theta])) for m in models)
+        np.testing.assert_allclose((got - even)[0], 800.0 * 0.5 * power * tangent * shift, rtol=0.03, atol=2e-4)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_a_wobble_at_one_angle_is_a_tilt(side: FlatSide) -> None:
+    """At φ = 0, a wobble by one small angle is the tilt of the whole axis by it; at φ = 180° it is the opposite one."""
+    cam, wedge, angle = camera(), prism(2.0, side), 0.03
+    xy, _ = samples(cam, 500)
+    for wobble, tilt in (((angle, 0.0), (0.0, angle)), ((0.0, angle), (-angle, 0.0))):
+        leaning = ExactModel(cam, wedge, wobble=(math.tan(wobble[0]), math.tan(wobble[1])))
+        for theta, sign in ((0.0, 1.0), (math.pi, -1.0)):
+            at = np.full(len(xy), theta)
+            expected = ExactModel(cam, wedge, tilt=(sign * tilt[0], sign * tilt[1])).compensate_points(xy, at)
+            assert distance(leaning.compensate_points(xy, at), expected).max() < ATOL
+
+
+@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.02, -0.03)], ids=str)
+@pytest.mark.parametrize("side", SIDES)
+def test_an_uneven_prism_of_smallest_angles_is_the_even_one(side: FlatSide, tilt: tuple[float, float]) -> None:
+    """The rare case meets the usual one; without a wedge or a slope nothing moves."""
+    cam = camera(90.0)
+    xy, theta = samples(cam, 500)
+    even = ExactModel(cam, prism(2.0, side), 0.3, tilt)
+    uneven = replace(even, cylinder=(1e-9, -1e-9), wobble=(1e-9, 1e-9))
+    for name in ("compensate_points", "deflect_points"):
+        assert distance(getattr(even, name)(xy, theta), getattr(uneven, name)(xy, theta)).max() < 5e-4
+    flat = replace(uneven, prism=Prism(0.0, 1.5, side))
+    assert distance(flat.compensate_points(xy, theta), xy).max() < 5e-4
+    still = ExactModel.from_values(
+        cam,
+        prism(2.0, side),
+        ExactModel.still_values({"apex": 0.03, "phase": 0.1, "cylinder_x": 0.02, "wobble_y": 0.1}),
+    )
+    assert distance(still.compensate_points(xy, theta), xy).max() < 5e-4
+
+
 @pytest.mark.parametrize(("side", "sign"), [(FlatSide.SCENE, 1.0), (FlatSide.CAMERA, -1.0)])
 @pytest.mark.parametrize("theta", [0.0, math.pi / 2, -2.0])
 def test_axis_is_moved_along_the_tilt(side: FlatSide, sign: float, theta: float) -> None:
@@ -531,6 +600,7 @@ def test_wrap_angle_before_rounding() -> None:
     [
         ExactModel(Camera(20, 10, 30.0, 30.0, 9.5, 4.5), Prism(0.03), 0.7),
         ExactModel(Camera(20, 10, 30.0, 30.0, 9.5, 4.5), Prism(0.03, 1.6, FlatSide.CAMERA), -2.7, (0.02, -0.01)),
+        ExactModel(Camera(20, 10, 30.0, 30.0, 9.5, 4.5), Prism(0.03), 0.7, (0.02, 0.0), (0.01, -0.02), (-0.03, 0.04)),
         CircleModel(Camera(20, 10, 30.0, 30.0, 9.5, 4.5), 0.013, 1.1),
         RadialCircleModel(Camera(20, 10, 30.0, 30.0, 9.5, 4.5), 0.013, 1.1, 1.6, FlatSide.CAMERA),
     ],
@@ -546,6 +616,10 @@ def test_kernel_values_are_the_fields_of_the_struct(model: ExactModel | CircleMo
         apex, tilted = model.prism.apex, any(model.tilt)
         expected |= {"sin_apex": math.sin(apex), "cos_apex": math.cos(apex), "index2": model.prism.index**2}
         expected |= {"flat_to_scene": (1 + side) / 2, "tilted": int(tilted)}
+        angle, (x, y) = math.atan(math.hypot(*model.wobble)), model.wobble
+        expected |= {"uneven": int(angle > 0.0), "cylinder_x": model.cylinder[0], "cylinder_y": model.cylinder[1]}
+        expected |= {"wobble_sine": math.sin(angle), "wobble_versine": 1.0 - math.cos(angle)}
+        expected |= {"wobble_cos": x / math.tan(angle) if angle else 1.0, "wobble_sin": y / math.tan(angle or 1.0)}
         assert np.allclose(row["axis"][0], np.eye(3), atol=1e-9) != tilted
     elif isinstance(model, CircleModel):
         expected |= {"sine": side * math.sin(model.deflection), "versine": 1.0 - math.cos(model.deflection)}

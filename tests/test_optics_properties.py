@@ -75,6 +75,8 @@ def prisms(draw: st.DrawFn) -> Prism:
 
 
 tilts = st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05))
+cylinders = st.tuples(st.floats(-0.02, 0.02), st.floats(-0.02, 0.02))
+wobbles = st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
 phases = st.floats(-math.pi, math.pi)
 seeds = st.integers(0, 2**32 - 1)
 
@@ -103,6 +105,21 @@ def test_exact_model_is_the_trace(
         got = move(xy, theta)
         assert np.isfinite(expected).all()
         assert distance(got, expected).max() < ATOL
+
+
+@quick
+@given(cam=cameras(), wedge=prisms(), cylinder=cylinders, wobble=wobbles, phase=phases, seed=seeds)
+def test_an_uneven_prism_is_the_trace(
+    cam: Camera, wedge: Prism, cylinder: tuple[float, float], wobble: tuple[float, float], phase: float, seed: int
+) -> None:
+    uneven = {"cylinder": cylinder, "wobble": wobble}
+    model = ExactModel(cam, wedge, phase, **uneven)
+    xy, theta = samples(cam, seed)
+    for to_scene, move in ((True, model.compensate_points), (False, model.deflect_points)):
+        expected = oracle.move(cam, wedge, xy, theta, to_scene=to_scene, phase=phase, **uneven)
+        assert np.isfinite(expected).all()
+        assert distance(move(xy, theta), expected).max() < ATOL
+    assert distance(model.deflect_points(model.compensate_points(xy, theta), theta), xy).max() < ATOL
 
 
 @quick

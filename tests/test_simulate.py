@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from amiwarp import (
     SensorModel,
     Simulation,
     simulate,
+    truth_model,
 )
 from amiwarp.kernels import launch as launching
 from amiwarp.kernels import pixels as kernels
@@ -98,18 +100,19 @@ def test_turning_camera_crosses_a_ramp_at_analytic_times(device: str) -> None:
         np.testing.assert_allclose(found[:n], expected[:n], rtol=0, atol=10.0)  # us; 0.1 px at this speed is 1.7 ms
 
 
+@pytest.mark.parametrize("uneven", [{}, {"cylinder": (0.03, -0.02), "wobble": (0.1, 0.05)}], ids=["even", "uneven"])
 @pytest.mark.parametrize("flat_side", list(FlatSide))
-def test_prism_events_match_an_independent_walk(device: str, flat_side: FlatSide) -> None:
+def test_prism_events_match_an_independent_walk(device: str, flat_side: FlatSide, uneven: Any) -> None:
     """Reference: pixel by pixel, in float64 and steps of 10 us, through the exact model of amiwarp.optics."""
     prism = replace(PRISM, flat_side=flat_side)
-    motion = PrismMotion(-900.0, phase=0.7, tilt=(0.02, -0.01))
+    motion = PrismMotion(-900.0, phase=0.7, tilt=(0.02, -0.01), **uneven)
     recording = simulate(
         ramp(), CAMERA, prism, duration_s=0.05, motion=motion, sensor=SensorModel.ideal(0.03), device=device
     )
     events, _ = everything(recording)
     t = np.arange(0.0, 50000.0, 10.0)
     theta = -900.0 / 60.0 * 2.0 * math.pi * t * 1e-6
-    model = ExactModel(CAMERA, prism, 0.7, (0.02, -0.01))
+    model = ExactModel(CAMERA, prism, 0.7, (0.02, -0.01), **uneven)
     for pixel in ((3, 5), (32, 24), (60, 40)):
         x = model.compensate_points(np.tile(np.array(pixel, np.float64), (len(t), 1)), theta)[:, 0]
         expected = walk(t, SLOPE * (x - CAMERA.cx) / CAMERA.fx, 0.03)
@@ -329,13 +332,17 @@ def stamps(events: Events, key: int) -> list[int]:
 @pytest.mark.parametrize("flat_side", list(FlatSide))
 def test_truth_agrees_with_the_model_and_the_encoder(device: str, flat_side: FlatSide) -> None:
     prism = replace(PRISM, flat_side=flat_side)
-    motion = PrismMotion([[0.0, 300.0], [0.06, 1500.0]], phase=1.1, tilt=(0.01, 0.02))
+    uneven = {"cylinder": (0.01, -0.02), "wobble": (0.03, 0.05)}
+    motion = PrismMotion([[0.0, 300.0], [0.06, 1500.0]], phase=1.1, tilt=(0.01, 0.02), **uneven)
     recording = base(prism=prism, motion=motion, sensor=SensorModel.ideal(), encoder_model=EncoderModel.ideal(),
                      device=device).run()  # fmt: skip
     events, points = everything(recording)
     assert recording.encoder is not None
     xy = np.stack([events.x, events.y], 1).astype(np.float64)
-    found = ExactModel(CAMERA, prism, 1.1, (0.01, 0.02)).compensate_points(xy, recording.encoder.angle_at(events.t))
+    model = ExactModel(CAMERA, prism, 1.1, (0.01, 0.02), **uneven)
+    found = model.compensate_points(xy, recording.encoder.angle_at(events.t))
+    assert recording.truth is not None
+    assert truth_model(CAMERA, recording.truth, flat_side) == model
     assert np.sqrt(np.mean(np.sum((found - points) ** 2, axis=1))) < 0.01  # px
     assert np.linalg.norm(xy - points, axis=1).mean() > 0.5  # px: the prism moves events
 

@@ -458,7 +458,8 @@ class Search:
             # variance, whatever the measure of the search: the paper's J may prefer an image without compensation
             plain = self.settings.sharpness is Sharpness.VARIANCE
             variance = parts if plain else self._objective_by_parts(Sharpness.VARIANCE)
-            points = (best, {**best, "phase": best["phase"] + math.pi}, {**best, space.size_name: 0.0})
+            unmoved = MODELS[space.model].still_values(best)
+            points = (best, {**best, "phase": best["phase"] + math.pi}, unmoved)
             sharp, opposite, still = (variance.each(values) for values in points)
             checks.check_texture(sharp, opposite, still, name)
             # not the border outside the sensor, and as much inside, where the view ends: at most a quarter of it

@@ -170,8 +170,9 @@ class ParameterOptions:
         str | None,
         typer.Option(
             help="Parameters to estimate, separated by commas: apex (or deflection), phase, clock_offset, rpm, tilt_x, "
-            "tilt_y, index, focal_length; motion (or rate_x, rate_y, rate_z) and change_x, change_y, change_z for a "
-            "rotating camera; off_ratio and leak of the sensor. Default: apex,phase, and rpm without an encoder.",
+            "tilt_y, cylinder_x, cylinder_y, wobble_x, wobble_y, index, focal_length; motion (or rate_x, rate_y, "
+            "rate_z) and change_x, change_y, change_z for a rotating camera; off_ratio and leak of the sensor. "
+            "Default: apex,phase, and rpm without an encoder.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None

@@ -255,7 +255,7 @@ def _listed(names: list[str]) -> str:
 
 def _degrees(parameters: dict[str, float]) -> dict[str, float]:
     """Return the true parameters of the prism with angles in degrees, under names that end in ``_deg``."""
-    angles = ("apex", "phase", "tilt_x", "tilt_y")
+    angles = ("apex", "phase", *(f"{name}_{axis}" for name in ("tilt", "cylinder", "wobble") for axis in "xy"))
     return {f"{n}_deg" if n in angles else n: math.degrees(v) if n in angles else v for n, v in parameters.items()}
 
 

@@ -67,6 +67,20 @@ class RigOptions:
     tilt_deg: Annotated[
         str, _in_prism(help="Tilt of the prism's rotation axis about the camera's x and y axes (deg).", metavar="X,Y")
     ] = "0,0"
+    cylinder_deg: Annotated[
+        str,
+        _in_prism(
+            help="Cylinder power of the prism's tilted face, along the wedge and at 45 deg to it (deg per unit of the "
+            "ray's tangent).",
+            metavar="X,Y",
+        ),
+    ] = "0,0"
+    wobble_deg: Annotated[
+        str,
+        _in_prism(
+            help="Wobble of the prism about the rotation axis, along the wedge and across it (deg).", metavar="X,Y"
+        ),
+    ] = "0,0"
 
     def build_camera(self, default: tuple[int, int] = (640, 480)) -> Camera:
         """Return the camera. ``default`` is the size of its image [px] if no option gives one."""
@@ -87,10 +101,17 @@ class RigOptions:
         return replace(self.build_prism(), apex=math.radians(nominal))
 
     def build_motion(self) -> PrismMotion:
-        """Return the prism's motion: speed, phase and tilt."""
-        x, y = (math.radians(v) for v in numbers(self.tilt_deg, 2, "--tilt-deg"))
+        """Return the prism's motion: speed, phase, tilt, cylinder power and wobble."""
+        tilt, cylinder, wobble = (
+            (math.radians(x), math.radians(y))
+            for x, y in (
+                numbers(self.tilt_deg, 2, "--tilt-deg"),
+                numbers(self.cylinder_deg, 2, "--cylinder-deg"),
+                numbers(self.wobble_deg, 2, "--wobble-deg"),
+            )
+        )
         rpm: Any = self.rpm if self.speed is None else _read_speed(self.speed)
-        return PrismMotion(rpm, math.radians(self.phase_deg), (x, y))
+        return PrismMotion(rpm, math.radians(self.phase_deg), tilt, cylinder, wobble)
 
 
 def _read_speed(path: Path) -> list[tuple[float, ...]]:

@@ -335,7 +335,8 @@ class Truth:
     """
 
     parameters: dict[str, float] = field(default_factory=dict)
-    """True parameters by name: apex, phase, tilt_x, tilt_y [rad], index, clock_offset_us [us], and others."""
+    """True parameters by name: apex, phase, tilt, cylinder and wobble in x and y (such as tilt_x) [rad], index,
+    clock_offset_us [us], and others."""
     stored_points: PointStore | None = None
     """Pixel without the prism of each event's scene point [px], shape ``(n, 2)``, float32, or None."""
     stored_causes: EventValues | None = None

@@ -489,8 +489,7 @@ def truth_model(camera: Camera, truth: Truth, flat_side: FlatSide) -> ExactModel
     0.3
     """
     p = truth.parameters
-    prism = Prism(p["apex"], p["index"], flat_side)
-    return ExactModel(camera, prism, p["phase"], (p.get("tilt_x", 0.0), p.get("tilt_y", 0.0)))
+    return ExactModel.from_values(camera, Prism(p["apex"], p["index"], flat_side), p)
 
 
 @guarded

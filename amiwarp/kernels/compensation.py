@@ -14,7 +14,7 @@ from amiwarp.kernels.native_code import (
     store_uint32,
 )
 from amiwarp.kernels.prism_angle import THETA_U32_RAD, EncoderParams, piece_at, theta_u32_at, theta_u32_on
-from amiwarp.kernels.refraction import displace
+from amiwarp.kernels.refraction import displace, even, is_even
 
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -71,6 +71,18 @@ def displace_event(model: Any, camera: Any, azimuths: wp.array(dtype=float), col
 
 
 @wp.func
+def displace_block(
+    model: Any, camera: Any, azimuths: wp.array(dtype=float), columns: Columns, turns: wp.array(dtype=wp.uint32),
+    first: int, xs: wp.array(dtype=float), ys: wp.array(dtype=float),
+):  # fmt: skip
+    """Compute the compensated positions [px] of a block of events."""
+    for k in range(BLOCK):
+        x, y = displace_event(model, camera, azimuths, columns, load_uint32(turns, k), first + k)
+        store_float(xs, k, x)
+        store_float(ys, k, y)
+
+
+@wp.func
 def store_position(size: wp.vec2, columns: Columns, i: int, x: float, y: float):
     """Store a compensated position, and whether it lies on a pixel of an image of ``size`` [px]."""
     across = wp.where(x >= -0.5, wp.where(x < size[0] - 0.5, 1, 0), 0)
@@ -102,10 +114,10 @@ def compensate_blocks(
     else:
         for k in range(BLOCK):
             turns[k] = theta_u32_at(encoder, columns.t[first + k])
-    for k in range(BLOCK):
-        x, y = displace_event(model, camera, azimuths, columns, load_uint32(turns, k), first + k)
-        store_float(xs, k, x)
-        store_float(ys, k, y)
+    if is_even(model) == 1:
+        displace_block(even(model), camera, azimuths, columns, turns, first, xs, ys)
+    else:
+        displace_block(model, camera, azimuths, columns, turns, first, xs, ys)
     for k in range(BLOCK):
         store_position(size, columns, first + k, load_float(xs, k), load_float(ys, k))
 

@@ -8,7 +8,7 @@ import warp as wp
 from amiwarp.kernels.camera import pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.pixels import LAG_ZERO, LARGEST_LAG, LOW_BITS, LOW_MASK, TICKS, Sink
 from amiwarp.kernels.prism_view import Steps, View
-from amiwarp.kernels.refraction import trace
+from amiwarp.kernels.refraction import ray_without_prism
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,7 +48,7 @@ def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.
     angle = steps.angle[k] + steps.turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
     ray = pixel_to_ray(view.camera, wp.vec2(float(col), float(row)))
     w = wp.vec2(wp.cos(angle), wp.sin(angle))
-    block.points[i] = ray_to_pixel(view.camera, trace(view.prism, ray, w, view.prism.flat_to_scene))
+    block.points[i] = ray_to_pixel(view.camera, ray_without_prism(view.prism, ray, w))
 
 
 @wp.kernel

@@ -8,7 +8,7 @@ from amiwarp.kernels.camera import NAN, CameraParams, CameraRotationParams, Pinh
 from amiwarp.kernels.equations import Atlas, Geometry, Pairs
 from amiwarp.kernels.equations_cpu import BLOCK, interpolate
 from amiwarp.kernels.native_code import load_float, load_int, load_uint16, store_float, store_int
-from amiwarp.kernels.refraction import compensate, displace, is_plain, plain
+from amiwarp.kernels.refraction import compensate, displace, even, is_even, is_plain, plain
 
 wp.set_module_options({"enable_backward": False})
 
@@ -225,6 +225,8 @@ def compensate_block(
         drift_block(model, pairs, drift, k, first, x, y)
     if is_plain(model) == 1:
         displace_block(plain(model), camera, pairs, k, first, drifts, x, y)
+    elif is_even(model) == 1:
+        displace_block(even(model), camera, pairs, k, first, drifts, x, y)
     else:
         displace_block(model, camera, pairs, k, first, drifts, x, y)
     if wp.length_sq(camera_rotation.velocity) + wp.length_sq(camera_rotation.acceleration) > 0.0:

@@ -25,7 +25,7 @@ from amiwarp.kernels.native_code import (
     store_float,
     store_int,
 )
-from amiwarp.kernels.refraction import displace, is_plain, plain
+from amiwarp.kernels.refraction import displace, even, is_even, is_plain, plain
 from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, rotate_azimuth
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -118,6 +118,8 @@ def vote_event_blocks(
     y = wp.zeros(shape=(64,), dtype=float)
     if is_plain(model) == 1:
         displace_block(plain(model), camera, events, first, x, y)
+    elif is_even(model) == 1:
+        displace_block(even(model), camera, events, first, x, y)
     else:
         displace_block(model, camera, events, first, x, y)
     vote_block(events, canvas, first, n, x, y, sums)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from amiwarp.kernels.camera import NAN, CameraParams, pixel_to_ray
-from amiwarp.kernels.refraction import ExactParams, trace
+from amiwarp.kernels.refraction import ExactParams, compensate_uneven, ray_without_prism
 
 wp.set_module_options({"enable_backward": False})
 
@@ -122,10 +122,15 @@ def depth_or_nan(depth: float) -> float:
 def see_level(view: View, step: Step, ray: wp.vec3) -> float:
     """Return the log intensity that a bearing, in the prism's frame, sees at an instant; NaN if no light passes."""
     w = step.azimuth
-    along = w[0] * ray[0] + w[1] * ray[1]
-    shift = prism_shift(view.prism, along, ray[2])
-    z = wp.sqrt(ray[2] * ray[2] - shift * (2.0 * along + shift))
-    h = step.to_texel * wp.vec3(ray[0] + shift * w[0], ray[1] + shift * w[1], z)
+    x, y, z = ray[0], ray[1], ray[2]
+    if view.prism.uneven == 1:
+        x, y, z = compensate_uneven(view.prism, x, y, z, w[0], w[1])
+    else:
+        along = w[0] * ray[0] + w[1] * ray[1]
+        shift = prism_shift(view.prism, along, ray[2])
+        x, y = ray[0] + shift * w[0], ray[1] + shift * w[1]
+        z = wp.sqrt(ray[2] * ray[2] - shift * (2.0 * along + shift))
+    h = step.to_texel * wp.vec3(x, y, z)
     depth = depth_or_nan(h[2])
     return level_at(view, step, h[0] / depth, h[1] / depth)
 
@@ -139,6 +144,12 @@ def texels_ahead(prism: ExactParams, m: Instants, ray: wp.vec3) -> TexelCoordina
     """
     met = TexelCoordinates()
     j = int(0)
+    while j < AHEAD and prism.uneven == 1:
+        x, y, z = compensate_uneven(prism, ray[0], ray[1], ray[2], m[0, j], m[1, j])
+        depth = depth_or_nan(m[8, j] * x + m[9, j] * y + m[10, j] * z)
+        met[0, j] = (m[2, j] * x + m[3, j] * y + m[4, j] * z) / depth
+        met[1, j] = (m[5, j] * x + m[6, j] * y + m[7, j] * z) / depth
+        j += 1
     while j < AHEAD:
         along = m[0, j] * ray[0] + m[1, j] * ray[1]
         shift = prism_shift(prism, along, ray[2])
@@ -202,7 +213,7 @@ def scene_bearings(
     """Compute the bearing, in the camera's frame, of the scene point that a pixel sees at tilt azimuth ``theta``."""
     i = start + wp.tid()
     w = wp.vec2(wp.cos(theta[i]), wp.sin(theta[i]))
-    out[i] = trace(prism, pixel_to_ray(camera, xy[i]), w, prism.flat_to_scene)
+    out[i] = ray_without_prism(prism, pixel_to_ray(camera, xy[i]), w)
 
 
 @wp.kernel

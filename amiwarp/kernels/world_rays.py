@@ -4,7 +4,7 @@ import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray
 from amiwarp.kernels.prism_view import Steps, View
-from amiwarp.kernels.refraction import ExactParams, trace
+from amiwarp.kernels.refraction import ExactParams, ray_without_prism
 from amiwarp.kernels.world import (
     FAR,
     NAN,
@@ -41,7 +41,7 @@ class RayView:
 @wp.func
 def look_through(view: RayView, steps: Steps, k: int, x: float, y: float) -> wp.vec3:
     """Return the unit vector in the world's frame along which a point of the image looks at instant ``k``."""
-    ray = trace(view.prism, pixel_to_ray(view.camera, wp.vec2(x, y)), steps.at[k].azimuth, view.prism.flat_to_scene)
+    ray = ray_without_prism(view.prism, pixel_to_ray(view.camera, wp.vec2(x, y)), steps.at[k].azimuth)
     return view.poses[k].rotation * wp.normalize(ray)
 
 

@@ -25,9 +25,9 @@ from amiwarp.optics.prism import (
     NominalPrism,
     Prism,
     apex_from_deflection,
+    check_angles,
     check_index,
     check_phase,
-    check_tilt,
     deflection_from_apex,
 )
 from amiwarp.validation import array, choice, guarded, instance, real, whole
@@ -79,7 +79,7 @@ class Model:
     Examples
     --------
     >>> amiwarp.ExactModel.SIZE, amiwarp.ExactModel.FREE
-    ('apex', ('apex', 'phase', 'tilt_x', 'tilt_y', 'index'))
+    ('apex', ('apex', 'phase', 'tilt_x', 'tilt_y', 'cylinder_x', 'cylinder_y', 'wobble_x', 'wobble_y', 'index'))
     """
 
     NAME: ClassVar[str]
@@ -223,6 +223,22 @@ class Model:
             The model.
         """
         return cls.from_values(camera, prism, {**cls.start_values(prism), PHASE.name: phase})
+
+    @classmethod
+    def still_values(cls, values: Mapping[str, float]) -> dict[str, float]:
+        """Return values with which the model moves no point, and that are else the given ones.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Values by name, in their units.
+
+        Returns
+        -------
+        dict
+            The values, with a size of 0.
+        """
+        return {**values, cls.SIZE: 0.0}
 
     def kernel_values(self) -> tuple[Any, ...]:
         """Return the values of the parameters for kernels, in the order of the fields of :attr:`STRUCT`.
@@ -529,6 +545,17 @@ UPRIGHT_ROWS = np.eye(3)
 """Rotation of a prism axis without tilt: the identity matrix."""
 
 
+def _pair(name: str, half_range: float, limit: float, slider: tuple[float, float]) -> tuple[Parameter, ...]:
+    """Return two parameters, x and y, of one pair of angles; ``slider``: its largest value and step [deg]."""
+    (end, step), limits = slider, (-limit, limit)
+    return tuple(
+        Parameter(
+            f"{name}_{axis}", "rad", half_range, limits=limits, label=f"{name} in {axis}", slider=(-end, end, step)
+        )
+        for axis in "xy"
+    )
+
+
 @guarded
 @dataclass(frozen=True)
 class ExactModel(Model):
@@ -557,13 +584,9 @@ class ExactModel(Model):
     PARAMETERS = (
         Parameter("apex", "rad"),
         PHASE,
-        *(
-            Parameter(
-                f"tilt_{axis}", "rad", math.radians(5.0), limits=(-45.0, 45.0), label=f"tilt in {axis}",
-                slider=(-5.0, 5.0, 0.05),
-            )
-            for axis in "xy"
-        ),
+        *_pair("tilt", math.radians(5.0), 45.0, (5.0, 0.05)),
+        *_pair("cylinder", 0.02, 5.0, (1.0, 0.01)),
+        *_pair("wobble", 0.1, 45.0, (5.0, 0.05)),
         Parameter("index", "1", 0.2, like_size=True, limits=(1.0, 5.0)),
     )  # fmt: skip
 
@@ -575,17 +598,32 @@ class ExactModel(Model):
     """Phase θ_b, added to the encoder's angle [rad]."""
     tilt: tuple[float, float] = (0.0, 0.0)
     """Rotation of the prism's rotation axis about the camera's x, then about its y [rad]."""
+    cylinder: tuple[float, float] = (0.0, 0.0)
+    """Cylinder power of the tilted face: change of its slope per unit of the camera ray's tangent [rad], along the
+    wedge (across it with the opposite sign), and at 45° to it."""
+    wobble: tuple[float, float] = (0.0, 0.0)
+    """Angles by which the prism's own axis is tipped out of the rotation axis, along the wedge and across it [rad].
+    They turn with the prism."""
 
     def __post_init__(self) -> None:
         instance(self.camera, Camera, "camera")
         instance(self.prism, Prism, "prism")
         object.__setattr__(self, "phase", check_phase(self.phase))
-        object.__setattr__(self, "tilt", check_tilt(self.tilt))
+        for name in ("tilt", "cylinder", "wobble"):
+            object.__setattr__(self, name, check_angles(getattr(self, name), name))
 
     @classmethod
     def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
         wedge = Prism(values["apex"], values.get("index", prism.index), prism.flat_side)
-        return cls(camera, wedge, values["phase"], (values.get("tilt_x", 0.0), values.get("tilt_y", 0.0)))
+        tilt, cylinder, wobble = (
+            (values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0)) for name in ("tilt", "cylinder", "wobble")
+        )
+        return cls(camera, wedge, values["phase"], tilt, cylinder, wobble)
+
+    @classmethod
+    def still_values(cls, values: Mapping[str, float]) -> dict[str, float]:
+        flat = {name: 0.0 if name in ("cylinder_x", "cylinder_y") else value for name, value in values.items()}
+        return super().still_values(flat)
 
     def params(self, device: Any) -> Any:
         *numbers, axis = self.kernel_values()
@@ -593,10 +631,12 @@ class ExactModel(Model):
         return struct_of(kernels.ExactParams, [*numbers, matrix])
 
     def kernel_values(self) -> tuple[Any, ...]:
-        tilted = any(self.tilt)
+        tilted, uneven = any(self.tilt), any((*self.cylinder, *self.wobble))
+        azimuth, angle = math.atan2(*reversed(self.wobble)), math.atan(math.hypot(*self.wobble))
         return (
             math.sin(self.prism.apex), math.cos(self.prism.apex), self.prism.index**2, *phase_values(self.phase),
-            int(self.prism.flat_side is FlatSide.SCENE), int(tilted),
+            int(self.prism.flat_side is FlatSide.SCENE), int(tilted or uneven), int(uneven), *self.cylinder,
+            math.cos(azimuth), math.sin(azimuth), math.sin(angle), 2.0 * math.sin(angle / 2.0) ** 2,
             axis_rotation(*self.tilt) if tilted else UPRIGHT_ROWS,
         )  # fmt: skip
 

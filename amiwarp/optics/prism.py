@@ -198,12 +198,12 @@ def check_phase(value: object, what: str = "phase") -> float:
     return real(value, what, -LARGEST_PHASE, LARGEST_PHASE, " rad")
 
 
-def check_tilt(value: object) -> tuple[float, float]:
-    """Return the two tilts of a rotation axis [rad], each below a right angle.
+def check_angles(value: object, what: str) -> tuple[float, float]:
+    """Return two angles [rad], such as the tilts of a rotation axis, each below a right angle.
 
     Raises :class:`AmiwarpError` for others.
     """
-    x, y = vector(value, 2, "tilt", _acute)
+    x, y = vector(value, 2, what, _acute)
     return x, y
 
 

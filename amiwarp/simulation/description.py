@@ -15,7 +15,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.recording import MetadataValue
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import Prism, check_phase, check_tilt
+from amiwarp.optics.models import ExactModel
+from amiwarp.optics.prism import Prism, check_angles, check_phase
 from amiwarp.simulation.pictures import linear_luminance, read_picture
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.validation import INT64, array, guarded, instance, one_of, real, whole
@@ -54,11 +55,16 @@ class PrismMotion:
     """Azimuth of the prism's tilt at encoder angle 0, θ_b [rad]."""
     tilt: tuple[float, float] = (0.0, 0.0)
     """Tilt of the axis of rotation about the camera's x and y axes [rad], as in :class:`amiwarp.ExactModel`."""
+    cylinder: tuple[float, float] = (0.0, 0.0)
+    """Cylinder power of the tilted face, which turns with the prism [rad], as in :class:`amiwarp.ExactModel`."""
+    wobble: tuple[float, float] = (0.0, 0.0)
+    """Wobble of the prism about the axis of rotation [rad], as in :class:`amiwarp.ExactModel`."""
 
     def __post_init__(self) -> None:
         _check_table("prism speed", self._table())
         object.__setattr__(self, "phase", check_phase(self.phase, "prism phase"))
-        object.__setattr__(self, "tilt", check_tilt(self.tilt))
+        for name in ("tilt", "cylinder", "wobble"):
+            object.__setattr__(self, name, check_angles(getattr(self, name), name))
 
     @classmethod
     def from_function(
@@ -624,7 +630,7 @@ class SimulationValues:
     duration_s: float
     """Duration of the recording [s]."""
     motion: PrismMotion = field(default_factory=PrismMotion)
-    """Motion of the prism: speed, phase and tilt."""
+    """Motion of the prism: speed, phase, tilt, cylinder power and wobble."""
     camera_motion: CameraMotion = field(default_factory=CameraMotion)
     """Rotation of the camera; by default none."""
     sensor: SensorModel = field(default_factory=SensorModel)
@@ -659,3 +665,9 @@ class SimulationValues:
     def duration_us(self) -> int:
         """Duration of the recording, rounded [us]."""
         return round(self.duration_s * 1e6)
+
+    @property
+    def true_model(self) -> ExactModel:
+        """True optical model of the prism."""
+        motion = self.motion
+        return ExactModel(self.camera, self.prism, motion.phase, motion.tilt, motion.cylinder, motion.wobble)

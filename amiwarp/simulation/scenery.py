@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -15,7 +15,6 @@ from amiwarp.kernels import prism_view, world_rays
 from amiwarp.kernels import world as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera, camera_params
-from amiwarp.optics.models import ExactModel
 from amiwarp.simulation.description import Scene, SimulationValues
 from amiwarp.simulation.pictures import DARK, Placement, log_map, place_picture
 from amiwarp.simulation.worlds.world import Body, Material, Trajectory, World, WorldScene
@@ -115,7 +114,7 @@ def image_motion(simulation: SimulationValues) -> ImageMotion:
     )
     turns = 72
     theta = np.linspace(0.0, 2.0 * np.pi, turns + 1)
-    model = ExactModel(camera, simulation.prism, 0.0, simulation.motion.tilt)
+    model = replace(simulation.true_model, phase=0.0)
     xy = wp.array(np.repeat(grid, turns + 1, axis=0).astype(np.float32), dtype=wp.vec2, device=device)
     angles = wp.array(np.tile(theta, len(grid)).astype(np.float32), dtype=float, device=device)
     path = model.compensate_points(xy, angles).numpy().reshape(len(grid), turns + 1, 2)
@@ -158,7 +157,7 @@ def seen_bearings(simulation: SimulationValues) -> NDArray[np.float64]:
     xy = wp.array(np.repeat(border, 24, axis=0).astype(np.float32), dtype=wp.vec2, device=device)
     angles = wp.array(np.tile(theta, len(border)).astype(np.float32), dtype=float, device=device)
     out = wp.empty(len(xy), dtype=wp.vec3, device=device)
-    prism = ExactModel(camera, simulation.prism, 0.0, simulation.motion.tilt).params(device)
+    prism = simulation.true_model.params(device)
     inputs = [camera_params(camera, str(wp.get_device(device))), prism, xy, angles]
     launch(prism_view.scene_bearings, len(xy), inputs, [out], device=device)
     bearings = out.numpy().astype(np.float64)

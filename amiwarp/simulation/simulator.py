@@ -89,12 +89,11 @@ class TruthRenderer:
             positions of the joints.
         """
         t = t_us * 1e-6
-        scene, camera, motion = self._scene, self._simulation.camera, self._simulation.motion
+        scene, camera, model = self._scene, self._simulation.camera, self._simulation.true_model
         (rotation,), (position,) = scene.trajectory.poses([t])
         self._world.set_instants(np.array([t]))
-        model = ExactModel(camera, self._simulation.prism, motion.phase, motion.tilt)
         pixels = camera.rays_to_pixels(self._rays)
-        theta = np.full(len(pixels), wrap_angle(motion.angle([t_us]))[0])
+        theta = np.full(len(pixels), wrap_angle(self._simulation.motion.angle([t_us]))[0])
         bare = scenery.surfaces_at(self._world, self._rays, rotation, position)
         places = model.compensate_points(pixels, theta)
         through = scenery.surfaces_at(self._world, camera.pixels_to_rays(places), rotation, position)
@@ -172,9 +171,11 @@ class TruthRenderer:
     def _intensity(self, t_us: int, *, prism: bool) -> NDArray[np.float32]:
         """Return the luminance of all pixels at a time, through the prism or without the prism, shape (n,)."""
         simulation, device = self._simulation, self._world.device
-        given = simulation.prism if prism else replace(simulation.prism, apex=0.0)
+        model = simulation.true_model
+        if not prism:
+            model = replace(model, prism=replace(model.prism, apex=0.0), cylinder=(0.0, 0.0))
         view = prism_view.View()
-        view.prism = ExactModel(simulation.camera, given, 0.0, simulation.motion.tilt).params(device)
+        view.prism = model.params(device)
         self._sight.set_instants(np.array([float(t_us)]), view)
         angle = simulation.motion.phase + float(simulation.motion.angle([t_us])[0])
         table: NDArray[Any] = np.zeros(1, cast("Any", prism_view.Step).numpy_dtype())
@@ -573,9 +574,7 @@ class Engine:
         self._sensor = sensor_params(simulation.sensor, self._step)
         self._view = prism_view.View()
         self._view.camera = camera_params(simulation.camera, str(self._device))
-        self._view.prism = ExactModel(simulation.camera, simulation.prism, 0.0, simulation.motion.tilt).params(
-            self._device
-        )
+        self._view.prism = simulation.true_model.params(self._device)
         if self._maps is not None:
             self._view.width, self._view.height = self._maps.placement.width, self._maps.placement.height
         sensor = simulation.sensor
@@ -790,8 +789,11 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
         "index": simulation.prism.index,
         "phase": simulation.motion.phase,
         **clock,
-        "tilt_x": simulation.motion.tilt[0],
-        "tilt_y": simulation.motion.tilt[1],
+        **{
+            f"{name}_{axis}": angle
+            for name in ("tilt", "cylinder", "wobble")
+            for axis, angle in zip("xy", getattr(simulation.motion, name), strict=True)
+        },
         **{name: value for name, value in omega.items() if math.isfinite(value)},
         **asdict(simulation.sensor),
     }
@@ -855,7 +857,8 @@ class Simulation(SimulationValues):
         Simulation
             The same scene, sensor and seed with an apex angle of 0. Its recording has neither encoder nor prism.
         """
-        return replace(self, prism=replace(self.prism, apex=0.0), nominal_prism=None, encoder_model=None)
+        prism, motion = replace(self.prism, apex=0.0), replace(self.motion, cylinder=(0.0, 0.0))
+        return replace(self, prism=prism, motion=motion, nominal_prism=None, encoder_model=None)
 
     def encoder(self) -> Encoder | None:
         """Sample the prism's encoder.

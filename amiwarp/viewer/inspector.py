@@ -953,12 +953,13 @@ class Inspector:
     def _values(self, knobs: Knobs) -> dict[str, float]:
         """Return the values of the optical model's parameters.
 
-        A prism that does not rotate gets apex 0, so that nothing is compensated.
+        A prism that does not rotate gets apex 0 and no cylinder power, so that nothing is compensated.
         """
-        apex, more = knobs.apex if self.has_encoder or knobs.rpm else 0.0, knobs.calibrated_only
+        turns, more = bool(self.has_encoder or knobs.rpm), knobs.calibrated_only
+        apex = knobs.apex if turns else 0.0
         prism = replace(self.prism, apex=apex, index=more.get("index", self.prism.index))
         kind = MODELS[knobs.model]
-        others = {name: knobs.value(name) or 0.0 for name in SLIDING}
+        others = {name: (knobs.value(name) if turns else None) or 0.0 for name in SLIDING}
         return {**more, **others, kind.SIZE: kind.size_from_apex(apex, prism), "phase": knobs.phase}
 
     def model_of(self, knobs: Knobs, camera: Camera | None = None) -> Model:
@@ -973,7 +974,7 @@ class Inspector:
     @property
     def _unprismed(self) -> Knobs:
         """Parameters that leave all events where they were recorded."""
-        return replace(self.knobs, model="exact", apex=0.0)
+        return replace(self.knobs, model="exact", apex=0.0, others=())
 
     def warped(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
         """Return the model, the events on the device and their drift [us], to vote the events of a window.

@@ -21,8 +21,7 @@ from amiwarp.calib.settings import GAUSS_NEWTON, PhotometricSettings
 from amiwarp.calib.sharpness import reach
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.events import Events
-from amiwarp.events.recording import MemoryEvents, Recording
+from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.iwe import Image
 from amiwarp.kernels.iwe import sum_segments
 from amiwarp.kernels.launch import launch

@@ -86,10 +86,10 @@ class KnownRecording:
 
     def calibration(self) -> Calibration:
         """Return the calibration with the true parameters."""
-        tilt_x, tilt_y = self.model.tilt
-        tilts = {"tilt_x": tilt_x, "tilt_y": tilt_y} if tilt_x or tilt_y else {}
-        prism = self.model.prism
-        values = {"apex": prism.apex, "phase": self.model.phase, "clock_offset": self.encoder.clock_offset_us, **tilts}
+        model, prism = self.model, self.model.prism
+        pairs = {"tilt": model.tilt, "cylinder": model.cylinder, "wobble": model.wobble}
+        angles = {f"{name}_{axis}": pair[k] for name, pair in pairs.items() if any(pair) for k, axis in enumerate("xy")}
+        values = {"apex": prism.apex, "phase": model.phase, "clock_offset": self.encoder.clock_offset_us, **angles}
         return Calibration(
             model_name="exact", camera=self.camera, prism=prism, parameters=values, uncertainty={}, free=(),
             sharpness_name="variance", sharpness_before=0.0, sharpness_after=0.0, stages=(),
@@ -105,9 +105,10 @@ def exact_places(model: ExactModel, xy: NDArray[np.float64], theta: NDArray[np.f
     """
     prism, camera = model.prism, model.camera
     axis = axis_rotation(*model.tilt)
-    ray = _rays(camera, xy) @ axis
-    w = np.stack([np.cos(theta + model.phase), np.sin(theta + model.phase)], axis=1)
-    sine, cosine, n2 = math.sin(prism.apex), math.cos(prism.apex), prism.index**2
+    wedge = np.stack([np.cos(theta + model.phase), np.sin(theta + model.phase)], axis=1)
+    ray = _tipped(model, _rays(camera, xy) @ axis, wedge, -1.0)
+    sine, cosine, w = _local_slope(model, ray, wedge)
+    n2 = prism.index**2
     along = sine * np.sum(w * ray[:, :2], axis=1)
     with np.errstate(invalid="ignore"):
         if prism.flat_side is FlatSide.SCENE:
@@ -118,7 +119,39 @@ def exact_places(model: ExactModel, xy: NDArray[np.float64], theta: NDArray[np.f
             shift = np.sqrt(1.0 - n2 + q**2) - q
         out = ray[:, :2] + (shift * sine)[:, None] * w
         ahead = np.sqrt(1.0 - np.sum(out**2, axis=1))
-    return _pixels(camera, np.column_stack([out, ahead]) @ axis.T)
+    return _pixels(camera, _tipped(model, np.column_stack([out, ahead]), wedge, 1.0) @ axis.T)
+
+
+def _tipped(
+    model: ExactModel, ray: NDArray[np.float64], wedge: NDArray[np.float64], sign: float
+) -> NDArray[np.float64]:
+    """Return bearing vectors out of the wobbling prism's frame (``sign`` 1), or into it (-1).
+
+    ``wedge`` (n, 2) holds the (cos, sin) of the wedge's azimuths.
+    """
+    if not any(model.wobble):
+        return ray
+    from scipy.spatial.transform import Rotation
+
+    x, y = model.wobble
+    angle = sign * math.atan(math.hypot(x, y)) / math.hypot(x, y)
+    w0, w1 = wedge.T
+    turns = np.column_stack([-(x * w1 + y * w0), x * w0 - y * w1, np.zeros(len(ray))])  # z × the direction of the tip
+    return np.asarray(Rotation.from_rotvec(angle * turns).apply(ray))
+
+
+def _local_slope(
+    model: ExactModel, ray: NDArray[np.float64], wedge: NDArray[np.float64]
+) -> tuple[Any, Any, NDArray[np.float64]]:
+    """Return sine and cosine of the apex angle, and its azimuth's (cos, sin), where rays meet the tilted face."""
+    apex, (x, y) = model.prism.apex, model.cylinder
+    if not (x or y):
+        return math.sin(apex), math.cos(apex), wedge
+    across = np.column_stack([-wedge[:, 1], wedge[:, 0]])
+    t, u = (np.sum(ray[:, :2] * each, axis=1) / ray[:, 2] for each in (wedge, across))
+    slope = (math.tan(apex) + x * t + y * u)[:, None] * wedge + (y * t - x * u)[:, None] * across
+    steep = np.linalg.norm(slope, axis=1)
+    return np.sin(np.arctan(steep)), np.cos(np.arctan(steep)), slope / np.maximum(steep, 1e-300)[:, None]
 
 
 def _rays(camera: Camera, xy: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -369,8 +369,7 @@ class Streams(RecordedStreams):
     @cached_property
     def true_model(self) -> ExactModel:
         """True model of the prism."""
-        motion = self.simulation.motion
-        return ExactModel(self.camera, self.simulation.prism, motion.phase, motion.tilt)
+        return self.simulation.true_model
 
     def compensated_late(self, delay_us: int, most: int) -> NDArray[np.float32]:
         """Return the places of events that the true model gives if the events are late by ``delay_us``, shape (n, 2).
