@@ -20,6 +20,7 @@ from amiwarp import (
     MemoryEvents,
     PhotometricSettings,
     Prism,
+    PrismMotion,
     RadialTangential,
     Recording,
     calibrate,
@@ -54,6 +55,7 @@ def test_a_right_camera_is_left_alone(wide: Recording) -> None:
     found = calibrated(wide)
     assert found.camera == CAMERA
     assert found.harmonics is None
+    assert not {"cylinder_x", "wobble_x"} & found.parameters.keys()
     assert found.warnings == ()
     assert error_px(wide, found) < 0.02
     assert abs(found.parameters["apex"] - PRISM.apex) < 3.0 * found.uncertainty["apex"]
@@ -140,6 +142,17 @@ def test_a_wrong_ratio_of_the_focal_lengths_is_found(texture: np.ndarray) -> Non
     assert found.camera.fy / found.camera.fx == pytest.approx(1.05, abs=0.01)
     assert found.harmonics is None
     assert error_px(recording, found, camera) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"), [("cylinder", (0.0, math.radians(0.1))), ("wobble", (math.radians(0.5), math.radians(3.0)))]
+)
+def test_an_uneven_or_wobbling_prism_is_found(texture: np.ndarray, name: str, shape: tuple[float, float]) -> None:
+    motion = PrismMotion(720.0, **{name: shape})
+    recording = simulate(texture, CAMERA, PRISM, duration_s=0.17, motion=motion, seed=6)
+    found = calibrated(recording)
+    assert {"cylinder_x", "wobble_x"} & found.parameters.keys()
+    assert error_px(recording, found) < 0.04  # the other one explains the events nearly as well
 
 
 def linear(truth: np.ndarray, noise: float, squares: int = 200) -> LinearFit:

@@ -67,10 +67,12 @@ CAUSES = (
     Cause("the lens distortion k1", ("k1",)),
     Cause("the ratio of the focal lengths fy / fx", ("fy_over_fx",)),
     Cause("the direction of the prism's axis", ("tilt_x", "tilt_y")),
+    Cause("the evenness of the prism's faces", ("cylinder_x", "cylinder_y")),
+    Cause("the prism's seat in its mount", ("wobble_x", "wobble_y")),
 )
 """All causes that the photometric stage can name and correct, the likeliest first."""
-ASPECT = CAUSES[4]
-SCREENED = (*CAUSES[:3], ASPECT)
+ASPECT, SHAPES = CAUSES[4], CAUSES[6:]
+SCREENED = (*CAUSES[:3], ASPECT, *SHAPES)
 """Causes that every answer is tested for. The effects of the others resemble those of the first two."""
 
 
@@ -452,11 +454,11 @@ def _untold(space: ParameterSpace, best: Vector, fit: LinearFit) -> float:
     if std * TELLING <= 1.0:
         return 0.0
     values = space.to_values(best)
-    away = _distance(other_side(space).build(turned(space, values)), space.build(values))
+    away = distance(other_side(space).build(turned(space, values)), space.build(values))
     return away if away >= LEAST_MOVE_PX else 0.0
 
 
-def _distance(model: Model, other: Model) -> float:
+def distance(model: Model, other: Model) -> float:
     """Return the distance of two models over the image and a turn, constant lag removed [px rms]."""
     return predicted_error(model, other, remove_lag=True, grid=8).rms
 
@@ -595,7 +597,9 @@ def testable(space: ParameterSpace) -> list[Cause]:
     """Return the causes that can be tested: those that are not free anyway, for the exact model."""
     if space.model != "exact" or not space.cartesian:
         return []
-    return [c for c in CAUSES if not set(c.names) & set(space.names)]
+    # a prism whose other side is flat looks nearly like one with cylinder power
+    shaped = {n for cause in SHAPES for n in cause.names} & set(space.names)
+    return [c for c in CAUSES if not set(c.names) & set(space.names) and not (shaped and c.names == (FLAT_SIDE,))]
 
 
 def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
@@ -633,10 +637,10 @@ def _corrected(cost: Cost, best: Vector, cause: Cause, change: Vector) -> tuple[
     here = space.build(space.to_values(best))
     wide, v = with_cause(space, cause, space.to_values(best))
     if cause.names == (FLAT_SIDE,):
-        return float(change[n]) * _distance(wide.build(wide.to_values(v)), here), v
+        return float(change[n]) * distance(wide.build(wide.to_values(v)), here), v
     low, high = wide.bounds()
     v = np.clip(v + change, low, high)
-    return _distance(wide.build(wide.to_values(v)), here), v
+    return distance(wide.build(wide.to_values(v)), here), v
 
 
 def _drift(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, float]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from amiwarp.brightness.solver import BrightnessMap, SensorTiming, Tiles, darkness, off_excess, set_lags
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import LENS, MOTION, ParameterSpace, like_size
+from amiwarp.calib.parameters import LENS, MOTION, ParameterSpace, like_size, units
 from amiwarp.calib.photometric import consistency
 from amiwarp.calib.photometric.cost import (
     Cost,
@@ -789,9 +789,16 @@ RIVAL_SHARE = 0.75
 """A cause is tried if it removes at least this share of the residual that the likeliest one removes."""
 TIE_SHARE = 0.04
 """Of the tried causes, the first one counts whose cost is at most this share of the gain above the lowest cost."""
+GIVEN_SHARE = 0.15
+"""The same share for what was given, the camera and the flat side: it is likelier wrong than the prism's shape, whose
+two free numbers follow the noise too."""
 TIMING_SHARE = 0.3
 """Systematic standard deviation of the answer if the sensor's timing was corrected: a share of the correction. The
 thresholds, which turn the map's brightness into light, are not known."""
+RIVAL_STD = 0.5
+"""Systematic standard deviation of an answer with a rival explanation: a share of the difference of their answers."""
+LEAST_RIVAL_PX = 0.02
+"""Distance of the models of two explanations from which on both are reported [px rms]."""
 LARGEST_LAST_STEP_PX = 0.01
 """Longest step that is added to the answer without a new search [px]."""
 
@@ -807,6 +814,13 @@ class _Corrected:
     space: ParameterSpace
     sharpest: dict[str, float]
     """Result of the sharpness stage, expressed in ``space``."""
+    rivals: tuple[_Corrected, ...] = ()
+    """Other corrections that explain the events as well."""
+
+    def distance_px(self, other: _Corrected) -> float:
+        """Return how far the models of two corrections are apart [px rms]."""
+        a, b = (each.space.build(each.space.to_values(each.answer.stage.x)) for each in (self, other))
+        return consistency.distance(a, b)
 
 
 def checked(search: AnswerSearch, answer: Answer) -> Answer:
@@ -819,12 +833,14 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
         return answer
     given, cost = search.cost.space, search.cost
     first = answer, search.sharpest
+    tied: list[tuple[_Corrected, _Corrected]] = []
     for left in range(MOST_CORRECTIONS, -1, -1):
         cost.converge(answer.stage.x)
         check = consistency.check_consistency(cost, answer.stage.x)
         best = _best_correction(search, answer, check) if left else None
         if best is not None:
             cost.space, search.sharpest, answer = best.space, best.sharpest, best.answer
+            tied += [(best, rival) for rival in best.rivals]
         elif left and cost.space is not given and np.linalg.norm(check.step) > LARGEST_LAST_STEP_PX:
             again = search.search(answer.stage.x + check.step)
             answer = replace(again, stage=join_runs(answer.stage, again.stage))
@@ -832,16 +848,31 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
             break
     unexplained = answer.result.cost > max(LARGEST_STILL_COST, LARGEST_COST_RATIO * first[0].result.cost)
     if unexplained and cost.space is not given:  # another trouble, such as a rotating camera, which is tried later
-        cost.space, (answer, search.sharpest) = given, first
+        cost.space, (answer, search.sharpest), tied = given, first, []
         cost.converge(answer.stage.x)
         check = consistency.check_consistency(cost, answer.stage.x)
-    answer = _final(search, answer, check)
-    notes = (*_corrections(given, search.cost.space, answer), *check.warnings())
-    return replace(answer, result=replace(answer.result, warnings=notes))
+    rivals = [(best, rival, best.distance_px(rival)) for best, rival in tied]
+    n = len(given.names)
+    apart = [
+        rival.answer.stage.x[:n] - best.answer.stage.x[:n]
+        for best, rival, _ in rivals
+        if best.space.prism.flat_side is rival.space.prism.flat_side
+    ]
+    answer = _final(search, answer, check, apart)
+    notes = [
+        f"the events do not tell whether {best.cause.words} or {rival.cause.words} is wrong: both explain them as "
+        f"well, and differ by {px:.2f} px rms"
+        for best, rival, px in rivals
+        if px >= LEAST_RIVAL_PX
+    ]
+    answer = replace(answer, result=replace(answer.result, warnings=(
+        *_corrections(given, search.cost.space, answer), *notes, *check.warnings(),
+    )))  # fmt: skip
+    return answer.judged(max([px for *_, px in rivals], default=0.0) <= LARGEST_INCONSISTENCY_PX, "; ".join(notes))
 
 
 def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Consistency) -> _Corrected | None:
-    """Return the best answer with one of the likeliest causes corrected; None if none lowers the cost."""
+    """Return the best answer with a likely cause corrected, and its rivals; None if none lowers the cost."""
     rivals = [f for f in check.findings if f.gain >= RIVAL_SHARE * check.findings[0].gain]
     if not rivals:
         return None
@@ -850,9 +881,18 @@ def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Co
     tried = [t for t in (_corrected(search, finding, v) for finding in rivals) if _significant(t)]
     if not tried:
         return None
-    limit = min(min(t.cost for t in tried), here)
-    limit += TIE_SHARE * (here - limit)
-    return next((t for t in sorted(tried, key=lambda t: t.cause.rank) if t.cost < here and t.cost <= limit), None)
+    least = min(min(t.cost for t in tried), here)
+
+    def ties(found: _Corrected) -> bool:
+        share = TIE_SHARE if found.cause in consistency.SHAPES else GIVEN_SHARE
+        return found.cost < here and found.cost <= least + share * (here - least)
+
+    equal = sorted(filter(ties, tried), key=lambda t: t.cause.rank)
+    if not equal:
+        return None
+    close, shape = equal[0].cost + TIE_SHARE * (here - least), equal[0].cause in consistency.SHAPES
+    alike = [t for t in equal[1:] if t.cost <= close and (t.cause in consistency.SHAPES) is shape]
+    return replace(equal[0], rivals=tuple(alike))
 
 
 def _corrected(search: AnswerSearch, finding: consistency.Finding, v: Vector) -> _Corrected:
@@ -887,12 +927,17 @@ def _comparable_cost(search: AnswerSearch, v: Vector) -> float:
     return mean
 
 
-def _final(search: AnswerSearch, answer: Answer, check: consistency.Consistency) -> Answer:
-    """Return the answer with the last step added, its whole uncertainty and the judgement of its consistency."""
+def _final(search: AnswerSearch, answer: Answer, check: consistency.Consistency, apart: Sequence[Vector]) -> Answer:
+    """Return the answer with the last step added, its whole uncertainty and the judgement of its consistency.
+
+    ``apart`` holds the difference to the answer of each rival explanation [px].
+    """
     result, v, space = answer.result, answer.stage.x, search.cost.space
     timing = np.zeros(len(v))
     timing[: len(search.timing)] = TIMING_SHARE * search.timing
     systematic = check.systematic + np.outer(check.step, check.step) + np.outer(timing, timing)
+    for change in apart:
+        systematic[: len(change), : len(change)] += RIVAL_STD**2 * np.outer(change, change)
     if np.linalg.norm(check.step) <= LARGEST_LAST_STEP_PX:
         v = v + check.step
     result = replace(
@@ -914,8 +959,10 @@ def _corrections(given: ParameterSpace, space: ParameterSpace, answer: Answer) -
         )
     for name in space.names:
         if name not in given.names:
-            scale, unit = (math.degrees(1.0), "deg") if name.startswith("tilt") else (1.0, "px")
-            unit = "" if name in ("k1", "fy_over_fx") else f" {unit}"
+            in_deg = units().get(name) == "rad"
+            scale, unit = (
+                (math.degrees(1.0), " deg") if in_deg else (1.0, "" if name in ("k1", "fy_over_fx") else " px")
+            )
             was, now, by = (scale * x for x in (space.start[name], found[name], std[name]))
             remedy = "; calibrate the lens" if name in LENS else ""
             out.append(
