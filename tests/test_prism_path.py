@@ -25,6 +25,7 @@ from amiwarp import (
 )
 from amiwarp.calib.prism_path import speed_in_words, varying_paths
 from amiwarp.optics.models import compensate_by_each
+from amiwarp.viewer.inspector import Inspector
 from tests.conftest import COARSE
 
 CAMERA = Camera.from_fov(160, 120, math.radians(60.0))
@@ -92,6 +93,13 @@ def test_the_file_keeps_the_path(
     np.testing.assert_array_equal(moved[0], moved[1])
     with pytest.raises(AmiwarpError, match=r"one recording only, from -.* calibrate this recording itself"):
         loaded.encoder_for(None, span[0], 10_000_000)
+
+
+def test_the_inspector_shows_the_path(spun_up: tuple[Recording, PrismMotion], calibrated: Calibration) -> None:
+    inspector = Inspector(spun_up[0], calibrated)
+    assert calibrated.path is not None
+    np.testing.assert_array_equal(inspector.encoder.angle, calibrated.path.angle)
+    assert inspector.as_calibration() is calibrated
 
 
 def test_ripple_is_found(texture: np.ndarray) -> None:
