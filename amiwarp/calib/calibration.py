@@ -4,7 +4,8 @@
 models. A calibrator makes attempts by the stages of the settings. If no brightness map explains the events, it tries
 three causes in turn. Hot or flickering pixels are masked and the attempt repeated. The camera's rotation is freed, also
 at a low cost if it explains much of the rest, and then dropped from the result. A wrong scale of the encoder ends in an
-error. :func:`prepare` sets up an attempt: the encoder, the events and the parameter space.
+error. :func:`prepare` sets up an attempt: the encoder, the events and the parameter space. Without an encoder, an
+attempt also examines whether the prism's speed varies, and finds the path of its angle.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from amiwarp.calib.model_choice import ModelChooser
 from amiwarp.calib.parameters import LENS, MOTION, RATES, ParameterSpace, make_space, nominal, with_lens
 from amiwarp.calib.photometric import stage
 from amiwarp.calib.photometric.cost import upload_ahead
+from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
 from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, Settings
 from amiwarp.calib.sharpness import Search
@@ -98,7 +100,7 @@ def calibrate(
         return Calibrator(recording, settings, device, progress).run()
     chooser = ModelChooser(recording, settings, device)
     exact = Calibrator(recording, chooser.settings, device, progress, meanwhile=chooser.prepare).run()
-    return chooser.choose(exact, lambda again, free: Calibrator(again, free, device, progress).run())
+    return chooser.choose(exact, lambda again, free: Calibrator(again, free, device, progress, path=exact.path).run())
 
 
 LEAST_BAD_SHARE = 0.01
@@ -162,6 +164,8 @@ class Calibrator:
     meanwhile: Callable[[Calibration], Iterator[None]] | None = None
     """Function that gets the answer of the first attempt's sharpness stage and returns other work. Some of its steps
     are taken while a GPU works on the photometric stage, those that are left after the stage."""
+    path: Encoder | None = None
+    """Path of the prism's angle that was found before, if the recording has no encoder."""
 
     def run(self) -> Calibration:
         """Return the calibration of ``settings.model``; raise :class:`AmiwarpError` as :func:`calibrate` does.
@@ -172,7 +176,7 @@ class Calibrator:
         began = time.perf_counter()
         tried = self.attempt()
         if "photometric" not in self.settings.stages:
-            return tried.found()
+            return self._told(tried.found())
         recording, calibrator = self.recording, replace(self, meanwhile=None)
         if recording.encoder is not None:
             calibrator, tried = calibrator.with_straight_angles(tried)
@@ -182,7 +186,9 @@ class Calibrator:
                 tried = calibrator.explained(tried)
             elif self.settings.free is None and tried.camera_turned:
                 tried = calibrator.with_rotation(tried)
-        found = replace(tried.found(), harmonics=calibrator.harmonics)
+        else:
+            tried = calibrator.with_straight_path(tried)
+        found = self._told(replace(tried.found(), harmonics=calibrator.harmonics))
         if not tried.accepted:  # the answer of sharpness alone may be off by tenths of a pixel
             reasons = [w for w in found.warnings if "photometric" in w]
             raise AmiwarpError(
@@ -199,11 +205,13 @@ class Calibrator:
         began = time.perf_counter()
         try:
             recording = rotation_window(self.recording, self.settings)
-            searches = prepare(recording, self.settings, device=self.device, progress=self.progress)
+            searches = prepare(recording, self.settings, self.path, device=self.device, progress=self.progress)
             with upload_ahead(recording, searches[0]) as ahead:
                 for search in searches:
                     search.run()
                 search = max(searches, key=lambda s: s.score)
+                if recording.encoder is None and self.path is None and _path_is_examined(search):
+                    search = _with_path(recording, search)
                 found = _sharpest(recording, search, *search.check_answer(recording.name))
                 if "photometric" in self.settings.stages:
                     search.ahead = ahead
@@ -237,6 +245,23 @@ class Calibrator:
             return self, tried
         said = f"{stage.harmonics_in_words(harmonics)}: it was corrected"
         return calibrator, Attempt(_warning(again.calibration, said))
+
+    def with_straight_path(self, tried: Attempt) -> Attempt:
+        """Correct an error of the path that repeats every turn, if the events ask for it, and calibrate again."""
+        found = tried.calibration
+        if found is None or found.path is None or found.photometric is None or not found.photometric.harmonics:
+            return tried
+        path = found.path.with_harmonics(found.photometric.harmonics)
+        zero = float(path.angle_at([middle_time(self.recording)])[0])
+        again = replace(self, path=replace(path, angle=path.angle - zero)).attempt()
+        return tried if again.calibration is None or again.cost > tried.cost else again
+
+    def _told(self, found: Calibration) -> Calibration:
+        """Return the calibration, with a warning if it found that the prism's speed is not constant."""
+        if found.path is None or self.path is not None:
+            return found
+        said = f"the prism's speed is not constant: it {speed_in_words(found.path)}"
+        return _warning(found, f"{said}; the path that was found holds for this recording only")
 
     def without_bad_pixels(self, tried: Attempt) -> tuple[Calibrator, Attempt]:
         """Mask hot and flickering pixels if they have a notable share of the events, and calibrate without them.
@@ -335,6 +360,7 @@ def _sharpest(
         stages=tuple(search.stages),
         # without an encoder, the prism angle is 0 at this time
         zero_us=middle_time(recording) if recording.encoder is None and space.sized else None,
+        path=search.calibration_events.encoder if recording.encoder is None and _on_path(search) else None,
         middle_us=space.middle_us if space.moving else None,
         events=len(search.calibration_events.events),
         seconds=0.0,
@@ -367,9 +393,16 @@ def _refined(
 
 
 def prepare(
-    recording: Recording, settings: Settings, *, device: Any = "cpu", progress: Progress | None = None
+    recording: Recording,
+    settings: Settings,
+    path: Encoder | None = None,
+    *,
+    device: Any = "cpu",
+    progress: Progress | None = None,
 ) -> list[Search]:
     """Return the searches for a recording: one, or one for each sense of rotation if the prism's speed is unknown.
+
+    ``path`` is the path of the prism's angle that was found before, if the recording has no encoder.
 
     For the model ``auto`` the search is that of the exact model, to which the smaller models are fitted later.
     Raises :class:`AmiwarpError` if the recording does not suit a calibration.
@@ -378,7 +411,7 @@ def prepare(
         settings = replace(settings, model="exact")
     name, camera = recording.name, _camera(recording)
     checks.check_events(len(recording.events), name)
-    encoders, free = _encoders(recording, settings)
+    encoders, free = _encoders(recording, settings, path)
     events = thin(recording, settings.events)
     if isinstance(recording.events, MaskedEventSource) and len(events) < settings.events:
         checks.check_unmasked_events(len(events), recording.events.mask, name)
@@ -394,16 +427,66 @@ def prepare(
     return searches
 
 
+def _on_path(search: Search) -> bool:
+    """Return whether the search for a recording without an encoder has a path, not a constant speed."""
+    return search.space.sized and "rpm" not in search.space.start
+
+
+def _path_is_examined(search: Search) -> bool:
+    """Return whether the path of the prism's angle is examined: for a still camera, if no speed is given."""
+    space, settings = search.space, search.settings
+    given = "rpm" in settings.start or "rpm" in (settings.free or ())
+    return space.cartesian and not space.moving and not given and "photometric" in settings.stages
+
+
+def _with_path(recording: Recording, search: Search) -> Search:
+    """Return the search with the path of the prism's angle, or unchanged if a constant speed explains the events."""
+    varies, encoder = _on_path(search), search.calibration_events.encoder
+    if not varies:
+        first, last = recording.events.t_first, recording.events.t_last
+        encoder = constant_speed(search.best["rpm"], first, last, middle_time(recording))
+    try:
+        start = _search_on(encoder, search)
+        if not varies and not PathFit(recording, start, GATE_PAIRS, GATE_TILES).deviates():
+            return search
+        path, deviation_px = PathFit(recording, start).run()
+    except AmiwarpError:
+        if varies:
+            raise
+        return search
+    if not varies and deviation_px < LEAST_DEVIATION_PX:
+        return search
+    found = _search_on(path, search)
+    found.run(found.best)
+    return found
+
+
+def _search_on(path: Encoder, search: Search) -> Search:
+    """Return a search like another one, at its answer, for a path of the prism's angle."""
+    space, events = search.full_space, search.calibration_events
+    best = {n: x for n, x in search.best.items() if n != "rpm"}
+    if not _on_path(search):
+        space = space.without(("rpm",))
+        space = replace(space, start={n: x for n, x in space.start.items() if n != "rpm"}, undrifted={})
+    found = Search(
+        space, CalibrationEvents(events.events, path, None, events.fold), search.settings, search.device,
+        search.progress,
+    )  # fmt: skip
+    found.best, found.stages = best, search.stages
+    return found
+
+
 def _camera(recording: Recording) -> Camera:
     if recording.camera is None:
         raise AmiwarpError(f"{recording.name}: the camera is unknown; give its intrinsics or its field of view")
     return recording.camera
 
 
-def _encoders(recording: Recording, settings: Settings) -> tuple[list[Encoder], tuple[str, ...]]:
+def _encoders(recording: Recording, settings: Settings, path: Encoder | None) -> tuple[list[Encoder], tuple[str, ...]]:
     """Return the encoders to try and the free parameters.
 
-    Without an encoder these are constant speeds: the given one, or the one found in the events with either sign.
+    Without an encoder these are the known path, or constant speeds: the given one, or the one found in the events with
+    either sign. If the events show that the speed varies much, they are paths with either sense of rotation.
     """
     kind = MODELS[settings.model]
     free = kind.FREE[:2] if settings.free is None else settings.free
@@ -421,7 +504,11 @@ def _encoders(recording: Recording, settings: Settings) -> tuple[list[Encoder], 
             f"{recording.name}: the recording has no encoder, so clock_offset is part of the phase; remove "
             "clock_offset from the settings"
         )
+    if path is not None:
+        return [path], free
     rpm = settings.start.get("rpm")
+    if rpm is None and "rpm" not in free and (paths := varying_paths(recording)):
+        return paths, free
     speeds = [rpm] if rpm is not None else [s * estimate_rpm(recording) for s in (1.0, -1.0)]
     first, last = recording.events.t_first, recording.events.t_last
     encoders = [constant_speed(s, first, last, middle_time(recording)) for s in speeds]

@@ -214,7 +214,7 @@ FORMAT = "amiwarp-calibration"
 VERSION = 1
 NEEDED = ("format", "version", "model", "camera", "prism", "parameters", "sharpness", "zero_us", "photometric",
           "events", "seconds", "warnings", "stages")  # fmt: skip
-OPTIONAL = ("middle_us", "ladder", "harmonics")
+OPTIONAL = ("middle_us", "ladder", "harmonics", "path")
 """Fields of the calibration file that files of earlier versions lack."""
 SHARPNESS = [kind.value for kind in Sharpness]
 
@@ -281,6 +281,9 @@ class Calibration:
     harmonics: tuple[float, ...] | None = None
     """Correction of the encoder's angle e by an error that repeats every turn: the factors of cos e, sin e, cos 2e and
     sin 2e [rad] (see :meth:`amiwarp.Encoder.with_harmonics`); None for no correction."""
+    path: Encoder | None = None
+    """Path of the prism's angle that was found in the events of a recording without an encoder; None if the speed is
+    constant, or if the recording has an encoder."""
 
     @property
     def model(self) -> Model:
@@ -319,19 +322,28 @@ class Calibration:
         Returns
         -------
         Encoder
-            The given encoder with the calibrated clock offset and correction; without an encoder, one of the calibrated
-            constant speed. If the prism's size is 0, an encoder at rest: the angle then has no effect.
+            The given encoder with the calibrated clock offset and correction; without an encoder, the path that was
+            found, or one of the calibrated constant speed. If the prism's size is 0, an encoder at rest: the angle then
+            has no effect.
 
         Raises
         ------
         AmiwarpError
-            If the recording has no encoder and the calibration no rpm.
+            If the recording has no encoder and the calibration no rpm, or a path that does not cover the events.
         """
         if self.parameters.get(MODELS[self.model_name].SIZE) == 0.0:
             return constant_speed(0.0, t_first, t_last, t_first)
         if encoder is not None:
             encoder = encoder.with_clock_offset(self.parameters.get("clock_offset", encoder.clock_offset_us))
             return encoder if self.harmonics is None else encoder.with_harmonics(self.harmonics)
+        if self.path is not None:
+            if not self.path.covers(t_first, t_last):
+                first, last = self.path.coverage
+                raise AmiwarpError(
+                    "the recording has no encoder, and the calibration found the prism's path for one recording only, "
+                    f"from {first} to {last} us; calibrate this recording itself"
+                )
+            return self.path
         if "rpm" not in self.parameters or self.zero_us is None:
             raise AmiwarpError(
                 "the recording has no encoder and the calibration has no rpm; calibrate this recording itself"
@@ -361,6 +373,7 @@ class Calibration:
             "zero_us": self.zero_us,
             "middle_us": self.middle_us,
             "harmonics": None if self.harmonics is None else list(self.harmonics),
+            "path": None if self.path is None else asdict(_Path.of(self.path)),
             "photometric": None if self.photometric is None else asdict(self.photometric),
             "ladder": None if self.ladder is None else asdict(self.ladder),
             "events": self.events,
@@ -433,6 +446,7 @@ class Calibration:
         entries = {name: _entry(name, entry) for name, entry in given.items()}
         prism = fields_of(data["prism"], "prism", "apex_rad", "index", "flat_side")
         sharpness = build(_Sharpness, data["sharpness"], "sharpness")
+        path = None if data.get("path") is None else build(_Path, data["path"], "path")
         names = [f.name for f in fields(_PlainFields)]
         rest = build(_PlainFields, {name: data[name] for name in names if name in data}, "")
         result = cls(
@@ -445,6 +459,7 @@ class Calibration:
             sharpness_name=one_of(sharpness.kind, SHARPNESS, "field sharpness.kind"),
             sharpness_before=sharpness.before,
             sharpness_after=sharpness.after,
+            path=None if path is None else path.encoder(),
             **{name: getattr(rest, name) for name in names},
         )
         _ = replace(result, model_name=MODELS[model].closed_form().NAME).model
@@ -470,6 +485,23 @@ class _Sharpness:
     kind: str
     before: float
     after: float
+
+
+@dataclass(frozen=True)
+class _Path:
+    """Path of the prism's angle in the calibration file."""
+
+    t_us: tuple[int, ...]
+    angle_rad: tuple[float, ...]
+
+    @classmethod
+    def of(cls, path: Encoder) -> _Path:
+        """Return the entry of a path."""
+        return cls(tuple(path.t.tolist()), tuple(path.angle.tolist()))
+
+    def encoder(self) -> Encoder:
+        """Return the path."""
+        return Encoder(np.array(self.t_us, np.int64), np.array(self.angle_rad, np.float64))
 
 
 @dataclass(frozen=True)

@@ -346,7 +346,7 @@ class Search:
         self.space = space.without(like_size(space.names)) if "photometric" in settings.stages else space
         """Parameter space of the sharpness search: without the parameters that are left to the photometric stage."""
         self.calibration_events, self.settings, self.device = calibration_events, settings, device
-        self._progress = progress
+        self.progress = progress
         self.ahead: EventsAhead | None = None
         """Events of the photometric stage that are already on the device."""
         self.meanwhile: Iterator[None] = iter(())
@@ -382,21 +382,24 @@ class Search:
             per_polarity=s.per_polarity, parts=parts, device=self.device,
         )  # fmt: skip
 
-    def run(self) -> None:
-        """Run the global and the local search; set ``best``, ``score`` and ``stages``."""
+    def run(self, start: Mapping[str, float] | None = None) -> None:
+        """Run the global and the local search; set ``best``, ``score`` and ``stages``.
+
+        With ``start``, values of all parameters, only the local search runs.
+        """
         s, space = self.settings, self.space
-        starts = [space.to_vector(space.start)]
+        starts = [space.to_vector(space.start if start is None else start)]
         still = space.without(MOTION) if space.moving else space  # the global search keeps a rotation's start values
-        if s.global_algorithm is not None and still.names:
-            objective, start = self._coarse_objective(self.calibration_events, still), still.to_vector(still.start)
-            stage = self._maximise(objective, s.global_algorithm, start, s.global_evaluations, step=1.0)
+        if start is None and s.global_algorithm is not None and still.names:
+            objective, first = self._coarse_objective(self.calibration_events, still), still.to_vector(still.start)
+            stage = self._maximise(objective, s.global_algorithm, first, s.global_evaluations, step=1.0)
             starts = [space.to_vector(still.to_values(v)) for v in distinct_optima(stage, CANDIDATES)]
         if space.moving:
-            starts = [self._track_rotation(start) for start in starts]
+            starts = [self._track_rotation(each) for each in starts]
         runs: list[SearchStage] = []
-        for start in starts:
+        for each in starts:
             known = [run.x for run in runs]  # near an optimum that is known a search ends early
-            runs.append(self._maximise(self.fine, s.local_algorithm, start, s.local_evaluations, step=0.7, known=known))
+            runs.append(self._maximise(self.fine, s.local_algorithm, each, s.local_evaluations, step=0.7, known=known))
         best = max(runs, key=lambda run: run.score)
         self.best, self.score = space.to_values(best.x), best.score
 
@@ -447,8 +450,8 @@ class Search:
 
     def report(self, stage: str, share: float) -> None:
         """Tell the progress function which share of a stage is finished."""
-        if self._progress is not None:
-            self._progress(*stage_share(self.settings, stage, share))
+        if self.progress is not None:
+            self.progress(*stage_share(self.settings, stage, share))
 
     def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
         """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the sharpness."""

@@ -686,6 +686,9 @@ class Inspector:
         source = recording.events
         if not len(source):
             raise AmiwarpError(f"{recording.name}: holds no events; give a recording with events")
+        path = None if calibration is None or recording.encoder is not None else calibration.path
+        if path is not None and path.covers(source.t_first, source.t_last):
+            recording = replace(recording, encoder=path)
         no_speed = recording.encoder is None and calibration is None
         self.notes = (NO_ENCODER,) * no_speed + (NO_CAMERA,) * (recording.camera is None)
         """What is missing to compensate the prism's motion, one sentence each."""

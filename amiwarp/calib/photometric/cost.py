@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -279,6 +280,8 @@ FEWEST_TURNS = 2
 """Number of turns of the prism that are always used, if the recording has them."""
 EVENTS_PER_PAIR = 10
 """Number of events that are copied ahead for each wanted pair. The tiles hold about a tenth of the events as pairs."""
+EVENTS_AT_A_TIME = 4_000_000
+"""Mean number of events in each of the time spans that are read one after the other."""
 FEWEST_TILES = 6
 """Number of tiles of the scene that are always used."""
 
@@ -424,6 +427,31 @@ def collect_pairs(recording: Recording, search: Search, settings: PhotometricSet
         return pairs, tiles, collector.silent_share
     pairs = pairs.of_tiles(np.isin(np.arange(count), van_der_corput(count)[:keep]))
     return pairs, tiles, collector.silent_share
+
+
+def collect_everywhere(
+    recording: Recording, search: Search, settings: PhotometricSettings, most: int, most_tiles: int
+) -> tuple[PairSet, Tiles]:
+    """Return about ``most`` pairs of events from all times of a recording, and at most ``most_tiles`` tiles.
+
+    The pairs come from pixels that are evenly spread over the tiles.
+    """
+    source = recording.events
+    tile_of, tiles = choose_tiles(search.fine.image(search.best), search.pad, settings.density, MARGIN_PX)
+    used = van_der_corput(len(tiles.origin))[:most_tiles]
+    number = np.full(len(tiles.origin) + 1, -1, np.int32)  # the last one is that of pixels without a tile
+    number[used] = np.arange(len(used))
+    tile_of, tiles = number[tile_of], replace(tiles, origin=tiles.origin[used])
+    near = near_tiles(tiles, MARGIN_PX, math.ceil(reach(search.space, search.best)) + 1, tile_of.shape)
+    share = most / max(1.0, len(source) * float(np.mean(tile_of >= 0)))
+    near[np.random.default_rng(0).random(near.shape) >= share] = -1
+    collector = _PairCollector(recording, search, tile_of, near, settings.sensor)
+    parts = -(-len(source) // EVENTS_AT_A_TIME)
+    edges = np.linspace(source.t_first, source.t_last + 1, parts + 1).astype(np.int64).tolist()
+    spans = [*itertools.pairwise(edges)]
+    for k in range(parts):
+        collector.read(spans[: k + 1])
+    return collector.pairs(), tiles
 
 
 def van_der_corput(n: int) -> list[int]:
