@@ -851,7 +851,9 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
         cost.space, (answer, search.sharpest), tied = given, first, []
         cost.converge(answer.stage.x)
         check = consistency.check_consistency(cost, answer.stage.x)
-    rivals = [(best, rival, best.distance_px(rival)) for best, rival in tied]
+    freed = set(search.cost.space.names)
+    # an explanation that was corrected later too is no rival: the answer is their joint one
+    rivals = [(best, rival, best.distance_px(rival)) for best, rival in tied if not freed >= {*rival.cause.names}]
     n = len(given.names)
     apart = [
         rival.answer.stage.x[:n] - best.answer.stage.x[:n]
@@ -865,34 +867,30 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
         for best, rival, px in rivals
         if px >= LEAST_RIVAL_PX
     ]
-    answer = replace(answer, result=replace(answer.result, warnings=(
-        *_corrections(given, search.cost.space, answer), *notes, *check.warnings(),
-    )))  # fmt: skip
-    return answer.judged(max([px for *_, px in rivals], default=0.0) <= LARGEST_INCONSISTENCY_PX, "; ".join(notes))
+    notes = [*_corrections(given, search.cost.space, answer), *notes, *check.warnings()]
+    return replace(answer, result=replace(answer.result, warnings=tuple(notes)))
 
 
 def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Consistency) -> _Corrected | None:
     """Return the best answer with a likely cause corrected, and its rivals; None if none lowers the cost."""
-    rivals = [f for f in check.findings if f.gain >= RIVAL_SHARE * check.findings[0].gain]
-    if not rivals:
+    likely = [f for f in check.findings if f.gain >= RIVAL_SHARE * check.findings[0].gain]
+    if not likely:
         return None
     v = answer.stage.x
     here = _comparable_cost(search, v)
-    tried = [t for t in (_corrected(search, finding, v) for finding in rivals) if _significant(t)]
+    tried = [t for t in (_corrected(search, finding, v) for finding in likely) if _significant(t) and t.cost < here]
     if not tried:
         return None
-    least = min(min(t.cost for t in tried), here)
 
-    def ties(found: _Corrected) -> bool:
-        share = TIE_SHARE if found.cause in consistency.SHAPES else GIVEN_SHARE
-        return found.cost < here and found.cost <= least + share * (here - least)
+    def near_best(among: list[_Corrected], share: float) -> float:
+        least = min(t.cost for t in among)
+        return least + share * (here - least)
 
-    equal = sorted(filter(ties, tried), key=lambda t: t.cause.rank)
-    if not equal:
-        return None
-    close, shape = equal[0].cost + TIE_SHARE * (here - least), equal[0].cause in consistency.SHAPES
-    alike = [t for t in equal[1:] if t.cost <= close and (t.cause in consistency.SHAPES) is shape]
-    return replace(equal[0], rivals=tuple(alike))
+    given = [t for t in tried if t.cause not in consistency.SHAPES]
+    if given and min(t.cost for t in given) <= near_best(tried, GIVEN_SHARE):
+        tried = given
+    best, *rivals = sorted((t for t in tried if t.cost <= near_best(tried, TIE_SHARE)), key=lambda t: t.cause.rank)
+    return replace(best, rivals=tuple(rivals))
 
 
 def _corrected(search: AnswerSearch, finding: consistency.Finding, v: Vector) -> _Corrected:
