@@ -228,6 +228,7 @@ OWN: dict[str, dict[str, Any]] = {
     "Encoder.constant_speed": {"rpm": 720.0},
     "Encoder.gaps": {"max_interval_us": 100.0},
     "Encoder.with_clock_offset": {"clock_offset_us": 1.0},
+    "Encoder.with_harmonics": {"harmonics": [0.1, 0.0, 0.0, 0.0]},
     "Encoder.with_index": {"index_t_us": [500]},
     "EncoderStream.append": {"t_us": [2000, 3000]},
     "EncoderStream.guessed": {"t": np.array([0, 5])},
