@@ -105,6 +105,9 @@ def calibrate(
 
 LEAST_BAD_SHARE = 0.01
 """Share of the events on hot or flickering pixels above which these pixels are masked."""
+LARGEST_STRAIGHT_COST_RATIO = 1.05
+"""Largest ratio of the photometric cost with a corrected encoder to that without. A small error of the encoder changes
+the cost by less than two maps of the same scene differ."""
 LEAST_SCALE_ERROR = 0.003
 """Smallest relative error of an encoder's scale that is reported. Three turns measure the scale to about 0.001."""
 
@@ -241,7 +244,7 @@ class Calibrator:
         straight = replace(self.recording, encoder=encoder.with_harmonics(harmonics))
         calibrator = replace(self, recording=straight, harmonics=harmonics)
         again = calibrator.attempt()
-        if again.calibration is None or again.cost > tried.cost:
+        if again.calibration is None or again.cost > LARGEST_STRAIGHT_COST_RATIO * tried.cost:
             return self, tried
         said = f"{stage.harmonics_in_words(harmonics)}: it was corrected"
         return calibrator, Attempt(_warning(again.calibration, said))

@@ -72,7 +72,8 @@ CAUSES = (
 )
 """All causes that the photometric stage can name and correct, the likeliest first."""
 ASPECT, SHAPES = CAUSES[4], CAUSES[6:]
-SCREENED = (*CAUSES[:3], ASPECT, *SHAPES)
+GATED = (ASPECT, *SHAPES)
+SCREENED = (*CAUSES[:3], *GATED)
 """Causes that every answer is tested for. The effects of the others resemble those of the first two."""
 
 
@@ -235,6 +236,32 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     )
 
 
+GATE = 2.0
+"""How many standard deviations more than by chance a group of unknowns must be away from 0 to be examined."""
+
+
+def telling(cost: Cost, groups: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return those groups of derivatives of the residuals that may explain some of them.
+
+    The map has been solved, so that the residuals are nearly orthogonal to what a change of the map explains. So the
+    gradient needs no projection, which takes most of the time of a :func:`linear_fit`.
+    """
+    groups = [group for group in groups if group]
+    if not groups:
+        return []
+    b, camera = cost.brightness, cost.space.camera
+    width, height = (-(-side // SQUARE_PX) for side in (camera.width, camera.height))
+    found = []
+    for group in groups:
+        columns = [*group.values(), b.residuals.values]
+        parts = b.residuals.products_by_square(columns, SQUARE_PX, width, height)[0][:, :-1, -1]
+        total = parts.sum(axis=0)
+        away = float(total @ np.linalg.lstsq(parts.T @ parts, total, rcond=1e-12)[0])
+        if away > (math.sqrt(len(group)) + GATE) ** 2:
+            found.append(group)
+    return found
+
+
 def masked(column: Any, factor: Any) -> Any:
     """Return a derivative times a factor for each pair, all on the device."""
     out = wp.empty_like(column)
@@ -365,7 +392,10 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
     doubtful = bool(set(LENS) & set(space.names))
     screened = causes if doubtful else [c for c in causes if c in SCREENED]
     for cause in screened:
-        columns |= _cause_columns(cost, best, cause)
+        if cause not in GATED:
+            columns |= _cause_columns(cost, best, cause)
+    for group in telling(cost, [_cause_columns(cost, best, cause) for cause in screened if cause in GATED]):
+        columns |= group
     fit = linear_fit(cost, columns)
     findings = _findings(cost, best, fit, screened, LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN)
     if findings and not doubtful:
@@ -545,7 +575,8 @@ def angle_errors(cost: Cost, best: Vector) -> tuple[str, ...]:
     What a slow rotation of the camera or a wrong fy / fx explains does not count.
     """
     angles = _angle_columns(cost, best)
-    if not angles:
+    groups = [{name: angles[name] for name in group} for group in (HARMONICS, SKEW) if angles]
+    if not telling(cost, groups):
         return ()
     given = _rivals_of_angles(cost, best)
     fit = linear_fit(cost, given | angles)

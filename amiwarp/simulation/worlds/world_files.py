@@ -9,11 +9,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from trimesh import Trimesh
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name, note_input, open_input
@@ -23,6 +22,9 @@ from amiwarp.simulation.pictures import BAND, LUMINANCE, MOST_PIXELS, PICTURE_FO
 from amiwarp.simulation.worlds.named.catalogue import named_world
 from amiwarp.simulation.worlds.world import Body, Lamp, Material, Mesh, Sky, Sun, Trajectory, World, looking_at
 from amiwarp.validation import guarded, one_of, real, shown
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 # Reader of mesh files (glTF, GLB, OBJ with MTL, PLY, STL) that uses trimesh. Colours become luminance.
 #
