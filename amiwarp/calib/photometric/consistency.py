@@ -246,20 +246,20 @@ def telling(cost: Cost, groups: list[dict[str, Any]]) -> list[dict[str, Any]]:
     The map has been solved, so that the residuals are nearly orthogonal to what a change of the map explains. So the
     gradient needs no projection, which takes most of the time of a :func:`linear_fit`.
     """
-    groups = [group for group in groups if group]
-    if not groups:
-        return []
     b, camera = cost.brightness, cost.space.camera
+    columns = {name: column for group in groups for name, column in group.items()}
+    if not columns:
+        return []
     width, height = (-(-side // SQUARE_PX) for side in (camera.width, camera.height))
-    found = []
-    for group in groups:
-        columns = [*group.values(), b.residuals.values]
-        parts = b.residuals.products_by_square(columns, SQUARE_PX, width, height)[0][:, :-1, -1]
-        total = parts.sum(axis=0)
-        away = float(total @ np.linalg.lstsq(parts.T @ parts, total, rcond=1e-12)[0])
-        if away > (math.sqrt(len(group)) + GATE) ** 2:
-            found.append(group)
-    return found
+    sums = b.residuals.products_by_square([*columns.values(), b.residuals.values], SQUARE_PX, width, height)[0]
+    parts = dict(zip(columns, sums[:, :-1, -1].T, strict=True))
+
+    def away(group: dict[str, Any]) -> float:
+        each = np.stack([parts[name] for name in group], axis=1)
+        total = each.sum(axis=0)
+        return math.sqrt(max(0.0, float(total @ np.linalg.lstsq(each.T @ each, total, rcond=1e-12)[0])))
+
+    return [group for group in groups if group and away(group) > math.sqrt(len(group)) + GATE]
 
 
 def masked(column: Any, factor: Any) -> Any:
@@ -394,8 +394,12 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
     for cause in screened:
         if cause not in GATED:
             columns |= _cause_columns(cost, best, cause)
-    for group in telling(cost, [_cause_columns(cost, best, cause) for cause in screened if cause in GATED]):
+    # cylinder power and wobble look so much alike that the first one tells of both
+    gates = [c for c in screened if c in GATED and (c is not SHAPES[1] or SHAPES[0] not in screened)]
+    for group in telling(cost, [_cause_columns(cost, best, cause) for cause in gates]):
         columns |= group
+    if set(SHAPES[0].names) <= columns.keys() and SHAPES[1] in screened:
+        columns |= _cause_columns(cost, best, SHAPES[1])
     fit = linear_fit(cost, columns)
     findings = _findings(cost, best, fit, screened, LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN)
     if findings and not doubtful:
