@@ -563,8 +563,8 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...]) -> AngleFit | N
 
     None if they cannot be examined.
     """
-    angles = _angle_columns(cost, best)
-    if not angles or not names:
+    angles = _angle_columns(cost, best) if names else {}
+    if not angles:
         return None
     given = _rivals_of_angles(cost, best)
     fit = linear_fit(cost, given | angles)
