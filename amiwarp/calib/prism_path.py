@@ -1,7 +1,7 @@
 """Path of the prism's angle over time, found in the events of a recording without an encoder.
 
 :func:`varying_paths` finds a smooth path from the repetition of the events alone, if the speed varies much.
-:func:`refine_path` finds ripple and remaining errors by the brightness map that the photometric stage uses too.
+:class:`PathFit` finds ripple and remaining errors by the brightness map that the photometric stage uses too.
 """
 
 from __future__ import annotations

@@ -73,6 +73,7 @@ CAUSES = (
 """All causes that the photometric stage can name and correct, the likeliest first."""
 ASPECT, SHAPES = CAUSES[4], CAUSES[6:]
 GATED = (ASPECT, *SHAPES)
+"""Causes whose effect is examined only if a first look, without the map's change, finds one."""
 SCREENED = (*CAUSES[:3], *GATED)
 """Causes that every answer is tested for. The effects of the others resemble those of the first two."""
 
@@ -394,7 +395,7 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
     for cause in screened:
         if cause not in GATED:
             columns |= _cause_columns(cost, best, cause)
-    # cylinder power and wobble look so much alike that the first one tells of both
+    # wobble has nearly the effect of cylinder power: where the first look finds none of that, it finds no wobble
     gates = [c for c in screened if c in GATED and (c is not SHAPES[1] or SHAPES[0] not in screened)]
     for group in telling(cost, [_cause_columns(cost, best, cause) for cause in gates]):
         columns |= group

@@ -574,7 +574,8 @@ def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
     """Return the correction of the prism's angle that the events ask for; None for none.
 
     It is the factors of :data:`consistency.PATTERNS`, shape (6,). A linearised fit finds a share of the error only,
-    because the map absorbs the other part. The share is told by the next fit.
+    because the map absorbs the other part; the next fit tells how large the share was. The pairs keep the corrected
+    angles, because an answer with an error ends the stage.
     """
     cost, camera = search.cost, search.cost.space.camera
     cost.converge(v)
@@ -585,7 +586,6 @@ def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
     pairs = cost.brightness.pairs
     waves = pairs.angle_patterns((0.5 * camera.width, 0.5 * camera.height)).numpy().reshape(6, 2, -1)
     angle, azimuth = np.arctan2(waves[1], waves[0]), pairs.arrays.azimuth
-    given = azimuth.numpy().copy()
     total, share, at = np.zeros(6), FIRST_SHARE, v
     for _ in range(MOST_ANGLE_FITS):
         step = found.change / share
@@ -600,8 +600,6 @@ def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
         before, found = found, consistency.fit_angles(cost, at, names)
         assert found is not None
         share = float(np.clip((before.change - found.change) @ step / (step @ step), LEAST_SHARE, 1.0))
-    azimuth.assign(given)
-    cost.renew(v)
     return total
 
 
@@ -957,10 +955,9 @@ def _corrections(given: ParameterSpace, space: ParameterSpace, answer: Answer) -
         )
     for name in space.names:
         if name not in given.names:
-            in_deg = units().get(name) == "rad"
-            scale, unit = (
-                (math.degrees(1.0), " deg") if in_deg else (1.0, "" if name in ("k1", "fy_over_fx") else " px")
-            )
+            scale, unit = 1.0, "" if name in ("k1", "fy_over_fx") else " px"
+            if units().get(name) == "rad":
+                scale, unit = math.degrees(1.0), " deg"
             was, now, by = (scale * x for x in (space.start[name], found[name], std[name]))
             remedy = "; calibrate the lens" if name in LENS else ""
             out.append(
