@@ -20,6 +20,18 @@ def release_memory() -> None:
 
 
 @contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Stop the garbage collector in all threads, inside a ``with`` block."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@contextmanager
 def only_new_garbage() -> Iterator[None]:
     """Make the garbage collector ignore the objects that exist now, inside a ``with`` block.
 

@@ -19,6 +19,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.iwe import UploadedEvents, upload_events
 from amiwarp.kernels.launch import pool
+from amiwarp.memory import no_garbage_collection
 
 SlopeOf = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 
@@ -171,6 +172,10 @@ class EventsAhead:
         self._copied = pool().submit(self._copy)
 
     def _copy(self) -> None:
+        with no_garbage_collection():  # Warp's recording of a graph fails if this thread frees memory of the GPU
+            self._copy_columns()
+
+    def _copy_columns(self) -> None:
         for name in NAMES:
             out = getattr(self._events, name)
             for first, part in zip(self._first, self._parts, strict=False):
