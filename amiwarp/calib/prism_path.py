@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from amiwarp.brightness.solver import BrightnessMap, Tiles, off_excess
 from amiwarp.calib.calibration_events import middle_time, thin
 from amiwarp.calib.first_guess import autocorrelation
-from amiwarp.calib.photometric.consistency import px_per_rad, shifted
+from amiwarp.calib.photometric.consistency import px_per_rad
 from amiwarp.calib.photometric.cost import (
     SLOPE_PX,
     Cost,
@@ -385,11 +385,8 @@ class PathFit:
 
     def _slopes(self) -> tuple[Vector, Vector]:
         """Return the residuals' derivatives by the angle at each event of a pair, shape (2, pairs), and by the size."""
-        b, n, ends = self._cost.brightness, len(self._pairs), []
-        for k in range(2):
-            shift = wp.zeros((2, self._pairs.arrays.stride), dtype=float, device=b.device)
-            shift[k].fill_(1.0)
-            ends.append(shifted(self._cost, self._v, shift).numpy()[:n].astype(np.float64))
+        b, n = self._cost.brightness, len(self._pairs)
+        ends = [end.numpy()[:n].astype(np.float64) for end in self._cost.by_angle(self._v)]
         by = SLOPE_PX * self._along_size
         size = b.find_slope(self._cost.at(self._v + by), self._cost.at(self._v - by), 2.0 * SLOPE_PX)
         return np.array(ends), size.numpy()[:n].astype(np.float64)

@@ -302,6 +302,19 @@ def multiply(a: wp.array(dtype=float), b: wp.array(dtype=float), start: int, out
 
 
 @wp.kernel
+def by_shift(
+    first: wp.array(dtype=float), second: wp.array(dtype=float), shift: wp.array(dtype=float), start: int,
+    out: wp.array(dtype=float),
+):  # fmt: skip
+    """Compute derivatives by a factor of ``shift``, changes of the angles at the ends of pairs, like ``Pairs.slope``.
+
+    ``first`` and ``second`` are the derivatives by the angle at either end.
+    """
+    i = start + wp.tid()
+    out[i] = first[i] * shift[i] + second[i] * shift[first.shape[0] + i]
+
+
+@wp.kernel
 def split_by_time(
     pairs: Pairs, middle: float, spread: float, gap: float, start: int, late: wp.array(dtype=float),
     is_long: wp.array(dtype=float),

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from amiwarp.calib.parameters import DRIFTS, LENS, RATES, ParameterSpace, widened
 from amiwarp.calib.photometric.cost import place_arguments, size_and_phase_directions
 from amiwarp.errors import AmiwarpError
-from amiwarp.kernels.equations import multiply
+from amiwarp.kernels.equations import by_shift, multiply
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.optics.models import Model, predicted_error
@@ -272,8 +272,6 @@ def masked(column: Any, factor: Any) -> Any:
 
 SLOPE_PX = 0.02
 """Step of the finite differences that give the derivatives of the residuals [px]."""
-STEP_RAD = 0.004
-"""Step of the finite differences that give the derivatives of the residuals by an angle [rad]."""
 SIGNIFICANT = 5.0
 """Number of standard deviations from which on a cause is significant."""
 LEAST_GAIN = 0.002
@@ -518,15 +516,12 @@ def slopes(cost: Cost, space: ParameterSpace, v: Vector, names: Iterable[str]) -
 def shifted(cost: Cost, v: Vector, shift: Any) -> Any:
     """Return the derivative of the residuals by a factor of ``shift``, changes of the angles at the ends of pairs.
 
-    ``shift`` is a Warp array of shape (2 · padded pairs,), or (2, padded pairs).
+    ``shift`` is a Warp array of shape (2 · padded pairs,), or (2, padded pairs). The map must be solved at ``v``.
     """
-    pairs, at = cost.brightness.pairs, cost.at(v)
-    none = pairs.arrays.slope
-    pairs.arrays.slope = shift.flatten()
-    ends = {**at, "drift": STEP_RAD}, {**at, "drift": -STEP_RAD}
-    column = cost.brightness.find_slope(*ends, 2.0 * STEP_RAD)
-    pairs.arrays.slope = none
-    return column
+    first, second = cost.by_angle(v)
+    out = wp.empty_like(first)
+    launch(by_shift, len(first), [first, second, shift.flatten()], [out], device=first.device)
+    return out
 
 
 def _rotation_columns(cost: Cost, best: Vector) -> dict[str, Any]:
@@ -553,43 +548,35 @@ def _angle_columns(cost: Cost, best: Vector) -> dict[str, Any]:
 class AngleFit:
     """Errors of the prism's angle, by a linearised fit."""
 
+    names: tuple[str, ...]
+    """Names of the errors, of :data:`PATTERNS`."""
     change: Vector
     """Correction of the angle: factors of :data:`PATTERNS`, 0 for those that were not fitted, shape (6,)."""
     moved_px: float
     """How far the correction moves events [px rms]."""
 
 
-def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...]) -> AngleFit | None:
-    """Return the errors ``names`` of the prism's angle, by a linearised fit at ``best`` [px].
+def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> AngleFit | None:
+    """Return the errors ``names`` of the prism's angle at ``best`` [px]; without names, those that are significant.
 
-    None if they cannot be examined.
-    """
-    angles = _angle_columns(cost, best) if names else {}
-    if not angles:
-        return None
-    given = _rivals_of_angles(cost, best)
-    fit = linear_fit(cost, given | angles)
-    found = dict(zip(names, fit.fit((*given, *names)).change[len(given) :].tolist(), strict=True))
-    change = np.array([found.get(name, 0.0) for name in PATTERNS])
-    return AngleFit(change, px_per_rad(cost.space, best) * rms_angle(cost.space.camera, change))
-
-
-def angle_errors(cost: Cost, best: Vector) -> tuple[str, ...]:
-    """Return the names of those errors of the prism's angle that are significant at ``best`` [px], of PATTERNS.
-
-    What a slow rotation of the camera or a wrong fy / fx explains does not count.
+    None if there are none, or if they cannot be examined. What a slow rotation of the camera or a wrong fy / fx
+    explains does not count.
     """
     angles = _angle_columns(cost, best)
     groups = [{name: angles[name] for name in group} for group in (HARMONICS, SKEW) if angles]
-    if not telling(cost, groups):
-        return ()
+    if not angles or not (names or telling(cost, groups)):
+        return None
     given = _rivals_of_angles(cost, best)
     fit = linear_fit(cost, given | angles)
-    found: list[str] = []
-    for group, other in ((HARMONICS, SKEW), (SKEW, HARMONICS)):
-        _, significance, gain = fit.adding((*given, *other), group)
-        found += group if significance >= SIGNIFICANT and gain >= LEAST_ANGLE_GAIN else ()
-    return tuple(found)
+    if not names:
+        for group, other in ((HARMONICS, SKEW), (SKEW, HARMONICS)):
+            _, significance, gain = fit.adding((*given, *other), group)
+            names += group if significance >= SIGNIFICANT and gain >= LEAST_ANGLE_GAIN else ()
+        if not names:
+            return None
+    found = dict(zip(names, fit.fit((*given, *names)).change[len(given) :].tolist(), strict=True))
+    change = np.array([found.get(name, 0.0) for name in PATTERNS])
+    return AngleFit(names, change, px_per_rad(cost.space, best) * rms_angle(cost.space.camera, change))
 
 
 def _rivals_of_angles(cost: Cost, best: Vector) -> dict[str, Any]:

@@ -46,6 +46,8 @@ FIRST_SCALE = 1.0
 """Scale of the Cauchy weights before the first brightness map is solved [thresholds]."""
 SLOPE_PX = 0.005
 """Step of the finite differences that give the derivatives of the residuals [px]."""
+STEP_RAD = 0.004
+"""Step of the finite differences that give the derivatives of the residuals by an angle [rad]."""
 PREDICTED_PX = 0.5
 """Longest step for which the change of the brightness map is predicted [px]."""
 
@@ -70,6 +72,7 @@ class Cost:
         self.columns: dict[str, tuple[Any, Any]] = {}
         """Derivatives of the residuals at the last solution, on the device, by name; each with the part of it that no
         change of the map explains."""
+        self._by_angle: tuple[Any, Any] | None = None
 
     @property
     def space(self) -> ParameterSpace:
@@ -78,7 +81,12 @@ class Cost:
 
     @space.setter
     def space(self, space: ParameterSpace) -> None:
-        self._space, self._solved, self._changes, self.columns = space, None, [], {}
+        self._space, self._changes = space, []
+        self._solve_at(None)
+
+    def _solve_at(self, v: NDArray[np.float64] | None) -> None:
+        """Note at which search vector the map was solved, and forget the derivatives of earlier residuals."""
+        self._solved, self.columns, self._by_angle = v, {}, None
 
     def warm_up(self, v: NDArray[np.float64]) -> None:
         """Solve the first brightness map at the search vector ``v``, and scale the weights by its residuals."""
@@ -93,14 +101,14 @@ class Cost:
     def renew(self, v: NDArray[np.float64]) -> None:
         """Discard the brightness map and solve a new one at ``v``: a map is biased to the parameters of its fit."""
         self.brightness.clear()
-        self._solved, self.columns = None, {}
+        self._solve_at(None)
         self.brightness.place(**self.at(v))
         self.brightness.solve(FIRST_SCALE, steps=2 * self.steps, rounds=3)
 
     def replace_map(self, unknowns: wp.array) -> None:
         """Replace the brightness map and the other unknowns; the residuals remain."""
         self.brightness.unknowns = unknowns
-        self._solved, self.columns = None, {}
+        self._solve_at(None)
 
     def at(self, v: NDArray[np.float64]) -> dict[str, Any]:
         """Return the keyword arguments of :meth:`BrightnessMap.place` for the search vector ``v``."""
@@ -110,12 +118,31 @@ class Cost:
         """Solve the brightness map at the search vector ``v``. The residuals stay on the device."""
         self.brightness.place(**self.at(v))
         self.brightness.solve(self.scale, steps=steps or self.steps, rounds=rounds)
-        self._solved, self.columns = v, {}
+        self._solve_at(v)
 
     def converge(self, v: NDArray[np.float64]) -> None:
         """Solve the brightness map at ``v`` in two rounds, unless it was last solved there."""
         if self._solved is None or not np.array_equal(self._solved, v):
             self.residuals(v, rounds=2)
+
+    def by_angle(self, v: NDArray[np.float64]) -> tuple[Any, Any]:
+        """Return the derivatives of the residuals by the prism's angle at the first and at the second event of a pair.
+
+        They are on the device, shape (padded pairs,) each. The map must be solved at ``v``.
+        """
+        if self._by_angle is None:
+            arrays, at = self.brightness.pairs.arrays, self.at(v)
+            given, ends = arrays.slope, ({**at, "drift": STEP_RAD}, {**at, "drift": -STEP_RAD})
+
+            def by(end: int) -> Any:
+                shift = wp.zeros((2, arrays.stride), dtype=float, device=self.brightness.device)
+                shift[end].fill_(1.0)
+                arrays.slope = shift.flatten()
+                return self.brightness.find_slope(*ends, 2.0 * STEP_RAD)
+
+            self._by_angle = by(0), by(1)
+            arrays.slope = given
+        return self._by_angle
 
     def mean(self) -> float:
         """Return the mean Cauchy cost, relative to that without a map.

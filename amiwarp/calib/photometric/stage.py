@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.brightness.solver import BrightnessMap, SensorTiming, Tiles, darkness, off_excess, set_lags
@@ -579,8 +578,7 @@ def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
     """
     cost, camera = search.cost, search.cost.space.camera
     cost.converge(v)
-    names = consistency.angle_errors(cost, v)
-    found = consistency.fit_angles(cost, v, names)
+    found = consistency.fit_angles(cost, v)
     if found is None or found.moved_px < consistency.LEAST_MOVE_PX:
         return None
     pairs = cost.brightness.pairs
@@ -597,7 +595,7 @@ def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
         if found.moved_px / share < LEAST_ANGLE_PX:
             break
         cost.converge(at)
-        before, found = found, consistency.fit_angles(cost, at, names)
+        before, found = found, consistency.fit_angles(cost, at, found.names)
         assert found is not None
         share = float(np.clip((before.change - found.change) @ step / (step @ step), LEAST_SHARE, 1.0))
     return total
@@ -659,11 +657,9 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
     """
     cost.converge(v)
     relative, _ = darkness(cost.brightness, cost.space.build(cost.space.to_values(v)))
-    # the refractory period sets the reference of a pair, its first event, later
-    reference = wp.zeros_like(relative)
-    reference[0].fill_(1.0)
     columns = consistency.slopes(cost, cost.space, v, cost.space.names)
-    columns["refractory"], columns["slow"] = (consistency.shifted(cost, v, shift) for shift in (reference, relative))
+    # the refractory period sets the reference of a pair, its first event, later
+    columns["refractory"], columns["slow"] = cost.by_angle(v)[0], consistency.shifted(cost, v, relative)
     fit = consistency.linear_fit(cost, columns)
 
     def angle(name: str, sign: float) -> float:
