@@ -523,6 +523,7 @@ class PairPositions:
         self.equations = (PairChains if self.device.is_cpu else PairEnds)(pairs, atlas, self.geometry)
         """Equations of the pairs at these positions."""
         self._nothing = wp.empty(0, dtype=float, device=self.device)
+        self._still = CameraRotation(middle_us=middle_us)
         self._launch = RepeatedLaunches(self.device)
 
     def _new_geometry(self) -> Any:
@@ -554,7 +555,11 @@ class PairPositions:
         self._launch(place_blocks, self.equations.threads, inputs, outputs, smallest=FEW_BLOCKS)
 
     def _turn(self, camera_rotation: CameraRotation | None) -> CameraRotation:
-        return (camera_rotation or CameraRotation()).about(self._middle_us)
+        return (
+            self._still
+            if camera_rotation is None or not camera_rotation.moves
+            else camera_rotation.about(self._middle_us)
+        )
 
     def _in_blocks(self, model: Model, turn: CameraRotation) -> bool:
         """Return whether the fast kernels apply: no distortion, no slow pixels, and on CUDA only the prism moves."""

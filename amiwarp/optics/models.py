@@ -409,7 +409,8 @@ def struct_of(kind: Any, values: Sequence[Any]) -> Any:
     """Return a Warp struct with the given values of its fields, in their order."""
     struct = kind()
     for name, value in zip(kind.vars, values, strict=True):
-        setattr(struct, name, value)
+        if not isinstance(value, int | float) or value:  # a new struct holds zeros, and to set a field takes longer
+            setattr(struct, name, value)
     return struct
 
 
@@ -610,15 +611,17 @@ class ExactModel(Model):
         instance(self.prism, Prism, "prism")
         object.__setattr__(self, "phase", check_phase(self.phase))
         for name in ("tilt", "cylinder", "wobble"):
-            object.__setattr__(self, name, check_angles(getattr(self, name), name))
+            if getattr(self, name) is not getattr(ExactModel, name):  # a tuple of the caller
+                object.__setattr__(self, name, check_angles(getattr(self, name), name))
 
     @classmethod
     def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
         wedge = Prism(values["apex"], values.get("index", prism.index), prism.flat_side)
-        tilt, cylinder, wobble = (
-            (values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0)) for name in ("tilt", "cylinder", "wobble")
-        )
-        return cls(camera, wedge, values["phase"], tilt, cylinder, wobble)
+        pairs = {
+            name: (values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0))
+            for name in ("tilt", "cylinder", "wobble") if not {f"{name}_x", f"{name}_y"}.isdisjoint(values)
+        }  # fmt: skip
+        return cls(camera, wedge, values["phase"], **pairs)
 
     @classmethod
     def still_values(cls, values: Mapping[str, float]) -> dict[str, float]:

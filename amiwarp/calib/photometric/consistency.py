@@ -222,45 +222,60 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
 
     The map must have been solved at the answer.
     """
-    b, camera = cost.brightness, cost.space.camera
+    b = cost.brightness
     b.prepare_projection()
     for name, column in columns.items():
         if name not in cost.columns or cost.columns[name][0] is not column:
             cost.columns[name] = column, b.unexplained(column, steps=MAP_STEPS)
     left = [cost.columns[name][1] for name in columns]
     next(cost.meanwhile, None)
-    width, height = (-(-side // SQUARE_PX) for side in (camera.width, camera.height))
-    sums, squares = b.residuals.products_by_square([*left, b.residuals.values], SQUARE_PX, width, height)
+    sums, squares, width = _products_by_square(cost, left)
     xy = np.stack([squares % width, squares // width], axis=1).astype(np.float64)
     return LinearFit(
         tuple(columns), sums[:, :-1, :-1], sums[:, :-1, -1], (xy + 0.5) * SQUARE_PX, float(sums[:, -1, -1].sum())
     )
 
 
-GATE = 2.0
+def _products_by_square(cost: Cost, columns: list[Any]) -> tuple[Vector, NDArray[np.int64], int]:
+    """Return the products of the columns and, as the last one, the residuals, shape (squares, n + 1, n + 1).
+
+    Also return the numbers of the squares that hold pairs, row by row, and how many a row has.
+    """
+    b, camera = cost.brightness, cost.space.camera
+    width, height = (-(-side // SQUARE_PX) for side in (camera.width, camera.height))
+    return *b.residuals.products_by_square([*columns, b.residuals.values], SQUARE_PX, width, height), width
+
+
+GATE = 1.0
 """How many standard deviations more than by chance a group of unknowns must be away from 0 to be examined."""
+GATE_SHARE = 0.15
+"""Share of the gain asked of a group of unknowns that it must have already while the map is fixed. It has 0.2 to 0.6 of
+the gain with the map's change where it is wrong."""
 
 
-def telling(cost: Cost, groups: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return those groups of derivatives of the residuals that may explain some of them.
+def telling(cost: Cost, groups: list[dict[str, Any]], least_gain: float) -> list[dict[str, Any]]:
+    """Return those groups of derivatives of the residuals that may remove the share ``least_gain`` of their squares.
 
     The map has been solved, so that the residuals are nearly orthogonal to what a change of the map explains. So the
     gradient needs no projection, which takes most of the time of a :func:`linear_fit`.
     """
-    b, camera = cost.brightness, cost.space.camera
     columns = {name: column for group in groups for name, column in group.items()}
     if not columns:
         return []
-    width, height = (-(-side // SQUARE_PX) for side in (camera.width, camera.height))
-    sums = b.residuals.products_by_square([*columns.values(), b.residuals.values], SQUARE_PX, width, height)[0]
-    parts = dict(zip(columns, sums[:, :-1, -1].T, strict=True))
+    sums, names = _products_by_square(cost, [*columns.values()])[0], [*columns]
+    total = sums.sum(axis=0)
 
-    def away(group: dict[str, Any]) -> float:
-        each = np.stack([parts[name] for name in group], axis=1)
-        total = each.sum(axis=0)
-        return math.sqrt(max(0.0, float(total @ np.linalg.lstsq(each.T @ each, total, rcond=1e-12)[0])))
+    def square(matrix: Vector, vector: Vector) -> float:
+        return max(0.0, float(vector @ np.linalg.lstsq(matrix, vector, rcond=1e-12)[0]))
 
-    return [group for group in groups if group and away(group) > math.sqrt(len(group)) + GATE]
+    def may(group: dict[str, Any]) -> bool:
+        k = [names.index(name) for name in group]
+        each, gradient = sums[:, k, -1], total[k, -1]
+        away = math.sqrt(square(each.T @ each, gradient))
+        gain = square(total[np.ix_(k, k)], gradient) / max(float(total[-1, -1]), 1e-30)
+        return away > math.sqrt(len(group)) + GATE and gain >= GATE_SHARE * least_gain
+
+    return [group for group in groups if group and may(group)]
 
 
 def masked(column: Any, factor: Any) -> Any:
@@ -395,12 +410,13 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
             columns |= _cause_columns(cost, best, cause)
     # wobble has nearly the effect of cylinder power: where the first look finds none of that, it finds no wobble
     gates = [c for c in screened if c in GATED and (c is not SHAPES[1] or SHAPES[0] not in screened)]
-    for group in telling(cost, [_cause_columns(cost, best, cause) for cause in gates]):
+    least_gain = LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN
+    for group in telling(cost, [_cause_columns(cost, best, cause) for cause in gates], least_gain):
         columns |= group
     if set(SHAPES[0].names) <= columns.keys() and SHAPES[1] in screened:
         columns |= _cause_columns(cost, best, SHAPES[1])
     fit = linear_fit(cost, columns)
-    findings = _findings(cost, best, fit, screened, LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN)
+    findings = _findings(cost, best, fit, screened, least_gain)
     if findings and not doubtful:
         for cause in causes:
             if cause not in SCREENED:
@@ -564,7 +580,7 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> AngleFi
     """
     angles = _angle_columns(cost, best)
     groups = [{name: angles[name] for name in group} for group in (HARMONICS, SKEW) if angles]
-    if not angles or not (names or telling(cost, groups)):
+    if not angles or not (names or telling(cost, groups, LEAST_ANGLE_GAIN)):
         return None
     given = _rivals_of_angles(cost, best)
     fit = linear_fit(cost, given | angles)

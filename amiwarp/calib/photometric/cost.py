@@ -386,7 +386,7 @@ def split_at_silence(events: Events, length_us: float) -> list[Events]:
     """
     t = events.t
     edges = np.arange(int(t[0]), int(t[-1]) + length_us, length_us) if len(t) else np.zeros(0)
-    at = np.searchsorted(t, edges)
+    at = np.searchsorted(t, np.ceil(edges).astype(np.int64))  # real numbers would make a copy of all times
     counts = np.diff(at)
     if not len(counts) or np.median(counts) < FEWEST_OF_SECTOR:
         return [events] if len(t) else []
