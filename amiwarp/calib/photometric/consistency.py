@@ -67,8 +67,8 @@ CAUSES = (
     Cause("the lens distortion k1", ("k1",)),
     Cause("the ratio of the focal lengths fy / fx", ("fy_over_fx",)),
     Cause("the direction of the prism's axis", ("tilt_x", "tilt_y")),
-    Cause("the evenness of the prism's faces", ("cylinder_x", "cylinder_y")),
     Cause("the prism's seat in its mount", ("wobble_x", "wobble_y")),
+    Cause("the evenness of the prism's faces", ("cylinder_x", "cylinder_y")),
 )
 """All causes that the photometric stage can name and correct, the likeliest first."""
 ASPECT, SHAPES = CAUSES[4], CAUSES[6:]
@@ -409,12 +409,13 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         if cause not in GATED:
             columns |= _cause_columns(cost, best, cause)
     # wobble has nearly the effect of cylinder power: where the first look finds none of that, it finds no wobble
-    gates = [c for c in screened if c in GATED and (c is not SHAPES[1] or SHAPES[0] not in screened)]
+    wobble, cylinder = SHAPES
+    gates = [c for c in screened if c in GATED and (c is not wobble or cylinder not in screened)]
     least_gain = LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN
     for group in telling(cost, [_cause_columns(cost, best, cause) for cause in gates], least_gain):
         columns |= group
-    if set(SHAPES[0].names) <= columns.keys() and SHAPES[1] in screened:
-        columns |= _cause_columns(cost, best, SHAPES[1])
+    if set(cylinder.names) <= columns.keys() and wobble in screened:
+        columns |= _cause_columns(cost, best, wobble)
     fit = linear_fit(cost, columns)
     findings = _findings(cost, best, fit, screened, least_gain)
     if findings and not doubtful:
@@ -575,18 +576,20 @@ class AngleFit:
 def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> AngleFit | None:
     """Return the errors ``names`` of the prism's angle at ``best`` [px]; without names, those that are significant.
 
-    None if there are none, or if they cannot be examined. What a slow rotation of the camera or a wrong fy / fx
-    explains does not count.
+    None if there are none, or if they cannot be examined. What a slow rotation of the camera, a wrong fy / fx or the
+    prism's shape explains does not count.
     """
     angles = _angle_columns(cost, best)
     groups = [{name: angles[name] for name in group} for group in (HARMONICS, SKEW) if angles]
     if not angles or not (names or telling(cost, groups, LEAST_ANGLE_GAIN)):
         return None
-    given = _rivals_of_angles(cost, best)
-    fit = linear_fit(cost, given | angles)
+    given, shape = _rivals_of_angles(cost, best), {}
+    if not names and SHAPES[1] in testable(cost.space):
+        shape = _cause_columns(cost, best, SHAPES[1])  # for wobble too, which has nearly the same effect
+    fit = linear_fit(cost, given | angles | shape)
     if not names:
         for group, other in ((HARMONICS, SKEW), (SKEW, HARMONICS)):
-            _, significance, gain = fit.adding((*given, *other), group)
+            _, significance, gain = fit.adding((*given, *shape, *other), group)
             names += group if significance >= SIGNIFICANT and gain >= LEAST_ANGLE_GAIN else ()
         if not names:
             return None
