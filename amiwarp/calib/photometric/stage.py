@@ -793,6 +793,8 @@ RIVAL_STD = 0.5
 """Systematic standard deviation of an answer with a rival explanation: a share of the difference of their answers."""
 LEAST_RIVAL_PX = 0.02
 """Distance of the models of two explanations from which on both are reported [px rms]."""
+CONTRADICTING = 3.0
+"""Number of standard deviations from which on a correction is said to contradict what was given."""
 LARGEST_LAST_STEP_PX = 0.01
 """Longest step that is added to the answer without a new search [px]."""
 
@@ -956,8 +958,9 @@ def _corrections(given: ParameterSpace, space: ParameterSpace, answer: Answer) -
                 scale, unit = math.degrees(1.0), " deg"
             was, now, by = (scale * x for x in (space.start[name], found[name], std[name]))
             remedy = "; calibrate the lens" if name in LENS else ""
-            out.append(
-                f"the events contradict {name} = {was:.5g}{unit}: it was corrected to {now:.5g} ± {by:.2g}{unit}"
-                f"{remedy}"
-            )
+            if abs(now - was) >= CONTRADICTING * by:
+                said = f"the events contradict {name} = {was:.5g}{unit}: it was corrected to"
+            else:  # the other one of two, or what a later correction explains
+                said = f"{name} = {was:.5g}{unit} was fitted too, and is"
+            out.append(f"{said} {now:.5g} ± {by:.2g}{unit}{remedy}")
     return out
