@@ -247,6 +247,24 @@ def test_an_encoder_s_own_clock_offset_counts_once(recording: Recording) -> None
     assert Inspector(late, found).adjusted_encoder.clock_offset_us == 700.0
 
 
+def test_an_encoder_s_error_that_a_calibration_found_is_corrected(recording: Recording) -> None:
+    assert recording.encoder is not None
+    error = (0.0, 0.05, 0.0, 0.0)
+    wrong = replace(recording, encoder=recording.encoder.with_harmonics(tuple(-x for x in error)))
+    found = replace(calibration_of(recording), harmonics=error)
+    right, late, corrected = Inspector(recording), Inspector(wrong), Inspector(wrong, found)
+    for each in (right, late, corrected):
+        each.set(true_knobs(recording))
+        each.open(*right.first_window())
+    shown = [each.show().after for each in (right, late, corrected)]
+    assert np.abs(shown[1] - shown[0]).max() > 0.1
+    np.testing.assert_allclose(shown[2], shown[0], atol=0.01)  # the correction is of first order
+    assert corrected.as_calibration().harmonics == error
+    late.accept(found)
+    late.set(true_knobs(recording))
+    np.testing.assert_array_equal(late.show().after, shown[2])
+
+
 def test_what_was_set_by_hand_can_be_saved_and_opened(
     inspector: Inspector, recording: Recording, tmp_path: Path
 ) -> None:

@@ -711,6 +711,7 @@ class Inspector:
         """Start and length of the time window [us]; None: that of :meth:`first_window`."""
         self.selection = Selection()
         self._found: tuple[Knobs, Calibration] | None = None
+        self._harmonics: tuple[float, ...] | None = None
         self._window: LoadedWindow | None = None
         self._span: Span | None = None
         self.lock = Lock()
@@ -749,7 +750,13 @@ class Inspector:
 
     def _encoder(self, rpm: float) -> Encoder:
         source = self.recording.events
-        return self.recording.encoder or constant_speed(rpm, source.t_first, source.t_last, self.zero_us)
+        return self._corrected or constant_speed(rpm, source.t_first, source.t_last, self.zero_us)
+
+    @cached_property
+    def _corrected(self) -> Encoder | None:
+        """The recording's encoder without the error that a calibration found in it; None if there is no encoder."""
+        encoder, harmonics = self.recording.encoder, self._harmonics
+        return encoder if encoder is None or harmonics is None else encoder.with_harmonics(harmonics)
 
     @property
     def adjusted_encoder(self) -> Encoder:
@@ -792,7 +799,14 @@ class Inspector:
             recording = self.latest()
             self.recording = replace(self.recording, events=recording.events, encoder=recording.encoder)
             self._span = None
-            self.__dict__.pop("hot", None)
+            self._forget_angles()
+
+    def _forget_angles(self) -> None:
+        """Forget what depends on the encoder's angles."""
+        for name in ("hot", "_corrected"):
+            self.__dict__.pop(name, None)
+        if self._window is not None:
+            self._window.angles.clear()
 
     def accept(self, calibration: Calibration) -> None:
         """Set the parameters to a calibration. Raises :class:`AmiwarpError` if its camera has another size."""
@@ -803,6 +817,8 @@ class Inspector:
                 "calibrate this recording"
             )
         self.prism, self.recording = calibration.prism, replace(self.recording, camera=calibration.camera)
+        self._harmonics = calibration.harmonics
+        self._forget_angles()
         self.set(self.knobs_of(calibration))
         found, free = (
             {"apex" if name in size_names() else name for name in names} & set(self.sources)
@@ -857,7 +873,7 @@ class Inspector:
             model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
             sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before.variance, sharpness_after=after.variance,
             stages=(), events=len(w.events), seconds=0.0, warnings=("set by hand in the inspector",),
-            zero_us=None if self.has_encoder else self.zero_us,
+            zero_us=None if self.has_encoder else self.zero_us, harmonics=self._harmonics,
         )  # fmt: skip
 
     def set(self, knobs: Knobs) -> None:
