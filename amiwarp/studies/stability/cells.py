@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
 from amiwarp._version import __version__
+from amiwarp.brightness.solver import SensorTiming
 from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.calib.parameters import build_model
@@ -365,6 +366,8 @@ class Condition:
     """True refractive index of the prism minus the one that the recording states."""
     lost_part: float = 0.0
     """Share of each turn whose events are lost, always the same part."""
+    timing_known: bool = False
+    """Whether latency and refractory period are given to the calibration. Else their effect is part of the phase."""
 
     @property
     def key(self) -> str:
@@ -407,7 +410,7 @@ class Condition:
 _LATER_FIELDS = (
     "cutoff_hz", "bus_rate_mev_s", "principal_px", "encoder_scale", "eccentric_deg", "second_deg", "index_only",
     "turn_ripple", "no_encoder", "ramp", "cylinder_deg", "wobble_deg", "column_us", "line_us", "row_us", "aspect_error",
-    "index_error", "lost_part",
+    "index_error", "lost_part", "timing_known",
 )  # fmt: skip
 """Fields of :class:`Condition` with default 0 that did not exist when the first cells were stored."""
 
@@ -781,8 +784,10 @@ def mild(seed: int) -> Condition:
     for name, span in TROUBLES.items():
         size, there = round(float(rng.uniform(*span)), 5), rng.uniform() < 0.25
         values |= {name: size} if there else {}
-    condition = Condition(scene=scene.value, index_only="turn_ripple" in values, **values)  # type: ignore[arg-type]
-    return replace(condition, eccentric_deg=0.0, second_deg=0.0) if condition.index_only else condition
+    condition = Condition(scene=scene.value, timing_known=True, **values)  # type: ignore[arg-type]
+    return (
+        replace(condition, index_only=True, eccentric_deg=0.0, second_deg=0.0) if condition.turn_ripple else condition
+    )
 
 
 # Methods, and cells: a condition, a seed, and the result of each calibration method on that recording.
@@ -847,8 +852,11 @@ class Method:
         """Calibrate a sample. Raises :class:`AmiwarpError` if the method refuses it."""
         if self.settings is None:
             return calibrate_as_paper(sample.recording, start=sample.hardware, device=device)
-        known = sample.hardware if condition.start != "none" else {}
-        return calibrate(sample.recording, replace(self.settings, seed=seed, start=known), device=device)
+        settings = replace(self.settings, seed=seed, start=sample.hardware if condition.start != "none" else {})
+        if condition.timing_known:
+            sensor = SensorTiming(condition.latency_us, condition.refractory_us)
+            settings = replace(settings, photometric=replace(settings.photometric, sensor=sensor))
+        return calibrate(sample.recording, settings, device=device)
 
 
 _SHARP = Settings(model="exact", stages=STAGES[:1])
@@ -962,16 +970,14 @@ def _judge(cell: Cell, method: Method, sample: SimulatedSample, device: str) -> 
 def deviations(found: Calibration, condition: Condition, sample: SimulatedSample) -> dict[str, float]:
     """Return the distance of each parameter of :data:`STATED` from the truth [stated standard deviations].
 
-    A parameter for which no standard deviation is stated is left out. The sensor's latency is part of the phase.
+    Quantities without a stated standard deviation are left out; so is the phase if the sensor's timing is part of it.
     """
     exact = found.exact
     at = compare(exact, sample)
     apex, std = exact.parameters["apex"], exact.uncertainty.get("apex", 0.0)
-    ends = np.array([sample.recording.events.t_first, sample.recording.events.t_last])
-    late = condition.latency_us * float(np.diff(sample.motion.angle(ends))[0] / np.diff(ends)[0])
     away = {
         "apex": (apex - sample.truth.prism.apex, std),
-        "phase": (at.lag - late, exact.uncertainty.get("phase", 0.0)),
+        "phase": (at.lag, exact.uncertainty.get("phase", 0.0) if condition.timing_known else 0.0),
         "size": (at.gain, std / apex if apex else 0.0),
     }
     return {name: min(abs(value) / std, MOST_DEVIATION) for name, (value, std) in away.items() if std > 0.0}
