@@ -81,8 +81,8 @@ def main() -> int:
         wanted = cells_of(axes, args.seeds, draws=args.draws)
         run(wanted, methods, Store(cells), workers, device=args.device, progress=show_progress,
             until=lambda: time.perf_counter() - began > args.limit_s)  # fmt: skip
-    with tarfile.open(args.out / "cells.tar", "w") as tar:
-        tar.add(cells, arcname="cells")
+        with tarfile.open(args.out / "cells.tar", "w") as tar:  # before the pool waits for cells that have begun
+            tar.add(cells, arcname="cells")
     print(f"{time.perf_counter() - began:6.0f} s  {len(list(cells.glob('*.json')))} cells in {args.out / 'cells.tar'}")
     return 0
 

@@ -182,6 +182,10 @@ def test_the_error_includes_the_encoder_and_not_a_constant_lag() -> None:
     right, sample = make(narrow, 0), make(replace(narrow, eccentric_deg=3.0), 0)
     assert compare(calibrated(right, phase=right.truth.phase - 0.2), right).rms < 1e-3
     assert compare(calibrated(right), right).lag == pytest.approx(0.0, abs=1e-6)
+    large = calibrated(right, apex=1.02 * right.truth.prism.apex, phase=right.truth.phase - 0.3)
+    assert compare(large, right).rms == pytest.approx(model_error(large.model, right.truth).rms, rel=0.01)
+    assert compare(large, right).gain == pytest.approx(0.02, abs=1e-4)
+    assert compare(large, right).lag == pytest.approx(0.3, abs=1e-3)
     wrong = calibrated(sample)
     # a harmonic of amplitude a moves events by a times the radius of the orbit, of which its rms is 1 / sqrt 2
     radius = sample.truth.camera.fx * sample.truth.prism.deflection
