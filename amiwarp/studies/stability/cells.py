@@ -731,7 +731,7 @@ AXES = (
     Axis("encoder, second harmonic", "second_deg", (0.0, 0.1, 0.3, 1.0, 3.0), "°, twice a turn"),
     Axis("speed ripple, index pulse only", "turn_ripple", (0.0, 0.01, 0.03, 0.1, 0.3), "relative, once a turn",
          (("index_only", True),)),
-    Axis("ramp without encoder", "ramp", (0.0, 0.1, 0.3, 0.6, 1.0), "of the speed, 8 turns at full speed",
+    Axis("ramp without encoder", "ramp", (0.0, 0.1, 0.3, 0.6, 1.0), "of the speed, up to 8 turns",
          (("no_encoder", True), ("turns", 8.0))),
     Axis("cylinder power", "cylinder_deg", (0.0, 0.01, 0.03, 0.1, 0.3), "° of apex over the image"),
     Axis("wobble", "wobble_deg", (0.0, 0.1, 0.5, 2.0, 5.0), "°"),
