@@ -38,7 +38,7 @@ from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, machine, proce
 from amiwarp.studies.dataset import making
 from amiwarp.studies.dataset.making import Item, list_items, simulation_of, write_recording
 from amiwarp.studies.dataset.specification import content_digest, load_specification
-from amiwarp.studies.stability.cells import AXES, METHODS, Axis, Cell, Store, Stored, run_cell
+from amiwarp.studies.stability.cells import AXES, METHODS, Axis, Cell, Store, Stored, cells_of, run_cell
 from amiwarp.studies.stability.cells import run as run_cells
 from benchmarks import compensate as file_benchmark
 from benchmarks import simulate
@@ -121,7 +121,7 @@ def known(cell: Stored) -> dict[str, Any]:
     """Return the result of a cell without what may differ: its time and its machine."""
     (result,) = cell.results.values()
     return {"events": cell.events, "outcome": result.outcome.value, "error_px": result.error_px,
-            "message": result.message, "deviation": result.deviation}  # fmt: skip
+            "message": result.message, "deviations": result.deviations}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def run_atlas(place: Place, scheduler: str, tasks: int) -> Done:
     cells.mkdir()
     with start_workers("benchmarks.two_gpus", "cluster", scheduler, 0, place.device) as workers:
         began = time.perf_counter()
-        done = run_cells([axis()], tasks // VALUES, METHODS[:1], Store(cells), workers, device=place.device)
+        done = run_cells(cells_of([axis()], tasks // VALUES), METHODS[:1], Store(cells), workers, device=place.device)
         seconds = time.perf_counter() - began
     shutil.rmtree(cells)
     return Done(seconds, sum(c.events for c in done), {c.cell.name: known(c) for c in done})

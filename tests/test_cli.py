@@ -19,7 +19,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner, Result
 
-from amiwarp import AmiwarpError, Calibration, open_recording
+from amiwarp import AmiwarpError, Calibration, PrismMotion, open_recording
 from amiwarp.cli.app import COMMANDS, app, function_of
 from amiwarp.cli.options import number
 
@@ -174,7 +174,7 @@ def test_simulate_takes_every_fault_of_sensor_and_encoder(place: Path) -> None:
         "simulate", "faulty.h5", "--picture", "photo.jpg", "--size", "64x48", "--duration", "0.1", "--ideal",
         "--contrast-on", "0.3", "--shot-noise-hz", "2", "--counts-per-turn", "0", "--rate-hz", "500",
         "--speed", "speed.csv", "--tilt-deg", "1,-0.5", "--rotate-deg-s", "0,5,0", "--flat-side", "camera",
-        "--cylinder-deg", "0.1,-0.2", "--wobble-deg", "0,1.5",
+        "--cylinder-deg", "0.1,-0.2", "--wobble-deg", "0,1.5", "--encoder-error-deg", "0,0.3,0,0",
     )  # fmt: skip
     data = ok("info", "faulty.h5")
     truth = data["truth"]
@@ -185,6 +185,10 @@ def test_simulate_takes_every_fault_of_sensor_and_encoder(place: Path) -> None:
     assert data["prism"]["flat_side"] == "camera"
     assert data["encoder"]["rpm"] == pytest.approx(720.0, abs=3.0)
     assert data["encoder"]["interval_us"] == pytest.approx(2000.0, abs=20.0)
+    encoder = open_recording("faulty.h5").encoder
+    assert encoder is not None
+    turned = PrismMotion([[0.0, 700.0], [0.1, 740.0]]).angle(encoder.t)
+    np.testing.assert_allclose(encoder.angle - turned, np.radians(0.3) * np.sin(turned), rtol=0, atol=5e-4)  # rad
 
 
 def test_calibrate_finds_the_truth(place: Path) -> None:
@@ -366,6 +370,7 @@ BAD = [
     (("simulate", "out.h5", "--picture", "photo.jpg", "--mismatch", "7"), "mismatch"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--tilt-deg", "1"), "--tilt-deg"),
     (("simulate", "out.h5", "--picture", "photo.jpg", "--cylinder-deg", "1"), "--cylinder-deg"),
+    (("simulate", "out.h5", "--picture", "photo.jpg", "--encoder-error-deg", "1,2"), "--encoder-error-deg"),
     (("simulate", "nowhere/out.h5", "--picture", "photo.jpg", "--size", "64x48", "--duration", "0.01"), "nowhere"),
     (("translate", "missing.mp4", "out.h5"), "missing.mp4"),
     (("translate", "notes.txt", "out.h5"), "notes.txt"),

@@ -442,6 +442,18 @@ def test_ideal_encoder_is_exact_and_clock_offset_is_undone() -> None:
     assert np.abs(encoder.angle_at(t) - motion.angle(t)).min() > 0.1  # rad: the offset has an effect
 
 
+def test_an_eccentric_encoder_is_wrong_by_its_harmonics_only() -> None:
+    motion, factors = PrismMotion(720.0), (0.02, -0.05, 0.01, 0.005)
+    right = EncoderModel().sample(motion, 300_000, seed=1)
+    wrong = EncoderModel(harmonics=factors).sample(motion, 300_000, seed=1)
+    np.testing.assert_array_equal(wrong.t, right.t)
+    theta = motion.angle(right.t)
+    error = 0.02 * np.cos(theta) - 0.05 * np.sin(theta) + 0.01 * np.cos(2 * theta) + 0.005 * np.sin(2 * theta)
+    np.testing.assert_allclose(
+        wrong.angle - right.angle, error, rtol=0, atol=2.0 * np.pi / 8192 + 1e-3
+    )  # jitter, counts
+
+
 # -- pictures
 
 
@@ -471,6 +483,8 @@ def test_a_picture_is_cut_to_the_view() -> None:
         (lambda: CameraMotion((1.0, 2.0)), "camera rotation has shape"),
         (lambda: EncoderModel(rate_hz=0.0), "rate_hz = 0"),
         (lambda: EncoderModel(counts_per_turn=0), "counts_per_turn = 0"),
+        (lambda: EncoderModel(harmonics=(0.0, 0.1)), "encoder harmonics is"),  # type: ignore[arg-type]
+        (lambda: EncoderModel(harmonics=(0.0, 3.0, 0.0, 0.0)), "harmonics = 3"),
         (lambda: base(duration_s=0.0), "duration_s = 0"),
         (lambda: base(seed=-1), "seed = -1"),
         (lambda: base(camera=Camera.from_fov(4000, 4000, 1.0)), "4000x4000"),

@@ -7,24 +7,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amiwarp import AmiwarpError, ExactModel, calibrate, model_error
+from amiwarp import AmiwarpError, Calibration, ExactModel, calibrate, model_error
 from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.stability.cells import (
     AXES,
+    TROUBLES,
     Condition,
     Outcome,
     SceneKind,
+    SimulatedSample,
     Store,
     best_fit,
+    cells_of,
     chosen,
+    compare,
     conditions,
+    deviations,
     draw,
     identity,
     make,
+    mild,
     quick_axes,
     run,
     sensible,
+    skewed,
 )
 from tests.conftest import COARSE
 
@@ -111,6 +118,106 @@ def test_what_is_asked_for_is_made() -> None:
     assert len(still.events) < 0.15 * len(plain.events)
 
 
+def error_of_encoder(sample: SimulatedSample) -> np.ndarray:
+    """Return the angle of each encoder sample minus the true one [rad]."""
+    encoder = sample.recording.encoder
+    assert encoder is not None
+    return np.asarray(encoder.angle - sample.motion.angle(encoder.t))
+
+
+def test_troubles_of_encoder_and_speed_are_made() -> None:
+    wrong = error_of_encoder(make(replace(SMALL, eccentric_deg=3.0, second_deg=1.0), 0))
+    assert np.degrees(np.abs(wrong).max()) == pytest.approx(3.5, abs=0.5)
+    assert np.degrees(wrong.std()) == pytest.approx(math.hypot(3.0, 1.0) / math.sqrt(2.0), rel=0.05)
+    pulses = make(replace(SMALL, turn_ripple=0.1, index_only=True), 0)
+    assert np.abs(error_of_encoder(pulses)).max() < 1e-4
+    middle = pulses.recording.encoder
+    assert middle is not None
+    assert np.unique(np.round(np.diff(middle.angle) / (2.0 * math.pi), 9)) == 1.0
+    t = np.arange(0, 200_000, 100)
+    ripple = middle.angle_at(t) - pulses.motion.angle(t)
+    assert np.ptp(ripple) == pytest.approx(2 * 0.1, rel=0.02)  # rad: 0.1 of the speed, once a turn
+    rising = make(replace(SMALL, ramp=1.0, no_encoder=True), 0)
+    assert rising.recording.encoder is None
+    assert rising.motion.angle([SMALL.duration_s * 1e6])[0] == pytest.approx(math.pi * SMALL.turns, rel=1e-3)
+
+
+def test_troubles_of_prism_camera_and_readout_are_made() -> None:
+    plain = make(SMALL, 0)
+    truth = make(replace(SMALL, cylinder_deg=0.1, wobble_deg=2.0, index_error=0.06), 0)
+    assert np.degrees(math.hypot(*truth.truth.cylinder)) == pytest.approx(0.05, abs=1e-9)
+    assert np.degrees(math.hypot(*truth.truth.wobble)) == pytest.approx(2.0, abs=1e-9)
+    assert truth.recording.prism is not None
+    assert truth.truth.prism.index - truth.recording.prism.index == pytest.approx(0.06, abs=1e-12)
+    wide = make(replace(SMALL, aspect_error=0.03), 0)
+    assert wide.truth.camera.fy == pytest.approx(1.03 * wide.truth.camera.fx, abs=1e-9)
+    assert wide.recording.camera is not None
+    assert wide.recording.camera.fy == wide.recording.camera.fx == wide.truth.camera.fx
+    some = make(replace(SMALL, lost_part=0.4), 0)
+    hits = np.histogram(
+        some.motion.angle(some.recording.events.slice(0, 10**9).t) % (2.0 * math.pi), 20, (0.0, 2.0 * math.pi)
+    )[0]
+    assert 7 <= (hits == 0).sum() <= 8
+    events = plain.recording.events.slice(0, 10**9)
+    late = skewed(events, replace(SMALL, column_us=5.0, line_us=10.0))
+    assert (np.diff(late.t) >= 0).all()
+    np.testing.assert_array_equal(np.sort(late.t - 5 * late.x.astype(int) - 10 * late.y.astype(int)), events.t)
+    assert late.t.mean() - events.t.mean() == pytest.approx(5.0 * events.x.mean() + 10.0 * events.y.mean(), abs=1e-6)
+    assert len(make(replace(SMALL, row_us=20.0), 0).recording.events) < len(plain.recording.events)
+
+
+def calibrated(sample: SimulatedSample, **changes: float) -> Calibration:
+    """Return a calibration of the true values, with changes."""
+    truth = sample.truth
+    values = {"apex": truth.prism.apex, "phase": truth.phase} | changes
+    return Calibration(
+        model_name="exact", camera=truth.camera, prism=truth.prism, parameters=values,
+        uncertainty={"apex": 1e-4, "phase": 1e-3}, free=("apex", "phase"), sharpness_name="variance",
+        sharpness_before=1.0, sharpness_after=2.0, stages=(), events=1, seconds=1.0,
+    )  # fmt: skip
+
+
+def test_the_error_includes_the_encoder_and_not_a_constant_lag() -> None:
+    narrow = replace(SMALL, fov_deg=20.0)
+    right, sample = make(narrow, 0), make(replace(narrow, eccentric_deg=3.0), 0)
+    assert compare(calibrated(right, phase=right.truth.phase - 0.2), right).rms < 1e-3
+    assert compare(calibrated(right), right).lag == pytest.approx(0.0, abs=1e-6)
+    large = calibrated(right, apex=1.02 * right.truth.prism.apex, phase=right.truth.phase - 0.3)
+    assert compare(large, right).rms == pytest.approx(model_error(large.model, right.truth).rms, rel=0.01)
+    assert compare(large, right).gain == pytest.approx(0.02, abs=1e-4)
+    assert compare(large, right).lag == pytest.approx(0.3, abs=1e-3)
+    wrong = calibrated(sample)
+    # a harmonic of amplitude a moves events by a times the radius of the orbit, of which its rms is 1 / sqrt 2
+    radius = sample.truth.camera.fx * sample.truth.prism.deflection
+    assert compare(wrong, sample).rms == pytest.approx(math.radians(3.0) / math.sqrt(2.0) * radius, rel=0.05)
+    true = sample.motion.angle(np.arange(0, 83_000, 100))
+    assert sample.plain is not None
+    error = sample.plain.angle_at(np.arange(0, 83_000, 100)) - true
+    found = np.linalg.lstsq(np.stack([np.cos(true), np.sin(true)], axis=1), -error, rcond=None)[0]
+    corrected = compare(replace(wrong, harmonics=(*found, 0.0, 0.0)), sample)
+    assert corrected.rms < 0.05 * compare(wrong, sample).rms
+
+
+def test_deviations_are_those_that_were_made() -> None:
+    sample = make(SMALL, 0)
+    found = calibrated(sample, apex=sample.truth.prism.apex + 2e-4, phase=sample.truth.phase - 3e-3)
+    known = deviations(found, replace(SMALL, timing_known=True), sample)
+    assert known == pytest.approx({"apex": 2.0, "phase": 3.0, "size": 2.0}, abs=0.05)
+    assert set(deviations(found, SMALL, sample)) == {"apex", "size"}
+
+
+def test_random_combinations_are_mild_and_different() -> None:
+    drawn = [mild(seed) for seed in range(40)]
+    assert drawn == [mild(seed) for seed in range(40)]
+    assert len(set(drawn)) == 40
+    assert all(sensible(c, 100_000) for c in drawn)
+    counts = [sum(getattr(c, name) != 0 for name in TROUBLES) for c in drawn]
+    assert 2.0 < np.mean(counts) < 4.0
+    assert max(counts) >= 5
+    cells = cells_of([a for a in AXES if a.name == "wobble"], 2, first=3, draws=4)
+    assert [c.seed for c in cells] == [0, 1, 2, 3, *[3] * 5, *[4] * 5]
+
+
 def test_best_fit_of_each_model() -> None:
     assert best_fit(SMALL, "exact") == 0.0
     circle = best_fit(SMALL, "circle")
@@ -179,10 +286,10 @@ def test_cells_are_kept_and_only_what_misses_is_run(tmp_path: Path) -> None:
     assert [m.name for m in methods] == ["default", "paper", "sharpness"]
     calls: list[tuple[str, float]] = []
     with single_worker() as worker:
-        some = run(small, 1, methods[:1], Store(tmp_path), worker, progress=lambda *a: calls.append(a))
+        some = run(cells_of(small, 1), methods[:1], Store(tmp_path), worker, progress=lambda *a: calls.append(a))
         assert calls == [("1 of 2 cells", 0.5), ("2 of 2 cells", 1.0)]
-        every = run(small, 1, methods, Store(tmp_path), worker)
-        again = run(small, 1, methods, Store(tmp_path), worker, progress=lambda *a: calls.append(a))
+        every = run(cells_of(small, 1), methods, Store(tmp_path), worker)
+        again = run(cells_of(small, 1), methods, Store(tmp_path), worker, progress=lambda *a: calls.append(a))
     assert len(calls) == 2
     name = identity(methods[0])
     for a, b, c in zip(some, every, again, strict=True):

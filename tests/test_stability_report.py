@@ -28,6 +28,7 @@ from amiwarp.studies.stability.report import (
     OVERVIEW,
     Atlas,
     Rate,
+    _markdown,
     _overview,
     _page,
     aggregate,
@@ -128,6 +129,21 @@ def test_aims_look_inside_and_outside_of_the_sensible_region(atlas: Atlas) -> No
     assert (swapped.inside, swapped.outside) == (Rate(8, 24), Rate(24, 24))
     assert set(swapped.holds.values()) == {False}
     assert all("MISSED" in line for line in swapped.lines())
+
+
+def test_deviations_are_counted_for_combinations_and_the_sensible_range() -> None:
+    name = identity(METHOD["default"])
+    right = replace(found(Outcome.SUCCESS), deviations={"apex": 0.5, "phase": 2.5})
+    wrong = replace(found(Outcome.SUCCESS), deviations={"apex": 1.5})
+    drawn = [Stored(Cell(study.mild(seed), seed), 100_000, {name: wrong if seed else right}) for seed in range(4)]
+    drawn.append(Stored(Cell(study.mild(9), 9), 100_000, {name: found(Outcome.REFUSAL)}))
+    known = cells({"default": lambda h: right}, seeds=2)
+    atlas = aggregate([*drawn, *known], AXES, METHODS, {})
+    assert [(d.where, d.quantity, *(r.count for r in d.within), d.within[0].total) for d in atlas.stated] == [
+        ("random combinations", "apex", 1, 4, 4, 4), ("random combinations", "phase", 0, 0, 1, 1),
+        ("sensible range", "apex", 6, 6, 6, 6), ("sensible range", "phase", 0, 0, 6, 6),
+    ]  # fmt: skip
+    assert "| random combinations | apex | 25 % (4.56 % to 69.9 %; 1 of 4) | 100 %" in _markdown(atlas)
 
 
 def test_worse_than_the_paper_is_told_by_the_same_recordings() -> None:
@@ -307,7 +323,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> Axis:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
 def test_command_runs_goes_on_and_redraws(tiny: Axis, tmp_path: Path) -> None:
-    words = ("--out", tmp_path, "--methods", "sharpness", "--seeds", "1", "--device", "cpu", "--json")
+    words = ("--out", tmp_path, "--methods", "sharpness", "--seeds", "1", "--draws", "0", "--device", "cpu", "--json")
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0"
     ) as cluster:

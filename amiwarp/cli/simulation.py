@@ -196,10 +196,20 @@ class EncoderModelOptions:
     dropout_us: Annotated[
         float | None, _in_encoder(help="Length of a drop-out, during which all samples are lost (us).")
     ] = None
+    encoder_error_deg: Annotated[
+        str,
+        _in_encoder(
+            help="Error of the angle that repeats every turn: factors of its cosine and sine, and of those of twice "
+            "the angle (deg). An eccentric disc causes the first two.",
+            metavar="C1,S1,C2,S2",
+        ),
+    ] = "0,0,0,0"
 
     def build(self) -> EncoderModel:
         """Return the encoder model that the options describe."""
         given: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
+        error = numbers(given.pop("encoder_error_deg"), 4, "--encoder-error-deg")
+        given["harmonics"] = tuple(map(math.radians, error))
         if self.counts_per_turn == 0:
             given["counts_per_turn"] = None
         return EncoderModel(**given)

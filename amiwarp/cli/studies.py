@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from amiwarp.studies.dataset.making import DatasetPlan, DatasetSummary
     from amiwarp.studies.design import Choice, Design, Limits, Timing
     from amiwarp.studies.evaluate.evaluation import EvaluationSummary
-    from amiwarp.studies.stability.cells import Axis, Method, Store, Stored
+    from amiwarp.studies.stability.cells import Axis, Cell, Method, Store, Stored
     from amiwarp.studies.stability.report import Atlas
 
 
@@ -546,6 +546,14 @@ def run_stability(
     seeds: Annotated[
         int | None, typer.Option(min=1, help=f"Recordings per value. Default: {SEEDS}, with --quick {QUICK_SEEDS}.")
     ] = None,
+    draws: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Recordings with random combinations of mild troubles, by which the stated deviations are judged. "
+            "Default: 300, none with --quick or --axes.",
+        ),
+    ] = None,
     minutes: Annotated[
         float | None,
         typer.Option(
@@ -568,7 +576,7 @@ def run_stability(
     Finished cells are saved in OUT/cells: the same command continues a stopped run and skips finished cells.
     """
     device = choose_device(common.device)
-    from amiwarp.studies.stability.cells import Store, identity
+    from amiwarp.studies.stability.cells import DRAWS, Store, cells_of, identity
     from amiwarp.studies.stability.report import aggregate, draw, load
 
     chosen_axes, chosen_methods = _axes(axes or (), quick), _methods(methods or (), quick)
@@ -583,7 +591,10 @@ def run_stability(
     else:
         of_each = seeds or (QUICK_SEEDS if quick else SEEDS)
         limit = QUICK_MINUTES if quick and minutes is None else minutes
-        cells, new = _run_cells(chosen_axes, of_each, chosen_methods, store, device, scheduler, limit, common.seed)
+        if draws is None:
+            draws = 0 if quick or axes else DRAWS
+        wanted = cells_of(chosen_axes, of_each, first=common.seed, draws=draws)
+        cells, new = _run_cells(wanted, chosen_methods, store, device, scheduler, limit)
         left = sum(not {identity(m) for m in chosen_methods} <= c.results.keys() for c in cells)
     took = time.perf_counter() - began
     atlas = aggregate(cells, chosen_axes, chosen_methods, _about(cells))
@@ -619,8 +630,8 @@ def _check_known(what: str, names: Sequence[str], known: Sequence[str]) -> None:
 
 
 def _run_cells(
-    axes: Sequence[Axis], seeds: int, methods: Sequence[Method], store: Store, device: str, scheduler: str | None,
-    minutes: float | None, first: int,
+    wanted: Sequence[Cell], methods: Sequence[Method], store: Store, device: str, scheduler: str | None,
+    minutes: float | None,
 ) -> tuple[list[Stored], int]:  # fmt: skip
     """Run all missing cells (single recordings). Return all cells and the number of new cells."""
     from amiwarp.studies.cluster import start_workers
@@ -639,7 +650,7 @@ def _run_cells(
             progress("starting workers") as advance,
             start_workers("amiwarp stability", "cluster", scheduler, cpu_threads(), device) as workers,
         ):
-            cells = run(axes, seeds, methods, store, workers, device=device, first=first, progress=count,
+            cells = run(wanted, methods, store, workers, device=device, progress=count,
                         until=None if end is None else lambda: time.monotonic() > end)  # fmt: skip
     except KeyboardInterrupt:
         say(f"amiwarp: finished cells are kept in {store.folder}; run the same command again to continue")
@@ -656,9 +667,11 @@ def _about(cells: Sequence[Stored]) -> dict[str, Any]:
 
 def stability_lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, took: float) -> list[Any]:
     """Return the results as tables and lines of text: where each method works, the aims, the files and the speed."""
-    from amiwarp.studies.stability.report import summary
+    from amiwarp.studies.stability.report import STATED_HEADINGS, summary
 
     shown: list[Any] = [table(summary(atlas), "works at", *atlas.methods), "", *atlas.aims.lines(), ""]
+    if atlas.stated:
+        shown += [table([d.row() for d in atlas.stated], *STATED_HEADINGS), ""]
     listed = ("overview", "pages", "summary", "data", "table")
     shown += [f"{name}: {files[name]}" for name in listed]
     speed = f"{new:,} cells in {took:,.0f} s, {new / took:.3g} per second; " if new else ""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -328,6 +328,13 @@ LARGEST_ANGLE = 1e10
 """Largest accepted magnitude of a prism angle [rad]: 1.6e9 turns. Up to this angle float64 resolves 2e-6 rad."""
 
 
+def periodic(angle: NDArray[np.float64], factors: Sequence[float]) -> NDArray[np.float64]:
+    """Return the sum of cos, sin, cos 2 and sin 2 of the angles [rad], each with its factor."""
+    return np.asarray(
+        np.array(factors) @ np.stack([np.cos(angle), np.sin(angle), np.cos(2.0 * angle), np.sin(2.0 * angle)])
+    )
+
+
 @guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class Encoder:
@@ -557,8 +564,7 @@ class Encoder:
         within = np.arange(first.size) - np.repeat(np.cumsum(parts) - parts, parts)
         t = np.append(self.t[first] + within * np.diff(self.t)[first] // parts[first], self.t[-1])
         angle = np.interp(t - self.t[0], self.t - self.t[0], self.angle)
-        turn = np.stack([np.cos(angle), np.sin(angle), np.cos(2.0 * angle), np.sin(2.0 * angle)])
-        return dataclasses.replace(self, t=t, angle=angle + factors @ turn)
+        return dataclasses.replace(self, t=t, angle=angle + periodic(angle, factors))
 
     def with_index(self, index_t_us: ArrayLike) -> Encoder:
         """Return an encoder with the same samples whose angle is zero at the index pulses.

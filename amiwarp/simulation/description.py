@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,14 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder
+from amiwarp.events.encoder import TWO_PI, Encoder, periodic
 from amiwarp.events.recording import MetadataValue
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism, check_angles, check_phase
 from amiwarp.simulation.pictures import linear_luminance, read_picture
 from amiwarp.simulation.worlds.world import WorldScene
-from amiwarp.validation import INT64, array, guarded, instance, one_of, real, whole
+from amiwarp.validation import INT64, array, guarded, instance, one_of, real, vector, whole
 
 # Motion of the prism and of the camera, and the encoder that measures the prism.
 
@@ -248,6 +249,11 @@ class EncoderModel:
     """Mean number of drop-outs per second [Hz]."""
     dropout_us: float = 5000.0
     """Duration of a drop-out, in which all encoder samples are lost [us]."""
+    harmonics: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Error of the angle that repeats every turn: factors of cos θ, sin θ, cos 2θ and sin 2θ [rad].
+
+    Eccentric discs and magnets cause the first two. The prism itself turns without this error.
+    """
 
     def __post_init__(self) -> None:
         if self.counts_per_turn is not None:
@@ -257,6 +263,8 @@ class EncoderModel:
                   "clock_offset_us": (-LARGEST_OFFSET_US, LARGEST_OFFSET_US)}  # fmt: skip
         for name, (low, high) in limits.items():
             object.__setattr__(self, name, real(getattr(self, name), f"encoder {name}", low, high))
+        harmonics = vector(self.harmonics, 4, "encoder harmonics", partial(real, low=-1.0, high=1.0, hint=" rad"))
+        object.__setattr__(self, "harmonics", harmonics)
 
     @classmethod
     def ideal(cls) -> EncoderModel:
@@ -293,6 +301,8 @@ class EncoderModel:
         spare = math.ceil((abs(self.clock_offset_us) + 8.0 * self.jitter_us) / interval) + 2
         true_t = np.rint(np.arange(-spare, math.ceil(duration_us / interval) + spare + 1) * interval).astype(np.int64)
         angle = motion.angle(true_t - self.clock_offset_us)
+        if any(self.harmonics):
+            angle = angle + periodic(angle, self.harmonics)
         if self.counts_per_turn is not None:
             angle = np.rint(angle * (self.counts_per_turn / TWO_PI)) * (TWO_PI / self.counts_per_turn)
         stamp = true_t + np.rint(rng.normal(0.0, self.jitter_us, len(true_t))).astype(np.int64)

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 
 from amiwarp._version import __version__
+from amiwarp.brightness.solver import SensorTiming
 from amiwarp.calib import Calibration, Settings, calibrate
-from amiwarp.calib.model_choice import Places
 from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.calib.parameters import build_model
 from amiwarp.calib.presets import settings_to
@@ -26,7 +26,6 @@ from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.recording import Events, MemoryEvents, Recording
-from amiwarp.imaging.metrics import model_error
 from amiwarp.io.json_files import CellStore, build, fields_of, value_of
 from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.models import ExactModel, predicted_error
@@ -339,6 +338,36 @@ class Condition:
     """Speed of the camera's rotation [deg/s], about a tilted axis."""
     cancelled: float = 0.0
     """Share of the prism's motion in the image that a rotation of the camera cancels."""
+    eccentric_deg: float = 0.0
+    """Amplitude of the encoder's error that repeats once a turn [deg], at a random angle."""
+    second_deg: float = 0.0
+    """Amplitude of the encoder's error that repeats twice a turn [deg], at a random angle."""
+    index_only: bool = False
+    """Whether the encoder gives but one index pulse per turn."""
+    turn_ripple: float = 0.0
+    """Relative amplitude of the speed ripple, one period per turn, at a random angle."""
+    no_encoder: bool = False
+    """Whether the recording has no encoder."""
+    ramp: float = 0.0
+    """Share of the speed that is missing at the start of the recording; the speed then rises linearly."""
+    cylinder_deg: float = 0.0
+    """Change of the apex over the image, by cylinder power at a random azimuth [deg per unit of the ray's tangent]."""
+    wobble_deg: float = 0.0
+    """Angle between the prism's axis and the axis of rotation, at a random azimuth [deg]."""
+    column_us: float = 0.0
+    """Delay of the events from each column of pixels to the next [us]."""
+    line_us: float = 0.0
+    """Delay of the events from each row of pixels to the next [us]."""
+    row_us: float = 0.0
+    """Time to read out a row of pixels, one row after the other without a pause [us]; 0 for all at once."""
+    aspect_error: float = 0.0
+    """True fy / fx - 1; the recording states 0."""
+    index_error: float = 0.0
+    """True refractive index of the prism minus the one that the recording states."""
+    lost_part: float = 0.0
+    """Share of each turn whose events are lost, always the same part."""
+    timing_known: bool = False
+    """Whether latency and refractory period are given to the calibration. Else their effect is part of the phase."""
 
     @property
     def key(self) -> str:
@@ -353,13 +382,14 @@ class Condition:
     def camera(self) -> Camera:
         """Camera with the true intrinsics."""
         camera = Camera.from_fov(self.width, self.height, math.radians(self.fov_deg))
+        camera = replace(camera, fy=camera.fy * (1.0 + self.aspect_error))
         return replace(camera, distortion=RadialTangential(k1=self.distortion)) if self.distortion else camera
 
     @property
     def stated_camera(self) -> Camera:
         """Camera with the intrinsics that the recording states."""
         true, scale = self.camera, 1.0 + self.focal_error
-        return replace(true, fx=true.fx * scale, fy=true.fy * scale, cx=true.cx + self.principal_px, distortion=None)
+        return replace(true, fx=true.fx * scale, fy=true.fx * scale, cx=true.cx + self.principal_px, distortion=None)
 
     @property
     def stated_side(self) -> FlatSide:
@@ -377,7 +407,11 @@ class Condition:
         return self.turns * 60.0 / self.rpm
 
 
-_LATER_FIELDS = ("cutoff_hz", "bus_rate_mev_s", "principal_px", "encoder_scale")
+_LATER_FIELDS = (
+    "cutoff_hz", "bus_rate_mev_s", "principal_px", "encoder_scale", "eccentric_deg", "second_deg", "index_only",
+    "turn_ripple", "no_encoder", "ramp", "cylinder_deg", "wobble_deg", "column_us", "line_us", "row_us", "aspect_error",
+    "index_error", "lost_part", "timing_known",
+)  # fmt: skip
 """Fields of :class:`Condition` with default 0 that did not exist when the first cells were stored."""
 
 
@@ -389,6 +423,12 @@ class SimulatedSample:
     """Simulated recording with its ground truth."""
     hardware: dict[str, float]
     """Approximate phase that the hardware states [rad]."""
+    truth: ExactModel
+    """Optical model with the true parameters."""
+    motion: PrismMotion
+    """True motion of the prism."""
+    plain: Encoder | None
+    """Encoder with none but the errors that repeat every turn, for at least a turn; None if the recording has none."""
 
 
 def make(condition: Condition, seed: int, device: str = "cpu") -> SimulatedSample:
@@ -405,18 +445,50 @@ def make(condition: Condition, seed: int, device: str = "cpu") -> SimulatedSampl
         events = events[rng.uniform(size=len(events)) >= condition.lost]
     if condition.readout_us:
         events = scanned(events, condition.readout_us)
+    events = skewed(events, condition)
+    motion = simulation.motion
+    if condition.lost_part:
+        begin = rng.uniform(0.0, TWO_PI)
+        events = events[(motion.angle(events.t) - begin) % TWO_PI >= condition.lost_part * TWO_PI]
     apex = condition.prism.apex * (1.0 + HARDWARE_APEX * rng.standard_normal())
-    nominal = Prism(apex, flat_side=condition.stated_side)
-    assert recording.encoder is not None
+    nominal = Prism(apex, condition.prism.index - condition.index_error, condition.stated_side)
+    end = max(int(events.t[-1]) if len(events) else 0, math.ceil(1.5 * 60e6 / condition.rpm))
+    plain = encoder = None
+    if condition.index_only:
+        plain = encoder = _index_pulses(motion, end, condition.rpm)
+    elif not condition.no_encoder:
+        assert recording.encoder is not None
+        assert simulation.encoder_model is not None
+        ideal = replace(EncoderModel.ideal(), rate_hz=1e4, harmonics=simulation.encoder_model.harmonics)
+        plain, encoder = ideal.sample(motion, end, 0), distorted_encoder(recording.encoder, condition, rng)
     stated = replace(
         recording,
         events=MemoryEvents(events, condition.width, condition.height),
         camera=condition.stated_camera,
-        encoder=distorted_encoder(recording.encoder, condition, rng),
+        encoder=encoder,
         prism=nominal,
     )
-    stated_phase = simulation.motion.phase + math.radians(HARDWARE_DEG) * rng.standard_normal()
-    return SimulatedSample(stated, {"phase": stated_phase + (math.pi / 2 if condition.start == "wrong" else 0.0)})
+    stated_phase = motion.phase + math.radians(HARDWARE_DEG) * rng.standard_normal()
+    known = {"phase": stated_phase + (math.pi / 2 if condition.start == "wrong" else 0.0)}
+    return SimulatedSample(stated, known, simulation.true_model, motion, plain)
+
+
+def skewed(events: Events, c: Condition) -> Events:
+    """Return events whose pixels are read out one column, or one row, after the other."""
+    if not (c.column_us or c.line_us):
+        return events
+    t = events.t + np.rint(c.column_us * events.x + c.line_us * events.y).astype(np.int64)
+    order = np.argsort(t, kind="stable")
+    return Events(events.x[order], events.y[order], t[order], events.p[order])
+
+
+def _index_pulses(motion: PrismMotion, end: int, rpm: float) -> Encoder:
+    """Return the encoder that has but a pulse at each whole turn, from before time 0 to after ``end`` [us]."""
+    spare = 2.0 * 60e6 / rpm
+    t = np.arange(-spare, end + spare, 100.0)
+    angle = motion.angle(t)
+    turns = np.arange(math.ceil(angle[0] / TWO_PI), math.floor(angle[-1] / TWO_PI) + 1) * TWO_PI
+    return Encoder(np.rint(np.interp(turns, angle, t)).astype(np.int64), turns)
 
 
 def _simulation(c: Condition, seed: int, rng: np.random.Generator, device: str) -> Simulation:
@@ -425,16 +497,24 @@ def _simulation(c: Condition, seed: int, rng: np.random.Generator, device: str) 
     sensor = SensorModel(
         contrast_on=c.contrast, contrast_off=c.contrast, mismatch=c.mismatch, latency_us=c.latency_us,
         refractory_us=c.refractory_us, hot_fraction=c.hot, hot_hz=500.0, shot_noise_hz=0.1, leak_hz=0.1,
-        cutoff_hz=c.cutoff_hz, bus_rate_mev_s=c.bus_rate_mev_s,
+        cutoff_hz=c.cutoff_hz, bus_rate_mev_s=c.bus_rate_mev_s, row_us=c.row_us,
     )  # fmt: skip
+    harmonics = (*_at_random(c.eccentric_deg, rng), *_at_random(c.second_deg, rng))
     encoder = EncoderModel(
-        counts_per_turn=c.counts_per_turn, clock_offset_us=c.clock_offset_us, dropouts_hz=c.dropouts_hz, jitter_us=1.0
-    )
-    motion = _prism_motion(c, phase)
+        counts_per_turn=c.counts_per_turn, clock_offset_us=c.clock_offset_us, dropouts_hz=c.dropouts_hz, jitter_us=1.0,
+        harmonics=harmonics,
+    )  # fmt: skip
+    motion = _prism_motion(c, phase, rng)
     return Simulation(
         _scene(c, seed), c.camera, c.prism, c.duration_s, motion, _camera_motion(c, motion, rng), sensor, encoder,
         seed=seed, device=device,
     )  # fmt: skip
+
+
+def _at_random(size_deg: float, rng: np.random.Generator) -> tuple[float, float]:
+    """Return the two components of a size [deg] in a random direction [rad]; nothing is drawn for a size of 0."""
+    direction = rng.uniform(0.0, TWO_PI) if size_deg else 0.0
+    return math.radians(size_deg) * math.cos(direction), math.radians(size_deg) * math.sin(direction)
 
 
 def _scene(c: Condition, seed: int) -> Scene:
@@ -443,7 +523,7 @@ def _scene(c: Condition, seed: int) -> Scene:
     half = min(math.radians(c.fov_deg) / 2.0 + wedge, 1.35)
     focal = TEXELS * c.camera.fx
     width = 2 * math.ceil(focal * math.tan(half)) + 2
-    height = math.ceil(width * c.height / c.width) + 2 * math.ceil(focal * wedge)
+    height = math.ceil(width * c.height / c.width / min(1.0, 1.0 + c.aspect_error)) + 2 * math.ceil(focal * wedge)
     diameter = 2.0 * c.prism.deflection * focal
     light = draw(SceneKind(c.scene), width, height, period=diameter, seed=seed)
     fov = 2.0 * math.atan(width / 2.0 / focal)
@@ -455,14 +535,19 @@ def _scene(c: Condition, seed: int) -> Scene:
     return Scene(Still(light), fov)
 
 
-def _prism_motion(c: Condition, phase: float) -> PrismMotion:
+def _prism_motion(c: Condition, phase: float, rng: np.random.Generator) -> PrismMotion:
     """Return the prism's motion under a condition."""
-    if not c.ripple:
-        return PrismMotion(c.rpm, phase)
-    hz = 3.0 * c.rpm / 60.0
-    return PrismMotion.from_function(
-        lambda t: c.rpm * (1.0 + c.ripple * np.sin(TWO_PI * hz * t)), c.duration_s, phase=phase
-    )
+    # the apex varies over the image by twice the cylinder power: along the wedge and across it, with opposite signs
+    shape = {"cylinder": _at_random(c.cylinder_deg / 2.0, rng), "wobble": _at_random(c.wobble_deg, rng)}
+    if not (c.ripple or c.turn_ripple or c.ramp):
+        return PrismMotion(c.rpm, phase, **shape)
+    begin = rng.uniform(0.0, TWO_PI) if c.turn_ripple else 0.0
+    hz = c.rpm / 60.0
+    t = np.arange(-3.0 / hz, max(c.duration_s, 1.5 / hz) + 3.0 / hz, 1e-3)
+    speed = c.rpm * (1.0 + c.ripple * np.sin(TWO_PI * 3.0 * hz * t))
+    speed *= 1.0 + c.turn_ripple * np.sin(TWO_PI * hz * t + begin)
+    speed *= np.interp(t, [0.0, c.duration_s], [1.0 - c.ramp, 1.0])
+    return PrismMotion(np.column_stack([t, speed]), phase, **shape)
 
 
 def _camera_motion(c: Condition, motion: PrismMotion, rng: np.random.Generator) -> CameraMotion:
@@ -532,6 +617,17 @@ _LARGEST: dict[str, float] = {
     "readout_us": 500.0, "clock_offset_us": 1000.0, "dropouts_hz": 10.0, "slip_deg": 0.0, "backwards": 0.0,
     "encoder_scale": 1e-4, "ripple": 0.2, "focal_error": 0.03, "principal_px": 10.0, "lamp": 0.05,
     "passing": 0.02, "cancelled": 0.0,
+    "eccentric_deg": 3.0,  # a disc of 10 mm radius, half a millimetre off centre
+    "second_deg": 1.0,  # sine and cosine signals of an encoder whose amplitudes differ by 3.5 %
+    "turn_ripple": 0.1,  # a small motor that turns an unbalanced prism
+    "ramp": 1.0,  # the recording begins when the motor is switched on
+    "cylinder_deg": 0.1,  # a cast wedge, bent by 7 um over 25 mm, 20 mm in front of the pupil
+    "wobble_deg": 0.5,  # 0.2 mm of play in a mount 20 mm wide
+    "column_us": 1.0, "line_us": 1.0,  # the whole sensor within 0.3 ms, as at 3,000 scans per second
+    "row_us": 4.0,  # 240 rows within 1 ms
+    "aspect_error": 0.03,  # pictures of the lens calibration that were resized, 640x480 to 640x466
+    "index_error": 0.06,  # fused silica taken for N-BK7
+    "lost_part": 0.4,  # a guard, or a bus that is full whenever the longest edges move
 }  # fmt: skip
 """Largest values of the condition fields for which a calibration is expected to work."""
 _SMALLEST: dict[str, float] = {"turns": 0.5, "counts_per_turn": 64, "distortion": -0.08, "apex_deg": 0.5}
@@ -631,6 +727,20 @@ AXES = (
     Axis("principal point, wide", "principal_px", (0.0, 2.0, 5.0, 10.0, 20.0), "px, 90°, apex 2°", WIDE),
     Axis("distortion ignored, wide", "distortion", (0.0, -0.03, -0.08, -0.15), "k1, 90°, apex 2°", WIDE),
     Axis("flat side, wide", "flat_side_wrong", (False, True), "90°, apex 2°", WIDE),
+    Axis("encoder off centre", "eccentric_deg", (0.0, 0.3, 1.0, 3.0, 10.0), "°, once a turn"),
+    Axis("encoder, second harmonic", "second_deg", (0.0, 0.1, 0.3, 1.0, 3.0), "°, twice a turn"),
+    Axis("speed ripple, index pulse only", "turn_ripple", (0.0, 0.01, 0.03, 0.1, 0.3), "relative, once a turn",
+         (("index_only", True),)),
+    Axis("ramp without encoder", "ramp", (0.0, 0.1, 0.3, 0.6, 1.0), "of the speed, up to 8 turns",
+         (("no_encoder", True), ("turns", 8.0))),
+    Axis("cylinder power", "cylinder_deg", (0.0, 0.01, 0.03, 0.1, 0.3), "° of apex over the image"),
+    Axis("wobble", "wobble_deg", (0.0, 0.1, 0.5, 2.0, 5.0), "°"),
+    Axis("column skew", "column_us", (0.0, 0.3, 1.0, 5.0, 20.0), "µs from column to column"),
+    Axis("row skew", "line_us", (0.0, 0.3, 1.0, 5.0, 20.0), "µs from row to row"),
+    Axis("readout of row after row", "row_us", (0.0, 1.0, 4.0, 20.0), "µs a row"),
+    Axis("fy / fx", "aspect_error", (0.0, 0.003, 0.01, 0.03, 0.1), "relative error"),
+    Axis("refractive index, wide", "index_error", (0.0, 0.01, 0.03, 0.06, 0.2), "error, 90°, apex 2°", WIDE),
+    Axis("events lost in a part of the turn", "lost_part", (0.0, 0.1, 0.2, 0.4, 0.6, 0.8), "of the turn"),
     Axis("focal length and distortion", "focal_error", (0.01, 0.03, 0.1), "relative error, k1 −0.05",
          (("distortion", -0.05),)),
     Axis("principal point and distortion", "principal_px", (2.0, 5.0, 10.0), "px, k1 −0.05", (("distortion", -0.05),)),
@@ -644,7 +754,40 @@ AXES = (
     Axis("events lost and noise", "lost", (0.1, 0.3, 0.5), "of all events, 25 % noise", (("noise", 0.25),)),
     Axis("small orbit, few events", "window_events", (100_000, 50_000, 20_000), "apex 0.5°", (("apex_deg", 0.5),)),
 )  # fmt: skip
-"""All axes of the stability study. The last eight combine two troubles that are likely to occur together."""
+"""All axes of the stability study. The last :data:`COMBINED` combine two troubles that are likely to occur together."""
+COMBINED = 8
+"""Number of axes that combine two troubles."""
+
+
+# Random combinations of mild troubles: no constant of the calibration was chosen with them.
+
+ALWAYS: dict[str, tuple[float, float]] = {
+    "apex_deg": (0.5, 2.0), "rpm": (400.0, 1200.0), "turns": (3.0, 6.0), "fov_deg": (45.0, 75.0),
+    "contrast": (0.15, 0.35), "mismatch": (0.0, 0.08), "noise": (0.0, 0.3), "latency_us": (50.0, 300.0),
+}  # fmt: skip
+"""Ranges of the condition fields that every combination draws."""
+TROUBLES: dict[str, tuple[float, float]] = {
+    "eccentric_deg": (0.0, 2.0), "second_deg": (0.0, 0.5), "turn_ripple": (0.0, 0.05), "cylinder_deg": (0.0, 0.1),
+    "wobble_deg": (0.0, 0.5), "focal_error": (-0.02, 0.02), "principal_px": (-5.0, 5.0), "distortion": (-0.05, 0.0),
+    "aspect_error": (-0.02, 0.02), "index_error": (-0.03, 0.03), "lost": (0.0, 0.1), "lost_part": (0.0, 0.3),
+}  # fmt: skip
+"""Troubles, and their ranges. Each combination has a quarter of them; ripple only shows with an index pulse alone."""
+DRAWS = 300
+"""Number of random combinations of the whole study."""
+
+
+def mild(seed: int) -> Condition:
+    """Return a random combination of mild troubles. All values are drawn uniformly."""
+    rng = np.random.default_rng([seed, 0x41D])
+    scene = (SceneKind.TEXTURE, SceneKind.EDGES, SceneKind.PRINT)[rng.integers(3)]
+    values = {name: round(float(rng.uniform(*span)), 5) for name, span in ALWAYS.items()}
+    for name, span in TROUBLES.items():
+        size, there = round(float(rng.uniform(*span)), 5), rng.uniform() < 0.25
+        values |= {name: size} if there else {}
+    condition = Condition(scene=scene.value, timing_known=True, **values)  # type: ignore[arg-type]
+    return (
+        replace(condition, index_only=True, eccentric_deg=0.0, second_deg=0.0) if condition.turn_ripple else condition
+    )
 
 
 # Methods, and cells: a condition, a seed, and the result of each calibration method on that recording.
@@ -654,13 +797,19 @@ LIMIT_PX = 0.1
 itself."""
 BEST_FIT = 1.5
 """Multiple of the error of the model's best fit to the truth that a successful calibration may have."""
+LAG_STEPS = 4
+"""Number of Gauss-Newton steps that find the lag of a calibration."""
+STATED = ("apex", "phase", "size")
+"""Quantities whose distance from the truth is measured in standard deviations that the calibration states.
+
+The size is that of the displacements in the image, which is proportional to the apex."""
 JUDGED = 5_000
 """Number of events at which the error of a smaller model is measured: enough for an rms error accurate to 1 %."""
 LARGEST_PX = 1e3
 """Largest model error that is stored [px rms]; that of a model without a valid position anywhere is this too."""
 MOST_DEVIATION = 1e9
-"""Largest stored distance of the apex angle from the true one [standard deviations]."""
-FORMAT = 3
+"""Largest stored distance of a parameter from the truth [standard deviations]."""
+FORMAT = 4
 """Version of the file format of a stored cell, which is part of the cell's identity."""
 
 
@@ -703,8 +852,11 @@ class Method:
         """Calibrate a sample. Raises :class:`AmiwarpError` if the method refuses it."""
         if self.settings is None:
             return calibrate_as_paper(sample.recording, start=sample.hardware, device=device)
-        known = sample.hardware if condition.start != "none" else {}
-        return calibrate(sample.recording, replace(self.settings, seed=seed, start=known), device=device)
+        settings = replace(self.settings, seed=seed, start=sample.hardware if condition.start != "none" else {})
+        if condition.timing_known:
+            sensor = SensorTiming(condition.latency_us, condition.refractory_us)
+            settings = replace(settings, photometric=replace(settings.photometric, sensor=sensor))
+        return calibrate(sample.recording, settings, device=device)
 
 
 _SHARP = Settings(model="exact", stages=STAGES[:1])
@@ -740,9 +892,9 @@ class Result:
     """Error message of a refusal, or warnings of the calibration."""
     machine: str = ""
     """Description of the machine that ran the calibration."""
-    deviation: Annotated[float, partial(real, low=0.0, high=MOST_DEVIATION)] | None = None
-    """Distance of the apex angle from the true one, in standard deviations that the calibration states; None for a
-    circle and for a refused recording."""
+    deviations: dict[str, Annotated[float, partial(real, low=0.0, high=MOST_DEVIATION)]] = field(default_factory=dict)
+    """Distances of the quantities :data:`STATED` from the truth, in standard deviations that the calibration states;
+    empty for a circle and for a refused recording."""
 
     def __post_init__(self) -> None:
         """Raise :class:`AmiwarpError` for an outcome that does not follow from the error."""
@@ -798,7 +950,6 @@ def run_cell(cell: Cell, methods: tuple[Method, ...], device: str) -> Stored:
 
 def _judge(cell: Cell, method: Method, sample: SimulatedSample, device: str) -> Result:
     """Run one method on a recording, and compare its result with the ground truth."""
-    truth = _truth(cell.condition, sample)
     limit = max(LIMIT_PX, BEST_FIT * best_fit(cell.condition, method.model))
     began = time.perf_counter()
     try:
@@ -808,41 +959,89 @@ def _judge(cell: Cell, method: Method, sample: SimulatedSample, device: str) -> 
     except Exception as error:  # a crash is no clear error, so it is no refusal
         return Result(Outcome.SILENT, None, limit, time.perf_counter() - began, f"crashed: {error!r}")
     took = time.perf_counter() - began
-    error_px = _error_px(found, sample, truth)
+    error_px = compare(found, sample).rms
     outcome = Outcome.SUCCESS if error_px <= limit else Outcome.SILENT
     return Result(
-        outcome, error_px if error_px < LARGEST_PX else LARGEST_PX, limit, took, "; ".join(found.warnings),
-        deviation=_deviation(found, cell.condition) if method.model == "exact" else None,
+        outcome, min(error_px, LARGEST_PX), limit, took, "; ".join(found.warnings),
+        deviations=deviations(found, cell.condition, sample) if method.model == "exact" else {},
     )  # fmt: skip
 
 
-def _deviation(found: Calibration, condition: Condition) -> float | None:
-    """Return the distance of the apex angle from the true one [standard deviations]; None if none is stated."""
-    exact = found.exact
-    std = exact.uncertainty.get("apex", 0.0)
-    return min(abs(exact.parameters["apex"] - condition.prism.apex) / std, MOST_DEVIATION) if std > 0.0 else None
+def deviations(found: Calibration, condition: Condition, sample: SimulatedSample) -> dict[str, float]:
+    """Return the distance of each parameter of :data:`STATED` from the truth [stated standard deviations].
 
-
-def _error_px(found: Calibration, sample: SimulatedSample, truth: ExactModel) -> float:
-    """Return the model error over the image [px rms].
-
-    If a smaller model was selected because it suffices at the events' positions, the error is that at these positions.
+    Quantities without a stated standard deviation are left out; so is the phase if the sensor's timing is part of it.
     """
+    exact = found.exact
+    at = compare(exact, sample)
+    apex, std = exact.parameters["apex"], exact.uncertainty.get("apex", 0.0)
+    away = {
+        "apex": (apex - sample.truth.prism.apex, std),
+        "phase": (at.lag, exact.uncertainty.get("phase", 0.0) if condition.timing_known else 0.0),
+        "size": (at.gain, std / apex if apex else 0.0),
+    }
+    return {name: min(abs(value) / std, MOST_DEVIATION) for name, (value, std) in away.items() if std > 0.0}
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Difference of a calibration from the truth, over the image and a turn."""
+
+    rms: float
+    """Difference of the compensated positions without the lag [px rms]; infinite if none is valid."""
+    lag: float
+    """Constant angle by which the calibration is behind the truth [rad]."""
+    gain: float
+    """Relative error of the size of the displacements."""
+
+
+def compare(found: Calibration, sample: SimulatedSample) -> Difference:
+    """Compare a calibration, the path that it gives the prism included, with the truth."""
+    events = sample.recording.events
+    xy, t = _places(found, sample)
+    target = sample.truth.compensate_points(xy, sample.motion.angle(t))
+    encoder = found.encoder_for(sample.plain, events.t_first, events.t_last).with_clock_offset(0.0)
+    theta, model = encoder.angle_at(np.clip(t, *encoder.coverage)), found.model
+
+    def away(lag: float) -> NDArray[np.float64]:
+        return model.compensate_points(xy, theta + lag) - target
+
+    def rms(lag: float) -> float:
+        return float(np.sqrt(np.nanmean((away(lag) ** 2).sum(axis=1))))
+
+    if not np.isfinite(away(0.0)).all(axis=1).any():
+        return Difference(math.inf, 0.0, 0.0)
+    lags = [0.0]
+    for _ in range(LAG_STEPS):
+        slope = (away(lags[-1] + 0.01) - away(lags[-1] - 0.01)) / 0.02
+        square = float(np.nansum(slope**2))
+        lags.append(lags[-1] - (float(np.nansum(away(lags[-1]) * slope)) / square if square else 0.0))
+    lag = min(lags, key=rms)
+    moved = target - xy
+    return Difference(rms(lag), lag, float(np.nansum(away(lag) * moved) / np.nansum(moved**2)))
+
+
+def _places(found: Calibration, sample: SimulatedSample) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return pixels [px] and times [us] at which a calibration is compared: over the image, and over a turn.
+
+    They are those of events if a smaller model was selected because it suffices there. Without an encoder, the times
+    are those of the whole recording.
+    """
+    events = sample.recording.events
     if found.ladder is not None and found.model_name != "exact":
-        recording = sample.recording
-        assert recording.encoder is not None
-        events = recording.events.slice(0, len(recording.events))
-        return Places.of(events, recording.encoder, JUDGED).distance(found.model, truth, remove_lag=True)
-    try:
-        return model_error(found.model, truth).rms
-    except AmiwarpError:
-        return math.inf
-
-
-def _truth(condition: Condition, sample: SimulatedSample) -> ExactModel:
-    """Return the optical model with the true parameters of a simulated recording."""
-    assert sample.recording.truth is not None
-    return ExactModel(condition.camera, condition.prism, sample.recording.truth.parameters["phase"])
+        some = events.slice(0, len(events))[:: max(1, len(events) // JUDGED)]
+        return np.stack([some.x, some.y], axis=1).astype(np.float64), some.t
+    if sample.plain is None:
+        times = np.linspace(events.t_first, events.t_last, 20_000)
+    else:
+        times = np.linspace(0.0, sample.plain.t[-1] - 1000.0, 20_000)
+    angle = sample.motion.angle(times)
+    wanted = np.linspace(angle[0], angle[-1], 97) if sample.plain is None else np.arange(36) * (TWO_PI / 36)
+    t = np.rint(np.interp(wanted, angle, times))
+    camera = sample.truth.camera
+    x, y = np.linspace(0.0, camera.width - 1.0, 32), np.linspace(0.0, camera.height - 1.0, 24)
+    every = np.stack([m.ravel() for m in np.meshgrid(x, y, t, indexing="ij")], axis=1)
+    return every[:, :2], every[:, 2].astype(np.int64)
 
 
 @cache
@@ -906,11 +1105,11 @@ QUICK_METHODS = ("default", "paper", "sharpness")
 
 
 def quick_axes() -> tuple[Axis, ...]:
-    """Return each axis with at most three values: both ends and the middle."""
+    """Return axes of one trouble with at most three values, both ends and the middle: what runs within ten minutes."""
     return tuple(
         replace(a, values=tuple(dict.fromkeys(a.values[i] for i in (0, len(a.values) // 2, -1))))
-        for a in AXES
-        if a.name != "many events"
+        for a in AXES[:-COMBINED]
+        if a.name not in ("many events", "encoder, second harmonic", "row skew", "readout of row after row")
     )
 
 
@@ -919,25 +1118,30 @@ def conditions(axes: Sequence[Axis]) -> list[Condition]:
     return list(dict.fromkeys(c for axis in axes for c in axis.conditions()))
 
 
+def cells_of(axes: Sequence[Axis], seeds: int, *, first: int = 0, draws: int = 0) -> list[Cell]:
+    """Return the cells of axes with ``seeds`` seeds from ``first`` on, and of random combinations of mild troubles.
+
+    The seed is the outer loop: an interrupted run covers every condition, with fewer seeds.
+    """
+    of_axes = [Cell(c, seed) for seed in range(first, first + seeds) for c in conditions(axes)]
+    return [*(Cell(mild(seed), seed) for seed in range(draws)), *of_axes]
+
+
 def run(
-    axes: Sequence[Axis],
-    seeds: int,
+    cells: Sequence[Cell],
     methods: Sequence[Method],
     store: Store,
     workers: Workers,
     *,
     device: str = "cpu",
-    first: int = 0,
     progress: Progress | None = None,
     until: Callable[[], bool] | None = None,
 ) -> list[Stored]:
-    """Run all cells (conditions and seeds) of the axes, and return their results.
+    """Run cells in their order, and return their results.
 
-    Cells in ``store`` are reused; if a cell lacks a method, only that method is run. Seeds begin at ``first``. The
-    seed is the outer loop: an interrupted run covers every condition, with fewer seeds. No new cell starts after
+    Cells in ``store`` are reused; if a cell lacks a method, only that method is run. No new cell starts after
     ``until`` returns True.
     """
-    cells = [Cell(c, seed) for seed in range(first, first + seeds) for c in conditions(axes)]
     known = {cell: store.load(cell) for cell in cells}
     missing = {cell: tuple(m for m in methods if identity(m) not in known[cell].results) for cell in cells}
     todo = [(cell, lacking) for cell, lacking in missing.items() if lacking]

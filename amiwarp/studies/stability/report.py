@@ -232,6 +232,48 @@ class Aims:
         ]
 
 
+STATED_HEADINGS = ("recordings", "quantity", "within 1", "within 2", "within 3 stated deviations")
+"""Headings of :meth:`StatedDeviations.row`."""
+
+
+@dataclass(frozen=True)
+class StatedDeviations:
+    """How often the truth lies within the standard deviations that the default method states."""
+
+    where: str
+    """Recordings that count: random combinations of mild troubles, or the sensible range of the axes."""
+    quantity: str
+    """Quantity, one of :data:`amiwarp.studies.stability.cells.STATED`."""
+    within: tuple[Rate, ...]
+    """Number of answers with the truth within one, two and three standard deviations."""
+
+    def row(self) -> tuple[str, ...]:
+        """Return the values as a row of a table."""
+        return (self.where, self.quantity, *map(str, self.within))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the values as JSON data."""
+        return {"where": self.where, "quantity": self.quantity, "within": [rate.to_json() for rate in self.within]}
+
+
+def _stated(cells: Iterable[Stored], default: str | None) -> tuple[StatedDeviations, ...]:
+    """Return how honest the stated deviations are: for random combinations of troubles, and for the sensible range."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for stored in cells:
+        result, cell = stored.results.get(default or ""), stored.cell
+        drawn = cell.condition == study.mild(cell.seed)
+        if result is None or not (drawn or study.sensible(cell.condition, stored.events)):
+            continue
+        of_where = found.setdefault("random combinations" if drawn else "sensible range", {})
+        for name, value in result.deviations.items():
+            of_where.setdefault(name, []).append(value)
+    return tuple(
+        StatedDeviations(where, name, tuple(Rate(sum(v <= k for v in values), len(values)) for k in (1.0, 2.0, 3.0)))
+        for where, of_where in sorted(found.items())
+        for name, values in of_where.items()
+    )
+
+
 @dataclass(frozen=True)
 class Atlas:
     """Results of the study as points, one per axis, method and value, in the order of axes and values.
@@ -247,6 +289,8 @@ class Atlas:
     """Number of cells (single recordings) that were evaluated."""
     about: dict[str, Any]
     """Description of the machine, the versions and the date."""
+    stated: tuple[StatedDeviations, ...] = ()
+    """How often the truth lies within the stated standard deviations."""
 
     @property
     def axes(self) -> list[Axis]:
@@ -313,7 +357,8 @@ def aggregate(cells: Sequence[Stored], axes: Sequence[Axis], methods: Sequence[M
         raise AmiwarpError(
             "found no results of single runs (cells) for these axes and methods; run without --redraw first"
         )
-    return Atlas(tuple(spots), _aims(met.values(), names.get(DEFAULT), worse), len(met), about)
+    default = names.get(DEFAULT)
+    return Atlas(tuple(spots), _aims(met.values(), default, worse), len(met), about, _stated(cells, default))
 
 
 def _aims(cells: Iterable[Stored], default: str | None, worse: Sequence[WorseThanPaper]) -> Aims:
@@ -350,7 +395,8 @@ def _worse(axis: Axis, value: Any, stored_cells: Sequence[Stored], names: dict[s
 
 def _json(atlas: Atlas) -> str:
     """Return the study's results as JSON, one line per point."""
-    data = {"format": "amiwarp-atlas", "version": 1, **atlas.about, "cells": atlas.cells, "aims": atlas.aims.to_json()}
+    data = {"format": "amiwarp-atlas", "version": 1, **atlas.about, "cells": atlas.cells, "aims": atlas.aims.to_json(),
+            "stated_deviations": [d.to_json() for d in atlas.stated]}  # fmt: skip
     head = json.dumps(data, indent=1, allow_nan=False).removesuffix("\n}")
     lines = (json.dumps(s.to_json(), allow_nan=False, ensure_ascii=False) for s in atlas.spots)
     return head + ',\n "spots": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n"
@@ -395,6 +441,8 @@ def _markdown(atlas: Atlas) -> str:
         + "; ".join(str(atlas.about[k]) for k in ("machine", "date") if k in atlas.about) + ".",
         "## Aims",
         "\n".join(f"- {line}" for line in atlas.aims.lines()),
+        "## Truth within the stated standard deviations",
+        _grid(STATED_HEADINGS, [d.row() for d in atlas.stated]),
         f"## Where each method works\n\nValues with at least {percent(WORKS)} successes.",
         _grid(("axis", *atlas.methods), summary(atlas)),
         "## Where the default succeeds less often than the paper's method",
