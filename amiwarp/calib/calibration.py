@@ -10,6 +10,7 @@ attempt also examines whether the prism's speed varies, and finds the path of it
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +18,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.calib import checks
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
@@ -118,6 +120,8 @@ class Attempt:
 
     calibration: Calibration | None
     error: AmiwarpError | None = None
+    search: Search | None = None
+    """The sharpness search, if it came to an answer."""
 
     @property
     def photometric(self) -> PhotometricSummary | None:
@@ -140,6 +144,11 @@ class Attempt:
         if self.photometric is None:
             return isinstance(self.error, checks.NoSharpOptimumError)
         return self.cost > stage.LARGEST_STILL_COST
+
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """Parts of the image in which something moves while others are still, shape (rows, columns); empty for none."""
+        return np.array(() if self.photometric is None else self.photometric.moving, np.bool_)
 
     @property
     def camera_turned(self) -> bool:
@@ -185,7 +194,9 @@ class Calibrator:
             calibrator, tried = calibrator.with_straight_angles(tried)
             if tried.unexplained:
                 calibrator, tried = calibrator.without_bad_pixels(tried)
-            if tried.unexplained:
+            if tried.moving.any():
+                tried = calibrator.without_moving_parts(tried)
+            elif tried.unexplained:
                 tried = calibrator.explained(tried)
             elif self.settings.free is None and tried.camera_turned:
                 tried = calibrator.with_rotation(tried)
@@ -203,9 +214,13 @@ class Calibrator:
             checks.check_nominal(found.model_name, found.parameters, recording.prism, recording.name)
         return replace(found, seconds=time.perf_counter() - began)
 
-    def attempt(self) -> Attempt:
-        """Calibrate once by the stages of the settings, with the free parameters that they name."""
-        began = time.perf_counter()
+    def attempt(self, rival: Attempt | None = None) -> Attempt:
+        """Calibrate once by the stages of the settings, with the free parameters that they name.
+
+        The attempt fails early if its image is not clearly sharper than that of a ``rival``, another attempt, or if it
+        does not come to a clearly lower cost.
+        """
+        began, search = time.perf_counter(), None
         try:
             recording = rotation_window(self.recording, self.settings)
             searches = prepare(recording, self.settings, self.path, device=self.device, progress=self.progress)
@@ -215,6 +230,10 @@ class Calibrator:
                 search = max(searches, key=lambda s: s.score)
                 if recording.encoder is None and self.path is None and _path_is_examined(search):
                     search = _with_path(recording, search)
+                if rival is not None:
+                    search.most_cost = stage.LARGEST_COST_RATIO * rival.cost
+                    if rival.search is not None:
+                        checks.check_sharper(search.gain_over(rival.search), recording.name)
                 found = _sharpest(recording, search, *search.check_answer(recording.name))
                 if "photometric" in self.settings.stages:
                     search.ahead = ahead
@@ -228,8 +247,9 @@ class Calibrator:
                     else:
                         found = _refined(search, found, *refined)
         except AmiwarpError as error:
-            return Attempt(None, error)
-        return Attempt(replace(found, seconds=time.perf_counter() - began))
+            return Attempt(None, error, search)
+        search.ahead, search.meanwhile = None, iter(())
+        return Attempt(replace(found, seconds=time.perf_counter() - began), search=search)
 
     def with_straight_angles(self, tried: Attempt) -> tuple[Calibrator, Attempt]:
         """Correct an error of the encoder that repeats every turn, if the events ask for it, and calibrate again.
@@ -286,43 +306,60 @@ class Calibrator:
             return cleaned, again
         return cleaned, Attempt(_warning(again.calibration, str(summary)))
 
+    def without_moving_parts(self, tried: Attempt) -> Attempt:
+        """Calibrate from the parts of the image in which nothing moves."""
+        source = self.recording.events
+        (width, height), (rows, columns) = source.size, tried.moving.shape
+        mask = tried.moving[np.arange(height) * rows // height][:, np.arange(width) * columns // width]
+        again = replace(self, recording=replace(self.recording, events=MaskedEventSource(source, mask))).attempt()
+        said = f"something moves: {100 * mask.mean():.0f} % of the view are left out"
+        if again.accepted and not again.unexplained:
+            return Attempt(_warning(again.found(), said))
+        return Attempt(None, AmiwarpError(f"{self.recording.name}: {said}, but the rest does not determine the prism; "
+                                          "record a scene that stays still"))  # fmt: skip
+
     def explained(self, tried: Attempt) -> Attempt:
-        """Return the attempt with a free camera rotation, the error of a wrong encoder scale, or ``tried`` unchanged.
+        """Return the attempt with a free camera rotation, the error of a wrong encoder, or ``tried`` unchanged.
 
-        A slow camera rotation and a wrong encoder scale have similar effects on the events. If the rotation leaves a
-        high cost, the cause with the lower cost is taken.
+        The encoder's direction and scale are examined first, because they take few searches. If a correction of them
+        leaves a high cost, the cause with the lower cost is taken.
         """
+        wrong = self.with_other_encoder(tried)
+        if wrong is not None and wrong[0] <= stage.LARGEST_STILL_COST:
+            return Attempt(None, wrong[1])
         moving = tried if self.settings.free is not None else self.with_rotation(tried)
-        if moving is not tried and moving.cost <= stage.LARGEST_STILL_COST:
+        if wrong is None or (moving is not tried and moving.cost <= wrong[0]):
             return moving
-        scaled = self.with_other_scale(tried)
-        if scaled is None or (moving is not tried and moving.cost <= scaled[1]):
-            return moving
-        turns, cost = scaled
-        return Attempt(None, checks.wrong_scale(self.recording.name, turns, "the events repeat", tried.cost, cost))
+        return Attempt(None, wrong[1])
 
-    def with_other_scale(self, tried: Attempt) -> tuple[float, float] | None:
-        """Return after how many encoder turns events repeat, and the photometric cost with the scale corrected by it.
+    def with_other_encoder(self, tried: Attempt) -> tuple[float, AmiwarpError] | None:
+        """Return the photometric cost with the encoder's direction or scale corrected, and the error that says so.
 
         The events of a still scene repeat every turn of the prism. If they repeat at another encoder angle, the
-        encoder's scale may be wrong. None if the corrected scale does not lower the cost enough.
+        encoder's scale may be wrong. None if no correction lowers the cost enough.
         """
-        encoder = self.recording.encoder
+        encoder, name = self.recording.encoder, self.recording.name
         assert encoder is not None
-        try:
-            turns = encoder_turns_per_period(self.recording, encoder)
-        except AmiwarpError:
-            return None  # the events do not repeat: the scene or the camera moves
-        if abs(turns - 1.0) < LEAST_SCALE_ERROR:
-            return None
-        corrected = replace(encoder, angle=encoder.angle / turns, index_t=None)
-        again = replace(self, recording=replace(self.recording, encoder=corrected)).attempt()
-        return (turns, again.cost) if again.accepted and again.cost <= stage.LARGEST_COST_RATIO * tried.cost else None
+        turns = [-1.0]
+        with contextlib.suppress(AmiwarpError):  # the events do not repeat: the scene or the camera moves
+            turns.append(encoder_turns_per_period(self.recording, encoder))
+        for each in turns:
+            if abs(each - 1.0) < LEAST_SCALE_ERROR:
+                continue
+            corrected = replace(encoder, angle=encoder.angle / each, index_t=None)
+            again = replace(self, recording=replace(self.recording, encoder=corrected)).attempt(tried)
+            if not again.accepted or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
+                continue
+            if each < 0.0:
+                return again.cost, checks.wrong_direction(name, tried.cost, again.cost)
+            return again.cost, checks.wrong_scale(name, each, "the events repeat", tried.cost, again.cost)
+        return None
 
     def with_rotation(self, tried: Attempt) -> Attempt:
         """Return the attempt with a free camera rotation if that lowers the photometric cost enough; else ``tried``."""
         free = (MODELS[self.settings.model].SIZE, "phase", "motion")
-        again = replace(self, settings=replace(self.settings, free=free)).attempt()
+        rival = None if tried.camera_turned else tried  # a slow rotation hardly blurs the image
+        again = replace(self, settings=replace(self.settings, free=free)).attempt(rival)
         if not again.accepted or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
             return tried
         moving = again.found()

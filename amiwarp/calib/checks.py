@@ -110,6 +110,18 @@ def wrong_scale(
     )
 
 
+def wrong_direction(name: str, cost: float, reversed_cost: float) -> AmiwarpError:
+    """Return the error for an encoder that counts against the prism's direction of rotation.
+
+    The costs are those of the photometric stage with the given and with the reversed direction.
+    """
+    return AmiwarpError(
+        f"{name}: the prism turns against the direction of the encoder: with its angles reversed a still camera "
+        f"explains the events ({100 * reversed_cost:.0f} % of the residual remains instead of "
+        f"{100 * min(cost, 1.0):.0f} %); read the encoder log again with the other direction (--direction)"
+    )
+
+
 def check_turned(theta: NDArray[np.float64], name: str) -> None:
     """Check that the prism turned far enough.
 
@@ -162,6 +174,16 @@ def _in_words(gain: float) -> str:
     return f"{gain:.1f} standard deviations" if gain > 0.0 else "it is less sharp, or the same"
 
 
+def check_size(size: str, least: float, bound: float, name: str) -> None:
+    """Check that the size of the prism's orbit may be at least ``least`` under its upper ``bound`` [rad]."""
+    if least > bound:
+        raise NoSharpOptimumError(
+            f"{name}: the image is sharpest for the largest {size} that is tried, {math.degrees(bound):.3g} deg (twice "
+            f"the nominal one, 2 deg if none is given, unless bounds are given): give the prism's nominal apex, or "
+            f"wider bounds ({size}=0:{2.0 * math.degrees(bound):.3g}deg)"
+        )
+
+
 def check_texture(
     best: NDArray[np.float64], opposite: NDArray[np.float64], still: NDArray[np.float64], name: str
 ) -> None:
@@ -182,6 +204,12 @@ def check_texture(
             f"{name}: the image is as sharp with no motion compensation ({_in_words(gain)}): no prism turned, its apex "
             "is too small for these events, or the encoder is wrong; check prism and encoder, or record more events"
         )
+
+
+def check_sharper(gain: float, name: str) -> None:
+    """Check that another cause makes the image sharper, by a ``gain`` in standard deviations."""
+    if not gain >= LEAST_SIGNIFICANCE:
+        raise AmiwarpError(f"{name}: this makes the image no sharper ({_in_words(gain)})")
 
 
 def check_directions(image: Image, inset: int, name: str) -> None:

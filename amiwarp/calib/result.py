@@ -132,6 +132,9 @@ class PhotometricSummary:
     harmonics: tuple[float, ...] = ()
     """Correction of the encoder's angle by an error that repeats every turn, in the form of
     :attr:`Calibration.harmonics`, if the events ask for one; else empty."""
+    moving: tuple[tuple[bool, ...], ...] = ()
+    """Parts of the image, row by row, in which something moves while the other parts are still: True for those; empty
+    if there are no such parts."""
     warnings: tuple[str, ...] = ()
     """Corrections of the given camera and prism, and where the result does not hold, one sentence each."""
 

@@ -323,6 +323,8 @@ class Quadratic:
 
 # Contrast maximisation: a global search on a coarse image of events, then a local search on a fine one.
 
+LEAST_INSIDE_PX = 0.05
+"""Distance of a parameter from its bounds below which it lies on them [px]."""
 CANDIDATES = 3
 """Largest number of optima of the coarse image from which the local search starts."""
 
@@ -351,6 +353,8 @@ class Search:
         """Events of the photometric stage that are already on the device."""
         self.meanwhile: Iterator[None] = iter(())
         """Other work, whose steps the photometric stage takes where the host would wait for a GPU."""
+        self.most_cost = math.inf
+        """Cost of the photometric stage above which its answer is of no use."""
         self.stages: list[StageSummary] = []
         self.pad = padding(self.space)
         """Border of the fine image outside the sensor [px]."""
@@ -453,6 +457,21 @@ class Search:
         if self.progress is not None:
             self.progress(*stage_share(self.settings, stage, share))
 
+    def gain_over(self, other: Search) -> float:
+        """Return by how much the image is sharper than at another search's answer [standard deviations].
+
+        Both searches have the same events, or this one has a camera's rotation, without which the other answer is
+        measured here.
+        """
+        parts = self._objective_by_parts(Sharpness.VARIANCE)
+        here, space = parts.each(self.best), self.space
+        if space.moving:
+            still = {n: other.best[n] for n in other.space.names} | dict.fromkeys(
+                (n for n in MOTION if n in self.best), 0.0
+            )
+            return checks.significance(here, parts.each({**self.best, **still}))
+        return checks.significance(here, other._objective_by_parts(Sharpness.VARIANCE).each(other.best))
+
     def check_answer(self, name: str) -> tuple[tuple[str, ...], dict[str, float]]:
         """Return warnings and standard deviations; raise :class:`AmiwarpError` if chance explains the sharpness."""
         best, space, camera = self.best, self.space, self.space.camera
@@ -464,6 +483,9 @@ class Search:
             unmoved = MODELS[space.model].still_values(best)
             points = (best, {**best, "phase": best["phase"] + math.pi}, unmoved)
             sharp, opposite, still = (variance.each(values) for values in points)
+            if "photometric" in self.settings.stages:
+                size, most = space.size_name, space.high[space.size_name]
+                checks.check_size(size, best[size] + LEAST_INSIDE_PX / space.pixels[size], most, name)
             checks.check_texture(sharp, opposite, still, name)
             # not the border outside the sensor, and as much inside, where the view ends: at most a quarter of it
             inset = self.pad + min(self.pad, min(camera.width, camera.height) // 4)
@@ -472,7 +494,7 @@ class Search:
         covariance, warnings = estimate_covariance(parts, v)
         at_bound = [
             n for n in space.names
-            if n != "phase" and min(best[n] - space.low[n], space.high[n] - best[n]) * space.pixels[n] < 0.05
+            if n != "phase" and min(best[n] - space.low[n], space.high[n] - best[n]) * space.pixels[n] < LEAST_INSIDE_PX
         ]  # fmt: skip
         unit = units()
         bounds = (f"{n} = {best[n]:.6g} {unit[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)

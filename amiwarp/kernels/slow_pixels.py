@@ -75,10 +75,19 @@ def filtered(
     model: Any, camera: CameraParams, pairs: Pairs, atlas: Atlas, image: wp.array(dtype=float), k: int, i: int,
     filter: Photoreceptor,
 ) -> float:  # fmt: skip
-    """Return the output of the filter at an event."""
+    """Return the output of the filter at an event.
+
+    A dark pixel remembers for longer than :data:`MEMORY`: its output begins on the contracted orbit.
+    """
     width = MEMORY / float(STEPS)  # step [time constants at median light]
     before = float(brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * filter.turn - filter.ahead))
-    level = float(before)
+    w0, w1 = event_azimuth(model, pairs, k, i)
+    past_azimuth = turned(w0, w1, wp.cos(MEMORY * filter.turn), -wp.sin(MEMORY * filter.turn))
+    pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
+    xy = contracted_position(model, camera, pixel, past_azimuth[0], past_azimuth[1], lag_of(pairs, k, i))
+    level = float(brightness_at_position(image, atlas, pairs.tile[i], xy))
+    if wp.isnan(level):
+        level = before
     steps = int(STEPS)  # a variable, so that Warp does not unroll the loop, which takes minutes to compile for CUDA
     for j in range(steps):
         past = MEMORY - float(j + 1) * width

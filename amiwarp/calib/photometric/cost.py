@@ -512,6 +512,8 @@ def check_pairs(name: str, coverage: NDArray[np.float32], pairs: int) -> float:
 
 MOST_STEPS = 15
 """Largest number of Gauss-Newton steps."""
+FIRST_STEPS = 3
+"""Number of steps after which a search may be given up: the first ones may only turn towards the optimum."""
 LONGEST_STEP_PX = 1.0
 """Largest change of any parameter in one Gauss-Newton step [px]."""
 HALVINGS = 4
@@ -597,16 +599,20 @@ def iterate(
     tolerance: float,
     report: Callable[[int, int], None],
     early: bool = True,
+    least: float = -math.inf,
+    walls: tuple[Vector, Vector] | None = None,
 ) -> SearchStage:
     """Maximise a score by Gauss-Newton steps until they are shorter than ``tolerance`` [px] in every parameter.
 
-    A step that lowers the score is halved. The search stays in the box ``low .. high`` [px]. Its answer is the best
-    evaluated point. ``report`` gets the number of steps done and the largest number. ``start_score`` and
-    ``start_slopes`` return functions that wait for the result at a point. If ``early``, slopes are also started where
-    the score may turn out lower, and then not waited for.
+    A step that lowers the score is halved. The search stays in the box ``low .. high`` [px]. It also ends if all steps
+    that are left, each as good as the last one, would not reach the score ``least``, and at the second step in turn to
+    one of the ``walls``, bounds [px] on which an answer is of no use. Its answer is the best evaluated point.
+    ``report`` gets the number of steps done and the largest number. ``start_score`` and ``start_slopes`` return
+    functions that wait for the result at a point. If ``early``, slopes are also started where the score may turn out
+    lower, and then not waited for.
     """
     began = time.perf_counter()
-    v, points, scores, ended = np.clip(start, low, high), [], [], "budget"
+    v, points, scores, ended, at_wall = np.clip(start, low, high), [], [], "budget", 0
     waiting = start_score(v)
     slopes = start_slopes(v) if early else None
     here = waiting()
@@ -627,8 +633,16 @@ def iterate(
             if value >= here:
                 break
             step = step / 2.0
+        gained = value - here
+        at_wall = at_wall + 1 if walls is not None and bool(((trial <= walls[0]) | (trial >= walls[1])).any()) else 0
         if value >= here:
             v, here = trial, value
+        if k + 1 >= FIRST_STEPS and here + (MOST_STEPS - 1 - k) * gained < least:
+            ended = "too far from the least score"
+            break
+        if at_wall > 1:
+            ended = "bound"
+            break
         if moved < tolerance or value < here:
             ended = "tolerance" if moved < tolerance else "no better step"
             break

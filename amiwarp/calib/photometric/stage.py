@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.brightness.solver import BrightnessMap, SensorTiming, Tiles, darkness, off_excess, set_lags
@@ -20,6 +21,7 @@ from amiwarp.calib.nlopt_solver import SearchStage, maximise
 from amiwarp.calib.parameters import LENS, MOTION, ParameterSpace, like_size, units
 from amiwarp.calib.photometric import consistency
 from amiwarp.calib.photometric.cost import (
+    GRID,
     Cost,
     check_pairs,
     collect_pairs,
@@ -30,7 +32,7 @@ from amiwarp.calib.photometric.cost import (
 )
 from amiwarp.calib.result import PhotometricSummary, StageSummary
 from amiwarp.calib.settings import GAUSS_NEWTON, LINEAR_UNKNOWNS, PhotometricSettings
-from amiwarp.calib.sharpness import Search
+from amiwarp.calib.sharpness import LEAST_INSIDE_PX, Search
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import Camera
 
@@ -46,6 +48,11 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
     given = search.settings.photometric.sensor
     found = _Equations(recording, search, given)
     answer = found.answers.search(found.start)
+    if answer.result.cost > min(LARGEST_STILL_COST, search.most_cost):
+        if answer.result.cost > search.most_cost and not answer.result.accepted:
+            return found.finished(answer)
+        if parts := moving_parts(found.answers.cost):
+            return found.finished(replace(answer, result=replace(answer.result, moving=parts)).judged(*MOVING))
     rpm, sensor, time_constant = search.calibration_events.encoder.rpm, given, 0.0
     rad_per_us, direction = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm)
     examined = can_be_examined(answer, found.answers.cost) and bool(rpm)
@@ -128,7 +135,7 @@ class _Equations:
         """Search vector of the sharpness stage's result."""
         if self.held:
             cost.warm_up(self.start)
-        self.answers = AnswerSearch(cost, dict(best), left, self._settings, self._report)
+        self.answers = AnswerSearch(cost, dict(best), left, self._settings, self._report, search.most_cost)
 
     def _report(self, share: float) -> None:
         self._search.report("photometric", share)
@@ -214,6 +221,8 @@ class AnswerSearch:
     """Share of equations of :func:`check_pairs`."""
     settings: PhotometricSettings
     report: Callable[[float], None]
+    most_cost: float = math.inf
+    """Cost above which an answer is of no use."""
     timing: Vector = field(default_factory=lambda: np.zeros(0))
     """Change of the first answer by a correction of the sensor's timing [px]; empty for none."""
 
@@ -226,14 +235,20 @@ class AnswerSearch:
     def search(self, start: Vector) -> Answer:
         """Search from ``start``, and again from any point near the new result with a lower cost.
 
-        If there are few events, the map can adapt to wrong parameters so well that no single step lowers the cost.
+        If there are few events, the map can adapt to wrong parameters so well that no single step lowers the cost. No
+        better answer is looked for where the search cannot reach one that is accepted.
         """
+        return self.judged(self.descend(start))
+
+    def judged(self, stage: SearchStage) -> Answer:
+        """Return the answer of a search, or of those that follow it."""
         cost = self.cost
-        stage = self.descend(start)
         answer, around = _evaluate(cost, stage, self.origin, self.left)
+        few = cost.brightness.count < FEW_PAIRS
         for _ in range(RESTARTS):
             lower = [point for point, rise in around if rise < 0.0]
-            if not lower:
+            most = LARGEST_EXAMINED_COST if stage.ended != "budget" else 0.0
+            if not lower or is_far(answer.result.moved_px) or (answer.result.cost > most and not few):
                 break
             cost.renew(lower[0])
             stage = join_runs(stage, self.descend(lower[0]))
@@ -257,7 +272,8 @@ class AnswerSearch:
             # After a low score, the map on a GPU converges from the derivatives there, to the same solution.
             return iterate(
                 cost.start_settled, cost.start_slopes, start, low=low, high=high, tolerance=settings.tolerance_px,
-                report=report_steps, early=not cost.brightness.device.is_cpu,
+                report=report_steps, early=not cost.brightness.device.is_cpu, least=-self.most_cost,
+                walls=search_walls(cost.space, low, high),
             )  # fmt: skip
 
         def run(at: Vector, step: float) -> SearchStage:
@@ -354,6 +370,13 @@ def search_box(space: ParameterSpace, v: Vector) -> tuple[Vector, Vector]:
     return np.clip(low, v - most, v + most), np.clip(high, v - most, v + most)
 
 
+def search_walls(space: ParameterSpace, low: Vector, high: Vector) -> tuple[Vector, Vector]:
+    """Return those bounds of the search box ``low .. high`` on which an answer is refused [px]; infinite for others."""
+    given_low, given_high = space.bounds()
+    lens = np.array([name in LENS for name in space.names])
+    return np.where(lens | (low > given_low), low, -np.inf), np.where(lens | (high < given_high), high, np.inf)
+
+
 # Acceptance of the photometric stage's optimum.
 #
 # Each limit was set by failures that it prevents; ``docs/explanation/stability.md`` describes them.
@@ -396,6 +419,11 @@ LARGEST_INCONSISTENCY_PX = 0.1
 """Largest accepted error that the check of the answer's consistency leaves [px]."""
 
 
+def is_far(moved: float) -> bool:
+    """Return whether an answer lies so far from that of the sharpness stage that it is refused [px]."""
+    return moved > 0.95 * LARGEST_MOVE_PX
+
+
 LARGEST_LAG_RAD = 0.35
 """Largest angle by which the prism may turn within the time constant of slow photoreceptors [rad]. At 0.2 an error of
 0.02 px remains, at 0.4 one of 0.14 px."""
@@ -419,6 +447,24 @@ def judge_consistency(error_px: float, cause: str) -> tuple[bool, str]:
     if error_px <= LARGEST_INCONSISTENCY_PX:
         return True, ""
     return False, f"the answer differs by {error_px:.2f} px between parts of the image or of the recording: {cause}"
+
+
+def judge_lens(given: ParameterSpace, space: ParameterSpace, answer: Answer) -> tuple[bool, str]:
+    """Return whether to accept an answer whose lens was corrected, and the reason: not if the correction is too large.
+
+    ``given`` is the space before the correction.
+    """
+    low, high = space.bounds()
+    inside = np.minimum(answer.stage.x - low, high - answer.stage.x).tolist()
+    lens = {n: x for n, x in zip(space.names, inside, strict=True) if n in LENS and n not in given.names}
+    unfinished = answer.stage.ended == "budget" and not answer.result.accepted
+    if not lens or not (unfinished or min(lens.values()) < LEAST_INSIDE_PX or is_far(answer.result.moved_px)):
+        return True, ""
+    values = ", ".join(f"{name} = {answer.result.parameters[name]:.4g}" for name in lens)
+    return False, (
+        f"the given lens is wrong by more than can be corrected (the search ended at {values}): give its true field of "
+        "view or focal length, and its distortion; a fisheye lens is no pinhole"
+    )
 
 
 def judge_optimum(cost: float, *, rise: float, moved: float, next_step: float) -> tuple[bool, str]:
@@ -447,7 +493,7 @@ def judge_optimum(cost: float, *, rise: float, moved: float, next_step: float) -
             f"no brightness map of the scene explains the events ({min(100 * cost, 100):.0f} % of the residual "
             "remains): the scene or the camera moved, light flickered, or the encoder or the lens is wrong"
         )
-    if moved > 0.95 * LARGEST_MOVE_PX:
+    if is_far(moved):
         return False, (
             f"the optimum is over {LARGEST_MOVE_PX:g} px away from that of sharpness: the lens or the encoder is "
             "wrong, or the scene or the camera moved"
@@ -557,6 +603,37 @@ def loss_notes(silent_share: float, step: float) -> list[str]:
     return notes
 
 
+# Parts of the image in which something moves.
+
+LEAST_PARTS = 0.2
+"""Smallest share of the pairs that must be in parts of the image that a still scene explains, and in others, for the
+two to be told apart: a part of a 4 x 3 grid and more."""
+MOVING = False, "something moves in a part of the view"
+"""Judgement of an answer if one part of the view is still and another one moves."""
+
+
+def moving_parts(cost: Cost) -> tuple[tuple[bool, ...], ...]:
+    """Return for each part of the image, row by row, whether the scene is not still there; empty if there are no such.
+
+    A map explains the events of a still part as well as those of a still scene, and hardly any of a moving one. If the
+    camera turns, all parts move.
+    """
+    pairs, (columns, rows), camera = cost.brightness.pairs, GRID, cost.space.camera
+    if cost.space.moving:
+        return ()
+    some = slice(None, len(pairs), max(1, len(pairs) // SAMPLED_PAIRS))
+    residuals = np.nan_to_num(cost.brightness.residuals.values[some].numpy(), nan=1.0)
+    costs = np.log1p((residuals / cost.scale) ** 2) / math.log1p(1.0 / cost.scale**2)
+    x, y = pairs.arrays.x[some].numpy().astype(int), pairs.arrays.y[some].numpy().astype(int)
+    part = y * rows // camera.height * columns + x * columns // camera.width
+    number = np.bincount(part, minlength=rows * columns)
+    mean = np.bincount(part, costs, rows * columns) / np.maximum(number, 1)
+    still, moving = ((mean < LARGEST_STILL_COST) & (number > 0), mean > LARGEST_EXAMINED_COST)
+    if min(number[still].sum(), number[moving].sum()) < LEAST_PARTS * number.sum():
+        return ()
+    return tuple(tuple(row) for row in (~still).reshape(rows, columns).tolist())
+
+
 # Errors of the prism's angle: harmonics of the encoder's angle, which repeat every turn, and delays of the read-out.
 
 MOST_ANGLE_FITS = 6
@@ -574,7 +651,7 @@ def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
 
     It is the factors of :data:`consistency.PATTERNS`, shape (6,). A linearised fit finds a share of the error only,
     because the map absorbs the other part; the next fit tells how large the share was. The pairs keep the corrected
-    angles, because an answer with an error ends the stage.
+    angles, because an answer with an error ends the stage. A small delay of the read-out is no error.
     """
     cost, camera = search.cost, search.cost.space.camera
     cost.converge(v)
@@ -584,7 +661,7 @@ def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
     pairs = cost.brightness.pairs
     waves = pairs.angle_patterns((0.5 * camera.width, 0.5 * camera.height)).numpy().reshape(6, 2, -1)
     angle, azimuth = np.arctan2(waves[1], waves[0]), pairs.arrays.azimuth
-    total, share, at = np.zeros(6), FIRST_SHARE, v
+    given, total, share, at = wp.clone(azimuth), np.zeros(6), FIRST_SHARE, v
     for _ in range(MOST_ANGLE_FITS):
         step = found.change / share
         total += step
@@ -598,7 +675,16 @@ def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
         before, found = found, consistency.fit_angles(cost, at, found.names)
         assert found is not None
         share = float(np.clip((before.change - found.change) @ step / (step @ step), LEAST_SHARE, 1.0))
+    if not total[:4].any() and skew_px(camera, total, consistency.px_per_rad(cost.space, v)) < LARGEST_SKEW_PX:
+        azimuth.assign(given)
+        cost.renew(v)
+        return None
     return total
+
+
+def skew_px(camera: Camera, error: Vector, px_per_rad: float) -> float:
+    """Return how far the delay of the read-out in an ``error`` of the angle moves events [px rms]."""
+    return px_per_rad * consistency.rms_angle(camera, np.append(np.zeros(4), error[4:]))
 
 
 def judge_angles(camera: Camera, error: Vector, px_per_rad: float, rad_per_us: float) -> tuple[bool, str]:
@@ -606,8 +692,7 @@ def judge_angles(camera: Camera, error: Vector, px_per_rad: float, rad_per_us: f
 
     ``px_per_rad`` is how far events move per angle, ``rad_per_us`` the speed of the prism.
     """
-    skew = np.append(np.zeros(4), error[4:])
-    px = px_per_rad * consistency.rms_angle(camera, skew)
+    px = skew_px(camera, error, px_per_rad)
     if px >= LARGEST_SKEW_PX:
         x, y = (-error[4:] / rad_per_us).tolist()
         return False, (
@@ -631,10 +716,6 @@ def harmonics_in_words(harmonics: Sequence[float] | Vector) -> str:
 # Both shift the angles of the prism at which events tell the brightness. A linearised fit tells whether one of them
 # explains much of the residual; then it is searched for. All angles are those by which the prism turns within a time.
 
-LEAST_TIMING_GAIN = 0.03
-"""Smallest share of the squared residuals that a time must explain. Right ones explain 0.01 at most."""
-SIGNIFICANT_TIMING = 10.0
-"""Smallest number of standard deviations of a time from 0."""
 LARGEST_RAD = 0.5
 """Largest angle that is searched [rad]."""
 FACTOR, MOST_TRIALS = 1.7, 7
@@ -653,7 +734,9 @@ def can_be_examined(answer: Answer, cost: Cost) -> bool:
 def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]:
     """Return the angles per refractory period and per time constant at median brightness [rad].
 
-    A linearised fit at the answer ``v`` estimates each of them. An angle that is not significant is 0.
+    A linearised fit at the answer ``v`` estimates each of them. An angle that is not significant, by the limits for
+    other errors of the prism's angle, is 0. Right times explain 0.002 of the squared residuals, or more of it with the
+    wrong sign.
     """
     cost.converge(v)
     relative, _ = darkness(cost.brightness, cost.space.build(cost.space.to_values(v)))
@@ -665,7 +748,11 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
     def angle(name: str, sign: float) -> float:
         estimate, significance, gain = fit.adding(cost.space.names, (name,))
         change = sign * float(estimate.change[-1])
-        return change if change > 0.0 and significance >= SIGNIFICANT_TIMING and gain >= LEAST_TIMING_GAIN else 0.0
+        return (
+            change
+            if change > 0.0 and significance >= consistency.SIGNIFICANT and gain >= consistency.LEAST_ANGLE_GAIN
+            else 0.0
+        )
 
     return angle("refractory", direction), angle("slow", -direction)
 
@@ -795,6 +882,8 @@ LEAST_RIVAL_PX = 0.02
 """Distance of the models of two explanations from which on both are reported [px rms]."""
 CONTRADICTING = 3.0
 """Number of standard deviations from which on a correction is said to contradict what was given."""
+SAME_COST = 1.05
+"""Largest ratio of the costs of two answers that count as equal. Two maps of the same scene differ by less."""
 LARGEST_LAST_STEP_PX = 0.01
 """Longest step that is added to the answer without a new search [px]."""
 
@@ -837,8 +926,14 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
         if best is not None:
             cost.space, search.sharpest, answer = best.space, best.sharpest, best.answer
             tied += [(best, rival) for rival in best.rivals]
+            accepted, reason = judge_lens(given, cost.space, answer)
+            if not accepted:
+                return replace(answer, result=replace(answer.result, accepted=False, verdict=reason))
         elif left and cost.space is not given and np.linalg.norm(check.step) > LARGEST_LAST_STEP_PX:
             again = search.search(answer.stage.x + check.step)
+            if again.result.cost > SAME_COST * answer.result.cost:
+                cost.converge(answer.stage.x)
+                break
             answer = replace(again, stage=join_runs(answer.stage, again.stage))
         else:
             break
@@ -874,7 +969,13 @@ def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Co
         return None
     v = answer.stage.x
     here = _comparable_cost(search, v)
-    tried = [t for t in (_corrected(search, finding, v) for finding in likely) if _significant(t) and t.cost < here]
+    found: list[_Corrected] = []
+    for finding in likely:
+        # a cause that cannot come near the cost of another one is given up
+        least = min((t.cost for t in found), default=math.inf)
+        each = _corrected(search, finding, v, least + GIVEN_SHARE * max(0.0, here - least))
+        found += [each] if each is not None else []
+    tried = [t for t in found if _significant(t) and t.cost < here]
     if not tried:
         return None
 
@@ -889,14 +990,16 @@ def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Co
     return replace(best, rivals=tuple(rivals))
 
 
-def _corrected(search: AnswerSearch, finding: consistency.Finding, v: Vector) -> _Corrected:
-    """Return the answer with a cause corrected. The search's space stays."""
+def _corrected(search: AnswerSearch, finding: consistency.Finding, v: Vector, most_cost: float) -> _Corrected | None:
+    """Return the answer with a cause corrected, or None if it costs far more than ``most_cost``. The space stays."""
     cost, space, sharpest, cause = search.cost, search.cost.space, search.sharpest, finding.cause
     cost.space, _ = consistency.with_cause(space, cause, space.to_values(v))
     if cause.names == (consistency.FLAT_SIDE,):
         search.sharpest = consistency.turned(space, sharpest)
-    answer = search.search(finding.start)
-    found = _Corrected(cause, answer, _comparable_cost(search, answer.stage.x), cost.space, search.sharpest)
+    stage, found = replace(search, most_cost=most_cost).descend(finding.start), None
+    if -stage.score <= SAME_COST * most_cost:
+        answer = search.judged(stage)
+        found = _Corrected(cause, answer, _comparable_cost(search, answer.stage.x), cost.space, search.sharpest)
     cost.space, search.sharpest = space, sharpest
     return found
 
