@@ -576,20 +576,22 @@ class AngleFit:
 def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> AngleFit | None:
     """Return the errors ``names`` of the prism's angle at ``best`` [px]; without names, those that are significant.
 
-    None if there are none, or if they cannot be examined. What a slow rotation of the camera, a wrong fy / fx or the
-    prism's shape explains does not count.
+    None if there are none, or if they cannot be examined. What a slow rotation of the camera or a wrong camera or prism
+    explains does not count.
     """
     angles = _angle_columns(cost, best)
     groups = [{name: angles[name] for name in group} for group in (HARMONICS, SKEW) if angles]
     if not angles or not (names or telling(cost, groups, LEAST_ANGLE_GAIN)):
         return None
-    given, shape = _rivals_of_angles(cost, best), {}
-    if not names and SHAPES[1] in testable(cost.space):
-        shape = _cause_columns(cost, best, SHAPES[1])  # for wobble too, which has nearly the same effect
-    fit = linear_fit(cost, given | angles | shape)
+    given, others = _rivals_of_angles(cost, best), {}
+    if not names:
+        # cylinder power stands for wobble too, which has nearly the same effect
+        for cause in (c for c in testable(cost.space) if c in SCREENED and c is not SHAPES[0]):
+            others |= {n: x for n, x in _cause_columns(cost, best, cause).items() if n not in given}
+    fit = linear_fit(cost, given | angles | others)
     if not names:
         for group, other in ((HARMONICS, SKEW), (SKEW, HARMONICS)):
-            _, significance, gain = fit.adding((*given, *shape, *other), group)
+            _, significance, gain = fit.adding((*given, *others, *other), group)
             names += group if significance >= SIGNIFICANT and gain >= LEAST_ANGLE_GAIN else ()
         if not names:
             return None
