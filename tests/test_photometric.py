@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -415,3 +416,23 @@ def test_gauss_newton_halves_steps_that_are_too_long() -> None:
     assert not kept.all()
     assert set(awaited) <= set(stage.points[kept, 0])
     assert set(awaited) < set(started)
+
+
+@pytest.mark.parametrize(
+    ("limits", "ended", "evaluations"),
+    [
+        ({}, "budget", 16),
+        ({"least": -1.0}, "too far from the least score", 4),
+        ({"least": -4.5}, "budget", 16),
+        ({"walls": (np.full(1, -np.inf), np.full(1, 3.0))}, "budget", 16),
+        ({"high": np.full(1, 0.25), "walls": (np.full(1, -np.inf), np.full(1, 0.25))}, "bound", 5),
+    ],
+)
+def test_a_hopeless_search_is_given_up(limits: dict[str, Any], ended: str, evaluations: int) -> None:
+    """Of a score that rises by 0.1 with each step of 0.1 px from -5 on."""
+    stage = iterate(
+        lambda v: lambda: float(v[0]) - 5.0, lambda _: lambda: Slopes(np.eye(1), np.full(1, -0.1), np.empty((1, 0))),
+        np.zeros(1), **{"low": np.zeros(1), "high": np.full(1, 9.0), **limits}, tolerance=1e-9,
+        report=lambda *_: None, early=False,
+    )  # fmt: skip
+    assert (stage.ended, stage.evaluations) == (ended, evaluations)

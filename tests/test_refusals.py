@@ -7,7 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from amiwarp import AmiwarpError, Camera, Encoder, Events, MemoryEvents, Prism, Recording, Settings, calibrate, simulate
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    CameraMotion,
+    Encoder,
+    Events,
+    MemoryEvents,
+    Prism,
+    Recording,
+    Settings,
+    calibrate,
+    simulate,
+)
 from amiwarp.calib.calibration import prepare
 from amiwarp.calib.checks import check_pulses, check_texture
 from amiwarp.calib.first_guess import encoder_turns_per_period
@@ -37,6 +49,43 @@ def test_a_wrong_scale_is_found_in_the_events(texture: np.ndarray) -> None:
     with pytest.raises(AmiwarpError, match=r"a still camera explains the events.*counts_per_turn") as caught:
         calibrate(scaled(recording, factor), model="exact", events=100_000, photometric=COARSE)
     assert float(str(caught.value).rpartition(" times ")[2]) == pytest.approx(factor, abs=0.002)
+
+
+SMALL = {"model": "exact", "events": 100_000, "photometric": COARSE}
+
+
+@pytest.fixture(scope="module")
+def still(texture: np.ndarray) -> Recording:
+    camera = Camera.from_fov(120, 90, math.radians(50.0))
+    return simulate(texture, camera, TRUE_PRISM, duration_s=0.18, seed=3)
+
+
+def test_a_wrong_direction_of_the_encoder_is_named(still: Recording) -> None:
+    with pytest.raises(AmiwarpError, match=r"turns against the direction of the encoder.*--direction"):
+        calibrate(scaled(still, -1.0), **SMALL)
+
+
+def test_an_apex_beyond_the_bound_is_refused_with_the_bound(still: Recording) -> None:
+    small = replace(still, prism=Prism(0.4 * TRUE_PRISM.apex))
+    bound = math.degrees(0.8 * TRUE_PRISM.apex)
+    with pytest.raises(AmiwarpError, match=rf"apex that is tried, {bound:.3g} deg.*apex=0:{2.0 * bound:.3g}deg"):
+        calibrate(small, **SMALL)
+
+
+def test_an_object_over_half_of_the_view_is_no_turning_camera(texture: np.ndarray, still: Recording) -> None:
+    assert still.camera is not None
+    moving = simulate(
+        texture[::-1].copy(), still.camera, TRUE_PRISM, duration_s=0.18, seed=4,
+        camera_motion=CameraMotion((0.0, 0.8, 0.1)),
+    )  # fmt: skip
+    left, right = (r.events.slice(0, len(r.events)) for r in (still, moving))
+    left, right = left[np.flatnonzero(left.x < 60)], right[np.flatnonzero(right.x >= 60)]
+    t = np.concatenate([left.t, right.t])
+    both = Events.concatenate([left, right])[np.argsort(t, kind="stable")]
+    found = calibrate(replace(still, events=MemoryEvents(both, 120, 90)), **SMALL)
+    assert any("something moves: 50 % of the view are left out" in w for w in found.warnings)
+    assert not any("camera turned" in w for w in found.warnings)
+    assert found.parameters["apex"] == pytest.approx(TRUE_PRISM.apex, rel=0.02)
 
 
 @pytest.mark.parametrize("factor", [0.98, 1.024, 0.5])

@@ -41,6 +41,14 @@ def test_an_unknown_refractory_period_is_found() -> None:
     assert 1500.0 < found.photometric.refractory_us < 4000.0
 
 
+def test_a_short_refractory_period_is_found() -> None:
+    """It explains 1.7 % of the residual. Without the correction the error is 0.021 px."""
+    found, error = calibrated(replace(SMALL, refractory_us=1700.0))
+    assert error < 0.02
+    assert found.photometric is not None
+    assert found.photometric.refractory_us > 200.0
+
+
 def test_fast_pixels_are_left_alone() -> None:
     found, error = calibrated(SMALL)
     assert error < 0.015  # a map with one node per pixel makes this orbit 0.012 px too large

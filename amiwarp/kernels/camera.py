@@ -88,7 +88,10 @@ def undistort_radial_tangential(c: CameraParams, d: wp.vec2) -> wp.vec3:
         p = p * (0.9 * c.limit / wp.length(p))
     steps = int(NEWTON_STEPS)  # a variable, so that Warp does not unroll the loop, which is slow to compile
     for _ in range(steps):
+        last = wp.vec2(p[0], p[1])
         p = p - wp.inverse(jacobian_radial_tangential(c, p)) * (distort_radial_tangential(c, p) - d)
+        if p[0] == last[0] and p[1] == last[1]:  # all further steps would be 0
+            break
     error = wp.length(distort_radial_tangential(c, p) - d)
     if not (error < LARGEST_RESIDUAL * (1.0 + wp.length(d)) and wp.length(p) <= c.limit):
         return invalid_ray()
@@ -118,7 +121,10 @@ def undistort_fisheye(c: CameraParams, d: wp.vec2) -> wp.vec3:
     angle = float(wp.min(radius, 0.9 * c.limit))
     steps = int(NEWTON_STEPS)  # a variable, so that Warp does not unroll the loop, which is slow to compile
     for _ in range(steps):
+        before = float(angle)
         angle = wp.clamp(angle - (fisheye_radius(c, angle) - radius) / fisheye_slope(c, angle), 0.0, c.limit)
+        if angle == before:
+            break
     if not (wp.abs(fisheye_radius(c, angle) - radius) < LARGEST_RESIDUAL * (1.0 + radius)):
         return invalid_ray()
     s = wp.sin(angle) / radius

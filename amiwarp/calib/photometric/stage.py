@@ -716,6 +716,12 @@ def harmonics_in_words(harmonics: Sequence[float] | Vector) -> str:
 # Both shift the angles of the prism at which events tell the brightness. A linearised fit tells whether one of them
 # explains much of the residual; then it is searched for. All angles are those by which the prism turns within a time.
 
+LEAST_REFRACTORY_GAIN = 0.01
+"""Smallest share of the squared residuals that a refractory period must explain: that of other errors of the angle.
+Sensors without one explain as much with the wrong sign only; 3 ms explain 0.023 and more."""
+LEAST_SLOW_GAIN = 0.03
+"""Smallest share that slow photoreceptors must explain. Others explain 0.002 at most, but a smaller lag does less harm
+than its correction, whose light is estimated."""
 LARGEST_RAD = 0.5
 """Largest angle that is searched [rad]."""
 FACTOR, MOST_TRIALS = 1.7, 7
@@ -734,9 +740,7 @@ def can_be_examined(answer: Answer, cost: Cost) -> bool:
 def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]:
     """Return the angles per refractory period and per time constant at median brightness [rad].
 
-    A linearised fit at the answer ``v`` estimates each of them. An angle that is not significant, by the limits for
-    other errors of the prism's angle, is 0. Right times explain 0.002 of the squared residuals, or more of it with the
-    wrong sign.
+    A linearised fit at the answer ``v`` estimates each of them. An angle that is not significant is 0.
     """
     cost.converge(v)
     relative, _ = darkness(cost.brightness, cost.space.build(cost.space.to_values(v)))
@@ -745,16 +749,12 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
     columns["refractory"], columns["slow"] = cost.by_angle(v)[0], consistency.shifted(cost, v, relative)
     fit = consistency.linear_fit(cost, columns)
 
-    def angle(name: str, sign: float) -> float:
+    def angle(name: str, sign: float, least_gain: float) -> float:
         estimate, significance, gain = fit.adding(cost.space.names, (name,))
         change = sign * float(estimate.change[-1])
-        return (
-            change
-            if change > 0.0 and significance >= consistency.SIGNIFICANT and gain >= consistency.LEAST_ANGLE_GAIN
-            else 0.0
-        )
+        return change if change > 0.0 and significance >= consistency.SIGNIFICANT and gain >= least_gain else 0.0
 
-    return angle("refractory", direction), angle("slow", -direction)
+    return angle("refractory", direction, LEAST_REFRACTORY_GAIN), angle("slow", -direction, LEAST_SLOW_GAIN)
 
 
 def find_refractory(search: AnswerSearch, v: Vector, first: float, direction: float) -> float:
