@@ -226,7 +226,7 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     b.prepare_projection()
     for name, column in columns.items():
         if name not in cost.columns or cost.columns[name][0] is not column:
-            cost.columns[name] = column, b.unexplained(column, steps=MAP_STEPS)
+            cost.columns[name] = column, cost.unexplained(column, steps=MAP_STEPS)
     left = [cost.columns[name][1] for name in columns]
     next(cost.meanwhile, None)
     width, height = (-(-side // SQUARE_PX) for side in (camera.width, camera.height))
