@@ -468,6 +468,14 @@ def judge_consistency(error_px: float, cause: str) -> tuple[bool, str]:
     return False, f"the answer differs by {error_px:.2f} px between parts of the image or of the recording: {cause}"
 
 
+def judge_shake(amplitude_px: float) -> tuple[bool, str]:
+    """Return that an answer is rejected whose camera shakes with the prism, and the reason."""
+    return False, (
+        f"the camera shakes with the prism, by {amplitude_px:.2f} px or more, which looks like a weaker or stronger "
+        "prism; mount the camera apart from the motor, or balance the prism"
+    )
+
+
 def judge_optimum(cost: float, *, rise: float, moved: float, next_step: float) -> tuple[bool, str]:
     """Return whether to accept an optimum of the photometric stage, and the reason.
 
@@ -881,6 +889,8 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
     for left in range(MOST_CORRECTIONS, -1, -1):
         cost.converge(answer.stage.x)
         check = consistency.check_consistency(cost, answer.stage.x)
+        if check.shake_px:
+            return answer.judged(*judge_shake(check.shake_px))
         best = _best_correction(search, answer, check) if left else None
         if best is not None:
             cost.space, search.sharpest, answer = best.space, best.sharpest, best.answer
