@@ -3,8 +3,8 @@
     python -m benchmarks.worlds_calibration [--device cuda:0] [--size 320 240] [--out FILE.json]
 
 The error is the rms difference [px] between the displacements of the calibrated model and of the true prism, over the
-image and a turn. A camera that translates causes parallax, which no calibration model describes. Each row therefore
-gives the largest speed of parallax in the image, and its ratio to the mean speed that the prism gives the image.
+image and a turn. A camera that translates causes parallax, which differs over the image. Each row therefore gives
+the largest speed of parallax in the image, and its ratio to the mean speed that the prism gives the image.
 """
 
 from __future__ import annotations

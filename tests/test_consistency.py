@@ -178,6 +178,17 @@ def test_a_slow_rotation_of_the_camera_is_noticed(texture: np.ndarray, wide: Rec
     assert moved.cost < LARGEST_STILL_COST
 
 
+def test_a_camera_that_shakes_with_the_prism_is_refused(texture: np.ndarray) -> None:
+    t = np.arange(0.0, 0.18, 1e-3)
+    angle = 2.0 * math.pi * 12.0 * t
+    away = -0.3 * PRISM.deflection * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    rates = np.gradient(away, t, axis=0)
+    motion = CameraMotion(np.column_stack([t, -rates[:, 1], rates[:, 0], np.zeros(len(t))]))
+    recording = simulate(texture, CAMERA, PRISM, duration_s=0.17, camera_motion=motion, seed=6)
+    with pytest.raises(AmiwarpError, match="the camera shakes with the prism, by 0"):
+        calibrated(recording)
+
+
 def test_linear_fit() -> None:
     truth = np.array([0.3, -0.2, 0.5])
     fit = linear(truth, noise=0.1)

@@ -251,3 +251,13 @@ def test_blank_scene() -> None:
     noisy = simulate(grey, SMALL, TRUE_PRISM, duration_s=0.25, seed=6, sensor=SensorModel(shot_noise_hz=50.0))
     with pytest.raises(AmiwarpError, match="sharper than chance"):
         calibrate(noisy)
+
+
+def test_a_hand_trembles(texture: NDArray[np.uint8]) -> None:
+    # within two turns, the speed of a tremor is no linear function of time
+    t = np.linspace(0.0, 0.2, 201)
+    rates = np.stack([0.1 * np.cos(18.0 * t), 0.08 * np.sin(18.0 * t + 0.5), np.zeros(len(t))], axis=1)
+    recording = turned(texture, np.column_stack([t, rates]))
+    c = calibrate(recording, free=FREE, photometric=replace(KNOWN, density=2.0, pairs=20_000), events=100_000)
+    assert {*RATES, "apex", "phase"} <= {*c.free} & {*c.uncertainty}
+    assert error_px(c, recording) <= 0.01

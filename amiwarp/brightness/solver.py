@@ -72,6 +72,18 @@ class PairSet:
     def __len__(self) -> int:
         return int(self.arrays.count)
 
+    def set_path(self, factors: NDArray[np.float64]) -> None:
+        """Set how the scene of each tile of a rotating camera moves in the image; see :meth:`path_array`."""
+        self.arrays.path = self.path_array(factors)
+
+    def path_array(self, factors: NDArray[np.float64]) -> Any:
+        """Return the paths of the tiles on the device.
+
+        ``factors`` are those of t, t², … along x and y [px/s, px/s², …], shape (tiles, 2, ``PATH_TERMS``), with the
+        time t of an event [s].
+        """
+        return wp.array(factors.ravel().astype(np.float32), dtype=float, device=self.device)
+
     def column(self, name: str) -> NDArray[Any]:
         """Return the column ``x``, ``y``, ``tile`` or ``on`` of the pairs as a NumPy array, shape (n,)."""
         values: NDArray[Any] = getattr(self.arrays, name).numpy()
@@ -389,7 +401,7 @@ def _empty(count: int, device: Any, *, weak: float = 0.0, drifts: bool = False) 
     out.x, out.y, out.on = pixels[:n], pixels[n:], flags
     out.tile, out.time, out.azimuth = values[:n].view(int), values[n : 3 * n], values[3 * n : 7 * n]
     out.slope = values[7 * n :] if drifts else nothing
-    out.lag = out.offset = nothing
+    out.lag = out.offset = out.path = nothing
     if pixels.device.is_cpu:
         for array in (pixels, flags, values):
             array.numpy().reshape(-1, n)[:, count:] = 0
@@ -534,13 +546,19 @@ class PairPositions:
         return g
 
     def place(
-        self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any, image: Any = None
-    ) -> None:
-        """Compute the positions into ``out``.
+        self, model: Model, drift: float, camera_rotation: CameraRotation | None, out: Any, image: Any = None,
+        path: Any = None,
+    ) -> None:  # fmt: skip
+        """Compute the positions into ``out``. A ``path`` replaces that of the pairs.
 
         With the map ``image``, on a CPU and if :meth:`_in_blocks`, ``out`` gets the changes of brightness instead.
         """
         arrays, turn = self.pairs.arrays, self._turn(camera_rotation)
+        if path is not None:
+            present, arrays.path = arrays.path, path
+            self.place(model, drift, camera_rotation, out, image)
+            arrays.path = present
+            return
         n = arrays.stride if self.device.is_cpu else arrays.count  # CPU kernels also read the padding
         if not self._in_blocks(model, turn):
             inputs = [model.params(self.device), model_camera(model, self.device), arrays, self._atlas]

@@ -27,7 +27,8 @@ class Pairs:
     All arrays are flat. ``azimuth`` holds four parts: the cosines of the encoder's angle at the first events, the
     sines, and both at the second events. ``time`` [s] counts from the middle of the window; ``slope`` is the derivative
     of the angle by the drifting parameter, or empty. Both hold the first events, then the second events. ``lag`` and
-    ``offset`` describe slow pixels (:mod:`amiwarp.kernels.slow_pixels`), or are empty.
+    ``offset`` describe slow pixels (:mod:`amiwarp.kernels.slow_pixels`), or are empty. ``path`` tells how the scene of
+    each tile moves in the image, or is empty.
     """
 
     count: int
@@ -42,6 +43,7 @@ class Pairs:
     time: wp.array(dtype=float)
     lag: wp.array(dtype=float)  # rotation and contraction of the orbit at each event, in parts as ``azimuth``
     offset: wp.array(dtype=float)  # what the equation's left side lacks [thresholds]
+    path: wp.array(dtype=float)  # for each tile, the factors of t, t², … in its motion along x, then along y [px]
 
 
 @wp.struct

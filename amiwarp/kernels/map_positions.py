@@ -12,6 +12,8 @@ from amiwarp.kernels.refraction import compensate, displace, even, is_even, is_p
 
 wp.set_module_options({"enable_backward": False})
 
+PATH_TERMS = wp.constant(4)  # number of powers of time in the path of a tile
+
 
 @wp.func
 def node_from(atlas: Atlas, tile: int, left: float, top: float, x: float, y: float):
@@ -60,6 +62,23 @@ def drifted_azimuth(model: Any, pairs: Pairs, drift: float, k: int, i: int) -> w
 
 
 @wp.func
+def without_path(pairs: Pairs, k: int, i: int, xy: wp.vec2) -> wp.vec2:
+    """Return where the scene at ``xy`` at the first (k = 0) or second event of a pair is at time 0.
+
+    The scene of each tile moves on its own path, a polynomial of time.
+    """
+    if pairs.path.shape[0] == 0:
+        return xy
+    first = 2 * PATH_TERMS * pairs.tile[i]
+    time = pairs.time[k * pairs.stride + i]
+    moved = wp.vec2(0.0, 0.0)
+    for j in range(PATH_TERMS):
+        term = first + PATH_TERMS - 1 - j
+        moved = (moved + wp.vec2(pairs.path[term], pairs.path[term + PATH_TERMS])) * time
+    return xy - moved
+
+
+@wp.func
 def compensated_position(
     model: Any, camera: CameraParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
 ) -> wp.vec2:
@@ -69,7 +88,8 @@ def compensated_position(
     if pairs.lag.shape[0] > 0:
         return contracted_position(model, camera, pixel, w[0], w[1], lag_of(pairs, k, i))
     xy = compensate(model, camera, pixel, w)
-    return undo_camera_rotation(camera, xy, camera_rotation, pairs.time[k * pairs.stride + i])
+    xy = undo_camera_rotation(camera, xy, camera_rotation, pairs.time[k * pairs.stride + i])
+    return without_path(pairs, k, i, xy)
 
 
 @wp.func
@@ -79,7 +99,8 @@ def compensated_position(
     """Return the compensated position for a camera without distortion, and pixels that are not slow."""
     w = drifted_azimuth(model, pairs, drift, k, i)
     u, v = displace(model, camera, float(pairs.x[i]), float(pairs.y[i]), w[0], w[1])
-    return undo_camera_rotation(camera, wp.vec2(u, v), camera_rotation, pairs.time[k * pairs.stride + i])
+    xy = undo_camera_rotation(camera, wp.vec2(u, v), camera_rotation, pairs.time[k * pairs.stride + i])
+    return without_path(pairs, k, i, xy)
 
 
 @wp.func
@@ -210,6 +231,7 @@ def undo_rotations(
         at = undo_camera_rotation(
             camera, wp.vec2(x[j], y[j]), camera_rotation, pairs.time[k * pairs.stride + first + j]
         )
+        at = without_path(pairs, k, first + j, at)
         x[j] = at[0]
         y[j] = at[1]
 

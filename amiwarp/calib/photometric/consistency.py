@@ -40,6 +40,8 @@ SKEW = ("skew x", "skew y")
 """Names of the unknown changes of the prism's angle from column to column and from row to row [rad/px]."""
 PATTERNS = (*HARMONICS, *SKEW)
 """Names of all errors of the prism's angle that are examined, in the order of ``PairSet.angle_patterns``."""
+SHAKE = ("shake x cos", "shake x sin", "shake y cos", "shake y sin")
+"""Names of the unknown amplitudes of a rotation of the camera about x and y that repeats every turn [px]."""
 FLAT_SIDE = "flat_side"
 """Name of the unknown that is 0 for the given flat side of the prism, and 1 for the other."""
 
@@ -226,7 +228,7 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     b.prepare_projection()
     for name, column in columns.items():
         if name not in cost.columns or cost.columns[name][0] is not column:
-            cost.columns[name] = column, b.unexplained(column, steps=MAP_STEPS)
+            cost.columns[name] = column, cost.unexplained(column, steps=MAP_STEPS)
     left = [cost.columns[name][1] for name in columns]
     next(cost.meanwhile, None)
     sums, squares, width = _products_by_square(cost, left)
@@ -293,6 +295,9 @@ LEAST_GAIN = 0.002
 """Smallest share of the squared residuals that a cause must remove. Right answers leave 0.001 at most."""
 LEAST_ANGLE_GAIN = 0.01
 """Smallest share that an error of the prism's angle must remove. Right angles leave 0.003 at most."""
+SHAKE_SHARE = 0.75
+"""A shake counts if it explains this share of what all causes together explain, with fewer unknowns. Eight wrong lenses
+left 0.02 to 0.62 of it, shakes by 30 % of the prism's motion 0.84 to 1.7."""
 LEAST_FURTHER_GAIN = 0.0005
 """Smallest share that a further cause must remove once the given lens has turned out to be wrong."""
 LEAST_MOVE_PX = 0.005
@@ -351,6 +356,9 @@ class Consistency:
     center_px: tuple[float, float] | None = None
     """Correction of the principal point, and its standard deviation, as displacements of events [px rms]; None if it is
     free or cannot be tested."""
+    shake_px: float = 0.0
+    """Least amplitude of a rotation of the camera that repeats every turn [px], if the camera seems to shake so; else
+    0."""
 
     def inconsistent_px(self) -> float:
         """Return the largest error that the check found [px].
@@ -416,14 +424,16 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         columns |= group
     if set(cylinder.names) <= columns.keys() and wobble in screened:
         columns |= _cause_columns(cost, best, wobble)
-    fit = linear_fit(cost, columns)
+    fit, shake_px = linear_fit(cost, columns), 0.0
     findings = _findings(cost, best, fit, screened, least_gain)
     if findings and not doubtful:
         for cause in causes:
             if cause not in SCREENED:
                 columns |= _cause_columns(cost, best, cause)
+        columns |= _shake_columns(cost, best)
         fit = linear_fit(cost, columns)
         findings = _findings(cost, best, fit, causes, LEAST_GAIN)
+        shake_px = _shake(space, fit)
     systematic = _systematic(space, fit, COARSE_STD_PX if cost.brightness.tiles.density <= 1.0 else LEAST_STD_PX)
     if doubtful:
         systematic = systematic + _doubt(space, fit, causes)
@@ -431,7 +441,7 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         step=fit.fit(space.names).change, systematic=systematic, findings=tuple(findings),
         drift=_drift(space, best, fit), spread=_spread(space, best, fit),
         rotation_gain=_rotation_gain(space, fit), untold_px=_untold(space, best, fit),
-        center_px=_center(space, best, fit),
+        center_px=_center(space, best, fit), shake_px=shake_px,
     )  # fmt: skip
 
 
@@ -552,6 +562,25 @@ def _rotation_columns(cost: Cost, best: Vector) -> dict[str, Any]:
     return columns
 
 
+def _shake_columns(cost: Cost, best: Vector) -> dict[str, Any]:
+    """Return the derivatives of the residuals by rotations of the camera that repeat every turn, for a still camera.
+
+    They are rotations about x and about y by the cosine and by the sine of the encoder's angle [px at the centre].
+    """
+    pairs, camera, at = cost.brightness.pairs, cost.space.camera, cost.at(best)
+    if cost.space.moving or not _orbit(cost.space):
+        return {}
+    rows, times, columns = pairs.angle_patterns((0.0, 0.0)), pairs.arrays.time, {}
+    for k, name in enumerate(SHAKE):
+        x, y = np.eye(2)[k // 2] * (SLOPE_PX / camera.fx)
+        pairs.arrays.time = rows[k % 2].flatten()
+        turns = (CameraRotation((s * x, s * y, 0.0), middle_us=cost.brightness.middle_us) for s in (1.0, -1.0))
+        up, down = ({**at, "camera_rotation": turn} for turn in turns)
+        columns[name] = cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
+    pairs.arrays.time = times
+    return columns
+
+
 def _angle_columns(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by patterns of the prism's angle, for a still camera."""
     pairs, camera = cost.brightness.pairs, cost.space.camera
@@ -583,7 +612,8 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> AngleFi
     groups = [{name: angles[name] for name in group} for group in (HARMONICS, SKEW) if angles]
     if not angles or not (names or telling(cost, groups, LEAST_ANGLE_GAIN)):
         return None
-    given, others = _rivals_of_angles(cost, best), {}
+    given = _rivals_of_angles(cost, best)
+    others: dict[str, Any] = {}
     if not names:
         # cylinder power stands for wobble too, which has nearly the same effect
         for cause in (c for c in testable(cost.space) if c in SCREENED and c is not SHAPES[0]):
@@ -615,6 +645,20 @@ def rms_angle(camera: Camera, factors: Vector) -> float:
 def px_per_rad(space: ParameterSpace, best: Vector) -> float:
     """Return how far events move per angle of the prism [px rms/rad]."""
     return float(np.linalg.norm(best[:2])) if space.cartesian else space.pixels.get("phase", 0.0)
+
+
+def _shake(space: ParameterSpace, fit: LinearFit) -> float:
+    """Return the amplitude of a shake that explains nearly as much as all causes together [px]; 0 if none does."""
+    if not {*SHAKE} <= {*fit.names}:
+        return 0.0
+    unknown = [n for cause in CAUSES for n in cause.names if n in fit.names and n not in space.names]
+    # a wrong fy / fx bends the orbit as a shake on an ellipse does: it is freed for both
+    free = (*space.names, *(n for n in unknown if n in ASPECT.names))
+    estimate, significance, gain = fit.adding(free, SHAKE)
+    others = fit.adding(free, tuple(n for n in unknown if n not in free))[2]
+    if significance < SIGNIFICANT or gain < max(LEAST_ANGLE_GAIN, SHAKE_SHARE * others):
+        return 0.0
+    return float(np.linalg.norm(estimate.change[-len(SHAKE) :]) / math.sqrt(2.0))
 
 
 def _rotation_gain(space: ParameterSpace, fit: LinearFit) -> float:

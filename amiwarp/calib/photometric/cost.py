@@ -26,6 +26,7 @@ from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.iwe import Image
 from amiwarp.kernels.iwe import sum_segments
 from amiwarp.kernels.launch import launch
+from amiwarp.kernels.map_positions import PATH_TERMS as POWERS
 
 if TYPE_CHECKING:
     from amiwarp.calib.sharpness import Search
@@ -42,14 +43,114 @@ def place_arguments(space: ParameterSpace, values: Mapping[str, float]) -> dict[
     }
 
 
+PATH_TERMS = int(POWERS)
+"""Number of powers of time in the path of a tile. With four, the motion of a hand over two turns leaves under 0.001 px;
+with two it leaves 0.015 px."""
 FIRST_SCALE = 1.0
 """Scale of the Cauchy weights before the first brightness map is solved [thresholds]."""
 SLOPE_PX = 0.005
 """Step of the finite differences that give the derivatives of the residuals [px]."""
 STEP_RAD = 0.004
 """Step of the finite differences that give the derivatives of the residuals by an angle [rad]."""
+PATH_RIDGE = 1e-4
+"""Damping of the paths of tiles, a share of their mean curvature: a scene of parallel edges does not determine both
+directions."""
 PREDICTED_PX = 0.5
 """Longest step for which the change of the brightness map is predicted [px]."""
+
+
+class TilePaths:
+    """Paths on which the scene of each tile of a :class:`BrightnessMap` moves in the image, beyond the rotation.
+
+    A path is a polynomial of time. As the map, it is a nuisance: derivatives by the parameters lose the part that a
+    change of the paths explains.
+    """
+
+    def __init__(self, brightness: BrightnessMap) -> None:
+        """Start with tiles at rest."""
+        self._map, pairs = brightness, brightness.pairs
+        self.tile: NDArray[np.int32] = pairs.column("tile")
+        """Tile of each pair."""
+        self._order = np.argsort(self.tile, kind="stable")
+        self._used, self._starts = np.unique(self.tile[self._order], return_index=True)
+        half_s = max(0.5 * float(np.ptp(pairs.some_times)), 1e-6)
+        self._units = np.tile(half_s ** -np.arange(1.0, PATH_TERMS + 1.0), 2)
+        """Factors of the powers of time that move a tile by 1 px at the ends of the window."""
+        self.moved_px: Vector = np.zeros((len(brightness.tiles.origin), 2 * PATH_TERMS))
+        """Motion until the end of the window by each power of time along x, then y [px], shape (tiles, terms)."""
+        self._changes: list[Any] = []
+
+    def set(self, moved_px: Vector) -> None:
+        """Set the paths."""
+        self.moved_px = moved_px
+        self._map.pairs.set_path(moved_px * self._units)
+
+    def linearise(self, at: Mapping[str, Any], steps: int) -> None:
+        """Compute the derivatives of the residuals by the paths, at a point where the map is solved."""
+        b, changes, left = self._map, self._changes or [None] * len(self._units), []
+        self._base, self._changes = self.moved_px, []
+        self._slopes: list[Vector] = []
+        for k, change in enumerate(changes):
+            step = np.zeros_like(self.moved_px)
+            step[:, k] = SLOPE_PX
+            up, down = (b.pairs.path_array((self.moved_px + s * step) * self._units) for s in (1.0, -1.0))
+            slope = b.find_slope({**at, "path": up}, {**at, "path": down}, 2.0 * SLOPE_PX)
+            left.append(self._on_host(b.unexplained(slope, change, steps=steps)))
+            self._changes.append(b.explaining_change())
+        self._left = np.stack(left, axis=1)
+        self._weight = self._on_host(b.residuals.weight)
+        hessian = self._sums(self._left[:, :, None] * (self._left * self._weight[:, None])[:, None, :])
+        ridge = PATH_RIDGE * np.trace(hessian, axis1=1, axis2=2) / hessian.shape[1] + 1e-9
+        self._inverse = np.linalg.inv(hessian + ridge[:, None, None] * np.eye(hessian.shape[1]))
+        self._step = -self._factors(b.residuals.values)
+
+    def unexplained(self, column: Any) -> Any:
+        """Return the part of a derivative, on the device, that no change of the paths explains."""
+        factors, rest = self._factors(column), column.numpy().copy()
+        rest[: len(self.tile)] -= np.einsum("ij,ij->i", self._left, factors[self.tile])
+        self._slopes.append(factors)
+        return wp.array(rest, dtype=float, device=column.device)
+
+    def gain(self) -> float:
+        """Return the share of a tile's squared residuals that the next step of its path removes.
+
+        It is the share that a quarter of the tiles exceed: the others may show moving objects.
+        """
+        residual = self._on_host(self._map.residuals.values)
+        removed = -(self._sums(self._left * (residual * self._weight)[:, None]) * self._step).sum(axis=1)
+        share = removed[self._used] / self._sums(residual**2 * self._weight)[self._used]
+        return float(np.quantile(share, 0.75))
+
+    def follow(self, step: Vector) -> None:
+        """Change the paths, and the map with them, as :meth:`linearise` predicts for a step of the parameters."""
+        moved = self._base + np.clip(self._step, -LONGEST_STEP_PX, LONGEST_STEP_PX)
+        moved = moved - np.tensordot(step, self._slopes[: len(step)], 1)
+        change, nodes = moved - self.moved_px, self._map.tiles.nodes
+        self.set(moved)
+        image = self._map.unknowns
+        for by, of_map in zip(change.T, self._changes, strict=True):
+            image[:nodes] -= (of_map.numpy()[:nodes].reshape(len(by), -1) * by[:, None]).ravel()
+        self._map.unknowns = image
+
+    def costs(self, scale: float) -> Vector:
+        """Return the mean Cauchy cost of each tile, relative to that without a map; 0 without pairs."""
+        residual = self._map.residuals.values.numpy()[: len(self.tile)].astype(np.float64)
+        cost = np.log1p((np.nan_to_num(residual, nan=1.0) / scale) ** 2) / math.log1p(1.0 / scale**2)
+        return self._sums(cost) / np.maximum(self._sums(np.ones(len(cost))), 1.0)
+
+    def _factors(self, column: Any) -> Vector:
+        """Return the changes of the paths that explain most of a column, shape (tiles, terms)."""
+        gradient = self._sums(self._left * (self._on_host(column) * self._weight)[:, None])
+        return np.asarray(np.einsum("tij,tj->ti", self._inverse, gradient))
+
+    def _on_host(self, column: Any) -> Vector:
+        return np.nan_to_num(column.numpy()[: len(self.tile)]).astype(np.float64)
+
+    def _sums(self, values: Vector) -> Vector:
+        """Return the sums of values of the pairs over each tile."""
+        out = np.zeros((len(self.moved_px), *values.shape[1:]))
+        out[self._used] = np.add.reduceat(values[self._order], self._starts, axis=0)
+        return out
 
 
 class Cost:
@@ -73,6 +174,8 @@ class Cost:
         """Derivatives of the residuals at the last solution, on the device, by name; each with the part of it that no
         change of the map explains."""
         self._by_angle: tuple[Any, Any] | None = None
+        self.paths: TilePaths | None = None
+        """Paths of the tiles; None if their scenes move with the camera's rotation alone."""
 
     @property
     def space(self) -> ParameterSpace:
@@ -181,9 +284,16 @@ class Cost:
         if self._solved is None or not self._changes:
             return
         step = v - self._solved
+        if self.paths is not None:
+            self.paths.follow(v - self._sloped)
         if np.linalg.norm(step) <= PREDICTED_PX:
             for change, moved in zip(self._changes, step, strict=True):
                 self.brightness.add(change, float(moved))
+
+    def unexplained(self, column: Any, change: Any = None, *, steps: int) -> Any:
+        """Return the part of a derivative that no change of the map and of the tiles' paths explains."""
+        left = self.brightness.unexplained(column, change, steps=steps)
+        return left if self.paths is None else self.paths.unexplained(left)
 
     def slopes(self, v: NDArray[np.float64], *, with_parts: bool = False) -> Slopes:
         """Return the residuals' derivatives at ``v``, minus the part that a change of the map can explain.
@@ -203,8 +313,11 @@ class Cost:
         for step in steps:
             slopes.append(b.find_slope(self.at(v + step), self.at(v - step), 2.0 * SLOPE_PX))
         left, changes, self._changes = [], self._changes or [None] * n, []
+        if self.paths is not None:
+            self._sloped = v
+            self.paths.linearise(self.at(v), self.steps // 2)
         for slope, change in zip(slopes, changes, strict=True):
-            left.append(b.unexplained(slope, change, steps=self.steps // 2))
+            left.append(self.unexplained(slope, change, steps=self.steps // 2))
             self._changes.append(b.explaining_change())
         upper = np.triu_indices(n)
         pairs = [(left[i], left[j]) for i, j in zip(*upper, strict=True)]

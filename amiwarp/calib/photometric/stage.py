@@ -23,6 +23,7 @@ from amiwarp.calib.photometric import consistency
 from amiwarp.calib.photometric.cost import (
     GRID,
     Cost,
+    TilePaths,
     check_pairs,
     collect_pairs,
     determined,
@@ -48,6 +49,8 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
     given = search.settings.photometric.sensor
     found = _Equations(recording, search, given)
     answer = found.answers.search(found.start)
+    if found.answers.cost.space.moving:
+        answer = found.with_paths(answer)
     if answer.result.cost > min(LARGEST_STILL_COST, search.most_cost):
         if answer.result.cost > search.most_cost and not answer.result.accepted:
             return found.finished(answer)
@@ -127,6 +130,8 @@ class _Equations:
             coverage = cost.brightness.coverage(cost.scale)
         left = check_pairs(recording.name, coverage, len(self.pairs))
         keep = determined(cost.slopes(v, with_parts=True), space, left)
+        self.rotation: dict[str, float] = {}
+        """Standard deviations of the camera's rotation, if it was found before the paths of the tiles."""
         self.held = tuple(n for n in space.names if n not in keep)
         """Free parameters that the events do not determine."""
         # undetermined parameters stay at the answer of sharpness, because the others were found together with them
@@ -164,8 +169,43 @@ class _Equations:
         """Return the result of the stage with ``answer``, the summary of the search, and the space of the result."""
         space, answers = self.answers.cost.space, self.answers
         result = replace(answer.result, sharpness_parameters=answers.sharpest, pairs=len(self.pairs), held=self.held)
-        values = map(space.to_values, answer.stage.points)
-        return result, StageSummary.of("photometric", answer.stage, space.names, values), space
+        summary = StageSummary.of("photometric", answer.stage, space.names, map(space.to_values, answer.stage.points))
+        result = replace(result, uncertainty={**self.rotation, **result.uncertainty})
+        return result, summary, replace(space, names=(*space.names, *self.rotation))
+
+    def with_paths(self, answer: Answer) -> Answer:
+        """Return the answer for tiles whose scenes move on their own paths, if these explain much of the residual.
+
+        The camera's rotation stays as it was found; the paths add what it lacks: a rotation that varies faster, and
+        parallax. Tiles that are not explained then, such as those of a moving object, are left out.
+        """
+        answers, cost = self.answers, self.answers.cost
+        turning, values = cost.space, cost.space.to_values(answer.stage.x)
+        names = tuple(n for n in turning.names if n in MOTION)
+        space = turning.without(names).holding({n: values[n] for n in names})
+        if not space.names or len(cost.brightness.tiles.origin) == 1:
+            return answer
+        v = space.to_vector(values)
+        cost.space, cost.paths = space, TilePaths(cost.brightness)
+        cost.residuals(v, rounds=2)
+        cost.slopes(v)
+        if cost.paths.gain() <= LARGEST_ROTATION_GAIN:
+            cost.space, cost.paths = turning, None
+            cost.converge(answer.stage.x)
+            return answer
+        v = answers.descend(v).x
+        cost.residuals(v, rounds=2)
+        costs = cost.paths.costs(cost.scale)
+        keep = costs <= max(LARGEST_STILL_COST, LARGEST_OF_LEAST * float(costs[costs > 0.0].min()))
+        if not keep[costs > 0.0].all():
+            self.pairs = self.pairs.of_tiles(keep)
+            answers.cost = self.cost_on(cost.brightness.tiles, space)
+            answers.cost.paths = paths = TilePaths(answers.cost.brightness)
+            paths.set(cost.paths.moved_px)
+            answers.cost.warm_up(v)
+        again = answers.search(v)
+        self.rotation = {n: answer.result.uncertainty[n] for n in names}
+        return again
 
     def with_slow_pixels(self, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:
         """Return the answer for pixels with slow photoreceptors, and the angle per time constant [rad]; 0 if it fails.
@@ -320,13 +360,16 @@ def _evaluate(
     waiting_final, residuals = cost.start_mean(), cost.brightness.residuals
     waiting_residual = residuals.start_median(residuals.count)
     waiting_slopes = cost.start_slopes(best, with_parts=True)
-    solved = cost.brightness.copy_unknowns()
+    solved, paths = cost.brightness.copy_unknowns(), cost.paths
+    moved_px = np.zeros(0) if paths is None else paths.moved_px
     waiting_around = start_costs_around(cost, best, waiting_final)
     # the map is better converged now than at the start of the search, so the cost at the start is measured again
     cost.predict(v)
     cost.residuals(v)
     waiting_at_start = cost.start_mean()
     cost.replace_map(solved)
+    if paths is not None:
+        paths.set(moved_px)
     cost.residuals(best, rounds=0)
     slopes, final, around = waiting_slopes(), waiting_final(), waiting_around()
     covariance = slopes.covariance() / left**2
@@ -412,6 +455,9 @@ encoder scale leave."""
 LARGEST_ROTATION_GAIN = 0.05
 """Largest share of the squared residuals that a camera rotation may explain before it is freed. Cameras that turned at
 0.1 to 1 deg/s left 0.1 to 0.5; still ones 0.007 at most, whatever the noise."""
+LARGEST_OF_LEAST = 2.0
+"""A tile whose scene moves on its own path is left out if its cost is over this multiple of the least cost of a tile,
+and over :data:`LARGEST_STILL_COST`."""
 LARGEST_COST_RATIO = 0.75
 """Ratio of the new to the previous cost up to which another explanation is accepted if the previous cost was high: a
 camera rotation, a corrected encoder scale, or a corrected lens."""
@@ -464,6 +510,14 @@ def judge_lens(given: ParameterSpace, space: ParameterSpace, answer: Answer) -> 
     return False, (
         f"the given lens is wrong by more than can be corrected (the search ended at {values}): give its true field of "
         "view or focal length, and its distortion; a fisheye lens is no pinhole"
+    )
+
+
+def judge_shake(amplitude_px: float) -> tuple[bool, str]:
+    """Return that an answer is rejected whose camera shakes with the prism, and the reason."""
+    return False, (
+        f"the camera shakes with the prism, by {amplitude_px:.2f} px or more, which looks like a weaker or stronger "
+        "prism; mount the camera apart from the motor, or balance the prism"
     )
 
 
@@ -922,6 +976,8 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
     for left in range(MOST_CORRECTIONS, -1, -1):
         cost.converge(answer.stage.x)
         check = consistency.check_consistency(cost, answer.stage.x)
+        if check.shake_px:
+            return answer.judged(*judge_shake(check.shake_px))
         best = _best_correction(search, answer, check) if left else None
         if best is not None:
             cost.space, search.sharpest, answer = best.space, best.sharpest, best.answer
