@@ -1027,9 +1027,9 @@ def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Co
     here = _comparable_cost(search, v)
     found: list[_Corrected] = []
     for finding in likely:
-        # a cause that cannot come near the cost of another one is given up
-        least = min((t.cost for t in found), default=math.inf)
-        each = _corrected(search, finding, v, least + GIVEN_SHARE * max(0.0, here - least))
+        # a cause that cannot come near the cost of another one on the same map is given up
+        least = min((t.answer.result.cost for t in found), default=math.inf)
+        each = _corrected(search, finding, v, least + GIVEN_SHARE * max(0.0, answer.result.cost - least))
         found += [each] if each is not None else []
     tried = [t for t in found if _significant(t) and t.cost < here]
     if not tried:
