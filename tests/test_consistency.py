@@ -28,6 +28,7 @@ from amiwarp import (
     simulate,
     truth_model,
 )
+from amiwarp.calib.photometric import stage
 from amiwarp.calib.photometric.consistency import CAUSES, Consistency, Finding, LinearFit
 from amiwarp.calib.photometric.stage import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
 
@@ -122,17 +123,30 @@ def test_an_error_that_cannot_be_corrected_is_refused(wide: Recording, monkeypat
         calibrated(given)
 
 
-def test_pixels_that_are_read_one_after_another_are_named(wide: Recording) -> None:
-    events = wide.events.slice(0, len(wide.events))  # type: ignore[attr-defined]
-    t = events.t + 6 * events.x.astype(np.int64)
+def read_by_column(recording: Recording, delay_us: int) -> Recording:
+    """Return the recording of a sensor that reads each column later than the last one."""
+    events = recording.events.slice(0, len(recording.events))  # type: ignore[attr-defined]
+    t = events.t + delay_us * events.x.astype(np.int64)
     order = np.argsort(t, kind="stable")
     skewed = Events(events.x[order], events.y[order], t[order], events.p[order])
-    assert wide.encoder is not None
+    return replace(recording, events=MemoryEvents(skewed, 160, 120))
+
+
+def test_pixels_that_are_read_one_after_another_are_named(wide: Recording) -> None:
     with pytest.raises(AmiwarpError, match=r"events come late by .* us more from column to column") as refused:
-        calibrated(replace(wide, events=MemoryEvents(skewed, 160, 120)))
+        calibrated(read_by_column(wide, 6))
     found = re.search(r"late by (\S+) us more", str(refused.value))
     assert found is not None
     assert float(found[1]) == pytest.approx(6.0, abs=1.0)
+
+
+def test_an_accepted_delay_of_the_read_out_is_no_error_of_the_encoder(
+    wide: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stage, "LARGEST_SKEW_PX", 0.1)
+    found = calibrated(read_by_column(wide, 6))
+    assert found.harmonics is None
+    assert found.parameters["apex"] == pytest.approx(PRISM.apex, rel=0.01)
 
 
 def test_a_wrong_ratio_of_the_focal_lengths_is_found(texture: np.ndarray) -> None:
