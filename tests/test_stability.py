@@ -249,7 +249,7 @@ def test_what_sharpness_alone_gets_wrong(changes: dict[str, float], says: str) -
     ("changes", "reason"),
     [
         ({"lost": 0.9}, "--stages sharpness"),
-        ({"cancelled": 0.6, "width": 320, "height": 240}, "nominal apex"),
+        ({"cancelled": 0.6, "width": 320, "height": 240}, "shakes with the prism"),
         ({"lamp": 0.9, "width": 48, "height": 36}, "flicker"),
         ({"backwards": True, "width": 128, "height": 96}, "."),
         ({"counts_per_turn": 4, "width": 80, "height": 60}, "--stages sharpness"),
