@@ -215,7 +215,7 @@ def stored_texture() -> CellResult:
 def stored_atlas() -> stability.Stored:
     """Return a cell of the stability study with a success and a refusal."""
     names = [stability.identity(method) for method in stability.METHODS[:2]]
-    good = stability.Result(stability.Outcome.SUCCESS, 0.02, 0.1, 1.5, deviation=0.5)
+    good = stability.Result(stability.Outcome.SUCCESS, 0.02, 0.1, 1.5, deviations={"apex": 0.5})
     refused = stability.Result(stability.Outcome.REFUSAL, None, 0.1, 1.5, "too little light", "two cores")
     cell = stability.Cell(stability.AXES[0].conditions()[0], 0)
     return stability.Stored(cell, 1000, dict(zip(names, (good, refused), strict=True)))

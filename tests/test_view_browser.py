@@ -432,7 +432,7 @@ def test_a_calibration_is_cancelled_and_a_closed_tab_ends_its_own(
     page.locator("#do-calibrate").filter(has_text="cancel").click()
     message(page, "calibration cancelled")
     assert ended.wait(WAIT_S)
-    assert page.locator("#found, #busy").count() == 0
+    until(lambda: page.locator("#found, #busy").count() == 0)
     ended.clear()
     second = opened()
     assert field(second, "apex") == NOMINAL_DEG
