@@ -770,9 +770,9 @@ def harmonics_in_words(harmonics: Sequence[float] | Vector) -> str:
 # Both shift the angles of the prism at which events tell the brightness. A linearised fit tells whether one of them
 # explains much of the residual; then it is searched for. All angles are those by which the prism turns within a time.
 
-LEAST_REFRACTORY_GAIN = 0.02
+LEAST_REFRACTORY_GAIN = 0.015
 """Smallest share of the squared residuals that a refractory period must explain. Eight photographs without one explain
-0.014 at most, or more with the wrong sign; 3 ms explain 0.023 and more."""
+0.014 at most, or more with the wrong sign; 1.7 ms explain 0.017, and 3 ms 0.023 and more."""
 LEAST_SLOW_GAIN = 0.03
 """Smallest share that slow photoreceptors must explain. Seven of eight photographs without them explain 0.005 at most,
 but a smaller lag does less harm than its correction, whose light is estimated."""
