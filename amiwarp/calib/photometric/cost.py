@@ -59,6 +59,11 @@ PREDICTED_PX = 0.5
 """Longest step for which the change of the brightness map is predicted [px]."""
 
 
+def cauchy_costs(residuals: NDArray[Any], scale: float) -> NDArray[Any]:
+    """Return the Cauchy cost of each residual [thresholds], relative to that without a map; 1 off the map."""
+    return np.asarray(np.log1p((np.nan_to_num(residuals, nan=1.0) / scale) ** 2) / math.log1p(1.0 / scale**2))
+
+
 class TilePaths:
     """Paths on which the scene of each tile of a :class:`BrightnessMap` moves in the image, beyond the rotation.
 
@@ -134,8 +139,7 @@ class TilePaths:
 
     def costs(self, scale: float) -> Vector:
         """Return the mean Cauchy cost of each tile, relative to that without a map; 0 without pairs."""
-        residual = self._map.residuals.values.numpy()[: len(self.tile)].astype(np.float64)
-        cost = np.log1p((np.nan_to_num(residual, nan=1.0) / scale) ** 2) / math.log1p(1.0 / scale**2)
+        cost = cauchy_costs(self._map.residuals.values.numpy()[: len(self.tile)].astype(np.float64), scale)
         return self._sums(cost) / np.maximum(self._sums(np.ones(len(cost))), 1.0)
 
     def _factors(self, column: Any) -> Vector:

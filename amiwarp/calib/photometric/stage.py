@@ -24,6 +24,7 @@ from amiwarp.calib.photometric.cost import (
     GRID,
     Cost,
     TilePaths,
+    cauchy_costs,
     check_pairs,
     collect_pairs,
     determined,
@@ -275,8 +276,8 @@ class AnswerSearch:
     def search(self, start: Vector) -> Answer:
         """Search from ``start``, and again from any point near the new result with a lower cost.
 
-        If there are few events, the map can adapt to wrong parameters so well that no single step lowers the cost. No
-        better answer is looked for where the search cannot reach one that is accepted.
+        If there are few events, the map can adapt to wrong parameters so well that no single step lowers the cost. An
+        answer that would be refused anyway is not searched for again.
         """
         return self.judged(self.descend(start))
 
@@ -660,8 +661,8 @@ def loss_notes(silent_share: float, step: float) -> list[str]:
 # Parts of the image in which something moves.
 
 LEAST_PARTS = 0.2
-"""Smallest share of the pairs that must be in parts of the image that a still scene explains, and in others, for the
-two to be told apart: a part of a 4 x 3 grid and more."""
+"""Smallest share of the pairs that the still parts of the image must hold, and that the moving parts must hold, before
+something is said to move. One part of the 4 x 3 grid holds less."""
 MOVING = False, "something moves in a part of the view"
 """Judgement of an answer if one part of the view is still and another one moves."""
 
@@ -676,8 +677,7 @@ def moving_parts(cost: Cost) -> tuple[tuple[bool, ...], ...]:
     if cost.space.moving:
         return ()
     some = slice(None, len(pairs), max(1, len(pairs) // SAMPLED_PAIRS))
-    residuals = np.nan_to_num(cost.brightness.residuals.values[some].numpy(), nan=1.0)
-    costs = np.log1p((residuals / cost.scale) ** 2) / math.log1p(1.0 / cost.scale**2)
+    costs = cauchy_costs(cost.brightness.residuals.values[some].numpy(), cost.scale)
     x, y = pairs.arrays.x[some].numpy().astype(int), pairs.arrays.y[some].numpy().astype(int)
     part = y * rows // camera.height * columns + x * columns // camera.width
     number = np.bincount(part, minlength=rows * columns)
