@@ -21,13 +21,14 @@ def release_memory() -> None:
 
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Stop the garbage collector in all threads, inside a ``with`` block."""
+    """Stop the garbage collector in all threads, inside a ``with`` block. What is due then is collected at its end."""
     enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
         if enabled:
+            gc.collect(0)  # in this thread, or the next thread that allocates anything would do it
             gc.enable()
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from threading import current_thread
 from typing import Any
 
 import numpy as np
@@ -269,21 +270,29 @@ def test_events_copied_ahead_are_those_of_their_spans(recording: Recording) -> N
         assert ahead.take(spans[3:5]) is None
 
 
-def test_no_garbage_is_collected_while_events_are_copied(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_garbage_is_collected_by_no_thread_that_copies_events(recording: Recording) -> None:
     if not wp.is_cuda_available():
         pytest.skip("no CUDA device")
-    source, copy, collecting = recording.events, wp.copy, list[bool]()
+    source, threads, thresholds = recording.events, list[str](), gc.get_threshold()
     assert isinstance(source, MemoryEvents)
 
-    def copy_and_note(*args: object, **kwargs: object) -> None:
-        collecting.append(gc.isenabled())
-        copy(*args, **kwargs)
+    def note(phase: str, info: object) -> None:
+        threads.append(current_thread().name)
 
-    monkeypatch.setattr(wp, "copy", copy_and_note)
-    with EventsAhead(source, [(source.t_first, source.t_last)], len(source), "cuda:0"):
-        pass
-    assert collecting == [False] * 4
-    assert gc.isenabled()
+    gc.callbacks.append(note)
+    gc.set_threshold(1)
+    try:
+        for _ in range(20):
+            with EventsAhead(source, [(source.t_first, source.t_last)], len(source), "cuda:0"):
+                before = len(threads)
+                garbage = [[] for _ in range(1000)]  # what this thread allocates is counted for all
+                assert len(threads) == before
+            del garbage
+            assert len(threads) > before
+    finally:
+        gc.set_threshold(*thresholds)
+        gc.callbacks.remove(note)
+    assert not [name for name in threads if name.startswith("amiwarp")]
 
 
 def test_damping_follows_the_contrast_of_the_seen_nodes(recording: Recording, device: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import wait
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from types import TracebackType
 from typing import Any
@@ -169,13 +170,12 @@ class EventsAhead:
         self._events = DeviceEvents(*(wp.empty(n, dtype=dtype, device=self._device) for dtype in TYPES))
         self._stream = wp.Stream(self._device)  # Warp's own one may be recording a graph
         self._stream.wait_stream(self._device.stream)  # which allocated the arrays
+        # Warp's recording of a graph fails if another thread frees memory of the GPU, which a collector may do there
+        self._copying = ExitStack()
+        self._copying.enter_context(no_garbage_collection())
         self._copied = pool().submit(self._copy)
 
     def _copy(self) -> None:
-        with no_garbage_collection():  # Warp's recording of a graph fails if this thread frees memory of the GPU
-            self._copy_columns()
-
-    def _copy_columns(self) -> None:
         for name in NAMES:
             out = getattr(self._events, name)
             for first, part in zip(self._first, self._parts, strict=False):
@@ -196,6 +196,7 @@ class EventsAhead:
 
     def _wait(self) -> None:
         wait([self._copied])
+        self._copying.close()
         self._device.stream.wait_stream(self._stream)
 
     def __enter__(self) -> EventsAhead:
