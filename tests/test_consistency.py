@@ -140,13 +140,24 @@ def test_pixels_that_are_read_one_after_another_are_named(wide: Recording) -> No
     assert float(found[1]) == pytest.approx(6.0, abs=1.0)
 
 
-def test_an_accepted_delay_of_the_read_out_is_no_error_of_the_encoder(
+def test_an_accepted_delay_of_the_read_out_is_reported_and_no_error_of_the_encoder(
     wide: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stage, "LARGEST_SKEW_PX", 0.1)
     found = calibrated(read_by_column(wide, 6))
+    assert any(re.search(r"late by [56]\.?\d* us more from column to column", said) for said in found.warnings)
     assert found.harmonics is None
     assert found.parameters["apex"] == pytest.approx(PRISM.apex, rel=0.01)
+
+
+def test_a_very_wrong_camera_is_no_error_of_the_encoder(wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A false error of the angle is found first; the camera is corrected with it and without it."""
+    errors = iter([np.array([0.004, 0.002, 0.0, 0.006, 0.0, 0.0])])
+    monkeypatch.setattr(stage, "find_angle_error", lambda *_: next(errors, None))
+    found = calibrated(replace(wide, camera=replace(wide.camera, cx=wide.camera.cx + 3.0)))
+    assert next(errors, None) is None
+    assert found.harmonics is None
+    assert found.camera.cx == pytest.approx(wide.camera.cx, abs=0.3)
 
 
 def test_a_wrong_ratio_of_the_focal_lengths_is_found(texture: np.ndarray) -> None:

@@ -214,11 +214,11 @@ class Calibrator:
             checks.check_nominal(found.model_name, found.parameters, recording.prism, recording.name)
         return replace(found, seconds=time.perf_counter() - began)
 
-    def attempt(self, rival: Attempt | None = None) -> Attempt:
+    def attempt(self, rival: Attempt | None = None, *, angles_hold: bool = False) -> Attempt:
         """Calibrate once by the stages of the settings, with the free parameters that they name.
 
         The attempt fails early if its image is not clearly sharper than that of a ``rival``, another attempt, or if it
-        does not come to a clearly lower cost.
+        does not come to a clearly lower cost. With ``angles_hold``, no error of the prism's angles is looked for.
         """
         began, search = time.perf_counter(), None
         try:
@@ -236,7 +236,7 @@ class Calibrator:
                         checks.check_sharper(search.gain_over(rival.search), recording.name)
                 found = _sharpest(recording, search, *search.check_answer(recording.name))
                 if "photometric" in self.settings.stages:
-                    search.ahead = ahead
+                    search.ahead, search.angles_hold = ahead, angles_hold
                     search.meanwhile = iter(()) if self.meanwhile is None else self.meanwhile(found)
                     try:
                         refined = stage.refine(recording, search)
@@ -266,6 +266,12 @@ class Calibrator:
         again = calibrator.attempt()
         if again.calibration is None or again.cost > LARGEST_STRAIGHT_COST_RATIO * tried.cost:
             return self, tried
+        assert found is not None
+        assert again.photometric is not None
+        if {*again.photometric.parameters} - {*found.parameters}:  # a very wrong camera looks like both errors
+            rival = self.attempt(angles_hold=True)
+            if rival.accepted and rival.cost <= again.cost:
+                return self, rival
         said = f"{stage.harmonics_in_words(harmonics)}: it was corrected"
         return calibrator, Attempt(_warning(again.calibration, said))
 

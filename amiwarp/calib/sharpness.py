@@ -355,6 +355,8 @@ class Search:
         """Other work, whose steps the photometric stage takes where the host would wait for a GPU."""
         self.most_cost = math.inf
         """Cost of the photometric stage above which its answer is of no use."""
+        self.angles_hold = False
+        """Whether the photometric stage takes the prism's angles as they are."""
         self.stages: list[StageSummary] = []
         self.pad = padding(self.space)
         """Border of the fine image outside the sensor [px]."""

@@ -58,15 +58,19 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
         if parts := moving_parts(found.answers.cost):
             return found.finished(replace(answer, result=replace(answer.result, moving=parts)).judged(*MOVING))
     rpm, sensor, time_constant = search.calibration_events.encoder.rpm, given, 0.0
-    rad_per_us, direction = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm)
+    rad_per_us, direction, delay = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm), list[str]()
     examined = can_be_examined(answer, found.answers.cost) and bool(rpm)
     missing = missing_step(found.answers.cost) if examined else 0.0
-    error = find_angle_error(found.answers, answer.stage.x) if examined else None
+    error = find_angle_error(found.answers, answer.stage.x) if examined and not search.angles_hold else None
     if error is not None:
         space, v = found.answers.cost.space, answer.stage.x
-        verdict = judge_angles(space.camera, error, consistency.px_per_rad(space, v), direction * rad_per_us)
-        harmonics = tuple(error[:4].tolist()) if error[:4].any() else ()
-        return found.finished(replace(answer, result=replace(answer.result, harmonics=harmonics)).judged(*verdict))
+        px = skew_px(space.camera, error, consistency.px_per_rad(space, v))
+        late_us = -direction / rad_per_us * error[4:]
+        if error[:4].any() or px >= LARGEST_SKEW_PX:
+            harmonics = tuple(error[:4].tolist()) if error[:4].any() else ()
+            answer = replace(answer, result=replace(answer.result, harmonics=harmonics))
+            return found.finished(answer.judged(False, angle_error_in_words(error, px, late_us)))
+        delay = [skew_in_words(late_us, px)] if px >= NOTABLE_SKEW_PX else []
     if examined:
         v = answer.stage.x
         pause, lag = timing_steps(found.answers.cost, v, direction)
@@ -86,7 +90,7 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
     answer = answer.judged(*judge_losses(missing)) if examined else answer
     notes = (
         *timing_notes(sensor.refractory_us - given.refractory_us, time_constant),
-        *loss_notes(found.silent_share, missing), *answer.result.warnings,
+        *loss_notes(found.silent_share, missing), *delay, *answer.result.warnings,
     )  # fmt: skip
     timed = replace(answer.result, warnings=notes, refractory_us=sensor.refractory_us, time_constant_us=time_constant)
     return found.finished(replace(answer, result=timed))
@@ -696,8 +700,9 @@ FIRST_SHARE, LEAST_SHARE = 0.5, 0.25
 """Share of the error that the first linearised fit is taken to find, and the least share of a later one."""
 LEAST_ANGLE_PX = 0.003
 """Length of a correction of the angle below which the search ends [px rms]."""
-LARGEST_SKEW_PX = 0.02
-"""Largest accepted error by pixels that are read one after another [px rms]. Compensation does not correct it."""
+NOTABLE_SKEW_PX, LARGEST_SKEW_PX = 0.02, 0.04
+"""Errors by pixels that are read one after another, from which on they are reported and refused [px rms]. Compensation
+does not correct them."""
 
 
 def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
@@ -705,7 +710,7 @@ def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
 
     It is the factors of :data:`consistency.PATTERNS`, shape (6,). A linearised fit finds a share of the error only,
     because the map absorbs the other part; the next fit tells how large the share was. The pairs keep the corrected
-    angles, because an answer with an error ends the stage. A small delay of the read-out is no error.
+    angles, because an answer with an error ends the stage, unless the error is but a small delay of the read-out.
     """
     cost, camera = search.cost, search.cost.space.camera
     cost.converge(v)
@@ -732,7 +737,6 @@ def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
     if not total[:4].any() and skew_px(camera, total, consistency.px_per_rad(cost.space, v)) < LARGEST_SKEW_PX:
         azimuth.assign(given)
         cost.renew(v)
-        return None
     return total
 
 
@@ -741,20 +745,21 @@ def skew_px(camera: Camera, error: Vector, px_per_rad: float) -> float:
     return px_per_rad * consistency.rms_angle(camera, np.append(np.zeros(4), error[4:]))
 
 
-def judge_angles(camera: Camera, error: Vector, px_per_rad: float, rad_per_us: float) -> tuple[bool, str]:
-    """Return that an answer whose angles have an ``error`` is rejected, and the reason.
+def skew_in_words(late_us: Vector, px: float) -> str:
+    """Return that events come late from column to column and from row to row [us], an error of ``px``."""
+    x, y = late_us.tolist()
+    return (
+        f"the sensor reads its pixels one after another: events come late by {x:.2g} us more from column to column "
+        f"and {y:.2g} us from row to row, an error of {px:.2f} px; subtract {x:.3g} * x + {y:.3g} * y from "
+        "the events' times [us]"
+    )
 
-    ``px_per_rad`` is how far events move per angle, ``rad_per_us`` the speed of the prism.
-    """
-    px = skew_px(camera, error, px_per_rad)
-    if px >= LARGEST_SKEW_PX:
-        x, y = (-error[4:] / rad_per_us).tolist()
-        return False, (
-            f"the sensor reads its pixels one after another: events come late by {x:.2g} us more from column to column "
-            f"and {y:.2g} us from row to row, an error of {px:.2f} px; subtract {x:.3g} * x + {y:.3g} * y from "
-            "the events' times [us]"
-        )
-    return False, f"{harmonics_in_words(error[:4])}, and its correction was not confirmed: check how it is mounted"
+
+def angle_error_in_words(error: Vector, skew_px: float, late_us: Vector) -> str:
+    """Return why an answer with an ``error`` of the angles is refused; see :func:`skew_in_words`."""
+    if skew_px >= LARGEST_SKEW_PX:
+        return skew_in_words(late_us, skew_px)
+    return f"{harmonics_in_words(error[:4])}, and its correction was not confirmed: check how it is mounted"
 
 
 def harmonics_in_words(harmonics: Sequence[float] | Vector) -> str:
