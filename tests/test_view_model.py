@@ -6,6 +6,7 @@ import io
 import json
 import math
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -804,3 +805,36 @@ def test_a_number_that_is_typed_during_an_update_stays() -> None:
     asyncio.run(Panel.make(panel, {"knobs"}))  # type: ignore[arg-type]
     assert state.apex == 2.5
     assert state.curve_mark == 2.5
+
+
+@pytest.mark.parametrize("polarity", [None, 1])
+def test_statistics_of_a_region(polarity: int | None) -> None:
+    events = random_events(20_000, 40, 30)
+    made = Inspector(Recording(MemoryEvents(events, 40, 30)))
+    made.open(10_000, 50_000, Selection(region=(5, 7, 25, 20), polarity=polarity))
+    last: dict[tuple[int, int], int] = {}
+    intervals, ons, n = [], 0, 0
+    for x, y, t, p in zip(*(getattr(events, name).tolist() for name in "xytp"), strict=True):
+        if 10_000 <= t < 60_000 and 5 <= x < 25 and 7 <= y < 20 and polarity in (None, p):
+            intervals += [t - last[x, y]] if (x, y) in last else []
+            last[x, y] = t
+            ons, n = ons + p, n + 1
+    found = made.statistics()
+    assert (found.on, found.off, found.duration_us) == (ons, n - ons, 50_000)
+    assert (found.pixels, found.area) == (len(last), 260)
+    assert found.on_share == ons / n
+    assert found.rate == pytest.approx(n / 0.05)
+    assert found.median_us == np.median(intervals)
+    edges = viewer.INTERVALS_US
+    assert found.intervals.tolist() == [sum(low <= each < high for each in intervals) for low, high in pairwise(edges)]
+
+
+def test_intervals_between_two_runs_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    events = random_events(6400, 2, 1)
+    monkeypatch.setattr(viewer, "MOST_EVENTS", 3200)
+    made = Inspector(Recording(MemoryEvents(events, 2, 1)))
+    made.open(0, 100_000)
+    found = made.statistics()
+    assert found.on + found.off == 3200
+    assert found.duration_us == 50_000
+    assert found.intervals.sum() == 3200 - 2 * viewer.RUNS

@@ -489,6 +489,62 @@ class DisplayedWindow:
     """Sharpness of ``image_after`` in the region."""
 
 
+# Statistics of the shown events.
+
+INTERVALS_US = np.logspace(0, 6, 49)
+"""Edges of the bins of the histogram of intervals [us]: eight bins per decade, from 1 us to 1 s."""
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Statistics of the selected events of a time window."""
+
+    on: int
+    """Number of ON events."""
+    off: int
+    """Number of OFF events."""
+    duration_us: int
+    """Length of the time window, or of the runs that were read from it [us]."""
+    pixels: int
+    """Number of pixels with events."""
+    area: int
+    """Number of pixels of the region."""
+    intervals: NDArray[np.int64]
+    """Numbers of intervals between successive events of a pixel in the bins of :data:`INTERVALS_US`. Intervals under
+    1 us are in the first bin, intervals over 1 s in the last one."""
+    median_us: float
+    """Median of these intervals [us]; NaN if there are none."""
+
+    @property
+    def on_share(self) -> float:
+        """Share of ON events."""
+        return self.on / (self.on + self.off)
+
+    @property
+    def rate(self) -> float:
+        """Number of events per time [1/s]."""
+        return (self.on + self.off) / self.duration_us * 1e6
+
+
+def find_statistics(window: LoadedWindow) -> Statistics:
+    """Return the statistics of the selected events of a window. Intervals between two runs are not counted."""
+    left, top, right, bottom = window.region
+    events, span = window.events, window.span
+    events = events[inside(events, window.region)]
+    starts = span.events.t[np.cumsum([0, *(run.stop - run.start for run in span.runs)])[:-1]]
+    run = np.searchsorted(starts, events.t, side="right")
+    pixel = (run * (bottom - top) + events.y.astype(np.int64) - top) * (right - left) + events.x - left
+    order = np.argsort(pixel, kind="stable")
+    steps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
+    counts, _ = np.histogram(np.clip(steps, 1, 999_999), INTERVALS_US)
+    on, read = int(events.p.sum()), len(span.events)
+    return Statistics(
+        on=on, off=len(events) - on, duration_us=max(1, round(span.length_us * read / span.count)),
+        pixels=len(np.unique(pixel % ((bottom - top) * (right - left)))), area=(bottom - top) * (right - left),
+        intervals=counts, median_us=float(np.median(steps)) if len(steps) else math.nan,
+    )  # fmt: skip
+
+
 # Selected events of a time window, on the host and with their prism angles on the device.
 
 MOST_POINTS = 100_000
@@ -946,6 +1002,10 @@ class Inspector:
             return imager.measure(model, on_device[rpm], drift_us, w.region).sharpness
 
         return sharpness
+
+    def statistics(self) -> Statistics:
+        """Return the statistics of the selected events of the time window."""
+        return find_statistics(self.loaded)
 
     def orbit(self, x: float, y: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Return the orbit of the scene point that would appear at (x, y) [px] without the prism.
