@@ -60,29 +60,34 @@ def test_fast_pixels_are_left_alone() -> None:
 def test_lags_on_a_slope_of_brightness(device: str, turn: float) -> None:
     """Where the brightness is linear, the filter sees a circle that is rotated and contracted: no offset remains.
 
-    The map is so flat that all places are equally bright, but not so flat that the path is lost in rounding.
+    The map is so flat that all places are equally bright, but not so flat that the path is lost in rounding. The tile
+    of the right half has twice the light.
     """
     sample = make(SMALL, 0)
     recording, width, height = sample.recording, SMALL.width, SMALL.height
     assert recording.encoder is not None
     assert recording.truth is not None
-    table = EventTable([recording.events.slice(0, 3000)], np.zeros((height, width), np.int32), device)
+    tile_of = np.repeat(np.arange(width)[None] >= width // 2, height, axis=0).astype(np.int32)
+    table = EventTable([recording.events.slice(0, 3000)], tile_of, device)
     pairs = table.pairs(recording.encoder, longest_gap_us=60_000)
     pairs.clear_lags()
     margin = 20.0
-    tiles = Tiles(np.array([[-margin, -margin]]), height + 40, width + 40, 1.0)
+    tiles = Tiles(np.full((2, 2), -margin), height + 40, width + 40, 1.0)
     brightness = BrightnessMap(pairs, tiles, off_excess=0.0)
     model = ExactModel(SMALL.camera, SMALL.prism, recording.truth.parameters["phase"])
     slope = 0.01
     columns = np.arange(tiles.columns) * slope
-    brightness.unknowns = np.concatenate([np.tile(columns, tiles.rows), [0.0, 0.0]]).astype(np.float32)
-    set_lags(brightness, model, turn, with_offsets=True)
+    brightness.unknowns = np.concatenate([np.tile(columns, 2 * tiles.rows), [0.0, 0.0]]).astype(np.float32)
+    turns = np.array([turn, 0.5 * turn])
+    set_lags(brightness, model, turns, math.atan(turn), with_offsets=True)
     n = len(pairs)
     lag = pairs.arrays.lag.numpy().reshape(4, -1)[:, :n]
     on_device, middle = darkness(brightness, model, ahead=math.atan(turn))
     relative = on_device.numpy()[:, :n]
     assert abs(middle - slope * (margin + width / 2)) < 0.5
-    np.testing.assert_allclose(np.hypot(lag[0], lag[1]), np.cos(np.arctan(turn * relative[0])), atol=1e-5)
+    np.testing.assert_allclose(
+        np.hypot(lag[0], lag[1]), np.cos(np.arctan(turns[pairs.column("tile")] * relative[0])), atol=1e-5
+    )
     np.testing.assert_allclose(relative, 1.0, atol=THRESHOLD * slope * width)
     offset = pairs.arrays.offset.numpy()[:n]
     step = 2.0 * slope * SMALL.prism.deflection * SMALL.camera.fx  # largest change of brightness on an orbit

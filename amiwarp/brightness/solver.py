@@ -152,6 +152,10 @@ class PairSet:
         arrays.lag.assign(none.ravel())
         arrays.offset.zero_()
 
+    def drop_lags(self) -> None:
+        """Undo :meth:`clear_lags`, for the maps that were made before."""
+        self.arrays.lag = self.arrays.offset = wp.empty(0, dtype=float, device=self.device)
+
     @classmethod
     def concatenate(cls, parts: Sequence[PairSet]) -> PairSet:
         """Join pair sets, in which equations from silence must have the same weight."""
@@ -1251,8 +1255,10 @@ def darkness(brightness: BrightnessMap, model: Model, *, ahead: float = 0.0) -> 
     return compute(1, pairs.arrays.stride), pixels.middle
 
 
-def set_lags(brightness: BrightnessMap, model: Model, turn: float, *, with_offsets: bool) -> None:
-    """Give the pairs the lags of slow pixels, relative to the mean lag, which remains part of the phase.
+def set_lags(
+    brightness: BrightnessMap, model: Model, turns: NDArray[np.float64], ahead: float, *, with_offsets: bool
+) -> None:
+    """Give the pairs the lags of slow pixels, relative to a mean lag, which remains part of the phase.
 
     Parameters
     ----------
@@ -1260,15 +1266,17 @@ def set_lags(brightness: BrightnessMap, model: Model, turn: float, *, with_offse
         Solved map, whose pairs have lags (:meth:`PairSet.clear_lags`).
     model : Model
         Model with the phase at which the map was solved.
-    turn : float
-        Angle by which the prism turns within the time constant at median brightness [rad].
+    turns : numpy.ndarray
+        Angle by which the prism turns within the time constant at median brightness [rad], shape (tiles,).
+    ahead : float
+        The mean lag [rad].
     with_offsets : bool
         Whether to compute what the filter's output differs from the brightness on the contracted orbit. The map must
         have been solved with lags.
     """
-    pairs, ahead = brightness.pairs, math.atan(turn)
+    pairs, tile = brightness.pairs, brightness.pairs.column("tile")
     relative, middle = darkness(brightness, model, ahead=ahead if with_offsets else 0.0)
-    lag = np.arctan(turn * relative.numpy()[:, : len(pairs)])
+    lag = np.arctan(turns[tile] * relative.numpy()[:, : len(pairs)])
     factor = np.cos(lag) * np.exp(1j * (ahead - lag))
     values = np.zeros((4, pairs.arrays.stride), np.float32)
     values[0] = values[2] = 1.0
@@ -1277,6 +1285,7 @@ def set_lags(brightness: BrightnessMap, model: Model, turn: float, *, with_offse
     pairs.arrays.offset.zero_()
     if with_offsets:
         filtering = slow_kernels.Photoreceptor()
-        filtering.threshold, filtering.middle, filtering.turn, filtering.ahead = THRESHOLD, middle, turn, ahead
+        filtering.threshold, filtering.middle, filtering.ahead = THRESHOLD, middle, ahead
+        filtering.turn = wp.array(turns, dtype=float, device=brightness.device)
         inputs = [*brightness.path_arguments(model), filtering]
         launch(slow_kernels.find_offsets, len(pairs), inputs, [pairs.arrays.offset], device=brightness.device)

@@ -27,7 +27,7 @@ class Photoreceptor:
 
     threshold: float  # ON threshold [log intensity]
     middle: float  # median brightness [ON thresholds]
-    turn: float  # angle of the prism per time constant at the median brightness [rad]
+    turn: wp.array(dtype=float)  # angle of the prism per time constant at the median brightness, by tile [rad]
     ahead: float  # angle by which the prism is ahead of the effective phase [rad]
 
 
@@ -80,9 +80,10 @@ def filtered(
     A dark pixel remembers for longer than :data:`MEMORY`: its output begins on the contracted orbit.
     """
     width = MEMORY / float(STEPS)  # step [time constants at median light]
-    before = float(brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * filter.turn - filter.ahead))
+    turn = filter.turn[pairs.tile[i]]
+    before = float(brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * turn - filter.ahead))
     w0, w1 = event_azimuth(model, pairs, k, i)
-    past_azimuth = turned(w0, w1, wp.cos(MEMORY * filter.turn), -wp.sin(MEMORY * filter.turn))
+    past_azimuth = turned(w0, w1, wp.cos(MEMORY * turn), -wp.sin(MEMORY * turn))
     pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
     xy = contracted_position(model, camera, pixel, past_azimuth[0], past_azimuth[1], lag_of(pairs, k, i))
     level = float(brightness_at_position(image, atlas, pairs.tile[i], xy))
@@ -91,7 +92,7 @@ def filtered(
     steps = int(STEPS)  # a variable, so that Warp does not unroll the loop, which takes minutes to compile for CUDA
     for j in range(steps):
         past = MEMORY - float(j + 1) * width
-        after = brightness_before(model, camera, pairs, atlas, image, k, i, past * filter.turn - filter.ahead)
+        after = brightness_before(model, camera, pairs, atlas, image, k, i, past * turn - filter.ahead)
         if wp.isnan(after):
             after = before
         light = wp.exp(filter.threshold * (0.5 * (before + after) - filter.middle))

@@ -213,16 +213,25 @@ class _Equations:
         return again
 
     def with_slow_pixels(self, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:
-        """Return the answer for pixels with slow photoreceptors, and the angle per time constant [rad]; 0 if it fails.
+        """Return the answer for pixels with slow photoreceptors, and the angle per time constant [rad].
 
-        ``first`` is a first estimate of that angle. The search has a new map then.
+        ``first`` is a first estimate of that angle. The search has a new map then. Where the orbit is contracted by
+        less than the smallest deviation of an answer, the answer remains, and the angle is 0.
         """
         answers, v = self.answers, answer.stage.x
         self.pairs.clear_lags()
-        turn = find_time_constant(self.coarse(), v, first, direction)
-        answers.cost = self._solved_on(answers.cost.brightness.tiles)
-        again = answers.search(v)
-        return replace(again, stage=join_runs(answer.stage, again.stage)), turn
+        turns, turn = find_time_constants(self.coarse(), v, first, direction)
+        if (1.0 - math.cos(math.atan(turn))) * consistency.px_per_rad(answers.cost.space, v) < consistency.LEAST_STD_PX:
+            self.pairs.drop_lags()
+            return answer, 0.0
+        answers.cost = cost = self._solved_on(answers.cost.brightness.tiles)
+        stage = answers.descend(v)
+        # this map tells better than the coarse one how the output of the filters differs from the brightness
+        model = cost.space.build(cost.space.to_values(stage.x))
+        set_lags(cost.brightness, model, direction * turns, math.atan(direction * turn), with_offsets=True)
+        cost.residuals(stage.x)
+        again = answers.search(stage.x)
+        return replace(again, stage=join_runs(join_runs(answer.stage, stage), again.stage)), turn
 
 
 # Search for the answer of the photometric stage on one brightness map, from the result of the sharpness stage.
@@ -787,6 +796,10 @@ FACTOR, MOST_TRIALS = 1.7, 7
 """Ratio between angles that are tried, and their largest number."""
 PARABOLAS = 2
 """Number of parabolas that are laid through the lowest costs."""
+LIGHT_STEP = 0.5
+"""Step of the logarithm of a tile's light. In photographs it has a standard deviation of about 0.6 between tiles."""
+LIGHT_ROUNDS = 2
+"""How many times the light of the tiles is found, and after it the mean time constant."""
 
 
 def can_be_examined(answer: Answer, cost: Cost) -> bool:
@@ -819,7 +832,7 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
 def find_refractory(search: AnswerSearch, v: Vector, first: float, direction: float) -> float:
     """Return the angle by which the prism turns in the refractory period, for which the cost is lowest [rad].
 
-    The parameters are those of :func:`find_time_constant`; the pairs remain unchanged.
+    The parameters are those of :func:`find_time_constants`; the pairs remain unchanged.
     """
     cost = search.cost
     azimuth = cost.brightness.pairs.arrays.azimuth
@@ -836,13 +849,16 @@ def find_refractory(search: AnswerSearch, v: Vector, first: float, direction: fl
         cost.residuals(at, rounds=2, steps=2 * cost.steps)
         return cost.mean()
 
-    best = _lowest(cost_at, first)
+    best = _lowest(cost_at, *_bracketed(cost_at, [FACTOR * first, FACTOR**2 * first]))
     azimuth.assign(given)
     return best
 
 
-def find_time_constant(search: AnswerSearch, v: Vector, first: float, direction: float) -> float:
-    """Return the angle per time constant at median brightness, for which the cost is lowest [rad].
+def find_time_constants(search: AnswerSearch, v: Vector, first: float, direction: float) -> tuple[Vector, float]:
+    """Return the angle per time constant at median brightness in each tile, and their mean, for the lowest cost [rad].
+
+    Events come late in the dark, but their steps of brightness do not tell how dark a tile is compared with another. So
+    each tile has a time constant of its own: the costs of the tiles at three values tell those of all tiles at once.
 
     Parameters
     ----------
@@ -852,45 +868,84 @@ def find_time_constant(search: AnswerSearch, v: Vector, first: float, direction:
     v : numpy.ndarray
         Search vector of the answer without lags, shape (n,).
     first : float
-        Angle from which the search starts [rad].
+        Estimate of a linearised fit [rad], a fifth to an eighth of the angle, because the map absorbs the rest.
     direction : float
         Direction of rotation of the prism: 1 or -1.
 
     Returns
     -------
-    float
-        The angle; 0 if no lag lowers the cost.
+    turns : numpy.ndarray
+        The angles, shape (tiles,); 0 if no lag lowers the cost.
+    mean : float
+        Their geometric mean over all pairs.
     """
     cost, space = search.cost, search.cost.space
+    tile, tiles = cost.brightness.pairs.column("tile"), len(cost.brightness.tiles.origin)
+    count = np.bincount(tile, minlength=tiles)
+    relative, at = np.ones(tiles), v
+    answers: dict[float, Vector] = {}
+
+    def renew() -> None:
+        cost.brightness.pairs.clear_lags()
+        cost.renew(at)
+        cost.residuals(at, rounds=2)
+
+    def lag(turn: float, longer: float, *, with_offsets: bool) -> None:
+        turns, ahead = direction * turn * math.exp(longer) * relative, math.atan(direction * turn)
+        set_lags(cost.brightness, space.build(space.to_values(at)), turns, ahead, with_offsets=with_offsets)
 
     def cost_at(turn: float) -> float:
         """Return the cost with the lags of an angle."""
-        cost.brightness.pairs.clear_lags()
-        cost.renew(v)
-        cost.residuals(v, rounds=2)
+        nonlocal at
         at = v
+        renew()
         for with_offsets in (False, True) if turn else ():
-            set_lags(cost.brightness, space.build(space.to_values(at)), direction * turn, with_offsets=with_offsets)
+            lag(turn, 0.0, with_offsets=with_offsets)
             at = search.descend(at).x
         cost.residuals(at, rounds=2, steps=2 * cost.steps)
+        answers[turn] = at
         return cost.mean()
 
-    return _lowest(cost_at, first)
+    def costs_of_tiles(turn: float, longer: float) -> Vector:
+        """Return the mean cost of each tile with longer time constants, at the answer for an angle."""
+        renew()
+        for with_offsets in (False, True):
+            lag(turn, longer, with_offsets=with_offsets)
+            cost.residuals(at, rounds=2, steps=2 * cost.steps)
+        each = cauchy_costs(cost.brightness.residuals.values.numpy()[: len(tile)], cost.scale)
+        return np.bincount(tile, each, tiles) / np.maximum(count, 1)
+
+    angles, costs = _bracketed(cost_at, [FACTOR**3 * first, FACTOR**4 * first])
+    for _ in range(LIGHT_ROUNDS if tiles > 1 else 0):
+        turn = angles[int(np.argmin(costs))]
+        at = answers[turn]
+        below, here, above = (costs_of_tiles(turn, k * LIGHT_STEP) for k in (-1.0, 0.0, 1.0))
+        curved = below + above > 2.0 * here
+        change = 0.5 * (below - above) / np.where(curved, below + above - 2.0 * here, 1.0)
+        change = np.where(curved, change, np.sign(below - above)).clip(-1.0, 1.0) * LIGHT_STEP
+        relative = relative * np.exp(change - np.average(change, weights=count))
+        angles, costs = _bracketed(cost_at, [turn, FACTOR * turn])
+    turn = _lowest(cost_at, angles, costs)
+    return turn * relative, turn
 
 
-def _lowest(cost_at: Callable[[float], float], first: float) -> float:
-    """Return the angle of the lowest cost, evaluated last; 0 if no angle costs less than 0.
-
-    Angles in geometric progression from a little above ``first`` on bracket the lowest one; parabolas then find it.
-    """
-    angles = [FACTOR * first, FACTOR**2 * first]
+def _bracketed(cost_at: Callable[[float], float], angles: list[float]) -> tuple[list[float], list[float]]:
+    """Return angles in geometric progression about the one of the lowest cost, and their costs, from two of them on."""
     costs = [cost_at(angle) for angle in angles]
     while len(angles) < MOST_TRIALS and costs[-1] < costs[-2] and FACTOR * angles[-1] <= LARGEST_RAD:
-        angles.append(FACTOR * angles[-1])
+        angles = [*angles, FACTOR * angles[-1]]
         costs.append(cost_at(angles[-1]))
     while len(angles) < MOST_TRIALS and costs[0] <= costs[1]:
-        angles.insert(0, angles[0] / FACTOR)
+        angles = [angles[0] / FACTOR, *angles]
         costs.insert(0, cost_at(angles[0]))
+    return angles, costs
+
+
+def _lowest(cost_at: Callable[[float], float], angles: list[float], costs: list[float]) -> float:
+    """Return the angle of the lowest cost, evaluated last; 0 if no angle costs less than 0.
+
+    Parabolas find it, between angles of :func:`_bracketed`.
+    """
     for _ in range(PARABOLAS):
         k = int(np.argmin(costs))
         if not 0 < k < len(angles) - 1:
