@@ -215,13 +215,13 @@ class _Equations:
     def with_slow_pixels(self, answer: Answer, first: float, direction: float) -> tuple[Answer, float]:
         """Return the answer for pixels with slow photoreceptors, and the angle per time constant [rad].
 
-        ``first`` is a first estimate of that angle. The search has a new map then. Where the orbit is contracted by
-        less than the smallest deviation of an answer, the answer remains, and the angle is 0.
+        ``first`` is a first estimate of that angle. The search has a new map then. The angle is 0 if no lag is found;
+        the answer remains.
         """
         answers, v = self.answers, answer.stage.x
         self.pairs.clear_lags()
         turns, turn = find_time_constants(self.coarse(), v, first, direction)
-        if (1.0 - math.cos(math.atan(turn))) * consistency.px_per_rad(answers.cost.space, v) < consistency.LEAST_STD_PX:
+        if not turn:
             self.pairs.drop_lags()
             return answer, 0.0
         answers.cost = cost = self._solved_on(answers.cost.brightness.tiles)
@@ -875,15 +875,20 @@ def find_time_constants(search: AnswerSearch, v: Vector, first: float, direction
     Returns
     -------
     turns : numpy.ndarray
-        The angles, shape (tiles,); 0 if no lag lowers the cost.
+        The angles, shape (tiles,); 0 if no lag lowers the cost, or if the lag contracts the orbit by less than the
+        smallest deviation of an answer.
     mean : float
         Their geometric mean over all pairs.
     """
     cost, space = search.cost, search.cost.space
     tile, tiles = cost.brightness.pairs.column("tile"), len(cost.brightness.tiles.origin)
     count = np.bincount(tile, minlength=tiles)
+    px_per_rad = consistency.px_per_rad(space, v) or math.inf
     relative, at = np.ones(tiles), v
     answers: dict[float, Vector] = {}
+
+    def is_negligible(turn: float) -> bool:
+        return (1.0 - math.cos(math.atan(turn))) * px_per_rad < consistency.LEAST_STD_PX
 
     def renew() -> None:
         cost.brightness.pairs.clear_lags()
@@ -916,6 +921,8 @@ def find_time_constants(search: AnswerSearch, v: Vector, first: float, direction
         return np.bincount(tile, each, tiles) / np.maximum(count, 1)
 
     angles, costs = _bracketed(cost_at, [FACTOR**3 * first, FACTOR**4 * first])
+    if is_negligible(angles[int(np.argmin(costs))]):
+        return np.zeros(tiles), 0.0
     for _ in range(LIGHT_ROUNDS if tiles > 1 else 0):
         turn = angles[int(np.argmin(costs))]
         at = answers[turn]
@@ -926,6 +933,7 @@ def find_time_constants(search: AnswerSearch, v: Vector, first: float, direction
         relative = relative * np.exp(change - np.average(change, weights=count))
         angles, costs = _bracketed(cost_at, [turn, FACTOR * turn])
     turn = _lowest(cost_at, angles, costs)
+    turn = 0.0 if is_negligible(turn) else turn
     return turn * relative, turn
 
 
