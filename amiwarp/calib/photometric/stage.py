@@ -821,12 +821,18 @@ def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]
     columns["refractory"], columns["slow"] = cost.by_angle(v)[0], consistency.shifted(cost, v, relative)
     fit = consistency.linear_fit(cost, columns)
 
-    def angle(name: str, sign: float, least_gain: float) -> float:
+    def angle(name: str, sign: float) -> tuple[float, float, float]:
         estimate, significance, gain = fit.adding(cost.space.names, (name,))
         change = sign * float(estimate.change[-1])
-        return change if change > 0.0 and significance >= consistency.SIGNIFICANT and gain >= least_gain else 0.0
+        return change, math.copysign(significance, change), gain
 
-    return angle("refractory", direction, LEAST_REFRACTORY_GAIN), angle("slow", -direction, LEAST_SLOW_GAIN)
+    pause, pause_significance, pause_gain = angle("refractory", direction)
+    lag, lag_significance, lag_gain = angle("slow", -direction)
+    is_pause = pause_significance >= consistency.SIGNIFICANT and pause_gain >= LEAST_REFRACTORY_GAIN
+    # where the lags are long and the light of the tiles differs, they look rather like a refractory period below 0
+    is_certain = max(lag_significance, -pause_significance) >= consistency.SIGNIFICANT
+    is_lag = lag > 0.0 and is_certain and lag_gain >= LEAST_SLOW_GAIN
+    return pause if is_pause else 0.0, lag if is_lag else 0.0
 
 
 def find_refractory(search: AnswerSearch, v: Vector, first: float, direction: float) -> float:
