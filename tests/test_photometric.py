@@ -2,6 +2,7 @@
 
 import gc
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -139,6 +140,45 @@ def test_a_camera_that_turns_is_found_out(texture: np.ndarray) -> None:
     assert error_px(recording, c) < 0.02
     assert any("turned at 40" in warning for warning in c.warnings)
     assert c.free == ("apex", "phase")
+
+
+def shaken(texture: np.ndarray, turning_s: float) -> Recording:
+    """A camera that turns to and fro at 100 deg/s, ``turning_s`` each way, for 0.18 s or longer, and then rests."""
+    way = [(turning_s * k, 0.75 * (-1) ** k, 1.5 * (-1) ** k, 0.0) for k in range(4)]
+    rest = [(way[-1][0] + t, 0.05, 0.1, 0.0) for t in (0.04, 1.0)]
+    return simulate(
+        texture, Camera.from_fov(140, 105, math.radians(50)), TRUE_PRISM, duration_s=0.4,
+        camera_motion=CameraMotion([*way, *rest]), seed=2, sensor=SensorModel(contrast_on=0.5, contrast_off=0.5),
+    )  # fmt: skip
+
+
+def test_the_calmest_turns_are_used(texture: np.ndarray) -> None:
+    recording = shaken(texture, turning_s=0.06)
+    c = calibrate(recording, events=100_000, photometric=COARSE, model="exact")
+    assert error_px(recording, c) < 0.02
+    since = [re.search(r"from (.*) to (.*) s, where the camera is calmest", warning) for warning in c.warnings]
+    assert [0.19 < float(found[1]) < float(found[2]) < 0.41 for found in since if found] == [True]
+
+
+def test_a_camera_that_moves_too_fast_is_named(texture: np.ndarray) -> None:
+    with pytest.raises(AmiwarpError, match=r"moves too fast for the prism.*hold the camera still"):
+        calibrate(shaken(texture, turning_s=0.13), events=100_000, photometric=COARSE, model="exact")
+
+
+def test_a_tremor_that_hides_the_prism_is_refused(texture: np.ndarray) -> None:
+    """A tremor of 0.5 px at 10.5 Hz beside a fast rotation: one map explains the events of two turns, by another orbit.
+
+    The prism has 12 turns per second. The answer was 0.27 px off and accepted.
+    """
+    t = np.arange(0.0, 0.4, 0.005)
+    tremor = 0.22 * np.sin(2.0 * math.pi * 10.5 * t + 1.0)
+    recording = simulate(
+        texture, Camera.from_fov(140, 105, math.radians(50)), TRUE_PRISM, duration_s=0.4,
+        camera_motion=CameraMotion(np.stack([t, 0.2 + tremor, np.full_like(t, 0.7), 0.0 * t], axis=1)), seed=2,
+        sensor=SensorModel(contrast_on=0.5, contrast_off=0.5),
+    )  # fmt: skip
+    with pytest.raises(AmiwarpError, match="the camera moves too fast for the prism"):
+        calibrate(recording, events=100_000, photometric=COARSE, model="exact")
 
 
 def test_the_result_survives_its_file(calibration: Calibration, tmp_path: Path) -> None:

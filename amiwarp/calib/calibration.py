@@ -20,10 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import checks
+from amiwarp.calib import checks, first_guess
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
-from amiwarp.calib.first_guess import encoder_turns_per_period, estimate_rates, estimate_rpm
 from amiwarp.calib.model_choice import ModelChooser
 from amiwarp.calib.parameters import LENS, MOTION, RATES, ParameterSpace, make_space, nominal, with_lens
 from amiwarp.calib.photometric import stage
@@ -34,9 +33,9 @@ from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, Settings
 from amiwarp.calib.sharpness import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import Events, Recording
+from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, size_names
+from amiwarp.optics.models import MODELS, predicted_error, size_names
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress
 from amiwarp.validation import check_names, guarded
@@ -110,6 +109,9 @@ LEAST_BAD_SHARE = 0.01
 LARGEST_STRAIGHT_COST_RATIO = 1.05
 """Largest ratio of the photometric cost with a corrected encoder to that without. A small error of the encoder changes
 the cost by less than two maps of the same scene differ."""
+LEAST_LONGER = 1.5
+"""Length of a recording from which on its ends can confirm the answer of its middle, as a multiple of the length of a
+calm span: they are half a turn apart then."""
 LEAST_SCALE_ERROR = 0.003
 """Smallest relative error of an encoder's scale that is reported. Three turns measure the scale to about 0.001."""
 
@@ -348,7 +350,7 @@ class Calibrator:
         assert encoder is not None
         turns = [-1.0]
         with contextlib.suppress(AmiwarpError):  # the events do not repeat: the scene or the camera moves
-            turns.append(encoder_turns_per_period(self.recording, encoder))
+            turns.append(first_guess.encoder_turns_per_period(self.recording, encoder))
         for each in turns:
             if abs(each - 1.0) < LEAST_SCALE_ERROR:
                 continue
@@ -362,24 +364,67 @@ class Calibrator:
         return None
 
     def with_rotation(self, tried: Attempt) -> Attempt:
-        """Return the attempt with a free camera rotation if that lowers the photometric cost enough; else ``tried``."""
-        free = (MODELS[self.settings.model].SIZE, "phase", "motion")
+        """Return the attempt with a free camera rotation if that lowers the photometric cost enough; else ``tried``.
+
+        It uses two turns of the prism: the calmest ones, if these are clearly calmer than those in the middle of the
+        recording. A camera that never rests must give about the same answer at other times.
+        """
+        encoder, name = self.recording.encoder, self.recording.name
+        assert encoder is not None
         rival = None if tried.camera_turned else tried  # a slow rotation hardly blurs the image
-        again = replace(self, settings=replace(self.settings, free=free)).attempt(rival)
+        repetition, span = first_guess.calmest_span(self.recording, encoder)
+        restless = repetition < first_guess.LEAST_REPETITION
+        again = self._turning(rival) if span is None else self._turning_in(span)
         if not again.accepted or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
+            # a rotation makes the image sharper, or the attempt would have failed
+            if restless and not tried.accepted and rival is not None and again.calibration is not None:
+                return Attempt(None, checks.moves_too_fast(name, repetition))
             return tried
-        moving = again.found()
-        speed = math.degrees(math.hypot(*(moving.parameters[n] for n in RATES)))
-        # only the prism's parameters are kept: the rotation holds for two turns in the middle of the recording
+        if restless and not self._confirmed(again):
+            return Attempt(None, checks.moves_too_fast(name, repetition))
+        found = again.found()
+        speed = math.degrees(math.hypot(*(found.parameters[n] for n in RATES)))
+        # only the prism's parameters are kept: the rotation holds for two turns of the recording
         still = replace(
-            moving,
-            parameters={n: x for n, x in moving.parameters.items() if n not in MOTION},
-            uncertainty={n: x for n, x in moving.uncertainty.items() if n not in MOTION},
-            free=tuple(n for n in moving.free if n not in MOTION),
+            found,
+            parameters={n: x for n, x in found.parameters.items() if n not in MOTION},
+            uncertainty={n: x for n, x in found.uncertainty.items() if n not in MOTION},
+            free=tuple(n for n in found.free if n not in MOTION),
             middle_us=None,
         )
         said = f"the camera turned at {speed:.1f} deg/s; its rotation was calibrated together with the prism"
+        if span is not None:
+            since = ((t - self.recording.events.t_first) * 1e-6 for t in span)
+            said += ", from {:.2f} to {:.2f} s, where the camera is calmest".format(*since)
         return Attempt(_warning(still, said))
+
+    def _turning(self, rival: Attempt | None) -> Attempt:
+        """Return the attempt with a free camera rotation, in the middle of the recording."""
+        free = (MODELS[self.settings.model].SIZE, "phase", "motion")
+        return replace(self, settings=replace(self.settings, free=free)).attempt(rival)
+
+    def _turning_in(self, span: tuple[int, int]) -> Attempt:
+        """Return the attempt with a free camera rotation in a time span [us]."""
+        source = self.recording.events
+        events = MemoryEvents(source.between(*span), *source.size)
+        return replace(self, recording=replace(self.recording, events=events))._turning(None)
+
+    def _confirmed(self, turning: Attempt) -> bool:
+        """Return whether the last or the first turns of the recording give the same answer as those in the middle.
+
+        A motion with frequencies near that of the prism changes the orbit, at each time otherwise. Where there is no
+        other answer, a low cost must do.
+        """
+        source, encoder = self.recording.events, self.recording.encoder
+        assert encoder is not None
+        length = int(first_guess.CALM_TURNS * 60e6 / abs(encoder.rpm))
+        if source.t_last - source.t_first >= LEAST_LONGER * length:
+            for span in (source.t_last - length, source.t_last), (source.t_first, source.t_first + length):
+                other = self._turning_in(span)
+                if other.accepted:
+                    apart = predicted_error(turning.found().model, other.found().model, grid=8).rms
+                    return apart <= stage.LARGEST_INCONSISTENCY_PX
+        return not turning.unexplained
 
 
 def _warning(found: Calibration, *said: str) -> Calibration:
@@ -555,7 +600,7 @@ def _encoders(recording: Recording, settings: Settings, path: Encoder | None) ->
     rpm = settings.start.get("rpm")
     if rpm is None and "rpm" not in free and (paths := varying_paths(recording)):
         return paths, free
-    speeds = [rpm] if rpm is not None else [s * estimate_rpm(recording) for s in (1.0, -1.0)]
+    speeds = [rpm] if rpm is not None else [s * first_guess.estimate_rpm(recording) for s in (1.0, -1.0)]
     first, last = recording.events.t_first, recording.events.t_last
     encoders = [constant_speed(s, first, last, middle_time(recording)) for s in speeds]
     return encoders, free if "rpm" in free else (*free, "rpm")
@@ -578,7 +623,7 @@ def _space(
     if "clock_offset" in free:
         start.setdefault("clock_offset", encoder.clock_offset_us)
     if ("motion" in free or set(RATES) & set(free)) and turned > 0.0 and not set(RATES) & set(start):
-        found = dict(zip(RATES, estimate_rates(events, encoder, camera), strict=True))
+        found = dict(zip(RATES, first_guess.estimate_rates(events, encoder, camera), strict=True))
         start |= {n: rate for n, rate in found.items() if "motion" in free or n in free}
     return make_space(
         settings.model, camera, nominal(recording.prism), free=free, start=start, bounds=settings.bounds,

@@ -122,6 +122,16 @@ def wrong_direction(name: str, cost: float, reversed_cost: float) -> AmiwarpErro
     )
 
 
+def moves_too_fast(name: str, repetition: float) -> AmiwarpError:
+    """Return the error for a camera in fast motion; ``repetition`` is the correlation of events of successive turns."""
+    return AmiwarpError(
+        f"{name}: the camera moves too fast for the prism: even in the calmest two turns the events of one hardly "
+        f"repeat in the next (correlation {repetition:.2f}; 0.9 at rest, 0.7 in a calm hand), and no rotation at a "
+        "steady speed explains them; hold the camera still for three turns, at any time of the recording, or turn the "
+        "prism faster"
+    )
+
+
 def check_turned(theta: NDArray[np.float64], name: str) -> None:
     """Check that the prism turned far enough.
 

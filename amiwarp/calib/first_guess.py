@@ -1,4 +1,4 @@
-"""First guesses from the events alone: the prism's speed, and the camera's angular velocity."""
+"""First guesses from the events alone: the prism's speed, when the camera is calm, and its angular velocity."""
 
 import math
 from collections.abc import Callable
@@ -133,6 +133,59 @@ def _peak_near(correlation: NDArray[np.float64], lag: float, reach: float) -> fl
     before, here, after = correlation[k - 1 : k + 2]
     bend = before - 2.0 * here + after
     return float(k + (0.5 * (before - after) / bend if bend < 0.0 else 0.0))
+
+
+# Time at which the camera is calmest: there the events of one turn repeat those of the turn before.
+
+CALM_TURNS = 2.15
+"""Length of a calm span [turns]: a little more than a camera's rotation is calibrated from."""
+LEAST_REPETITION = 0.5
+"""Smallest correlation of the events of successive turns in a calm span. A still camera's is 0.9, and that of a scene
+that moves by a cell in a turn is near 0."""
+MOST_CALM_TURNS = 96
+"""Largest number of turns that are examined, which limits the memory."""
+LESS_CALM = 0.5
+"""Largest correlation in the middle of a recording for which a calmer span replaces it, as a share of the span's."""
+
+
+def calmest_span(recording: Recording, encoder: Encoder) -> tuple[float, tuple[int, int] | None]:
+    """Return how well the events of successive turns repeat where the camera moves least, and that time span [us].
+
+    The first is their correlation. The span is None if the camera does not become clearly calmer than in the middle of
+    the recording. Of a long recording :data:`LONGEST_US` about its middle are
+    examined, and at most :data:`MOST_CALM_TURNS`.
+    """
+    covered = encoder.coverage
+    first, last = max(recording.events.t_first, covered[0]), min(recording.events.t_last, covered[1])
+    middle, longest = (first + last) // 2, min(LONGEST_US, int(MOST_CALM_TURNS * 60e6 / max(abs(encoder.rpm), 1.0)))
+    first, last = max(first, middle - longest // 2), min(last, middle + longest // 2)
+    at = np.linspace(first, last, max(2, (last - first) // BIN_US)).astype(np.int64)
+    begin = float(encoder.angle_at(first))
+
+    def turned(t: NDArray[np.int64]) -> NDArray[np.float64]:
+        return np.asarray(np.abs(encoder.angle_at(t) - begin) * (ANGLE_RANGES / math.tau))
+
+    counts = _signed_counts(recording, first, last, lambda t: turned(t).astype(np.int64))
+    counts -= counts.mean(axis=0)
+    pairs, span = round((CALM_TURNS - 1.0) * ANGLE_RANGES), round(CALM_TURNS * ANGLE_RANGES)
+    if len(counts) <= span:
+        return 1.0, None
+
+    def over_span(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Return the sums of products over ``pairs`` bins, from each bin on."""
+        total = np.concatenate([[0.0], np.cumsum(np.einsum("ij,ij->i", a, b), dtype=np.float64)])
+        return np.asarray(total[pairs:] - total[:-pairs])
+
+    here, later = counts[:-ANGLE_RANGES], counts[ANGLE_RANGES:]
+    energy = np.sqrt(over_span(here, here) * over_span(later, later))
+    repetition = over_span(here, later) / np.maximum(energy, 1e-30)
+    best, bins = int(np.argmax(repetition)), np.maximum.accumulate(turned(at))
+    in_middle = repetition[min(len(repetition) - 1, max(0, int(np.interp(middle, at, bins)) - span // 2))]
+    most = float(repetition[best])
+    if most < LEAST_REPETITION or in_middle > LESS_CALM * most:
+        return most, None
+    start, stop = np.interp([best, best + span], bins, at)
+    return most, (int(start), int(stop))
 
 
 # Estimate of the camera's angular velocity from events that are one turn of the prism apart.
