@@ -144,8 +144,9 @@ LEAST_REPETITION = 0.5
 that moves by a cell in a turn is near 0."""
 MOST_CALM_TURNS = 96
 """Largest number of turns that are examined, which limits the memory."""
-LESS_CALM = 0.5
-"""Largest correlation in the middle of a recording for which a calmer span replaces it, as a share of the span's."""
+LESS_CALM = 0.75
+"""Largest correlation in the middle of a recording for which a calmer span replaces it, as a share of the span's. In a
+hand it was 0.91 at least."""
 
 
 def calmest_span(recording: Recording, encoder: Encoder) -> tuple[float, tuple[int, int] | None]:
