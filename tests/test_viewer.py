@@ -29,7 +29,6 @@ from amiwarp.calib.bad_pixels import MaskedEventSource
 from amiwarp.calib.parameters import build_model
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
-from amiwarp.viewer import inspector as window
 from amiwarp.viewer.drawing import WIDEST_PX, Look, Scene, axis_range, colours_of, orbit_lines, residual, third_axis
 from amiwarp.viewer.inspector import Inspector, Knobs, Selection, read_span
 from reference.calibration_sample import exact_calibration
@@ -144,9 +143,8 @@ def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recordin
         assert np.abs(ours - plain).max() < 0.05 * plain.max()
 
 
-def test_points_are_thinned_evenly(inspector: Inspector, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(window, "MOST_POINTS", 1000)
-    shown = inspector.show()
+def test_points_are_thinned_evenly(recording: Recording) -> None:
+    shown = Inspector(recording, most_points=1000).show()
     assert len(shown.events) == len(shown.after) == 1000
     parts = np.histogram(shown.events.t, 4, (shown.span.start_us, shown.span.start_us + shown.span.length_us))[0]
     assert parts.sum() == 1000

@@ -23,65 +23,81 @@ from amiwarp.io.formats import check_ending
 from amiwarp.viewer.serve import warning
 
 if TYPE_CHECKING:
+    from amiwarp.viewer.drawing import Look
     from amiwarp.viewer.inspector import Inspector, Library
 
-_PICTURE, _SERVER = "Picture", "Server"
+_LOOK, _SERVER = "Window and picture", "Server"
 RETURN_S = 3600.0
 """How long to wait for the sender of a socket to return after its stream broke off [s]."""
 LEAST_PX, MOST_PX = 100, 8000
-"""Smallest and largest width or height of a screenshot [px]."""
+"""Smallest and largest width or height of a window or a screenshot [px]."""
+PICTURE_PX = 1400, 620
+"""Width and height of a screenshot [px]."""
 
 
 @dataclass(frozen=True)
-class ScreenshotOptions:
-    """Options of a screenshot, which is written instead of opening the inspector's page."""
+class LookOptions:
+    """Options of the window, and of a screenshot that is written instead of opening it."""
 
     screenshot: Annotated[
         Path | None,
-        typer.Option(help="Write a picture of both event clouds (.png) and exit.", rich_help_panel=_PICTURE),
+        typer.Option(help="Write a picture of both event clouds (.png) and exit.", rich_help_panel=_LOOK),
         OUTPUT,
     ] = None
-    view: Annotated[View, typer.Option(help="Viewpoint of the picture.", rich_help_panel=_PICTURE)] = View.FREE
+    view: Annotated[View, typer.Option(help="Viewpoint.", rich_help_panel=_LOOK)] = View.FREE
     colour: Annotated[
         Colour,
         typer.Option(
             help="Quantity shown by colour. Cause, instance and depth need a simulated recording with ground truth.",
-            rich_help_panel=_PICTURE,
+            rich_help_panel=_LOOK,
         ),
     ] = Colour.POLARITY
     axis: Annotated[
         Axis | None,
         typer.Option(
             help="Third axis of the plot. Default: the prism angle if known, otherwise the time.",
-            rich_help_panel=_PICTURE,
+            rich_help_panel=_LOOK,
         ),
     ] = None
-    dark: Annotated[bool, typer.Option("--dark", help="Use a dark background.", rich_help_panel=_PICTURE)] = False
+    dark: Annotated[bool, typer.Option("--dark", help="Use a dark background.", rich_help_panel=_LOOK)] = False
     overlaid: Annotated[
-        bool, typer.Option("--overlaid", help="Draw both clouds in one frame.", rich_help_panel=_PICTURE)
+        bool, typer.Option("--overlaid", help="Draw both clouds in one frame.", rich_help_panel=_LOOK)
     ] = False
     size: Annotated[
-        str, typer.Option(help="Size of the picture (px).", metavar="WIDTHxHEIGHT", rich_help_panel=_PICTURE)
-    ] = "1400x620"
+        str | None,
+        typer.Option(
+            help="Size of the window or the picture (px). Default: 1500x950, and 1400x620 for a picture.",
+            metavar="WIDTHxHEIGHT", rich_help_panel=_LOOK,
+        ),
+    ] = None  # fmt: skip
+
+    def look(self, inspector: Inspector) -> Look:
+        """Return the style in which the clouds are drawn."""
+        from amiwarp.viewer.drawing import Look
+
+        third = self.axis or (Axis.ANGLE if inspector.has_encoder or inspector.knobs.rpm else Axis.TIME)
+        return Look(self.colour, third, dark=self.dark, overlaid=self.overlaid)
+
+    def pixels(self, usual: tuple[int, int]) -> tuple[int, int]:
+        """Return width and height [px], by default the ``usual`` ones. Raises :class:`AmiwarpError` for a bad size."""
+        width, height = usual if self.size is None else parse_size(self.size)
+        if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:
+            raise AmiwarpError(f"--size {self.size!r}: width and height must be {LEAST_PX} to {MOST_PX} px")
+        return width, height
 
     def write(self, inspector: Inspector, path: Path) -> dict[str, Any]:
         """Write the picture; return a description of its content for ``--json``. An unknown phase is estimated first.
 
         Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
         """
-        from amiwarp.viewer.drawing import Look
         from amiwarp.viewer.jobs import estimate_phase
         from amiwarp.viewer.layout import notes
         from amiwarp.viewer.panel import save_screenshot
 
         check_ending(path, "pictures are written", [".png"])
-        third = self.axis or (Axis.ANGLE if inspector.has_encoder or inspector.knobs.rpm else Axis.TIME)
-        width, height = parse_size(self.size)
-        if min(width, height) < LEAST_PX or max(width, height) > MOST_PX:
-            raise AmiwarpError(f"--size {self.size!r}: width and height must be {LEAST_PX} to {MOST_PX} px")
+        size = self.pixels(PICTURE_PX)
         estimate_phase(inspector)
-        look = Look(self.colour, third, dark=self.dark, overlaid=self.overlaid)
-        save_screenshot(inspector, path, view=self.view, look=look, size=(width, height))
+        save_screenshot(inspector, path, view=self.view, look=self.look(inspector), size=size)
         shown = inspector.show()
         return {
             "file": str(path), "events": shown.span.count, "drawn": len(shown.events),
@@ -137,7 +153,7 @@ class PageOptions:
 
     web: Annotated[
         bool,
-        typer.Option("--web", help="Serve the page and print its address; open no window.", rich_help_panel=_SERVER),
+        typer.Option("--web", help="Serve the page for a browser and print its address.", rich_help_panel=_SERVER),
     ] = False
     host: Annotated[
         str,
@@ -149,26 +165,21 @@ class PageOptions:
         int, typer.Option(min=0, max=65535, help="Port to serve on; 0 for any free port.", rich_help_panel=_SERVER)
     ] = 0
 
-    def show(
+    def serve(
         self, new_inspector: Callable[[], Inspector], library: Library | None, *, name: str, common: Common
     ) -> None:
-        """Show the inspector's page in a window, or serve the page for a browser, until closed or interrupted.
+        """Serve the inspector's page for a browser until interrupted.
 
         ``library``: other recordings that the page may open; ``name``: name of the recording.
         """
-        from amiwarp.viewer.panel import has_display, open_window, serve_panel
-
-        in_browser = self.web or not has_display()
+        from amiwarp.viewer.panel import serve_panel
 
         def ready(url: str) -> None:
-            if in_browser and (text := warning(self.host)) is not None:
+            if (text := warning(self.host)) is not None:
                 say(text)
             report(common, {"url": url}, [f"{name}: {url}", "stop with Ctrl-C"])
 
-        if in_browser:
-            serve_panel(new_inspector, library, host=self.host, port=self.port, ready=ready)
-        else:
-            open_window(new_inspector, library, ready)
+        serve_panel(new_inspector, library, host=self.host, port=self.port, ready=ready)
 
 
 @dataclass(frozen=True)
@@ -191,17 +202,20 @@ class StartOptions:
         ),
     ] = None
 
-    def build(self, recording: Recording, device: str, latest: Callable[[], Recording] | None) -> Inspector:
+    def build(
+        self, recording: Recording, device: str, latest: Callable[[], Recording] | None, most_points: int | None
+    ) -> Inspector:
         """Return an inspector of a recording.
 
-        ``latest``: function that returns the latest events of a live stream, or None.
+        ``latest``: function that returns the latest events of a live stream, or None. ``most_points``: largest number
+        of points in each cloud, or None.
         """
         from amiwarp.calib import Calibration
         from amiwarp.optics.models import MODELS
         from amiwarp.viewer.inspector import Inspector
 
         found = None if self.calibration is None else Calibration.load(self.calibration)
-        inspector = Inspector(recording, found, device=device, latest=latest)
+        inspector = Inspector(recording, found, device=device, latest=latest, most_points=most_points)
         if self.model is not None:
             if self.model not in MODELS:
                 raise AmiwarpError(f"--model {self.model!r} is unknown; choose among {', '.join(MODELS)}")
@@ -221,25 +235,30 @@ def run_view(
     stream: StreamOptions,
     start: StartOptions,
     page: PageOptions,
-    picture: ScreenshotOptions,
+    look: LookOptions,
     camera: CameraOptions,
     prism: NominalPrismOptions,
     common: Common,
 ) -> None:
     """Show events in x, y and prism angle, recorded and compensated, and adjust the prism's parameters by hand."""
-    from amiwarp.viewer.inspector import Inspector, Library
+    from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector, Library
 
     device = choose_device(common.device)
     with stream.follow(str(recording)) as latest:
 
         def new_inspector() -> Inspector:
             opened = open_recording(recording) if latest is None else latest()
-            return start.build(complete(opened, camera, prism), device, latest)
+            return start.build(complete(opened, camera, prism), device, latest, None if page.web else WINDOW_POINTS)
 
         waiting = [new_inspector()]  # created before the page opens, so that bad input is reported at once
-        if picture.screenshot is not None:
-            data = {**picture.write(waiting[0], picture.screenshot), "device": device}
+        if look.screenshot is not None:
+            data = {**look.write(waiting[0], look.screenshot), "device": device}
             report(common, data, _lines(data))
+            return
+        if not page.web:
+            from amiwarp.viewer import window
+
+            window.Window(waiting[0], look=look.look(waiting[0]), view=look.view, size=look.pixels(window.SIZE)).run()
             return
 
         def open_other(path: Path) -> Inspector:
@@ -250,7 +269,7 @@ def run_view(
         def inspector_of_tab() -> Inspector:
             return waiting.pop() if waiting else new_inspector()
 
-        page.show(inspector_of_tab, library, name=recording.name, common=common)
+        page.serve(inspector_of_tab, library, name=recording.name, common=common)
 
 
 def _lines(d: dict[str, Any]) -> list[str]:

@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from ctypes import CDLL, c_void_p
 from ctypes.util import find_library
 from dataclasses import dataclass, replace
 from functools import cache
@@ -387,11 +388,13 @@ def truth_colours(truth: DrawnTruth, colour: Colour) -> NDArray[np.uint8]:
 
 
 def legend_of(truth: DrawnTruth, colour: Colour, most: int) -> Legend:
-    """Return the legend of a colour choice; the legend is empty if the choice does not show ground truth.
+    """Return the legend of a colour choice; the legend is empty if a scale explains the colours.
 
     A legend of depth has ``most`` rows. Other legends list at most ``most`` causes or instances, the most frequent
     first, with their fractions of the drawn events.
     """
+    if colour is Colour.POLARITY:
+        return ("", "polarity"), (ON_COLOUR, "ON: brighter"), (OFF_COLOUR, "OFF: darker")
     if colour not in STORES:
         return ()
     if colour is Colour.DEPTH:
@@ -493,8 +496,10 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
         return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
     if look.colour in STORES:
         return truth_colours(shown.truth, look.colour)
-    value, table = _measure(shown, look.colour, after=after), colour_table(look.colour, dark=look.dark)
-    return np.asarray(table[np.clip(np.nan_to_num(value) * 255.0, 0, 255).astype(np.uint8)])
+    bar = colour_bar(shown, look.colour, dark=look.dark)
+    assert bar is not None
+    share = np.clip((_measure(shown, look.colour, after=after) - bar.low) / (bar.high - bar.low), 0.0, 1.0)
+    return np.asarray(bar.colours[(255.0 * np.nan_to_num(share) ** bar.gamma).astype(np.uint8)])
 
 
 def colour_table(colour: Colour, *, dark: bool) -> NDArray[np.uint8]:
@@ -511,16 +516,41 @@ def colour_table(colour: Colour, *, dark: bool) -> NDArray[np.uint8]:
     return np.asarray(255.0 * table, np.uint8)
 
 
-def scale_of(shown: DisplayedWindow, colour: Colour) -> tuple[str, str, str]:
-    """Return the texts at both ends of a colour scale, and its title."""
+@dataclass(frozen=True, eq=False)
+class ColourBar:
+    """Scale of a quantity that colours show."""
+
+    low: float
+    """Value of the first colour."""
+    high: float
+    """Value of the last colour."""
+    title: str
+    """Name of the quantity."""
+    unit: str
+    """Unit of the values; empty for numbers."""
+    colours: NDArray[np.uint8]
+    """Red, green and blue from ``low`` to ``high``, shape ``(256, 3)``."""
+    gamma: float = 1.0
+    """Exponent of a value's share of the range that gives the place of its colour."""
+
+    @property
+    def label(self) -> str:
+        """Name and unit of the quantity."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+
+def colour_bar(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> ColourBar | None:
+    """Return the scale of a colour choice; None for polarity and ground truth, whose legends have rows."""
+    if colour not in COLOUR_MAPS:
+        return None
+    table = colour_table(colour, dark=dark)
     if colour is Colour.ANGLE:
-        return "0°", "360°", "prism angle θ"
+        return ColourBar(0.0, 360.0, "prism angle θ", "°", table)
     if colour is Colour.TIME:
-        low, high = axis_range(shown, Axis.TIME)
-        return f"{low:.6g}", f"{high:.6g} ms", "time"
+        return ColourBar(*axis_range(shown, Axis.TIME), "time", "ms", table)
     if colour is Colour.DENSITY:
-        return "0", f"{density_top(shown):.3g}", "events per pixel (square root)"
-    return "0", f"{WIDEST_PX:g} px", "residual: width of the edge near an event"
+        return ColourBar(0.0, density_top(shown), "events per pixel", "", table, 0.5)
+    return ColourBar(0.0, WIDEST_PX, "residual", "px", table)
 
 
 def density_top(shown: DisplayedWindow) -> float:
@@ -530,16 +560,20 @@ def density_top(shown: DisplayedWindow) -> float:
 
 
 def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> NDArray[np.float64]:
-    """Return the displayed quantity of each point, scaled to 0 … 1."""
-    if colour is Colour.ANGLE:
-        return shown.theta / math.tau
-    if colour is Colour.TIME:
-        return (shown.events.t - shown.span.start_us) / shown.span.length_us
+    """Return the displayed quantity of each point, in the unit of its scale, shape ``(n,)``."""
+    if colour in (Colour.ANGLE, Colour.TIME):
+        return third_axis(shown, Axis(colour.value))
+    if colour is Colour.RESIDUAL:
+        return residuals(shown, after=after)
     image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
-    if colour is Colour.DENSITY:
-        return np.sqrt(at_pixels(image, xy) / density_top(shown))
+    return at_pixels(image, xy)
+
+
+def residuals(shown: DisplayedWindow, *, after: bool) -> NDArray[np.float64]:
+    """Return the :func:`residual` of each point of the first or the second cloud [px], shape ``(n,)``."""
+    image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
     left, top, right, bottom = shown.region
-    return residual(image, xy, (slice(top, bottom), slice(left, right))) / WIDEST_PX
+    return residual(image, xy, (slice(top, bottom), slice(left, right)))
 
 
 def at_pixels(image: NDArray[Any], xy: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -591,17 +625,23 @@ def _spread_across_edges(image: NDArray[np.float32], where: tuple[slice, slice])
     return np.asarray(spread[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left])
 
 
-# Legend of the inspector's picture as VTK actors: rows of a coloured mark and the meaning of the colour.
+# Legend of the inspector's picture as VTK actors: rows of a coloured mark and the meaning of the colour, or a scale.
 
 CORNER = (0.05, 0.985)
 """Upper left corner of the legend in the strip of the picture that is reserved for the legend.
 
 The coordinates are fractions of the width and height of the strip, from its lower left corner.
 """
+BAR_BOTTOM = 0.3
+"""Lower end of a scale, in shares of the height of the strip."""
 FONT_SIZE, MARK = 12, "■"
 """Font size of the legend [px], and character that shows the colour of a row."""
 LETTER_PX, MARGIN_PX, LARGEST_STRIP = 7.2, 48, 0.35
 """Width of a letter, width of mark and margins [px], and largest width of the strip as a fraction of the picture."""
+TITLE_PX = 22
+"""Height of the title of a scale [px]."""
+FOOT_PX, OWN_RENDERERS = 22, 4
+"""Height of the caption [px], and number of renderers of a scene: two clouds, their legend and the caption."""
 ROW_PX, LEAST_ROWS, MOST_ROWS = 40, 3, 12
 """Height of the picture per row of the legend [px], and smallest and largest number of rows."""
 
@@ -611,35 +651,56 @@ def rows_in(height: int) -> int:
     return max(LEAST_ROWS, min(MOST_ROWS, height // ROW_PX))
 
 
-def strip_share(legend: Legend, width: int) -> float:
-    """Return the fraction of a picture's ``width`` [px] that a legend needs; 0 for an empty legend."""
-    if not legend:
-        return 0.0
-    return min((MARGIN_PX + LETTER_PX * max(len(text) for _, text in legend)) / width, LARGEST_STRIP)
+def strip_share(texts: Sequence[str], width: int) -> float:
+    """Return the fraction of a picture's ``width`` [px] that the texts of a legend need."""
+    return min((MARGIN_PX + LETTER_PX * max(map(len, texts))) / width, LARGEST_STRIP)
 
 
-def legend_actors(legend: Legend, ink: str, font: Path) -> list[Any]:
-    """Return the actors of a legend in the upper left corner of its strip; ``ink`` is the colour of the text."""
+def legend_actors(legend: Legend, ink: str, place: tuple[float, float]) -> list[Any]:
+    """Return the actors of a legend whose upper left corner is at a place; ``ink`` is the colour of the text."""
     actors = []
     for k, (colour, text) in enumerate(legend):
         # all rows start at one corner, after line breaks: their distance does not depend on the picture's size
         if colour:
-            actors.append(_text("\n" * k + MARK, colour, font))
-        actors.append(_text("\n" * k + ("     " if colour else "") + text, ink, font))
+            actors.append(text_actor("\n" * k + MARK, colour, place))
+        actors.append(text_actor("\n" * k + ("     " if colour else "") + text, ink, place))
     return actors
 
 
-def _text(text: str, colour: str, font: Path) -> Any:
-    """Return an actor that shows a text at :data:`CORNER`."""
+def bar_actors(bar: ColourBar, ink: str, height: int) -> list[Any]:
+    """Return the actors of a vertical scale in the strip of a picture of a given height [px].
+
+    ``ink`` is the colour of the text.
+    """
+    import pyvista
+    from vtkmodules.vtkRenderingAnnotation import vtkScalarBarActor
+
+    rgb = bar.colours[np.rint(255.0 * np.linspace(0.0, 1.0, 256) ** bar.gamma).astype(int)]
+    table = pyvista.LookupTable(values=np.column_stack([rgb, np.full(256, 255, np.uint8)]))
+    table.scalar_range = bar.low, bar.high
+    actor = vtkScalarBarActor()
+    actor.SetLookupTable(table)
+    actor.SetNumberOfLabels(5)
+    actor.SetLabelFormat("{:.4g}")
+    actor.UnconstrainedFontSizeOn()
+    actor.SetPosition(CORNER[0], BAR_BOTTOM)
+    actor.SetWidth(0.5)
+    actor.SetHeight(CORNER[1] - TITLE_PX / height - BAR_BOTTOM)
+    actor.SetLabelTextProperty(pyvista.TextProperty(color=ink, font_size=FONT_SIZE, font_file=str(font())))
+    return [actor, text_actor(bar.label, ink, CORNER)]
+
+
+def text_actor(text: str, colour: str, place: tuple[float, float]) -> Any:
+    """Return an actor that shows a text below and to the right of a place, in shares of its renderer's size."""
     import pyvista
 
     actor = pyvista.Text(text)
     actor.prop = pyvista.TextProperty(
-        color=colour, font_size=FONT_SIZE, font_file=str(font), justification_horizontal="left",
+        color=colour, font_size=FONT_SIZE, font_file=str(font()), justification_horizontal="left",
         justification_vertical="top",
     )  # fmt: skip
     actor.GetPositionCoordinate().SetCoordinateSystemToNormalizedViewport()
-    actor.position = CORNER
+    actor.position = place
     return actor
 
 
@@ -658,6 +719,8 @@ CAMERA_DIRECTIONS = {
 """Direction from the clouds to the camera, and the upward direction, for each view."""
 ORBIT_COLOUR = "#009e73"
 """Colour of the model's orbit, as on the page."""
+ROUND_PX = 4.0
+"""Diameter of the points from which they are round [px]."""
 VIEW_ANGLE = 26.0
 """Vertical field of view of the camera [deg]."""
 MARGIN = 0.1
@@ -682,6 +745,11 @@ class Look:
     """Whether both clouds are drawn in one frame, with the first one in grey."""
     titles: tuple[str, ...] = ("as recorded", "compensated")
     """Titles of the clouds. With a single title, only the second cloud is drawn."""
+
+    @property
+    def is_round(self) -> bool:
+        """Whether points are drawn as discs. Smaller ones have no visible shape, and squares are faster."""
+        return self.point_size >= ROUND_PX
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "colour", choice(Colour, self.colour, "colour"))
@@ -725,7 +793,7 @@ class Box:
         return np.stack([xy[:, 0], -xy[:, 1], (third - self.low) * self.stretch], axis=1).astype(np.float32)
 
 
-def check_display() -> None:
+def check_opengl() -> None:
     """Select EGL for VTK on Linux. Raises :class:`AmiwarpError` without EGL, where VTK would end the process."""
     if not sys.platform.startswith("linux"):
         return
@@ -733,6 +801,27 @@ def check_display() -> None:
         raise AmiwarpError("VTK needs OpenGL (EGL) to draw; on Debian run: apt-get install libegl1 libgl1-mesa-dri")
     # by default VTK tries X first, and crashes if libX11 is missing; EGL needs no display
     os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"
+
+
+def check_display() -> None:
+    """Raise :class:`AmiwarpError` if no window can be opened, where VTK would end the process."""
+    if not sys.platform.startswith("linux"):
+        return
+    remedy = "run with --web to serve the page for a browser, or with --screenshot to write a picture"
+    libraries = find_library("X11"), find_library("GL")
+    if None in libraries:
+        raise AmiwarpError(
+            f"a window needs libX11 and libGL; on Debian run: apt-get install libx11-6 libgl1; or {remedy}"
+        )
+    x11 = CDLL(libraries[0])
+    x11.XOpenDisplay.restype, x11.XCloseDisplay.argtypes = c_void_p, [c_void_p]
+    display = x11.XOpenDisplay(None)
+    if display is None:
+        given = os.environ.get("DISPLAY")
+        found = f"the display {given!r} cannot be opened" if given else "there is no display to open a window on"
+        raise AmiwarpError(f"{found}; {remedy}")
+    x11.XCloseDisplay(display)
+    os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkXOpenGLRenderWindow"
 
 
 def font() -> Path:
@@ -743,44 +832,54 @@ def font() -> Path:
 
 
 class Scene:
-    """Event clouds before and after compensation, drawn off screen, with one camera for both."""
+    """Event clouds before and after compensation, with one camera for both, their legend and a caption."""
 
-    def __init__(self, size: tuple[int, int] = (1000, 420)) -> None:
+    def __init__(
+        self, size: tuple[int, int] = (1000, 420), *, corner: tuple[float, float] = (0.0, 0.0), more: int = 0,
+        off_screen: bool = True,
+    ) -> None:  # fmt: skip
         """Create an empty scene; ``size`` is the picture's width and height [px].
 
-        Raises :class:`AmiwarpError` if VTK cannot draw on this machine.
+        ``corner``: lower left corner of the part of the picture that the scene fills, in shares of its size. ``more``:
+        number of renderers for other parts; they follow the :data:`OWN_RENDERERS` of the scene. Without ``off_screen``,
+        a window shows the scene. Raises :class:`AmiwarpError` if VTK cannot draw on this machine.
         """
-        check_display()
+        check_opengl() if off_screen else check_display()
         import pyvista
 
-        self.plotter = pyvista.Plotter(off_screen=True, shape=(1, 3), border=False, window_size=list(size))
+        parts = 1, OWN_RENDERERS + more
+        self.plotter = pyvista.Plotter(off_screen=off_screen, shape=parts, border=False, window_size=list(size))
         self.plotter.render_window.SetMultiSamples(0)  # doubles the speed of a software renderer
         self.plotter.link_views((0, 1))
+        self._corner, self._foot = corner, 0.0
         self._divide(0.0, overlaid=False)
         self.view = View.FREE
+        self.stride = 1
+        """Distance between the events that are drawn: 1 for all."""
         self._clouds: list[Any] = []
+        self._meshes: list[Any] = [None, None]
+        self._drawn: list[tuple[Any, ...]] = [(), ()]
         self._frame: list[tuple[int, Any]] = []
         self._lines: list[tuple[int, Any]] = []
-        self._explained: tuple[Legend, str] | None = None
+        self._explained: tuple[Any, ...] = ()
+        self._caption = text_actor("", "black", (0.01, 0.9))
+        self.plotter.renderers[3].add_actor(self._caption, render=False, pickable=False, reset_camera=False)
         self._framed: tuple[Any, ...] | None = None
         self.box = Box(0, 0, 1, 1, 0.0, 1.0)
 
-    def show(self, shown: DisplayedWindow, look: Look, lines: Sequence[NDArray[Any]] = ()) -> None:
+    def show(self, shown: DisplayedWindow, look: Look, lines: Sequence[NDArray[Any]] = (), caption: str = "") -> None:
         """Draw the events of a window. The camera moves only if the region of the image has changed.
 
-        ``lines``: a line for each cloud, points x, y [px] and on the third axis, shape ``(n, 3)``.
+        ``lines``: a line for each cloud, points x, y [px] and on the third axis, shape ``(n, 3)``. ``caption``: text
+        below the clouds.
         """
         before = self.box
         self.box = Box(*shown.region, *axis_range(shown, look.axis))
-        third = third_axis(shown, look.axis)
         for k, xy in enumerate((shown.before, shown.after)):
-            points = self.box.positions(xy, third)
-            colours = colours_of(shown, look, after=k == 1)
-            valid = np.isfinite(points).all(axis=1) & (k == 1 or len(look.titles) > 1)
-            self._cloud(k, points[valid], colours[valid], look)
+            self._cloud(k, xy, shown, look)
         self._draw_frame(look)
         self._draw_lines(lines, look)
-        self._draw_legend(legend_of(shown.truth, look.colour, rows_in(self.plotter.window_size[1])), look)
+        self._draw_legend(shown, look, caption)
         if replace(before, low=self.box.low, high=self.box.high) != self.box:  # the region has changed
             self.look_from(self.view, look)
 
@@ -799,7 +898,8 @@ class Scene:
         corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T - middle
         wide, tall, near = (np.abs(corners @ right), np.abs(corners @ up), corners @ away)
         width, height = self.plotter.window_size
-        aspect = width / height * (1.0 - self._strip) * (1.0 if look.overlaid else 0.5)
+        wide_share, tall_share = 1.0 - self._corner[0] - self._strip, 1.0 - self._corner[1] - self._foot
+        aspect = width / height * wide_share / tall_share * (1.0 if look.overlaid else 0.5)
         half = math.tan(math.radians(VIEW_ANGLE / 2.0))
         camera = self.plotter.renderers[0].camera
         camera.parallel_projection, camera.view_angle = view is not View.FREE, VIEW_ANGLE
@@ -809,6 +909,13 @@ class Scene:
         for renderer in self._views:
             renderer.camera = camera
             renderer.reset_camera_clipping_range()
+
+    def place(self, corner: tuple[float, float], look: Look) -> None:
+        """Fill the part of the picture from another lower left corner on, in shares of its size."""
+        if corner != self._corner:
+            self._corner = corner
+            self._divide(self._strip, overlaid=look.overlaid)
+            self.look_from(self.view, look)
 
     def picture(self) -> NDArray[np.uint8]:
         """Return the drawn picture, shape ``(height, width, 3)``."""
@@ -843,16 +950,43 @@ class Scene:
         return self.plotter.add_mesh(mesh, lighting=False, show_scalar_bar=False, reset_camera=False, render=False,
                                      pickable=False, **how)  # fmt: skip
 
-    def _cloud(self, k: int, points: NDArray[np.float32], colours: NDArray[np.uint8], look: Look) -> None:
+    def _cloud(self, k: int, xy: NDArray[np.float32], shown: DisplayedWindow, look: Look) -> None:
+        """Draw the points of a cloud. Only what has changed is computed, and the points are moved where they are."""
+        drawn = k == 1 or len(look.titles) > 1
+        places = (xy, shown.theta if look.axis is Axis.ANGLE else shown.events, self.box, self.stride, drawn)
+        depends = (shown.image_before, shown.image_after) if look.colour in (Colour.DENSITY, Colour.RESIDUAL) else ()
+        colours = (shown.events, shown.theta, look.colour, look.dark, look.overlaid, *depends)
+        mesh = self._meshes[k]
+        same = [len(a) == len(b) and all(x is y or (not isinstance(x, np.ndarray | Events) and x == y)
+                                         for x, y in zip(a, b, strict=True))
+                for a, b in zip((places, colours), self._drawn[k] or ((), ()), strict=True)]  # fmt: skip
+        self._drawn[k] = places, colours
+        if not all(same):
+            some = slice(None, None, self.stride if drawn else len(xy) + 1)
+            points = self.box.positions(xy[some], third_axis(shown, look.axis)[some])
+            valid = ... if math.isfinite(float(points.sum())) else np.isfinite(points).all(axis=1)
+            points = points[valid] if drawn else points[:1] * 0.0
+            fits = mesh is not None and len(mesh.points) == len(points)
+            if fits and valid is ...:
+                mesh.points = points
+            else:
+                mesh = self._new_cloud(k, points)
+            if not (same[1] and fits and valid is ...):
+                rgb = colours_of(shown, look, after=k == 1)[some][valid] if drawn else np.zeros((1, 3), np.uint8)
+                mesh["colour"] = rgb
+        prop = self._clouds[k].prop
+        self._clouds[k].visibility = drawn
+        prop.point_size, prop.opacity, prop.render_points_as_spheres = look.point_size, look.opacity, look.is_round
+
+    def _new_cloud(self, k: int, points: NDArray[np.float32]) -> Any:
         import pyvista
 
-        mesh = pyvista.PolyData(points) if len(points) else pyvista.PolyData(np.zeros((1, 3), np.float32))
-        mesh["colour"] = colours if len(points) else np.zeros((1, 4), np.uint8)
+        mesh = pyvista.PolyData(points)
+        mesh["colour"] = np.zeros((len(points), 3), np.uint8)
         while len(self._clouds) <= k:
             self._clouds.append(self._add(len(self._clouds), mesh, style="points", scalars="colour", rgb=True))
-        actor = self._clouds[k]
-        actor.mapper.dataset = mesh
-        actor.prop.point_size, actor.prop.opacity = look.point_size, look.opacity
+        self._clouds[k].mapper.dataset = self._meshes[k] = mesh
+        return mesh
 
     def _draw_frame(self, look: Look) -> None:
         """Draw the box, the ticks and the axis titles, if they have changed."""
@@ -877,42 +1011,61 @@ class Scene:
             self._frame += [(k, actor) for actor in self._axes(k, look, ink, title)]
 
     def _draw_lines(self, lines: Sequence[NDArray[Any]], look: Look) -> None:
-        """Draw a line in each cloud, instead of those drawn before."""
+        """Draw a line in each cloud, instead of those drawn before, which are moved if there are as many."""
         import pyvista
 
+        places = [self.box.positions(line[:, :2], line[:, 2]) for line in lines]
+        homes = [0 if look.overlaid else number for number in range(len(lines))]
+        if homes == [k for k, _ in self._lines]:
+            for (_, actor), points in zip(self._lines, places, strict=True):
+                actor.mapper.dataset.points = points
+            return
         for k, actor in self._lines:
             self.plotter.renderers[k].remove_actor(actor, render=False)
-        self._lines = []
-        for number, line in enumerate(lines):
-            k = 0 if look.overlaid else number
-            curve = pyvista.lines_from_points(self.box.positions(line[:, :2], line[:, 2]))
-            self._lines.append((k, self._add(k, curve, color=ORBIT_COLOUR, line_width=2.5)))
+        curves = [pyvista.lines_from_points(points) for points in places]
+        self._lines = [(k, self._add(k, curve, color=ORBIT_COLOUR, line_width=2.5))
+                       for k, curve in zip(homes, curves, strict=True)]  # fmt: skip
 
-    def _draw_legend(self, legend: Legend, look: Look) -> None:
-        """Draw the legend in a strip on the left, if it has changed. The clouds shrink to make room."""
-        ink, home, camera = BACKGROUND_AND_INK[look.dark][1], self.plotter.renderers[2], self._views[0].camera
-        strip = strip_share(legend, self.plotter.window_size[0])
-        if strip != self._strip:
-            grows = (1.0 - self._strip) / (1.0 - strip)
+    def _draw_legend(self, shown: DisplayedWindow, look: Look, caption: str) -> None:
+        """Draw the legend in a strip on the left, and the caption below. The clouds shrink to make room."""
+        ink, camera = BACKGROUND_AND_INK[look.dark][1], self._views[0].camera
+        home = self.plotter.renderers[2]
+        width, height = self.plotter.window_size
+        bar = colour_bar(shown, look.colour, dark=look.dark)
+        rows = legend_of(shown.truth, look.colour, rows_in(height))
+        if look.overlaid and len(look.titles) > 1:
+            rows = (*rows, (GREY, look.titles[0]))
+        title = [] if bar is None else [bar.label]
+        strip, foot = strip_share([*title, *(text for _, text in rows)], width), FOOT_PX / height * bool(caption)
+        if (strip, foot) != (self._strip, self._foot):
+            grows = (1.0 - self._corner[0] - self._strip) / (1.0 - self._corner[0] - strip)
+            self._foot = foot
             self._divide(strip, overlaid=look.overlaid)
             camera.Dolly(1.0 / grows)
             camera.parallel_scale *= grows
             self._views[0].reset_camera_clipping_range()
-        if self._explained == (legend, ink):
+        self._caption.input, self._caption.prop.color = caption, ink
+        explained = (rows, ink) if bar is None else (rows, ink, bar.low, bar.high, bar.title)
+        if self._explained == explained:
             return
-        self._explained = legend, ink
+        self._explained = explained
+        actors = legend_actors(rows, ink, CORNER if bar is None else (CORNER[0], BAR_BOTTOM - 0.05))
+        actors += [] if bar is None else bar_actors(bar, ink, height)
         home.clear_actors()
-        for actor in legend_actors(legend, ink, font()):
+        for actor in actors:
             home.add_actor(actor, render=False, pickable=False, reset_camera=False)
 
     def _divide(self, strip: float, *, overlaid: bool) -> None:
-        """Divide the picture into the legend's strip, given as a share of the width, and one or two clouds."""
-        self._strip, (left, right, legend) = strip, self.plotter.renderers
-        middle = (1.0 + strip) / 2.0
-        legend.SetViewport(0.0, 0.0, strip, 1.0)
-        left.SetViewport(strip, 0.0, 1.0 if overlaid else middle, 1.0)
-        right.SetViewport(middle, 0.0, 1.0, 1.0)
+        """Divide the scene's part of the picture into the legend's strip, a share of the width, and the clouds."""
+        self._strip, (left, right, legend, foot, *_) = strip, self.plotter.renderers
+        start, low = self._corner[0] + strip, self._corner[1] + self._foot
+        middle = (1.0 + start) / 2.0
+        legend.SetViewport(self._corner[0], low, start, 1.0)
+        foot.SetViewport(self._corner[0], self._corner[1], 1.0, low)
+        left.SetViewport(start, low, 1.0 if overlaid else middle, 1.0)
+        right.SetViewport(middle, low, 1.0, 1.0)
         legend.SetDraw(strip > 0.0)
+        foot.SetDraw(self._foot > 0.0)
         right.SetDraw(not overlaid)
 
     def _axes(self, k: int, look: Look, ink: str, title: str) -> list[Any]:
@@ -987,13 +1140,14 @@ def cloud_state(shown: DisplayedWindow, colour: Colour, axis: Axis, *, dark: boo
 
 def legend(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> dict[str, Any]:
     """Return the legend of a colour choice: title, rows of colour and text, or a scale with its ends."""
-    if colour is Colour.POLARITY:
-        rows = [[ON_COLOUR, "ON: brighter"], [OFF_COLOUR, "OFF: darker"]]
-        return {"title": "polarity", "rows": rows, "bar": "", "low": "", "high": ""}
-    if known := legend_of(shown.truth, colour, LEGEND_ROWS):
-        return {"title": known[0][1], "rows": [list(row) for row in known[1:]], "bar": "", "low": "", "high": ""}
-    low, high, title = scale_of(shown, colour)
-    return {"title": title, "rows": [], "bar": gradient(colour_table(colour, dark=dark)), "low": low, "high": high}
+    bar = colour_bar(shown, colour, dark=dark)
+    if bar is None:
+        (_, title), *rows = legend_of(shown.truth, colour, LEGEND_ROWS)
+        return {"title": title, "rows": [list(row) for row in rows], "bar": "", "low": "", "high": ""}
+    title = f"{bar.title} (square root)" if bar.gamma != 1.0 else bar.title
+    low, high = f"{bar.low:.6g}", f"{bar.high:.3g}" if colour is Colour.DENSITY else f"{bar.high:.6g}"
+    unit = f" {bar.unit}" if bar.unit and bar.unit != "°" else bar.unit
+    return {"title": title, "rows": [], "bar": gradient(bar.colours), "low": low, "high": high + unit}
 
 
 def gradient(table: NDArray[Any]) -> str:

@@ -19,6 +19,7 @@ from amiwarp.calib.bad_pixels import strange_pixels, stretch
 from amiwarp.calib.parameters import build_model, nominal, optical_parameters
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.choices import Colour, Sharpness
+from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, turn_between
 from amiwarp.events.recording import Events, EventSource, Recording
@@ -453,6 +454,9 @@ class LoadedWindow:
     """Part of these events from which the sharpness curve is computed."""
     angles: dict[float, WindowAngles] = field(default_factory=dict)
     """Prism angles by the speed of a prism without encoder [1/min]; with an encoder, the only key is 0."""
+    wrapped: dict[tuple[float, float], NDArray[np.float64]] = field(default_factory=dict)
+    """Prism angles of the drawn events from 0 to 2π [rad], by speed and drift of the clock offset; the last ones only.
+    """
     unmoved: list[MeasuredImage] = field(default_factory=list)
     """Image of the events as recorded, once it is measured."""
     chosen: list[Picture] = field(default_factory=list)
@@ -547,18 +551,20 @@ def find_statistics(window: LoadedWindow) -> Statistics:
 
 # Selected events of a time window, on the host and with their prism angles on the device.
 
-MOST_POINTS = 100_000
-"""Largest number of points in each event cloud."""
+MOST_POINTS, WINDOW_POINTS = 100_000, 1_000_000
+"""Largest number of points in each event cloud: of the page, which sends them to a browser, and of the window."""
 CURVE_EVENTS = 200_000
 """Largest number of events that a sharpness curve uses."""
 
 
 def load_window(
-    recording: Recording, span: Span, selection: Selection, *, margin_px: int, hot: NDArray[np.bool_] | None
-) -> LoadedWindow:
+    recording: Recording, span: Span, selection: Selection, *, margin_px: int, hot: NDArray[np.bool_] | None,
+    most_points: int,
+) -> LoadedWindow:  # fmt: skip
     """Select the events of a time window.
 
     ``margin_px``: how far outside the region events belong to its images. ``hot``: the hot pixels to leave out.
+    ``most_points``: largest number of events that are drawn.
     Raises :class:`AmiwarpError` if no event meets the selection.
     """
     region = selection.region or (0, 0, *recording.events.size)
@@ -573,7 +579,7 @@ def load_window(
         what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
         raise AmiwarpError(f"{what} from {(span.start_us - recording.events.t_first) * 1e-3:.3f} ms on for "
                            f"{span.length_us * 1e-3:.3f} ms; take another window")  # fmt: skip
-    thin = np.arange(min(n, MOST_POINTS)) * n // min(n, MOST_POINTS)
+    thin = np.arange(min(n, most_points)) * n // min(n, most_points)
     thin = thin if within is None else within[thin]
     drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
     xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
@@ -733,11 +739,15 @@ class Inspector:
         *,
         device: Any = "cpu",
         latest: Callable[[], Recording] | None = None,
+        most_events: int | None = None,
+        most_points: int | None = None,
     ) -> None:
         """Start with a recording; a calibration sets the prism's parameters.
 
-        ``latest`` returns the current events of a live stream, see :meth:`renew`. Raises :class:`AmiwarpError` if there
-        are no events, or if the calibration belongs to another camera.
+        ``latest`` returns the current events of a live stream, see :meth:`renew`. ``most_events``: largest number of
+        events that are read from a window, by default :data:`MOST_EVENTS`. ``most_points``: largest number of points
+        in each cloud, by default :data:`MOST_POINTS`. Raises :class:`AmiwarpError` if there are no events, or if the
+        calibration belongs to another camera.
         """
         source = recording.events
         if not len(source):
@@ -758,6 +768,7 @@ class Inspector:
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
         self.recording, self.device, self.latest = recording, device, latest
+        self._most_events, self._most_points = most_events or MOST_EVENTS, most_points or MOST_POINTS
         self.prism = nominal(recording.prism)
         """Nominal prism of the recording, with an assumed apex if it is unknown."""
         self.zero_us = (source.t_first + source.t_last) // 2
@@ -863,6 +874,7 @@ class Inspector:
             self.__dict__.pop(name, None)
         if self._window is not None:
             self._window.angles.clear()
+            self._window.wrapped.clear()
 
     def accept(self, calibration: Calibration) -> None:
         """Set the parameters to a calibration. Raises :class:`AmiwarpError` if its camera has another size."""
@@ -966,7 +978,7 @@ class Inspector:
         w, knobs = self.loaded, knobs or self.knobs
         first = self._unmoved(w) if against is None else self._measured(w, against)
         xy = w.xy if against is None else self._moved(w, against)
-        second, theta = self._measured(w, knobs), np.mod(self._theta(w, knobs), math.tau)
+        second, theta = self._measured(w, knobs), self._wrapped(w, knobs)
         return DisplayedWindow(
             w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), theta, first.image, second.image,
             first.sharpness, second.sharpness,
@@ -974,14 +986,15 @@ class Inspector:
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return values of a parameter around its current one, in its unit, and the sharpness at each of them."""
-        current = self.knobs
-        half = CURVE_HALF_WIDTH[name]
-        values = (current.value(name) or 0.0) + np.linspace(-half, half, CURVE_POINTS)
-        if name == "apex":
-            values = values[values >= 0.0]
-        sharpness = self.sharpness_meter(self._curve_imager)
-        changed = [current.with_values({name: float(value)}) for value in values]
+        values, sharpness = self.curve_values(name), self.sharpness_meter(self._curve_imager)
+        changed = [self.knobs.with_values({name: float(value)}) for value in values]
         return values, np.array([sharpness(knobs) for knobs in changed])
+
+    def curve_values(self, name: str) -> NDArray[np.float64]:
+        """Return the values of a parameter at which :meth:`curve` measures the sharpness, in its unit."""
+        half = CURVE_HALF_WIDTH[name]
+        values = (self.knobs.value(name) or 0.0) + np.linspace(-half, half, CURVE_POINTS)
+        return values[values >= 0.0] if name == "apex" else values
 
     def sharpness_meter(self, imager: WindowImager | None = None) -> Callable[[Knobs | None], float]:
         """Return a function that measures the sharpness of part of the window's events with given parameters.
@@ -1072,7 +1085,7 @@ class Inspector:
     def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:
         """Read and select the events of a time window. The events of the last one are not read again."""
         if self._span is None or (self._span.start_us, self._span.length_us) != (start_us, length_us):
-            self._span = read_span(self.recording.events, start_us, length_us, most_events=MOST_EVENTS)
+            self._span = read_span(self.recording.events, start_us, length_us, most_events=self._most_events)
         return self._select(self._span, selection)
 
     def select(self, span: Span) -> Events:
@@ -1081,7 +1094,8 @@ class Inspector:
 
     def _select(self, span: Span, selection: Selection) -> LoadedWindow:
         hot = self.hot if selection.hide_hot else None
-        return load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot)
+        return load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot,
+                           most_points=self._most_points)  # fmt: skip
 
     def _drift_us(self, knobs: Knobs) -> float:
         """Return how far the clock offset is from that of the recording's own encoder [us]."""
@@ -1109,8 +1123,19 @@ class Inspector:
         angles = self._angles(w, knobs)
         return angles.theta + angles.speed * self._drift_us(knobs)
 
+    def _wrapped(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
+        """Return the prism angles of the drawn events, from 0 to 2π [rad], shape ``(n,)``."""
+        key = 0.0 if self.has_encoder else knobs.rpm, self._drift_us(knobs)
+        if key not in w.wrapped:
+            w.wrapped.clear()
+            w.wrapped[key] = np.mod(self._theta(w, knobs), math.tau)
+        return w.wrapped[key]
+
     def _moved(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float32]:
         """Return the compensated positions of the drawn events [px], shape ``(n, 2)``."""
+        encoder, (first, last) = self.encoder_of(knobs), w.drawn.t[[0, -1]].tolist()
+        if encoder.covers(first, last) and w.drawn.x.dtype == np.uint16:  # several times as fast
+            return np.asarray(compensate_events(w.drawn, self.model_of(knobs), encoder, device=self.device))
         theta = self._theta(w, knobs).astype(np.float32)
         return np.asarray(self.model_of(knobs).compensate_points(w.xy, theta), np.float32)
 

@@ -33,7 +33,7 @@ from amiwarp.live.stream.session import RecentEvents
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.viewer.drawing import Look, Scene, SelectedPart, ShownImages, orbit_lines, select_part
-from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, Inspector, Knobs, Source, kept
+from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, DisplayedWindow, Inspector, Knobs, Source, kept
 
 # Work of one page: its threads, jobs and updates, and the messages about their errors.
 
@@ -558,20 +558,20 @@ def download_name(recording: str, what: str) -> str:
 
 def write_film(
     path: Path, inspector: Inspector, look: Look, view: View, progress: Progress, *, what: str,
-    against: Knobs | None, with_orbit: bool, speed: float,
+    against: Knobs | None, with_orbit: bool, speed: float, caption: Callable[[Inspector, DisplayedWindow], str],
 ) -> None:  # fmt: skip
     """Write a film of the clouds to a new file.
 
     ``what``: "turntable" for a camera that moves once around the clouds of the inspector's window, or "film" for a time
     window that moves on from there with ``speed`` times real time. ``against``: parameters of the left cloud; None for
-    the recorded events. ``progress`` may raise an error to stop the film.
+    the recorded events. ``progress`` may raise an error to stop the film. ``caption`` gives the text below the clouds.
     """
 
     def draw(scene: Scene) -> None:
         shown = inspector.show(against=against)
         orbit, column = orbit_lines(inspector, shown)
         lines = (orbit if against is None else column, column)
-        scene.show(shown, look, lines if with_orbit else ())
+        scene.show(shown, look, lines if with_orbit else (), caption(inspector, shown))
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         with contextlib.closing(Scene(FILM_SIZE)) as scene:

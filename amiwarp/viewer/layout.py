@@ -291,6 +291,8 @@ SPEEDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10)
 """Choices of the playback speed, relative to real time."""
 VIEWS = ((View.FREE.value, "corner"), (View.XY.value, "x-y"), (View.X_AXIS.value, "x-θ"), (View.Y_AXIS.value, "y-θ"))
 """Viewpoints of the clouds, with the texts of their buttons."""
+RECORDED = "events as recorded"
+"""Title of the only cloud, if there is no motion to compensate."""
 SCOPES = ("selection", "whole recording")
 """Choices of the events that a calibration uses."""
 TOOLS = (("region", "draw region"), ("move", "move"), ("measure", "measure"))
@@ -320,8 +322,8 @@ KEYS = (
     ("b", ("keep_b",), "keep the parameters as B, to compare with"),
     ("c", ("calibrate",), "calibrate, or cancel"),
     ("a", ("accept",), "accept the result of the calibration"),
-    ("s", ("export", "calibration"), "download the calibration"),
-    ("p", ("export", "picture"), "download a picture of the clouds"),
+    ("s", ("export", "calibration"), "save the calibration"),
+    ("p", ("export", "picture"), "save a picture of the clouds"),
     ("?", ("toggle", "help_shown"), "show or hide this help"),
 )
 """Keys of the page: name of the key, method of the panel with its arguments, and help text."""
@@ -347,6 +349,12 @@ CLIENT_ONLY = ("hover", "measured", "tool")
 """State variables that the browser keeps to itself."""
 NO_SCALE = {"bar": "", "ticks": [], "title": ""}
 """Scale of an image before the first update."""
+
+
+def cloud_titles(against: str, *, compensates: bool) -> tuple[str, ...]:
+    """Return the titles of the clouds. ``against``: name of what the left one shows, see :data:`AGAINST`."""
+    pair = AGAINST[against], "compensated" if against == "recorded" else "compensated with A"
+    return pair if compensates else (RECORDED,)
 
 
 def template() -> str:
@@ -376,7 +384,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "trame__title": f"amiwarp: {recording.name}", "trame_error_report_msg": "", "name": recording.name,
         "size": list(size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
         "has_encoder": inspector.has_encoder, "models": list(MODELS),
-        "apex_most": max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1)), "truths": truths(inspector),
+        "apex_most": apex_most(inspector), "truths": truths(inspector),
         "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth),
         "exports": [[name, text, name in FILMS] for name, (text, *_) in EXPORTS.items()],
         "open_shown": False, "playing": False, "speed": 0.1, "speeds": list(SPEEDS), "loop": False, "polarity": "both",
@@ -400,6 +408,11 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "curve_mark": 0.0, "against": "recorded", "has_b": False, "b_text": "", "busy": "", "calibrating": False,
         "progress": 0, "found": "", "surface": None, "scope": SCOPES[0], "scopes": list(SCOPES), "calibrate_on": "",
     }  # fmt: skip
+
+
+def apex_most(inspector: Inspector) -> float:
+    """Return the end of the slider of the apex angle [deg]."""
+    return max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1))
 
 
 def source_state(inspector: Inspector) -> dict[str, Any]:
@@ -445,6 +458,17 @@ def notes(inspector: Inspector) -> list[str]:
 
 
 # Texts and figures about the shown window, a live stream and a calibration.
+
+
+def caption(inspector: Inspector, shown: DisplayedWindow) -> str:
+    """Return what a picture of the clouds shows: recording, time, region, numbers of events and sharpness."""
+    left, top, right, bottom = shown.region
+    end_ms = shown.span.start_ms + shown.span.length_us * 1e-3
+    sharpness = sharpness_text(shown, compensated=math.isfinite(inspector.turn_us))
+    return (
+        f"{inspector.recording.name}: {shown.span.start_ms:.3f} to {end_ms:.3f} ms; x {left} to {right - 1}, "
+        f"y {top} to {bottom - 1} px; {events_text(shown)}; sharpness {sharpness}"
+    )
 
 
 def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:

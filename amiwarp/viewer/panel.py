@@ -1,19 +1,13 @@
-"""Page of the inspector: passes input from the browser to the inspector, and results back; ways to open the page."""
+"""Page of the inspector: passes input from the browser to the inspector, and results back; ways to show the page."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import math
-import os
 import secrets
-import shutil
-import subprocess
-import sys
-import tempfile
 import traceback
 import weakref
-import webbrowser
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -35,8 +29,6 @@ from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Kno
 from amiwarp.viewer.jobs import SLOW, JobCancelled, JobProgress, PageWork
 from amiwarp.viewer.serve import finite, serve, use_page
 
-RECORDED = "events as recorded"
-"""Title of the only cloud, if there is no motion to compensate."""
 BINS = 400
 """Number of points of the drawn event rates."""
 STEP_S = 0.2
@@ -528,7 +520,7 @@ class Panel:
         self._progress = progress = JobProgress(self._show_progress)
         film = partial(
             jobs.write_film, inspector=inspector, look=look, view=View(s.view[0]), progress=progress, what=what,
-            against=self._against, with_orbit=self._orbit_drawn, speed=float(s.speed),
+            against=self._against, with_orbit=self._orbit_drawn, speed=float(s.speed), caption=layout.caption,
         )  # fmt: skip
         with s:
             s.update({"busy": f"making the {jobs.EXPORTS[what][0]}", "progress": 0})
@@ -687,13 +679,13 @@ class Panel:
         values |= self._images(shown) | self._orbit(shown)
         if before is None or shown.span is not before.span:
             values["overview"] = drawing.whole_image(shown.span.events, self.inspector.recording.events.size)
-        left = layout.AGAINST["recorded" if against is None else s.against]
-        pair = [[0, left], [1, "compensated" if s.against == "recorded" else "compensated with A"]]
+        left = "recorded" if against is None else s.against
+        titles = layout.cloud_titles(left, compensates=self.compensates)
         return shown, {
-            **values, "titles": pair if self.compensates else [[0, RECORDED]], "events": layout.events_text(shown),
+            **values, "titles": [list(each) for each in enumerate(titles)], "events": layout.events_text(shown),
             "sharpness": layout.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
             "picked_text": "" if self._picked < 0 else drawing.event_text(shown, self._picked),
-            "against_title": left, "against_choices": self._against_choices(),
+            "against_title": layout.AGAINST[left], "against_choices": self._against_choices(),
         }  # fmt: skip
 
     def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
@@ -775,19 +767,9 @@ def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progre
         known = None
 
 
-# Ways to open the inspector: in a browser, in a window, in a notebook, or as a picture file.
-#
-# The window is a browser window without tabs or address bar that shows the same page. So there is only one user
-# interface to maintain, nothing extra to install, and the inspector works in the same way over SSH.
+# Ways to show the page, in a browser or in a notebook, and a picture of the clouds.
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge", "brave-browser")
-"""Commands of the browsers that can show a page in a window without tabs (``--app``), in order of preference."""
 LOCALHOST = "127.0.0.1"
-
-
-def has_display() -> bool:
-    """Return whether this machine has a display on which a window can be opened."""
-    return not sys.platform.startswith("linux") or any(os.environ.get(n) for n in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def serve_panel(
@@ -815,41 +797,6 @@ async def _serve(
         return Panel(server, make_inspector(), library).close
 
     await serve(build, settable=layout.SETTABLE, host=host, port=port, token=secrets.token_urlsafe(16), ready=ready)
-
-
-def open_window(make_inspector: Callable[[], Inspector], library: Library | None, ready: Callable[[str], None]) -> None:
-    """Open the page in a window and serve it until the window is closed.
-
-    If none of :data:`BROWSERS` is installed, open a tab of the default browser and serve until interrupted.
-    """
-
-    async def serve_and_show() -> None:
-        address: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
-        serving: asyncio.Future[Any] = asyncio.create_task(
-            _serve(make_inspector, library, LOCALHOST, 0, address.set_result)
-        )
-        await asyncio.wait([serving, address], return_when=asyncio.FIRST_COMPLETED)
-        if serving.done():
-            serving.result()
-        url = address.result()
-        ready(url)
-        browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-        if browser is None:
-            webbrowser.open(url)
-            await serving
-            return
-        with tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True) as profile:
-            options = [f"--app={url}", f"--user-data-dir={profile}", "--no-first-run", "--window-size=1366,768"]
-            if hasattr(os, "geteuid") and os.geteuid() == 0:
-                options.append("--no-sandbox")  # browsers refuse to run as root otherwise
-            window = await asyncio.create_subprocess_exec(browser, *options, stderr=subprocess.DEVNULL)
-            await window.wait()
-        serving.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await serving
-
-    with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(serve_and_show())
 
 
 @guarded
@@ -942,12 +889,12 @@ def save_screenshot(
     check_output(path)
     look = look or Look()
     if not math.isfinite(inspector.turn_us):
-        look = look.for_clouds([RECORDED])
+        look = look.for_clouds([layout.RECORDED])
     clouds = inspector.show()
     with (
         interrupts_later(),
         contextlib.closing(Scene(size)) as scene,
     ):  # VTK crashes if an exception leaves it half-drawn
-        scene.show(clouds, look)
+        scene.show(clouds, look, caption=layout.caption(inspector, clouds))
         scene.look_from(view, look)
         scene.save(path)

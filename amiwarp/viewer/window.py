@@ -1,0 +1,648 @@
+"""Window of the inspector: both event clouds, sliders, sharpness curves and orbit, drawn with PyVista."""
+
+import contextlib
+import itertools
+import math
+import textwrap
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.calib import Calibration
+from amiwarp.choices import Axis, View
+from amiwarp.errors import AmiwarpError
+from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
+from amiwarp.io.files import interrupts_later
+from amiwarp.optics.models import MODELS
+from amiwarp.viewer import jobs, layout
+from amiwarp.viewer.drawing import (
+    BACKGROUND_AND_INK,
+    ORBIT_COLOUR,
+    OWN_RENDERERS,
+    Look,
+    Scene,
+    font,
+    orbit_lines,
+    text_actor,
+)
+from amiwarp.viewer.inspector import SLIDING, DisplayedWindow, Inspector, Knobs, colours_on_offer
+
+SIZE = (1500, 950)
+"""Width and height of the window at the start [px]."""
+CORNER = (0.2, 0.25)
+"""Width of the column of sliders and height of the row of charts, in shares of the window's size."""
+SMOOTH_S = 0.05
+"""Longest time for drawing while something moves [s]. Slower renderers then draw every second (third, ...) point."""
+LEAST_POINTS = 30_000
+"""Number of points that are drawn in any case."""
+REST_S = 0.3
+"""Time without a change after which all points are drawn, and the sharpness curves computed [s]."""
+IDLE_S, FOLLOW_S = 0.005, 0.25
+"""Interval between two looks for input, and between two pictures of a live stream [s]."""
+COLUMN_LETTERS = 34
+"""Length of the lines of text above the sliders [characters]."""
+HELP_PLACE = (0.35, 0.48, 0.72, 0.97)
+"""Left, bottom, right and top of the help, in shares of the window's size."""
+VTK_FONT_FILE = 4
+"""Number by which VTK knows that a text has a font of a file."""
+HELP_PAPER = {False: "#f0f0ea", True: "#24282e"}
+"""Background of the help, for light (False) and dark (True) mode."""
+MARKS = ((ORBIT_COLOUR, 5.0, "truth"), (ON_COLOUR, 2.0, "now"))
+"""Colour, width and name of the lines that mark values on a sharpness curve."""
+ORBIT_CURVES = ((ON_COLOUR, 2.0, "in x"), (OFF_COLOUR, 2.0, "in y"))
+"""Colour, width and name of the curves of a scene point's displacement."""
+KEY_NAMES = {"?": "h or ?", "ArrowRight": "→", "ArrowLeft": "←", " ": "space", "Up": "↑", "Down": "↓"}
+"""How the help writes keys, where it does not use their names."""
+SPEED = 0.1
+"""Speed of playing, relative to real time."""
+FINE = ("start_ms", "length_ms")
+"""Sliders of the time window."""
+X_KEYS = {
+    "Right": "ArrowRight", "Left": "ArrowLeft", "space": " ", "question": "?", "h": "?", "plus": "+", "equal": "+",
+    "minus": "-",
+}  # fmt: skip
+"""Keys by their names in VTK, where these differ."""
+MORE_KEYS = (
+    ("Up", ("nudge", 1), "the parameter moved last: up by a step"),
+    ("Down", ("nudge", -1), "the parameter moved last: down by a step"),
+    ("Tab", ("choose_next",), "choose the next parameter for these keys and the curve"),
+    ("m", ("next_model",), "next optical model"),
+    ("k", ("next_colour",), "next quantity shown by colour"),
+    ("n", ("next_polarity",), "ON, OFF or both"),
+    ("v", ("take_truth",), "take the known true parameters of a simulation"),
+    ("+", ("resize_points", 1.0), "larger points"),
+    ("-", ("resize_points", -1.0), "smaller points"),
+    ("q", ("close",), "close the window"),
+)
+"""Keys that only the window has, as :data:`amiwarp.viewer.layout.KEYS`."""
+
+
+class Window:
+    """Window that shows an inspector. :meth:`run` follows the user until the window is closed.
+
+    Input only notes what must be done (:meth:`request`); :meth:`update` does it, so that many moves of a slider during
+    one picture cost one.
+    """
+
+    def __init__(
+        self, inspector: Inspector, *, look: Look | None = None, view: View = View.FREE, size: tuple[int, int] = SIZE,
+        off_screen: bool = False,
+    ) -> None:  # fmt: skip
+        """Open the window. ``off_screen``: draw without a display, for tests.
+
+        Raises :class:`AmiwarpError` if there is no display, or no events in the inspector's window.
+        """
+        self.scene = Scene(size, corner=CORNER, more=3, off_screen=off_screen)
+        self.inspector, self.view = inspector, view
+        compensates = math.isfinite(inspector.turn_us)
+        self.look = look or Look(axis=Axis.ANGLE if compensates else Axis.TIME)
+        self.shown: DisplayedWindow
+        """What the window shows."""
+        self.b: Knobs | None = None
+        """Parameters that were kept as B, which the left cloud shows; None for the recorded events."""
+        self.found: Calibration | None = None
+        """Result of a calibration that is not accepted yet."""
+        self.help_shown = self.plays = self.loop = self.closed = False
+        self.knob, self.message = "apex", ""
+        self.sliders: dict[str, Any] = {}
+        """Slider widgets by the name of their value."""
+        self.plotter = self.scene.plotter
+        self._controls, self._charts, self._help = list(self.plotter.renderers)[OWN_RENDERERS:]
+        self._wanted: set[str] = set()
+        self._change, self._progress = "", False
+        self._built: tuple[Any, ...] = ()
+        self._dirty, self._changed_s, self._played_s = True, 0.0, 0.0
+        self._coarse = 1
+        self._curves: Iterator[None] = iter(())
+        self._history: layout.History | None = None
+        self._plots: dict[str, tuple[Any, list[Any]]] = {}
+        self.curves: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
+        """Values and sharpness of the curves by parameter, in the units of the sliders."""
+        self._texts = [text_actor("", "black", (0.05, top)) for top in (0.985, 0.97)]
+        self._listen()
+        self._start()
+
+    def close(self) -> None:
+        """Close the window after the current picture."""
+        self.closed = True
+
+    def run(self) -> None:
+        """Follow the user until the window is closed or the command is interrupted."""
+        with contextlib.suppress(KeyboardInterrupt), contextlib.closing(self.scene):
+            while not (self.closed or self.plotter.iren.interactor.GetDone()):
+                with interrupts_later():  # VTK ends the process if an exception leaves one of its callbacks
+                    if not self.turn():
+                        time.sleep(IDLE_S)
+
+    def turn(self) -> bool:
+        """Handle the input so far, and draw if something has changed; return whether there was something to do."""
+        interactor = self.plotter.iren.interactor
+        interactor.EnableRenderOff()  # VTK would draw after each of many mouse moves
+        interactor.ProcessEvents()
+        interactor.EnableRenderOn()
+        now = time.perf_counter()
+        self._play(now)
+        if self._wanted or self._dirty:
+            self._changed_s = now
+            self._draw_at(self._coarse)
+            return True
+        if now - self._changed_s < REST_S:
+            return False
+        if self.scene.stride > 1:
+            self._draw_at(1)
+            return True
+        return next(self._curves, self) is not self
+
+    def update(self) -> None:
+        """Compute what was requested, and give it to VTK."""
+        wanted, self._wanted = self._wanted, set()
+        inspector = self.inspector
+        try:
+            if wanted & {"window", "suggestion"}:
+                inspector.open(*self._window_wanted(), inspector.selection)
+            if "suggestion" in wanted:
+                jobs.estimate_phase(inspector)
+                region = inspector.suggest_region().region
+                inspector.open(*self._window_wanted(), replace(inspector.selection, region=region))
+            self.shown = inspector.show(against=self.b)
+            self.message = "" if wanted - {"look"} else self.message
+        except AmiwarpError as error:
+            if not hasattr(self, "shown"):
+                raise
+            self.message = str(error)
+        self._window = inspector.window or inspector.first_window()
+        self._build()
+        self._show()
+        if not self.plays:
+            self._remember()
+
+    def request(self, *what: str, change: str = "") -> None:
+        """Request an update: "window", "suggestion", "knobs" or "look". Successive changes of one name are one step."""
+        self._wanted.update(what)
+        self._change = change
+        if set(what) & {"window", "knobs", "suggestion"}:
+            self._curves = self._curve_steps()
+
+    # Input: sliders and keys
+
+    def key(self, name: str) -> None:
+        """Run the action of a key, by its name in VTK."""
+        name = X_KEYS.get(name, name)
+        for known, (method, *given), _ in (*layout.KEYS, *MORE_KEYS):
+            if name == known and hasattr(self, method):
+                getattr(self, method)(*given)
+                return
+
+    def slide(self, name: str, value: float) -> None:
+        """Set a value, in the unit of its slider."""
+        if name in FINE:
+            start_us, length_us = self._window
+            whole_us = self._whole_us
+            if name == "start_ms":
+                start_us = self.inspector.recording.events.t_first + round(value * 1e3)
+            else:
+                length_us = max(1, round(value * 1e3))
+            self._move(start_us, min(length_us, whole_us), change=name)
+            return
+        self.knob = name
+        knobs = self.inspector.knobs.with_values({name: value * layout.UNITS[name]})
+        if knobs != self.inspector.knobs:
+            self.inspector.set(knobs)
+            self.request("knobs", change=name)
+
+    def _slid(self, name: str, value: float) -> None:
+        if name in self.sliders:  # PyVista also calls this while it makes a slider
+            self.slide(name, value)
+
+    def nudge(self, steps: int) -> None:
+        """Move the chosen parameter by steps of its slider."""
+        _, _, (_, _, step), _ = layout.SLIDERS[self.knob]
+        self.slide(self.knob, layout.knob_values(self.inspector)[self.knob] + steps * float(step))
+
+    def choose_next(self) -> None:
+        """Choose the next parameter for the keys and the sharpness curve."""
+        names = [name for name in self.sliders if name not in FINE]
+        self.knob = names[(names.index(self.knob) + 1) % len(names)] if self.knob in names else names[0]
+        self._curves = self._curve_steps()
+        self.request("look")
+
+    def next_model(self) -> None:
+        """Show the next optical model."""
+        names = list(MODELS)
+        knobs = self.inspector.knobs
+        self.inspector.set(replace(knobs, model=names[(names.index(knobs.model) + 1) % len(names)]))
+        self.request("knobs")
+
+    def next_colour(self) -> None:
+        """Show the next quantity by colour."""
+        offered = colours_on_offer(self.inspector.recording.truth)
+        self._restyle(colour=offered[(offered.index(self.look.colour) + 1) % len(offered)])
+
+    def next_polarity(self) -> None:
+        """Show only ON events, only OFF events, or both."""
+        following = {None: 1, 1: 0, 0: None}
+        self._select(polarity=following[self.inspector.selection.polarity])
+
+    def resize_points(self, px: float) -> None:
+        """Make the points larger."""
+        self._restyle(point_size=min(max(self.look.point_size + px, 1.0), 20.0))
+
+    def toggle(self, name: str) -> None:
+        """Invert "overlaid", "dark", "loop" or "help_shown"."""
+        if name == "help_shown":
+            self.help_shown = not self.help_shown
+            self.request("look")
+        elif name == "loop":
+            self.loop = not self.loop
+        elif name in ("overlaid", "dark"):
+            self._restyle(**{name: not getattr(self.look, name)})
+
+    def toggle_axis(self) -> None:
+        """Switch the third axis between angle and time."""
+        self._restyle(axis=Axis.TIME if self.look.axis is Axis.ANGLE else Axis.ANGLE)
+
+    def look_from(self, view: str) -> None:
+        """Set the direction from which the clouds are seen, and fit them into the window."""
+        self.view = View(view)
+        self.scene.look_from(self.view, self._look)
+        self.request("look")
+
+    def suggest(self) -> None:
+        """Show the region in which compensation gains most sharpness."""
+        self.request("suggestion")
+
+    def whole(self) -> None:
+        """Show the whole image."""
+        self._select(region=None)
+
+    def take_truth(self) -> None:
+        """Set the parameters to the known truth of a simulation."""
+        with self._errors_shown():
+            self.inspector.take_truth()
+            self.request("knobs")
+
+    def keep_b(self) -> None:
+        """Keep the parameters as B, and show them on the left; a second time, show the recorded events again."""
+        self.b = None if self.b == self.inspector.knobs else self.inspector.knobs
+        self.request("knobs")
+
+    def step(self, count: int) -> None:
+        """Move the time window by turns; without a prism, by its length."""
+        start_us, length_us = self._window
+        turn = round(self.inspector.turn_us) if self.compensates else length_us
+        self._move(start_us + count * turn, length_us)
+
+    def play(self) -> None:
+        """Play the recording from the current window, or follow a live stream; stop if already playing."""
+        self.plays, self._played_s = not self.plays, time.perf_counter()
+
+    def undo(self) -> None:
+        """Go back by one step."""
+        self._travel(layout.History.undo)
+
+    def redo(self) -> None:
+        """Go forward by one step that was undone."""
+        self._travel(layout.History.redo)
+
+    def reset(self) -> None:
+        """Show the first state again."""
+        self._travel(layout.History.reset)
+
+    def calibrate(self) -> None:
+        """Calibrate on the shown events, or cancel the running calibration. The window goes on meanwhile."""
+        if self._progress:
+            self._progress = False
+            return
+        self._progress = True
+        with self._errors_shown():
+            try:
+                found = jobs.find_calibration(self.inspector, progress=self._show_progress)
+                self.found, self.message = found.calibration, f"{layout.found_text(found)}. Press a to accept"
+            except jobs.JobCancelled:
+                self.message = "calibration cancelled"
+        self._progress = False
+        self.request("look")
+
+    def accept(self) -> None:
+        """Set the parameters to the result of the calibration."""
+        if self.found is not None:
+            with self._errors_shown():
+                self.inspector.accept(self.found)
+            self.found = None
+            self.request("knobs")
+
+    def export(self, what: str) -> None:
+        """Save the calibration, or a picture of the window, under a new name in the current folder."""
+        name = Path(jobs.download_name(self.inspector.recording.name, what))
+        names = (name.with_stem(f"{name.stem}-{k}") if k else name for k in itertools.count())
+        path = next(each for each in names if not each.exists())
+        with self._errors_shown():
+            if what == "picture":
+                self.scene.save(path)
+            else:
+                self.inspector.as_calibration().save(path)
+            self.message = f"saved {path}"
+        self.request("look")
+
+    # State
+
+    @property
+    def compensates(self) -> bool:
+        """Whether the prism rotates, so that there is a motion to compensate."""
+        return math.isfinite(self.inspector.turn_us)
+
+    @property
+    def _look(self) -> Look:
+        against = "recorded" if self.b is None else "B"
+        return self.look.for_clouds(layout.cloud_titles(against, compensates=self.compensates))
+
+    @property
+    def _whole_us(self) -> int:
+        source = self.inspector.recording.events
+        return int(source.t_last - source.t_first + 1)
+
+    @contextlib.contextmanager
+    def _errors_shown(self) -> Iterator[None]:
+        try:
+            yield
+        except (AmiwarpError, OSError) as error:
+            self.message = str(error)
+            self.request("look")
+
+    def _restyle(self, **changes: Any) -> None:
+        self.look = replace(self.look, **changes)
+        self.request("look")
+
+    def _select(self, **changes: Any) -> None:
+        self.inspector.selection, before = replace(self.inspector.selection, **changes), self.inspector.selection
+        with self._errors_shown():
+            try:
+                self.inspector.open(*self._window, self.inspector.selection)
+            except AmiwarpError:
+                self.inspector.selection = before
+                raise
+        self.request("knobs")
+
+    def _window_wanted(self) -> tuple[int, int]:
+        return self._window
+
+    def _move(self, start_us: int, length_us: int, change: str = "") -> bool:
+        """Move the time window, within the recording. Return whether it is at the end."""
+        first, whole = self.inspector.recording.events.t_first, self._whole_us
+        last = first + whole - length_us
+        self._window = min(max(start_us, first), last), length_us
+        self.request("window", change=change)
+        return start_us >= last
+
+    def _remember(self) -> None:
+        now = replace(
+            layout.current_state(self.inspector), against=self.b, axis=self.look.axis, colour=self.look.colour,
+            view=self.view, overlaid=self.look.overlaid,
+        )  # fmt: skip
+        self._history = self._history or layout.History(now)
+        self._history.add(now, self._change)
+
+    def _travel(self, step: Any) -> None:
+        if self._history is None:
+            return
+        state = step(self._history)
+        with self._errors_shown():
+            layout.apply_state(self.inspector, state)
+        self.b, self.look = state.against, replace(
+            self.look, axis=state.axis, colour=state.colour, overlaid=state.overlaid
+        )  # fmt: skip
+        self.request("knobs")
+        if state.view is not self.view:
+            self.look_from(state.view)
+
+    def _play(self, now: float) -> None:
+        """Move the window by the time since the last call, if the recording is played or a stream is followed."""
+        live = self.inspector.latest is not None
+        if not self.plays or (live and now - self._played_s < FOLLOW_S):
+            return
+        start_us, length_us = self._window
+        if live:
+            with self._errors_shown():
+                self.inspector.renew()
+            start_us = self.inspector.recording.events.t_last
+        else:
+            start_us += round(1e6 * SPEED * (now - self._played_s))
+        if self._move(start_us, length_us) and not live:
+            self.plays = self.loop
+            self._move(self.inspector.recording.events.t_first if self.loop else start_us, length_us)
+        self._played_s = now
+
+    def _show_progress(self, what: str, share: float) -> None:
+        """Show how far a calibration is, and handle the input meanwhile."""
+        if not self._progress:
+            raise jobs.JobCancelled
+        if time.perf_counter() - self._changed_s > jobs.PROGRESS_S:
+            self.message = f"{what}: {100.0 * min(share, 1.0):.0f} % (c cancels)"
+            self.request("look")
+            self.turn()
+
+    # Drawing
+
+    def _listen(self) -> None:
+        """Follow keys and requests to draw, instead of what VTK and PyVista do with them."""
+        iren = self.plotter.iren
+        iren.clear_key_event_callbacks()
+        iren.interactor.AddObserver("KeyPressEvent", lambda caller, _: self.key(caller.GetKeySym()))
+        iren.interactor.AddObserver("RenderEvent", lambda *_: setattr(self, "_dirty", True))
+        iren.style.AddObserver("CharEvent", lambda *_: None)
+        if not self.plotter.off_screen:
+            iren.initialize()
+            self.plotter.render_window.SetWindowName(f"amiwarp: {self.inspector.recording.name}")
+
+    def _start(self) -> None:
+        self._controls.SetViewport(0.0, 0.0, CORNER[0], 1.0)
+        self._charts.SetViewport(CORNER[0], 0.0, 1.0, CORNER[1])
+        self._help.SetViewport(*HELP_PLACE)
+        for renderer, actor in zip((self._controls, self._help), self._texts, strict=True):
+            renderer.add_actor(actor, render=False, pickable=False, reset_camera=False)
+        self.inspector.renew()
+        self._window = self.inspector.window or self.inspector.first_window()
+        self.plays = self.inspector.latest is not None
+        self.request("window", *(["suggestion"] if self.compensates else []))
+        self.update()
+        self.scene.look_from(self.view, self._look)
+        self._draw_at(1)
+
+    def _draw_at(self, stride: int) -> None:
+        """Draw every ``stride``-th point."""
+        changed = self.scene.stride != stride
+        self.scene.stride = stride
+        if self._wanted:
+            self.update()
+        elif changed:
+            self._show()
+        start = time.perf_counter()
+        self.plotter.render_window.Render()
+        self._dirty = False
+        if stride == 1:
+            too_slow = math.ceil((time.perf_counter() - start) / SMOOTH_S)
+            self._coarse = max(1, min(too_slow, len(self.shown.events) // LEAST_POINTS))
+
+    def _show(self) -> None:
+        """Give what is to be shown to VTK."""
+        shown, look = self.shown, self._look
+        lines: tuple[NDArray[Any], ...] = ()
+        if self.compensates:
+            orbit, column = orbit_lines(self.inspector, shown)
+            self._plot_orbit(orbit, column)
+            lines = (orbit if self.b is None else column, column) if look.axis is Axis.ANGLE else ()
+        caption = layout.caption(self.inspector, shown)
+        self.scene.show(shown, look, lines, caption)
+        for name in self.curves:
+            self._plot_curve(name)
+
+    def _build(self) -> None:
+        """Make sliders, charts and texts anew if they have changed, and set the sliders' values."""
+        inspector, dark = self.inspector, self.look.dark
+        names = tuple(self._names())
+        if (names, dark, self.compensates, self.knob) != self._built[:4]:
+            self._built = names, dark, self.compensates, self.knob
+            self._make_sliders(names)
+            self._make_charts()
+            self.scene.place((CORNER[0], CORNER[1] if self.compensates else 0.0), self._look)
+            self._curves = self._curve_steps()
+        values = layout.knob_values(inspector)
+        values |= {"start_ms": (self._window[0] - inspector.recording.events.t_first) * 1e-3,
+                   "length_ms": self._window[1] * 1e-3}  # fmt: skip
+        for name, slider in self.sliders.items():
+            slider.GetRepresentation().SetValue(values[name])
+            slider.GetRepresentation().SetTitleText(self._slider_title(name, values[name]))
+        self._show_texts()
+
+    def _names(self) -> list[str]:
+        """Return the names of the sliders: of the parameters that matter, and of the time window."""
+        knobs, model = self.inspector.knobs, MODELS[self.inspector.knobs.model]
+        time_name = "clock_offset" if self.inspector.has_encoder else "rpm"
+        others = [n for n in SLIDING if n in model.FREE and (n.startswith("tilt") or knobs.value(n))]
+        return ["apex", "phase", time_name, *others, *FINE]
+
+    def _slider_title(self, name: str, value: float) -> str:
+        """Return name, value and unit of a slider, and where the value comes from."""
+        if name in FINE:
+            return f"{'window from' if name == 'start_ms' else 'length'} {value:.3f} ms"
+        label, unit, *_ = layout.SLIDERS[name]
+        return f"{label} {value:.6g}{unit if unit in ('°', '') else f' {unit}'} ({self.inspector.sources[name].value})"
+
+    def _range(self, name: str) -> tuple[float, float]:
+        whole_ms = self._whole_us * 1e-3
+        if name in FINE:
+            return {"start_ms": (0.0, whole_ms), "length_ms": (min(0.1, 0.5 * whole_ms), whole_ms)}[name]
+        low, high, _ = layout.SLIDERS[name][2]
+        if high == "apex_most":
+            high = str(layout.apex_most(self.inspector))
+        return float(low), float(high)
+
+    def _make_sliders(self, names: tuple[str, ...]) -> None:
+        _, ink = BACKGROUND_AND_INK[self.look.dark]
+        self.plotter.clear_slider_widgets()
+        self.plotter.subplot(0, OWN_RENDERERS)
+        self.sliders = {}
+        for k, name in enumerate(names):
+            y = 0.8 - 0.74 * k / max(len(names) - 1, 9)
+            chosen = ORBIT_COLOUR if name == self.knob else ink
+            slider = self.plotter.add_slider_widget(
+                lambda value, name=name: self._slid(name, value), self._range(name), value=sum(self._range(name)) / 2,
+                pointa=(0.05, y), pointb=(0.95, y), color=chosen, title_color=chosen, interaction_event="always",
+                title_height=0.014, tube_width=0.003, slider_width=0.02,
+            )  # fmt: skip
+            slider.GetRepresentation().ShowSliderLabelOff()
+            slider.GetRepresentation().SetEndCapWidth(0.01)
+            title = slider.GetRepresentation().GetTitleProperty()
+            title.SetFontFamily(VTK_FONT_FILE)
+            title.SetFontFile(str(font()))
+            title.BoldOff()
+            title.ShadowOff()
+            self.sliders[name] = slider
+
+    def _make_charts(self) -> None:
+        """Make the charts: sharpness over two parameters, and the displacement of a scene point over one turn."""
+        import pyvista
+
+        paper, ink = BACKGROUND_AND_INK[self.look.dark]
+        for chart, _ in self._plots.values():
+            self._charts.remove_chart(chart)
+        self._charts.SetDraw(self.compensates)
+        self._plots = {}
+        for k, name in enumerate((*self._curve_names(), "orbit")):
+            label, unit, *_ = layout.SLIDERS.get(name, ("prism angle", "°"))
+            chart = pyvista.Chart2D(
+                size=(0.32, 0.96), loc=(0.01 + 0.33 * k, 0.02), x_label=f"{label} [{unit}]" if unit else label,
+                y_label="displacement [px]" if name == "orbit" else "sharpness", grid=False,
+            )  # fmt: skip
+            chart.background_color, chart.border_color = paper, paper
+            for axis in (chart.x_axis, chart.y_axis):
+                axis.pen.color, axis.label_size, axis.tick_label_size = ink, 13, 11
+                axis.GetTitleProperties().SetColor(pyvista.Color(ink).float_rgb)
+                axis.GetLabelProperties().SetColor(pyvista.Color(ink).float_rgb)
+            curves = ORBIT_CURVES if name == "orbit" else ((ink, 2.0, "sharpness"), *MARKS)
+            lines = [chart.line([], [], color=colour, width=width, label=text) for colour, width, text in curves]
+            chart.legend_visible, legend = True, chart.GetLegend()
+            legend.GetBrush().SetColorF(pyvista.Color(paper).float_rgb)
+            legend.GetPen().SetColorF(pyvista.Color(paper).float_rgb)
+            legend.GetLabelProperties().SetColor(pyvista.Color(ink).float_rgb)
+            self._charts.add_chart(chart)
+            self._plots[name] = chart, lines
+
+    def _curve_names(self) -> tuple[str, str]:
+        """Return the parameters of the two sharpness curves: the chosen one, and phase or apex."""
+        return self.knob, "apex" if self.knob == "phase" else "phase"
+
+    def _curve_steps(self) -> Iterator[None]:
+        """Compute the sharpness curves, one value at a time, so that the window can follow the user meanwhile."""
+        for name in self._curve_names() if self.compensates else ():
+            values, meter = self.inspector.curve_values(name), self.inspector.sharpness_meter()
+            found = []
+            for value in values.tolist():
+                found.append(meter(self.inspector.knobs.with_values({name: value})))
+                yield
+            self.curves[name] = values / layout.UNITS[name], np.array(found)
+            self._plot_curve(name)
+            self._dirty = True
+
+    def _plot_curve(self, name: str) -> None:
+        """Plot a sharpness curve with the current value and the known true one."""
+        if name not in self._plots or name not in self.curves:
+            return
+        (chart, lines), (x, y) = self._plots[name], self.curves[name]
+        lines[0].update(x, y)
+        ends = np.array([y.min(), y.max()]) + 0.05 * np.ptp(y) * np.array([-1.0, 1.0])
+        known = layout.truths(self.inspector)[name], layout.knob_values(self.inspector)[name]
+        for line, value in zip(lines[1:], known, strict=True):
+            inside = value is not None and x[0] <= value <= x[-1]
+            line.update([value, value], ends) if inside else line.update([], [])
+        chart.x_range, chart.y_range = (x[0], x[-1]), ends
+
+    def _plot_orbit(self, orbit: NDArray[Any], column: NDArray[Any]) -> None:
+        """Plot how far the prism displaces the scene point of the orbit, over one turn."""
+        chart, lines = self._plots["orbit"]
+        moved = orbit[:, :2] - column[:, :2]
+        for k in range(2):
+            lines[k].update(orbit[:, 2], moved[:, k])
+        chart.x_range, chart.y_range = (0.0, 360.0), (1.1 * moved.min(), 1.1 * moved.max())
+
+    def _show_texts(self) -> None:
+        """Show what is missing, messages, and the help."""
+        paper, ink = BACKGROUND_AND_INK[self.look.dark]
+        shown = (*layout.notes(self.inspector), self.message)
+        texts = [f"model {self.inspector.knobs.model}      h: help", ""]
+        for text in filter(None, shown):
+            texts += textwrap.wrap(text, COLUMN_LETTERS)
+        keys = (*((key, words) for key, (method, *_), words in layout.KEYS if hasattr(self, method)),
+                *((key, words) for key, _, words in MORE_KEYS))  # fmt: skip
+        rows = [f"{KEY_NAMES.get(key, key):>6}   {words}" for key, words in keys]
+        for actor, lines in zip(self._texts, (texts, rows), strict=True):
+            actor.input, actor.prop.color = "\n".join(lines), ink
+        self._help.SetDraw(self.help_shown)
+        for renderer in (self._controls, self._charts):
+            renderer.set_background(paper)
+        self._help.set_background(HELP_PAPER[self.look.dark])

@@ -1,0 +1,289 @@
+"""The inspector's window, drawn off screen: sliders, keys, curves, and that it shows the inspector's values."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from amiwarp import AmiwarpError, Camera, Events, MemoryEvents, Prism, Recording, simulate
+from amiwarp.choices import Axis, Colour, View
+from amiwarp.optics.models import MODELS
+from amiwarp.viewer import layout
+from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.window import MORE_KEYS, Window
+
+SIZE = (900, 600)
+TRUE = Prism(math.radians(1.0))
+
+
+@pytest.fixture(scope="module")
+def recording(texture: np.ndarray) -> Recording:
+    camera = Camera.from_fov(120, 90, math.radians(50))
+    return simulate(texture, camera, TRUE, duration_s=0.25, seed=1, nominal_prism=Prism(math.radians(1.2)))
+
+
+@pytest.fixture
+def window(recording: Recording) -> Iterator[Window]:
+    made = Window(Inspector(recording), size=SIZE, off_screen=True)
+    yield made
+    made.scene.close()
+
+
+def points(window: Window, k: int) -> np.ndarray:
+    """Return the points of a cloud as VTK has them, at x, y [px] and on the third axis."""
+    box, xyz = window.scene.box, np.asarray(window.scene._clouds[k].mapper.dataset.points, float)
+    return np.stack([xyz[:, 0], -xyz[:, 1], xyz[:, 2] / box.stretch + box.low], axis=1)
+
+
+def check(window: Window) -> None:
+    """Both clouds are where the inspector says."""
+    shown, third = window.inspector.show(), np.degrees(window.shown.theta)
+    for k, xy in enumerate((shown.before, shown.after)):
+        np.testing.assert_allclose(points(window, k), np.column_stack([xy, third]), atol=2e-3)
+
+
+def drag(window: Window, name: str, value: float) -> None:
+    """Move a slider as the mouse does, and draw."""
+    slider = window.sliders[name]
+    slider.GetRepresentation().SetValue(value)
+    slider.InvokeEvent("InteractionEvent")
+    assert window.turn()
+
+
+def test_the_window_starts_as_the_page_does(window: Window, recording: Recording) -> None:
+    """It shows the suggested region, with an estimated phase, one turn in the middle."""
+    assert "phase estimated" in window._texts[0].input
+    assert window.inspector.selection.region is not None
+    assert window.inspector.window == Inspector(recording).first_window()
+    assert set(window.sliders) == {"apex", "phase", "clock_offset", "tilt_x", "tilt_y", "start_ms", "length_ms"}
+    check(window)
+    assert f"{window.shown.selected:,} selected" in window.scene._caption.input
+
+
+@pytest.mark.parametrize(("name", "value"), [("apex", 0.7), ("phase", -30.0), ("clock_offset", 900.0), ("tilt_y", 5.0)])
+def test_a_slider_moves_the_compensated_cloud(window: Window, name: str, value: float) -> None:
+    before, after = points(window, 0), points(window, 1)
+    mesh = window.scene._meshes[1]
+    drag(window, name, value)
+    assert window.inspector.knobs.value(name) == pytest.approx(value * layout.UNITS[name], abs=1e-6)
+    assert window.scene._meshes[1] is mesh  # the points are moved where they are
+    check(window)
+    assert np.abs(points(window, 1)[:, :2] - after[:, :2]).max() > 0.05
+    np.testing.assert_array_equal(points(window, 0)[:, :2], before[:, :2])
+    assert f"{value:g}" in window.sliders[name].GetRepresentation().GetTitleText()
+    assert window.knob == name
+
+
+def test_sliders_set_the_time_window(window: Window, recording: Recording) -> None:
+    drag(window, "length_ms", 20.0)
+    drag(window, "start_ms", 50.0)
+    assert window.inspector.window == (recording.events.t_first + 50_000, 20_000)
+    check(window)
+    t = window.shown.events.t
+    assert t.min() >= recording.events.t_first + 50_000
+    assert t.max() < recording.events.t_first + 70_000
+
+
+def test_many_moves_of_a_slider_cost_one_picture(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    shows: list[float] = []
+    show = window.inspector.show
+    monkeypatch.setattr(window.inspector, "show", lambda **given: shows.append(0.0) or show(**given))
+    for value in (0.5, 0.6, 0.7):
+        window.sliders["apex"].GetRepresentation().SetValue(value)
+        window.sliders["apex"].InvokeEvent("InteractionEvent")
+    window.turn()
+    assert len(shows) == 1
+    assert window.inspector.knobs.apex == pytest.approx(math.radians(0.7), abs=1e-6)
+
+
+def test_a_slow_renderer_draws_fewer_points_until_nothing_moves(
+    window: Window, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    everything = len(points(window, 1))
+    window._coarse = 7
+    drag(window, "apex", 0.8)
+    assert len(points(window, 1)) == -(-everything // 7)
+    monkeypatch.setattr("amiwarp.viewer.window.REST_S", 0.0)
+    assert window.turn()
+    check(window)
+
+
+def test_the_curves_have_their_top_at_the_true_parameters(window: Window, recording: Recording) -> None:
+    window.take_truth()
+    window.update()
+    steps = sum(1 for _ in window._curves)
+    assert steps == sum(len(window.curves[name][0]) for name in ("apex", "phase"))
+    for name, tolerance in (("apex", 0.1), ("phase", 8.0)):
+        values, sharpness = window.curves[name]
+        expected = window.inspector.curve(name)
+        np.testing.assert_allclose(values * layout.UNITS[name], expected[0])
+        np.testing.assert_allclose(sharpness, expected[1])
+        assert values[np.argmax(sharpness)] == pytest.approx(layout.knob_values(window.inspector)[name], abs=tolerance)
+        _, (line, truth, now) = window._plots[name]
+        np.testing.assert_allclose(line.y, sharpness)
+        assert truth.x[0] == now.x[0] == layout.truths(window.inspector)[name]
+    _, (x, y) = window._plots["orbit"]
+    radius = np.hypot(x.y, y.y)
+    camera = recording.camera
+    assert camera is not None
+    assert radius.mean() == pytest.approx(camera.fx * math.tan(TRUE.deflection), rel=0.1)
+
+
+def test_keys_do_what_the_help_says(window: Window) -> None:
+    window.key("h")
+    window.turn()
+    assert window._help.GetDraw()
+    text = window._texts[1].input
+    assert all(words in text for _, _, words in MORE_KEYS)
+    assert "redo" in text
+    window.key("question")
+    window.turn()
+    assert not window._help.GetDraw()
+
+    pictures = [window.scene.picture()]
+    for key in ("d", "k", "2", "o", "t", "plus", "n", "m", "w"):
+        window.key(key)
+        assert window.turn(), key
+        pictures.append(window.scene.picture())
+        assert (pictures[-1] != pictures[-2]).any(), key
+    assert window.look.dark
+    assert window.look.overlaid
+    assert (window.look.colour, window.look.axis, window.view) == (Colour.ANGLE, Axis.TIME, View.XY)
+    assert window.look.point_size == 3.0
+    assert window.inspector.knobs.model == list(MODELS)[(list(MODELS).index("exact") + 1) % len(MODELS)]
+    assert (window.shown.events.p == 1).all()
+    assert window.shown.region == (0, 0, 120, 90)
+
+
+def test_steps_nudges_and_undo(window: Window) -> None:
+    drag(window, "length_ms", 20.0)
+    start = window.inspector.window
+    assert start is not None
+    window.key("Right")
+    window.turn()
+    assert window.inspector.window == (pytest.approx(start[0] + window.inspector.turn_us, abs=50.0), start[1])
+    window.key("Tab")
+    window.turn()
+    assert window.knob == "phase"
+    phase = layout.knob_values(window.inspector)["phase"]
+    window.key("Up")
+    window.turn()
+    assert layout.knob_values(window.inspector)["phase"] == pytest.approx(phase + 0.25, abs=1e-3)
+    for _ in range(2):
+        window.key("z")
+        window.turn()
+    assert layout.knob_values(window.inspector)["phase"] == pytest.approx(phase)
+    assert window.inspector.window == start
+    window.key("q")
+    assert window.closed
+
+
+def test_b_is_compared_with(window: Window) -> None:
+    window.key("b")
+    drag(window, "apex", 0.4)
+    assert window._look.titles == ("compensated with B", "compensated with A")
+    assert window.b is not None
+    shown = window.inspector.show(against=window.b)
+    np.testing.assert_allclose(points(window, 0)[:, :2], shown.before, atol=2e-3)
+    assert np.abs(shown.before - shown.after).max() > 1.0
+
+
+def test_a_time_without_events_is_said_and_the_picture_stays(window: Window, recording: Recording) -> None:
+    shown = window.shown
+    events = recording.events.slice(0, len(recording.events))
+    gap = Events.concatenate([events[:1], events[-9_000:]])
+    window.inspector.recording = replace(window.inspector.recording, events=MemoryEvents(gap, *recording.events.size))
+    drag(window, "start_ms", 20.0)
+    assert "take another window" in " ".join(window._texts[0].input.split())
+    assert window.shown is shown
+
+
+def test_playing_moves_the_window_to_the_end(window: Window, recording: Recording) -> None:
+    start = window.inspector.window
+    assert start is not None
+    window.key("space")
+    window._played_s -= 0.1  # 10 ms of the recording
+    window.turn()
+    assert window.inspector.window is not None
+    assert window.inspector.window[0] >= start[0] + 10_000
+    window._played_s -= 100.0
+    window.turn()
+    assert not window.plays
+    assert sum(window.inspector.window) == recording.events.t_last + 1
+
+
+def test_a_file_without_a_prism_has_one_large_cloud(recording: Recording) -> None:
+    plain = replace(recording, encoder=None, truth=None)
+    window = Window(Inspector(plain), size=SIZE, off_screen=True)
+    assert window._look.titles == (layout.RECORDED,)
+    assert window.look.axis is Axis.TIME
+    assert not window._charts.GetDraw()
+    assert "no encoder" in window._texts[0].input
+    assert window.plotter.renderers[0].GetViewport()[2] == 1.0
+    drag(window, "rpm", 720.0)  # now there is a motion to compensate
+    assert window._charts.GetDraw()
+    assert len(window._look.titles) == 2
+    window.scene.close()
+
+
+def test_the_calibration_and_a_picture_are_saved_under_new_names(
+    window: Window, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for key in ("s", "p", "p"):
+        window.key(key)
+        window.turn()
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert len(names) == 3
+    assert [name.rpartition(".")[2] for name in names] == ["json", "png", "png"]
+    assert "saved" in window._texts[0].input
+
+
+def test_calibrate_shows_its_progress_and_is_accepted(window: Window) -> None:
+    window.whole()
+    window.turn()
+    window.key("c")
+    window.turn()
+    assert window.found is not None
+    assert "Press a to accept" in " ".join(window._texts[0].input.split())
+    window.key("a")
+    window.turn()
+    assert window.inspector.knobs.apex == pytest.approx(TRUE.apex, rel=0.05)
+    check(window)
+
+
+def test_a_calibration_is_cancelled_by_the_same_key(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    def find_calibration(_inspector: Inspector, *, progress: object) -> None:
+        window.key("c")
+        assert callable(progress)
+        progress("fitting", 0.5)
+
+    monkeypatch.setattr("amiwarp.viewer.jobs.find_calibration", find_calibration)
+    window.key("c")
+    window.turn()
+    assert "calibration cancelled" in window._texts[0].input
+    assert window.found is None
+
+
+def test_a_live_stream_is_followed(recording: Recording) -> None:
+    half = recording.events.slice(0, len(recording.events) // 2)
+    early = replace(recording, events=MemoryEvents(half, *recording.events.size))
+    streams = [recording, early, early]
+    window = Window(Inspector(early, latest=lambda: streams.pop() if len(streams) > 1 else recording), size=SIZE,
+                    off_screen=True)  # fmt: skip
+    assert window.plays
+    for _ in range(3):
+        window._played_s -= 1.0
+        window.turn()
+    assert sum(window.inspector.window or ()) == recording.events.t_last + 1
+    window.scene.close()
+
+
+def test_an_empty_window_at_the_start_is_an_error(recording: Recording) -> None:
+    inspector = Inspector(recording)
+    inspector.window = recording.events.t_last + 1_000, 1_000
+    with pytest.raises(AmiwarpError, match="take another window"):
+        Window(inspector, size=SIZE, off_screen=True)
