@@ -223,6 +223,8 @@ def test_a_file_without_a_prism_has_one_large_cloud(recording: Recording) -> Non
     assert not window._charts.GetDraw()
     assert "no encoder" in window._texts[0].input
     assert window.plotter.renderers[0].GetViewport()[2] == 1.0
+    middle = window.scene.picture()[200:400, 400:700].astype(int)
+    assert (np.ptp(middle, axis=2) > 100).mean() > 0.1  # its points are there, in colour
     drag(window, "rpm", 720.0)  # now there is a motion to compensate
     assert window._charts.GetDraw()
     assert len(window._look.titles) == 2

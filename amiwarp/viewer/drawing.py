@@ -914,8 +914,9 @@ class Scene:
         """Fill the part of the picture from another lower left corner on, in shares of its size."""
         if corner != self._corner:
             self._corner = corner
-            self._divide(self._strip, overlaid=look.overlaid)
-            self.look_from(self.view, look)
+            self._divide(self._strip, overlaid=self._overlaid)
+            if self._clouds:
+                self.look_from(self.view, look)
 
     def picture(self) -> NDArray[np.uint8]:
         """Return the drawn picture, shape ``(height, width, 3)``."""

@@ -5,7 +5,7 @@ import itertools
 import math
 import textwrap
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, View
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.io.files import interrupts_later
 from amiwarp.optics.models import MODELS
@@ -114,6 +115,7 @@ class Window:
         self.plotter = self.scene.plotter
         self._controls, self._charts, self._help = list(self.plotter.renderers)[OWN_RENDERERS:]
         self._wanted: set[str] = set()
+        self._window = inspector.window or inspector.first_window()  # start and length [us]
         self._change, self._progress = "", False
         self._built: tuple[Any, ...] = ()
         self._dirty, self._changed_s, self._played_s = True, 0.0, 0.0
@@ -123,6 +125,7 @@ class Window:
         self._plots: dict[str, tuple[Any, list[Any]]] = {}
         self.curves: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         """Values and sharpness of the curves by parameter, in the units of the sliders."""
+        self._stream: list[str] = []
         self._texts = [text_actor("", "black", (0.05, top)) for top in (0.985, 0.97)]
         self._listen()
         self._start()
@@ -164,11 +167,11 @@ class Window:
         inspector = self.inspector
         try:
             if wanted & {"window", "suggestion"}:
-                inspector.open(*self._window_wanted(), inspector.selection)
+                inspector.open(*self._window)
             if "suggestion" in wanted:
                 jobs.estimate_phase(inspector)
                 region = inspector.suggest_region().region
-                inspector.open(*self._window_wanted(), replace(inspector.selection, region=region))
+                inspector.open(*self._window, replace(inspector.selection, region=region))
             self.shown = inspector.show(against=self.b)
             self.message = "" if wanted - {"look"} else self.message
         except AmiwarpError as error:
@@ -379,17 +382,10 @@ class Window:
         self.request("look")
 
     def _select(self, **changes: Any) -> None:
-        self.inspector.selection, before = replace(self.inspector.selection, **changes), self.inspector.selection
+        inspector = self.inspector
         with self._errors_shown():
-            try:
-                self.inspector.open(*self._window, self.inspector.selection)
-            except AmiwarpError:
-                self.inspector.selection = before
-                raise
-        self.request("knobs")
-
-    def _window_wanted(self) -> tuple[int, int]:
-        return self._window
+            inspector.open(*self._window, replace(inspector.selection, **changes))
+            self.request("knobs")
 
     def _move(self, start_us: int, length_us: int, change: str = "") -> bool:
         """Move the time window, within the recording. Return whether it is at the end."""
@@ -421,25 +417,33 @@ class Window:
             self.look_from(state.view)
 
     def _play(self, now: float) -> None:
-        """Move the window by the time since the last call, if the recording is played or a stream is followed."""
-        live = self.inspector.latest is not None
-        if not self.plays or (live and now - self._played_s < FOLLOW_S):
+        """Move the window by the time since the last call, if the recording is played; or follow a live stream."""
+        if self.inspector.latest is not None:
+            self._follow(self.inspector.latest, now)
+        elif self.plays:
+            (start_us, length_us), elapsed_s = self._window, now - self._played_s
+            self._played_s = now
+            if self._move(start_us + round(1e6 * SPEED * elapsed_s), length_us):
+                self.plays = self.loop
+                self._move(self.inspector.recording.events.t_first if self.loop else start_us, length_us)
+
+    def _follow(self, latest: Callable[[], Recording], now: float) -> None:
+        """Show the figures of a live stream, and its last events if it is followed."""
+        if now - self._played_s < FOLLOW_S:
             return
-        start_us, length_us = self._window
-        if live:
+        self._played_s = now
+        if isinstance(latest, jobs.LiveSource):
+            state = layout.live_state(latest.figures())
+            self._stream = [state["stream_note"], *(f"{name}: {text}" for name, text, _ in state["live_rows"])]
+        if self.plays:
             with self._errors_shown():
                 self.inspector.renew()
-            start_us = self.inspector.recording.events.t_last
-        else:
-            start_us += round(1e6 * SPEED * (now - self._played_s))
-        if self._move(start_us, length_us) and not live:
-            self.plays = self.loop
-            self._move(self.inspector.recording.events.t_first if self.loop else start_us, length_us)
-        self._played_s = now
+            self._move(self.inspector.recording.events.t_last, self._window[1])
+        self.request("look")
 
     def _show_progress(self, what: str, share: float) -> None:
         """Show how far a calibration is, and handle the input meanwhile."""
-        if not self._progress:
+        if not self._progress or self.closed or self.plotter.iren.interactor.GetDone():
             raise jobs.JobCancelled
         if time.perf_counter() - self._changed_s > jobs.PROGRESS_S:
             self.message = f"{what}: {100.0 * min(share, 1.0):.0f} % (c cancels)"
@@ -466,7 +470,6 @@ class Window:
         for renderer, actor in zip((self._controls, self._help), self._texts, strict=True):
             renderer.add_actor(actor, render=False, pickable=False, reset_camera=False)
         self.inspector.renew()
-        self._window = self.inspector.window or self.inspector.first_window()
         self.plays = self.inspector.latest is not None
         self.request("window", *(["suggestion"] if self.compensates else []))
         self.update()
@@ -505,6 +508,7 @@ class Window:
         """Make sliders, charts and texts anew if they have changed, and set the sliders' values."""
         inspector, dark = self.inspector, self.look.dark
         names = tuple(self._names())
+        self.knob = self.knob if self.knob in names else "apex"
         if (names, dark, self.compensates, self.knob) != self._built[:4]:
             self._built = names, dark, self.compensates, self.knob
             self._make_sliders(names)
@@ -633,7 +637,7 @@ class Window:
     def _show_texts(self) -> None:
         """Show what is missing, messages, and the help."""
         paper, ink = BACKGROUND_AND_INK[self.look.dark]
-        shown = (*layout.notes(self.inspector), self.message)
+        shown = (self.message, *layout.notes(self.inspector), *self._stream)
         texts = [f"model {self.inspector.knobs.model}      h: help", ""]
         for text in filter(None, shown):
             texts += textwrap.wrap(text, COLUMN_LETTERS)
