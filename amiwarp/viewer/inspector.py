@@ -768,7 +768,7 @@ class Inspector:
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
         self.recording, self.device, self.latest = recording, device, latest
-        self._most_events, self._most_points = most_events or MOST_EVENTS, most_points or MOST_POINTS
+        self._most_events, self._most_points = most_events, most_points
         self.prism = nominal(recording.prism)
         """Nominal prism of the recording, with an assumed apex if it is unknown."""
         self.zero_us = (source.t_first + source.t_last) // 2
@@ -1085,7 +1085,9 @@ class Inspector:
     def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:
         """Read and select the events of a time window. The events of the last one are not read again."""
         if self._span is None or (self._span.start_us, self._span.length_us) != (start_us, length_us):
-            self._span = read_span(self.recording.events, start_us, length_us, most_events=self._most_events)
+            self._span = read_span(
+                self.recording.events, start_us, length_us, most_events=self._most_events or MOST_EVENTS
+            )
         return self._select(self._span, selection)
 
     def select(self, span: Span) -> Events:
@@ -1095,7 +1097,7 @@ class Inspector:
     def _select(self, span: Span, selection: Selection) -> LoadedWindow:
         hot = self.hot if selection.hide_hot else None
         return load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot,
-                           most_points=self._most_points)  # fmt: skip
+                           most_points=self._most_points or MOST_POINTS)  # fmt: skip
 
     def _drift_us(self, knobs: Knobs) -> float:
         """Return how far the clock offset is from that of the recording's own encoder [us]."""

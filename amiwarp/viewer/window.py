@@ -126,7 +126,7 @@ class Window:
         self.curves: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         """Values and sharpness of the curves by parameter, in the units of the sliders."""
         self._stream: list[str] = []
-        self._texts = [text_actor("", "black", (0.05, top)) for top in (0.985, 0.97)]
+        self._texts = [text_actor("", "black", (0.05, top)) for top in (0.985, 0.97, 0.26)]
         self._listen()
         self._start()
 
@@ -421,9 +421,10 @@ class Window:
         if self.inspector.latest is not None:
             self._follow(self.inspector.latest, now)
         elif self.plays:
-            (start_us, length_us), elapsed_s = self._window, now - self._played_s
+            start_us, length_us = self._window
+            start_us += round(1e6 * SPEED * (now - self._played_s))
             self._played_s = now
-            if self._move(start_us + round(1e6 * SPEED * elapsed_s), length_us):
+            if self._move(start_us, length_us):
                 self.plays = self.loop
                 self._move(self.inspector.recording.events.t_first if self.loop else start_us, length_us)
 
@@ -434,12 +435,14 @@ class Window:
         self._played_s = now
         if isinstance(latest, jobs.LiveSource):
             state = layout.live_state(latest.figures())
-            self._stream = [state["stream_note"], *(f"{name}: {text}" for name, text, _ in state["live_rows"])]
+            self._stream = [*(f"{name}: {text}" for name, text, _ in state["live_rows"]), state["stream_note"]]
         if self.plays:
             with self._errors_shown():
                 self.inspector.renew()
             self._move(self.inspector.recording.events.t_last, self._window[1])
-        self.request("look")
+        else:
+            self._show_texts()
+            self.plotter.render_window.Render()
 
     def _show_progress(self, what: str, share: float) -> None:
         """Show how far a calibration is, and handle the input meanwhile."""
@@ -459,21 +462,21 @@ class Window:
         iren.interactor.AddObserver("KeyPressEvent", lambda caller, _: self.key(caller.GetKeySym()))
         iren.interactor.AddObserver("RenderEvent", lambda *_: setattr(self, "_dirty", True))
         iren.style.AddObserver("CharEvent", lambda *_: None)
-        if not self.plotter.off_screen:
-            iren.initialize()
-            self.plotter.render_window.SetWindowName(f"amiwarp: {self.inspector.recording.name}")
 
     def _start(self) -> None:
         self._controls.SetViewport(0.0, 0.0, CORNER[0], 1.0)
         self._charts.SetViewport(CORNER[0], 0.0, 1.0, CORNER[1])
         self._help.SetViewport(*HELP_PLACE)
-        for renderer, actor in zip((self._controls, self._help), self._texts, strict=True):
+        for renderer, actor in zip((self._controls, self._help, self._controls), self._texts, strict=True):
             renderer.add_actor(actor, render=False, pickable=False, reset_camera=False)
         self.inspector.renew()
         self.plays = self.inspector.latest is not None
         self.request("window", *(["suggestion"] if self.compensates else []))
         self.update()
         self.scene.look_from(self.view, self._look)
+        if not self.plotter.off_screen:  # not before there is something to show
+            self.plotter.iren.initialize()
+            self.plotter.render_window.SetWindowName(f"amiwarp: {self.inspector.recording.name}")
         self._draw_at(1)
 
     def _draw_at(self, stride: int) -> None:
@@ -637,14 +640,13 @@ class Window:
     def _show_texts(self) -> None:
         """Show what is missing, messages, and the help."""
         paper, ink = BACKGROUND_AND_INK[self.look.dark]
-        shown = (self.message, *layout.notes(self.inspector), *self._stream)
-        texts = [f"model {self.inspector.knobs.model}      h: help", ""]
-        for text in filter(None, shown):
-            texts += textwrap.wrap(text, COLUMN_LETTERS)
+        notes = [f"model {self.inspector.knobs.model}      h: help", "", self.message, *layout.notes(self.inspector)]
+        notes, stream = ([line for text in texts for line in textwrap.wrap(text, COLUMN_LETTERS)]
+                         for texts in (notes, self._stream))  # fmt: skip
         keys = (*((key, words) for key, (method, *_), words in layout.KEYS if hasattr(self, method)),
                 *((key, words) for key, _, words in MORE_KEYS))  # fmt: skip
         rows = [f"{KEY_NAMES.get(key, key):>6}   {words}" for key, words in keys]
-        for actor, lines in zip(self._texts, (texts, rows), strict=True):
+        for actor, lines in zip(self._texts, (notes, rows, stream), strict=True):
             actor.input, actor.prop.color = "\n".join(lines), ink
         self._help.SetDraw(self.help_shown)
         for renderer in (self._controls, self._charts):
