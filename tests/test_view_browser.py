@@ -28,6 +28,7 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.viewer import jobs
+from amiwarp.viewer.drawing import FOOT_PX, strip_share
 from amiwarp.viewer.inspector import Inspector, Library
 from amiwarp.viewer.jobs import JobCancelled, LiveFigures, LiveSource, estimate_phase
 from amiwarp.viewer.layout import KEYS, SETTABLE
@@ -492,7 +493,10 @@ def test_downloads_leave_no_file_on_the_server(
         """Return the pictures of a film, and the mean difference of the two clouds in the first one."""
         with av.open(str(download(page, "turntable", tmp_path))) as container:
             pictures = np.array([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], np.int16)
-        left, right = np.split(pictures[0], 2, axis=1)
+        width, height = jobs.FILM_SIZE
+        strip = round(width * strip_share(["ON: brighter"], width))  # the legend is on the left, the caption below
+        half = (width - strip) // 2
+        left, right = (pictures[0, : height - FOOT_PX, first : first + half] for first in (strip, strip + half))
         return pictures, float(np.abs(left - right).mean())
 
     pictures, apart = film()

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from amiwarp import AmiwarpError, Camera, Events, MemoryEvents, Prism, Recording
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer import layout
-from amiwarp.viewer.inspector import Inspector
+from amiwarp.viewer.inspector import DisplayedWindow, Inspector
 from amiwarp.viewer.window import MORE_KEYS, Window
 
 SIZE = (900, 600)
@@ -85,6 +86,34 @@ def test_sliders_set_the_time_window(window: Window, recording: Recording) -> No
     t = window.shown.events.t
     assert t.min() >= recording.events.t_first + 50_000
     assert t.max() < recording.events.t_first + 70_000
+
+
+def test_a_slider_stays_the_same_while_it_is_dragged(window: Window) -> None:
+    """Also if it chooses another parameter, or there is a motion to compensate only from then on."""
+    slider = window.sliders["phase"]
+    for value in (10.0, 20.0):
+        drag(window, "phase", value)
+        assert window.sliders["phase"] is slider
+        assert slider.GetEnabled()
+        assert slider.GetRepresentation().GetValue() == pytest.approx(value)
+    assert window.knob == "phase"
+    assert "phase" in window._plots
+
+
+def test_parameters_that_cannot_be_shown_are_refused(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    good, show = window.inspector.knobs, window.inspector.show
+
+    def refusing(**given: Any) -> DisplayedWindow:
+        if window.inspector.knobs.apex > math.radians(2.0):
+            raise AmiwarpError("no such prism")
+        return show(**given)
+
+    monkeypatch.setattr(window.inspector, "show", refusing)
+    drag(window, "apex", 2.2)
+    assert "no such prism" in window._texts[0].input
+    assert window.inspector.knobs == good
+    value = window.sliders["apex"].GetRepresentation().GetValue()
+    assert value == pytest.approx(math.degrees(good.apex), abs=1e-3)
 
 
 def test_many_moves_of_a_slider_cost_one_picture(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -172,12 +172,13 @@ class Window:
                 jobs.estimate_phase(inspector)
                 region = inspector.suggest_region().region
                 inspector.open(*self._window, replace(inspector.selection, region=region))
-            self.shown = inspector.show(against=self.b)
+            self.shown, self._shown_knobs = inspector.show(against=self.b), inspector.knobs
             self.message = "" if wanted - {"look"} else self.message
         except AmiwarpError as error:
             if not hasattr(self, "shown"):
                 raise
             self.message = str(error)
+            inspector.knobs = self._shown_knobs
         self._window = inspector.window or inspector.first_window()
         self._build()
         self._show()
@@ -231,7 +232,6 @@ class Window:
         """Choose the next parameter for the keys and the sharpness curve."""
         names = [name for name in self.sliders if name not in FINE]
         self.knob = names[(names.index(self.knob) + 1) % len(names)] if self.knob in names else names[0]
-        self._curves = self._curve_steps()
         self.request("look")
 
     def next_model(self) -> None:
@@ -508,13 +508,19 @@ class Window:
             self._plot_curve(name)
 
     def _build(self) -> None:
-        """Make sliders, charts and texts anew if they have changed, and set the sliders' values."""
+        """Make sliders, charts and texts anew if they have changed, and set the sliders' values.
+
+        A slider is not made anew while the mouse drags it.
+        """
+        import pyvista
+
         inspector, dark = self.inspector, self.look.dark
         names = tuple(self._names())
         self.knob = self.knob if self.knob in names else "apex"
-        if (names, dark, self.compensates, self.knob) != self._built[:4]:
-            self._built = names, dark, self.compensates, self.knob
+        built, self._built = self._built, (names, dark, self.compensates, self.knob)
+        if built[:1] != self._built[:1]:
             self._make_sliders(names)
+        if built[1:] != self._built[1:]:
             self._make_charts()
             self.scene.place((CORNER[0], CORNER[1] if self.compensates else 0.0), self._look)
             self._curves = self._curve_steps()
@@ -522,8 +528,14 @@ class Window:
         values |= {"start_ms": (self._window[0] - inspector.recording.events.t_first) * 1e-3,
                    "length_ms": self._window[1] * 1e-3}  # fmt: skip
         for name, slider in self.sliders.items():
-            slider.GetRepresentation().SetValue(values[name])
-            slider.GetRepresentation().SetTitleText(self._slider_title(name, values[name]))
+            shape, (low, high) = slider.GetRepresentation(), self._range(name)
+            shape.SetMinimumValue(low)
+            shape.SetMaximumValue(high)
+            shape.SetValue(values[name])
+            shape.SetTitleText(self._slider_title(name, values[name]))
+            ink = ORBIT_COLOUR if name == self.knob else BACKGROUND_AND_INK[dark][1]
+            for part in ("Title", "Slider", "Tube", "Cap"):
+                getattr(shape, f"Get{part}Property")().SetColor(pyvista.Color(ink).float_rgb)
         self._show_texts()
 
     def _names(self) -> list[str]:
@@ -550,17 +562,15 @@ class Window:
         return float(low), float(high)
 
     def _make_sliders(self, names: tuple[str, ...]) -> None:
-        _, ink = BACKGROUND_AND_INK[self.look.dark]
         self.plotter.clear_slider_widgets()
         self.plotter.subplot(0, OWN_RENDERERS)
         self.sliders = {}
         for k, name in enumerate(names):
             y = 0.8 - 0.74 * k / max(len(names) - 1, 9)
-            chosen = ORBIT_COLOUR if name == self.knob else ink
             slider = self.plotter.add_slider_widget(
                 lambda value, name=name: self._slid(name, value), self._range(name), value=sum(self._range(name)) / 2,
-                pointa=(0.05, y), pointb=(0.95, y), color=chosen, title_color=chosen, interaction_event="always",
-                title_height=0.014, tube_width=0.003, slider_width=0.02,
+                pointa=(0.05, y), pointb=(0.95, y), interaction_event="always", title_height=0.014, tube_width=0.003,
+                slider_width=0.02,
             )  # fmt: skip
             slider.GetRepresentation().ShowSliderLabelOff()
             slider.GetRepresentation().SetEndCapWidth(0.01)
