@@ -41,15 +41,19 @@ from amiwarp import (
 from amiwarp.choices import Axis, Colour
 from amiwarp.studies.cluster import machine
 from amiwarp.viewer.drawing import ImageKind, cloud_state, count_images, jpeg, make_images, prepare, scale_state
-from amiwarp.viewer.inspector import Inspector, Selection
+from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector, Selection
+from amiwarp.viewer.window import LEAST_POINTS, Window
 
 WIDTH, HEIGHT = 640, 480
 """Width and height of the sensor [px]."""
 REPEATS = 20
 REGION = (260, 200, 380, 290)
 """Region of the image in which the parameter is changed [px]."""
-TARGETS_MS = {"cpu": {"update": 150.0, "log_intensity": 1000.0}, "cuda": {"update": 40.0, "log_intensity": 100.0}}
-"""Longest times of an update and of a log intensity [ms]."""
+TARGETS_MS = {
+    "cpu": {"update": 150.0, "window": 100.0, "log_intensity": 1000.0},
+    "cuda": {"update": 40.0, "window": 100.0, "log_intensity": 100.0},
+}
+"""Longest times of an update of the page and of the window, and of a log intensity [ms]."""
 MOST_S, MOST_GIB, MOST_RATE_MS = 3.0, 1.0, 50.0
 OPENED = """
 import sys, time
@@ -140,6 +144,30 @@ def update(device: str, region: tuple[int, int, int, int] | None) -> dict[str, A
     return {"events": shown.selected, **found, "error_px": error, "ok": error < 0.01 and found["ms"] <= most}
 
 
+def window(device: str) -> dict[str, Any]:
+    """Measure the time from a moved slider to the points in VTK (1 million events), and the drawing off screen."""
+    inspector = Inspector(recorded(made(1_000_000, 0.2)), device=device, most_points=WINDOW_POINTS)
+    inspector.window = 0, 200_000
+    shown = Window(inspector, off_screen=True)
+    shown.whole()
+
+    def slide(k: int) -> None:
+        shown.slide("apex", 0.6 + 0.03 * k)
+        shown.update()
+
+    found, draw = timed(slide), shown.plotter.render_window.Render
+    expected = compensate_events(shown.shown.events, inspector.model, inspector.encoder)
+    places = np.asarray(shown.scene._clouds[1].mapper.dataset.points)
+    error = float(np.nanmax(np.abs(expected - places[:, :2] * (1.0, -1.0))))
+    out = {"events": len(shown.shown.events), **found, "error_px": error, "drawing": timed(lambda _: draw(), 3)}
+    shown.scene.stride = len(shown.shown.events) // LEAST_POINTS
+    slide(-1)
+    out["drawing_moving"] = timed(lambda _: draw(), 3)
+    shown.scene.close()
+    most = TARGETS_MS["cuda" if "cuda" in device else "cpu"]["window"]
+    return {**out, "ok": error < 0.01 and found["ms"] <= most}
+
+
 def images(device: str) -> dict[str, Any]:
     """Measure each kind of image of a region, and a log intensity of the whole image (simulated texture)."""
     texture = np.kron(np.random.default_rng(0).integers(0, 255, (75, 100), dtype=np.uint8), np.ones((16, 16), np.uint8))
@@ -199,6 +227,7 @@ def main() -> int:
     args = parser.parse_args()
     found: dict[str, Any] = {"machine": machine(args.device), "device": args.device}
     found["update_whole"], found["update_region"] = update(args.device, None), update(args.device, REGION)
+    found["window"] = window(args.device)
     found["images"] = images(args.device)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "long.h5"

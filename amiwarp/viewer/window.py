@@ -53,6 +53,8 @@ VTK_FONT_FILE = 4
 """Number by which VTK knows that a text has a font of a file."""
 HELP_PAPER = {False: "#f0f0ea", True: "#24282e"}
 """Background of the help, for light (False) and dark (True) mode."""
+LEGEND_SHARE = 0.5
+"""Height of the space for the legend above the curves of a chart, as a share of their height."""
 MARKS = ((ORBIT_COLOUR, 5.0, "truth"), (ON_COLOUR, 2.0, "now"))
 """Colour, width and name of the lines that mark values on a sharpness curve."""
 ORBIT_CURVES = ((ON_COLOUR, 2.0, "in x"), (OFF_COLOUR, 2.0, "in y"))
@@ -632,7 +634,7 @@ class Window:
             return
         (chart, lines), (x, y) = self._plots[name], self.curves[name]
         lines[0].update(x, y)
-        ends = np.array([y.min(), y.max()]) + 0.05 * np.ptp(y) * np.array([-1.0, 1.0])
+        ends = np.array([y.min(), y.max()]) + max(np.ptp(y), 1e-6) * np.array([-0.05, LEGEND_SHARE])
         known = layout.truths(self.inspector)[name], layout.knob_values(self.inspector)[name]
         for line, value in zip(lines[1:], known, strict=True):
             inside = value is not None and x[0] <= value <= x[-1]
@@ -645,7 +647,8 @@ class Window:
         moved = orbit[:, :2] - column[:, :2]
         for k in range(2):
             lines[k].update(orbit[:, 2], moved[:, k])
-        chart.x_range, chart.y_range = (0.0, 360.0), (1.1 * moved.min(), 1.1 * moved.max())
+        low, high = moved.min(), max(moved.max(), moved.min() + 1e-3)
+        chart.x_range, chart.y_range = (0.0, 360.0), (1.1 * low, high + LEGEND_SHARE * (high - low))
 
     def _show_texts(self) -> None:
         """Show what is missing, messages, and the help."""
