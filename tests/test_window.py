@@ -13,6 +13,7 @@ from amiwarp import AmiwarpError, Camera, Events, MemoryEvents, Prism, Recording
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer import layout
+from amiwarp.viewer.drawing import orbit_lines
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector
 from amiwarp.viewer.window import MORE_KEYS, Window
 
@@ -159,6 +160,37 @@ def test_the_curves_have_their_top_at_the_true_parameters(window: Window, record
     camera = recording.camera
     assert camera is not None
     assert radius.mean() == pytest.approx(camera.fx * math.tan(TRUE.deflection), rel=0.1)
+
+
+@pytest.mark.parametrize("cloud", [0, 1])
+def test_a_click_describes_the_event_and_shows_its_orbit(window: Window, cloud: int) -> None:
+    from vtkmodules.vtkRenderingCore import vtkCoordinate
+
+    shown, renderer = window.shown, window.plotter.renderers[cloud]
+    place = vtkCoordinate()
+    place.SetCoordinateSystemToWorld()
+    drawn = np.asarray(window.scene._clouds[cloud].mapper.dataset.points)
+    place.SetValue(*drawn[1234])
+    at = place.GetComputedDisplayValue(renderer)
+    interactor = window.plotter.iren.interactor
+    interactor.SetEventPosition(*at)
+    interactor.InvokeEvent("LeftButtonPressEvent")
+    interactor.InvokeEvent("LeftButtonReleaseEvent")
+    window.turn()
+    k = window._picked
+    place.SetValue(*drawn[k])
+    assert math.dist(place.GetComputedDisplayValue(renderer), at) <= 6.0
+    e = shown.events
+    assert f"x {e.x[k]}, y {e.y[k]} px" in " ".join(window._texts[0].input.split())
+    _, (x, _) = window._plots["orbit"]
+    orbit, column = orbit_lines(window.inspector, shown, k)
+    np.testing.assert_allclose(x.y, orbit[:, 0] - column[:, 0], atol=1e-3)
+    np.testing.assert_allclose(column[0, :2], shown.after[k], atol=1e-3)
+    window.pick((int(renderer.GetOrigin()[0]) + 3, int(renderer.GetOrigin()[1]) + 3))
+    window.turn()
+    assert window._picked == -1
+    drag(window, "length_ms", 20.0)
+    assert window._picked == -1
 
 
 def test_keys_do_what_the_help_says(window: Window) -> None:

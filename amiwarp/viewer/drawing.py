@@ -719,6 +719,8 @@ CAMERA_DIRECTIONS = {
 """Direction from the clouds to the camera, and the upward direction, for each view."""
 ORBIT_COLOUR = "#009e73"
 """Colour of the model's orbit, as on the page."""
+PICK_PX = 4.0
+"""Distance from the mouse up to which an event is found [px]."""
 ROUND_PX = 4.0
 """Diameter of the points from which they are round [px]."""
 VIEW_ANGLE = 26.0
@@ -917,6 +919,28 @@ class Scene:
             self._divide(self._strip, overlaid=self._overlaid)
             if self._clouds:
                 self.look_from(self.view, look)
+
+    def event_at(self, place: tuple[int, int], shown: DisplayedWindow, look: Look) -> int:
+        """Return the index of the front event within :data:`PICK_PX` of a place in the picture; -1 if there is none.
+
+        ``place``: pixels from the left and from the bottom.
+        """
+        import pyvista
+
+        for k, renderer in enumerate(self._views):
+            if not (renderer.GetDraw() and renderer.IsInViewport(*place)):
+                continue
+            xy = shown.after if k == 1 or self._overlaid else shown.before
+            aspect = renderer.GetTiledAspectRatio()
+            matrix = pyvista.array_from_vtkmatrix(renderer.camera.GetCompositeProjectionTransformMatrix(aspect, 0, 1))
+            x, y, depth, w = matrix[:, :3] @ self.box.positions(xy, third_axis(shown, look.axis)).T + matrix[:, 3:]
+            (left, low), (width, height) = renderer.GetOrigin(), renderer.GetSize()
+            away = np.hypot(
+                left + (x / w + 1.0) * width / 2.0 - place[0], low + (y / w + 1.0) * height / 2.0 - place[1]
+            )
+            near = np.flatnonzero((away <= PICK_PX) & (w > 0.0))
+            return int(near[np.argmin(depth[near] / w[near])]) if len(near) else -1
+        return -1
 
     def picture(self) -> NDArray[np.uint8]:
         """Return the drawn picture, shape ``(height, width, 3)``."""

@@ -27,6 +27,7 @@ from amiwarp.viewer.drawing import (
     OWN_RENDERERS,
     Look,
     Scene,
+    event_text,
     font,
     orbit_lines,
     text_actor,
@@ -41,6 +42,8 @@ SMOOTH_S = 0.05
 """Longest time for drawing while something moves [s]. Slower renderers then draw every second (third, ...) point."""
 LEAST_POINTS = 30_000
 """Number of points that are drawn in any case."""
+CLICK_PX = 3.0
+"""Distance up to which the mouse may move between press and release for a click [px]."""
 REST_S = 0.3
 """Time without a change after which all points are drawn, and the sharpness curves computed [s]."""
 IDLE_S, FOLLOW_S = 0.005, 0.25
@@ -119,6 +122,7 @@ class Window:
         self._wanted: set[str] = set()
         self._window = inspector.window or inspector.first_window()  # start and length [us]
         self._change, self._progress = "", False
+        self._picked, self._pressed = -1, (0, 0)
         self._built: tuple[Any, ...] = ()
         self._dirty, self._changed_s, self._played_s = True, 0.0, 0.0
         self._coarse = 1
@@ -174,7 +178,9 @@ class Window:
                 jobs.estimate_phase(inspector)
                 region = inspector.suggest_region().region
                 inspector.open(*self._window, replace(inspector.selection, region=region))
+            before = getattr(self, "shown", None)
             self.shown, self._shown_knobs = inspector.show(against=self.b), inspector.knobs
+            self._picked = self._picked if before is not None and before.events is self.shown.events else -1
             self.message = "" if wanted - {"look"} else self.message
         except AmiwarpError as error:
             if not hasattr(self, "shown"):
@@ -275,6 +281,19 @@ class Window:
         """Set the direction from which the clouds are seen, and fit them into the window."""
         self.view = View(view)
         self.scene.look_from(self.view, self._look)
+        self.request("look")
+
+    def _click(self, event: str) -> None:
+        place = self.plotter.iren.interactor.GetEventPosition()
+        if event.startswith("LeftButtonPress"):
+            self._pressed = place
+        elif math.dist(place, self._pressed) <= CLICK_PX:
+            self.pick(place)
+
+    def pick(self, place: tuple[int, int]) -> None:
+        """Describe the event that is drawn at a place, and show its orbit. ``place``: pixels from left and bottom."""
+        self._picked = self.scene.event_at(place, self.shown, self._look)
+        self.message = "" if self._picked < 0 else event_text(self.shown, self._picked)
         self.request("look")
 
     def suggest(self) -> None:
@@ -464,6 +483,8 @@ class Window:
         iren.interactor.AddObserver("KeyPressEvent", lambda caller, _: self.key(caller.GetKeySym()))
         iren.interactor.AddObserver("RenderEvent", lambda *_: setattr(self, "_dirty", True))
         iren.style.AddObserver("CharEvent", lambda *_: None)
+        for event in ("LeftButtonPressEvent", "LeftButtonReleaseEvent"):
+            iren.style.AddObserver(event, lambda _, event: self._click(event))
 
     def _start(self) -> None:
         self._controls.SetViewport(0.0, 0.0, CORNER[0], 1.0)
@@ -501,7 +522,7 @@ class Window:
         shown, look = self.shown, self._look
         lines: tuple[NDArray[Any], ...] = ()
         if self.compensates:
-            orbit, column = orbit_lines(self.inspector, shown)
+            orbit, column = orbit_lines(self.inspector, shown, self._picked)
             self._plot_orbit(orbit, column)
             lines = (orbit if self.b is None else column, column) if look.axis is Axis.ANGLE else ()
         caption = layout.caption(self.inspector, shown)
