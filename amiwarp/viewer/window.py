@@ -42,6 +42,8 @@ SMOOTH_S = 0.05
 """Longest time for drawing while something moves [s]. Slower renderers then draw every second (third, ...) point."""
 LEAST_POINTS = 30_000
 """Number of points that are drawn in any case."""
+DRAWING_SHARE = 0.2
+"""Largest share of the time of a calibration in which the window draws."""
 CLICK_PX = 3.0
 """Distance up to which the mouse may move between press and release for a click [px]."""
 REST_S = 0.3
@@ -122,6 +124,7 @@ class Window:
         self._wanted: set[str] = set()
         self._window = inspector.window or inspector.first_window()  # start and length [us]
         self._change, self._progress = "", False
+        self._progress_due_s = 0.0
         self._picked, self._pressed = -1, (0, 0)
         self._built: tuple[Any, ...] = ()
         self._dirty, self._changed_s, self._played_s = True, 0.0, 0.0
@@ -469,10 +472,12 @@ class Window:
         """Show how far a calibration is, and handle the input meanwhile."""
         if not self._progress or self.closed or self.plotter.iren.interactor.GetDone():
             raise jobs.JobCancelled
-        if time.perf_counter() - self._changed_s > jobs.PROGRESS_S:
+        if (now := time.perf_counter()) >= self._progress_due_s:
             self.message = f"{what}: {100.0 * min(share, 1.0):.0f} % (c cancels)"
             self.request("look")
             self.turn()
+            after = time.perf_counter()
+            self._progress_due_s = after + max(jobs.PROGRESS_S, (after - now) / DRAWING_SHARE)
 
     # Drawing
 
