@@ -681,7 +681,7 @@ def bar_actors(bar: ColourBar, ink: str, height: int) -> list[Any]:
     actor = vtkScalarBarActor()
     actor.SetLookupTable(table)
     actor.SetNumberOfLabels(5)
-    actor.SetLabelFormat("{:.4g}")
+    actor.SetLabelFormat("%.4g")
     actor.UnconstrainedFontSizeOn()
     actor.SetPosition(CORNER[0], BAR_BOTTOM)
     actor.SetWidth(0.5)

@@ -986,15 +986,15 @@ class Inspector:
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return values of a parameter around its current one, in its unit, and the sharpness at each of them."""
-        values, sharpness = self.curve_values(name), self.sharpness_meter(self._curve_imager)
-        changed = [self.knobs.with_values({name: float(value)}) for value in values]
-        return values, np.array([sharpness(knobs) for knobs in changed])
+        values, sharpness = np.array([*self.curve_points(name)], np.float64).reshape(-1, 2).T
+        return values, sharpness
 
-    def curve_values(self, name: str) -> NDArray[np.float64]:
-        """Return the values of a parameter at which :meth:`curve` measures the sharpness, in its unit."""
-        half = CURVE_HALF_WIDTH[name]
-        values = (self.knobs.value(name) or 0.0) + np.linspace(-half, half, CURVE_POINTS)
-        return values[values >= 0.0] if name == "apex" else values
+    def curve_points(self, name: str) -> Iterator[tuple[float, float]]:
+        """Yield the points of :meth:`curve` one after the other."""
+        knobs, half, sharpness = self.knobs, CURVE_HALF_WIDTH[name], self.sharpness_meter(self._curve_imager)
+        values = (knobs.value(name) or 0.0) + np.linspace(-half, half, CURVE_POINTS)
+        for value in values[values >= 0.0].tolist() if name == "apex" else values.tolist():
+            yield value, sharpness(knobs.with_values({name: value}))
 
     def sharpness_meter(self, imager: WindowImager | None = None) -> Callable[[Knobs | None], float]:
         """Return a function that measures the sharpness of part of the window's events with given parameters.

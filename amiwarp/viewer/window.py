@@ -645,12 +645,12 @@ class Window:
     def _curve_steps(self) -> Iterator[None]:
         """Compute the sharpness curves, one value at a time, so that the window can follow the user meanwhile."""
         for name in self._curve_names() if self.compensates else ():
-            values, meter = self.inspector.curve_values(name), self.inspector.sharpness_meter()
             found = []
-            for value in values.tolist():
-                found.append(meter(self.inspector.knobs.with_values({name: value})))
+            for point in self.inspector.curve_points(name):
+                found.append(point)
                 yield
-            self.curves[name] = values / layout.UNITS[name], np.array(found)
+            values, sharpness = np.array(found).T
+            self.curves[name] = values / layout.UNITS[name], sharpness
             self._plot_curve(name)
             self._dirty = True
 
