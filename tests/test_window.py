@@ -1,5 +1,6 @@
 """The inspector's window, drawn off screen: sliders, keys, curves, and that it shows the inspector's values."""
 
+import gc
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -25,6 +26,12 @@ TRUE = Prism(math.radians(1.0))
 def recording(texture: np.ndarray) -> Recording:
     camera = Camera.from_fov(120, 90, math.radians(50))
     return simulate(texture, camera, TRUE, duration_s=0.25, seed=1, nominal_prism=Prism(math.radians(1.2)))
+
+
+@pytest.fixture(autouse=True)
+def without_garbage() -> None:
+    """Free the windows of earlier tests here: a helper thread would do it while VTK draws."""
+    gc.collect()
 
 
 @pytest.fixture
@@ -115,6 +122,33 @@ def test_parameters_that_cannot_be_shown_are_refused(window: Window, monkeypatch
     assert window.inspector.knobs == good
     value = window.sliders["apex"].GetRepresentation().GetValue()
     assert value == pytest.approx(math.degrees(good.apex), abs=1e-3)
+
+
+def test_events_without_a_solution_are_not_drawn(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    show = window.inspector.show
+    for step in (3, 1):  # every third event has no solution; no event has one
+        with monkeypatch.context() as patch:
+            patch.setattr(window.inspector, "show", lambda step=step, **given: without(show(**given), step))
+            drag(window, "apex", 1.0 + 0.1 * step)
+            cloud = window.scene._clouds[1]
+            lost = np.isnan(window.shown.after[:, 0]).sum()
+            assert lost == -(-len(window.shown.after) // step)
+            assert cloud.visibility == (step == 3)
+            assert step == 1 or len(points(window, 1)) == len(window.shown.after) - lost
+            assert window.scene._clouds[0].visibility
+            window._draw_at(7)
+            assert cloud.visibility == (step == 3)
+            window._draw_at(1)
+    drag(window, "apex", 0.9)
+    assert window.scene._clouds[1].visibility
+    check(window)
+
+
+def without(shown: DisplayedWindow, step: int) -> DisplayedWindow:
+    """Return a window in which every ``step``-th event has no solution."""
+    after = shown.after.copy()
+    after[::step] = np.nan
+    return replace(shown, after=after)
 
 
 def test_many_moves_of_a_slider_cost_one_picture(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:

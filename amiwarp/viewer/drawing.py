@@ -979,26 +979,30 @@ class Scene:
         """Draw the points of a cloud. Only what has changed is computed, and the points are moved where they are."""
         drawn = k == 1 or len(look.titles) > 1
         places = (xy, shown.theta if look.axis is Axis.ANGLE else shown.events, self.box, self.stride, drawn)
-        depends = (shown.image_before, shown.image_after) if look.colour in (Colour.DENSITY, Colour.RESIDUAL) else ()
-        colours = (shown.events, shown.theta, look.colour, look.dark, look.overlaid, *depends)
+        colours: tuple[Any, ...] = (shown.events, shown.theta, look.colour, look.dark, look.overlaid)
+        if look.colour is Colour.DENSITY:  # the scale is that of the second image
+            colours = (*colours, shown.image_before, shown.image_after)
+        elif look.colour is Colour.RESIDUAL:
+            colours = (*colours, shown.image_after if k else shown.image_before)
         mesh = self._meshes[k]
         same = [len(a) == len(b) and all(x is y or (not isinstance(x, np.ndarray | Events) and x == y)
                                          for x, y in zip(a, b, strict=True))
                 for a, b in zip((places, colours), self._drawn[k] or ((), ()), strict=True)]  # fmt: skip
         self._drawn[k] = places, colours
         if not all(same):
-            some = slice(None, None, self.stride if drawn else len(xy) + 1)
-            points = self.box.positions(xy[some], third_axis(shown, look.axis)[some])
+            few = shown.every(self.stride if drawn else len(xy))
+            points = self.box.positions(few.after if k else few.before, third_axis(few, look.axis))
             valid = ... if math.isfinite(float(points.sum())) else np.isfinite(points).all(axis=1)
-            points = points[valid] if drawn else points[:1] * 0.0
+            if valid is not ... and not valid.any():  # VTK needs a point, which is then not visible
+                drawn, points, valid = False, np.zeros((len(points), 3), np.float32), np.arange(len(points)) < 1
+            points = points[valid]
             fits = mesh is not None and len(mesh.points) == len(points)
             if fits and valid is ...:
                 mesh.points = points
             else:
                 mesh = self._new_cloud(k, points)
             if not (same[1] and fits and valid is ...):
-                rgb = colours_of(shown, look, after=k == 1)[some][valid] if drawn else np.zeros((1, 3), np.uint8)
-                mesh["colour"] = rgb
+                mesh["colour"] = colours_of(few, look, after=k == 1)[valid]
         prop = self._clouds[k].prop
         self._clouds[k].visibility = drawn
         prop.point_size, prop.opacity, prop.render_points_as_spheres = look.point_size, look.opacity, look.is_round

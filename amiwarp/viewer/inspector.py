@@ -492,6 +492,15 @@ class DisplayedWindow:
     sharpness_after: float
     """Sharpness of ``image_after`` in the region."""
 
+    def every(self, step: int) -> DisplayedWindow:
+        """Return the window with every ``step``-th point."""
+        if step == 1:
+            return self
+        read = {colour: values[::step] for colour, values in self.truth._read.items()}
+        truth = replace(self.truth, positions=self.truth.positions[::step], _read=read)
+        return replace(self, events=self.events[::step], truth=truth, before=self.before[::step],
+                       after=self.after[::step], theta=self.theta[::step])  # fmt: skip
+
 
 # Statistics of the shown events.
 

@@ -19,6 +19,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.io.files import interrupts_later
+from amiwarp.memory import no_garbage_collection
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer import jobs, layout
 from amiwarp.viewer.drawing import (
@@ -153,6 +154,10 @@ class Window:
 
     def turn(self) -> bool:
         """Handle the input so far, and draw if something has changed; return whether there was something to do."""
+        with no_garbage_collection():  # by a helper thread, which would end VTK's objects while this thread draws
+            return self._turn()
+
+    def _turn(self) -> bool:
         interactor = self.plotter.iren.interactor
         interactor.EnableRenderOff()  # VTK would draw after each of many mouse moves
         interactor.ProcessEvents()
