@@ -6,7 +6,9 @@ import math
 import re
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -27,12 +29,16 @@ from amiwarp import (
     save_recording,
     simulate,
 )
+from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
+from amiwarp.live.stream.session import RecentEvents, followed
+from amiwarp.live.stream.sources import open_source, reopen_source
 from amiwarp.viewer import jobs
 from amiwarp.viewer.drawing import FOOT_PX, strip_share
 from amiwarp.viewer.inspector import Inspector, Library
 from amiwarp.viewer.jobs import JobCancelled, LiveFigures, LiveSource, estimate_phase
 from amiwarp.viewer.layout import KEYS, SETTABLE
 from tests.test_serve import WAIT_S, served, until
+from tests.test_stream_returning import sender
 
 pytest.importorskip("trame_client")
 APEX_DEG, NOMINAL_DEG, RPM, PHASE = 1.0, 1.2, 720.0, 2.0
@@ -740,6 +746,36 @@ def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, 
     assert field(page, "start_ms") == start
     page.locator("#do-play").click()
     until(lambda: field(page, "start_ms") > start)
+
+
+def test_a_live_stream_comes_back_after_its_source_was_restarted(
+    opened: Open, tabs: Tabs, recording: Recording, tmp_path: Path
+) -> None:
+    """The clock of the second sender is an hour behind that of the first one."""
+    encoder, events = recording.encoder, recording.events.slice(0, len(recording.events))
+    assert encoder is not None
+    streams = [
+        encode_hello(128, 96, recording.camera, recording.prism)
+        + encode_encoder(encoder.t - hour, encoder.angle) + encode_events(replace(events, t=events.t - hour))
+        for hour in (0, 3_600_000_000)
+    ]  # fmt: skip
+    said: list[str] = []
+    with ExitStack() as stack:
+        with sender(tmp_path / "s", streams[0]) as address:
+            recent = RecentEvents(source := open_source(address))
+            stack.enter_context(followed(source, None, recent, said.append, partial(reopen_source, address)))
+            latest = LiveSource(recent, said)
+            page = opened(of=latest(), latest=latest)
+            page.locator("#stream-note").filter(has_text="the stream broke off").wait_for()
+            assert page.locator("#live").filter(has_text="segment").count() == 0
+        with sender(tmp_path / "s", streams[1]):
+            page.locator("#live dl").filter(has_text="2, since the source came back").wait_for()
+            until(lambda: latest().events.t_first < events.t[0])
+            until(lambda: tabs.panels[-1].inspector.recording.events.t_first < events.t[0])
+    assert any("the stream is back: segment 2" in text for text in said)
+    before = sharpness(page)
+    enter(page, "apex", 0.7)  # the page goes on with the new events
+    until(lambda: sharpness(page) != before)
 
 
 def test_another_file_of_the_folder_is_opened(opened: Open, tabs: Tabs, recording: Recording, tmp_path: Path) -> None:

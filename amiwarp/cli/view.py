@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
     from amiwarp.viewer.inspector import Inspector, Library
 
 _LOOK, _SERVER = "Window and picture", "Server"
-RETURN_S = 3600.0
-"""How long to wait for the sender of a socket to return after its stream broke off [s]."""
 LEAST_PX, MOST_PX = 100, 8000
 """Smallest and largest width or height of a window or a screenshot [px]."""
 PICTURE_PX = 1400, 620
@@ -129,7 +128,7 @@ class StreamOptions:
             yield None
             return
         from amiwarp.live.stream.session import RecentEvents, followed
-        from amiwarp.live.stream.sources import SOCKETS, open_source
+        from amiwarp.live.stream.sources import open_source, reopen_source
         from amiwarp.viewer.jobs import LiveSource
 
         messages: list[str] = []
@@ -139,11 +138,10 @@ class StreamOptions:
             say(text)
 
         with SourceOptions(port=self.controller).link() as link:
-            wait_s = RETURN_S if source.partition(":")[0] in SOCKETS else 0.0
-            stream = open_source(source, wait_s=wait_s, say=tell)
+            stream = open_source(source)
             check_angles(stream, link)
             recent = RecentEvents(stream)
-            with followed(stream, link, recent, tell):
+            with followed(stream, link, recent, tell, partial(reopen_source, source)):
                 yield LiveSource(recent, messages)
 
 

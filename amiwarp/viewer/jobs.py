@@ -392,6 +392,8 @@ class LiveFigures:
     """Measured speed of the prism in the last turn of the shown events [turns/min]; None if it is unknown."""
     message: str
     """Latest message of the source or of the controller; empty if there was none."""
+    segment: int = 1
+    """Number of the shown segment: a new one begins when the source comes back, with a clock of its own."""
 
 
 class LiveSource:
@@ -421,7 +423,7 @@ class LiveSource:
         return LiveFigures(
             not problem, problem, "" if problem else recent.encoder_silence, 0.0 if problem else status.rate_mev_s,
             1e3 * recent.age_s, recent.turn_share, status.dropped, status.late, rpm,
-            self._messages[-1] if self._messages else "",
+            self._messages[-1] if self._messages else "", recent.segment,
         )  # fmt: skip
 
 

@@ -501,6 +501,8 @@ def live_state(f: LiveFigures) -> dict[str, Any]:
         ("speed of the prism", speed if fresh else f"{speed}, last measured", f.rpm is None or not fresh),
         ("lost events", f"{f.dropped:,}", f.dropped > 0), ("out of order", f"{f.late:,}", f.late > 0),
     ]  # fmt: skip
+    if f.segment > 1:
+        rows.append(("segment", f"{f.segment}, since the source came back", False))
     if f.connected and f.message:
         rows.append(("last message", f.message, False))
     message = "" if f.message == f.problem else f.message

@@ -692,6 +692,8 @@ Encoder samples have a memory limit of the same size.
 """
 SILENT_S = 1.0
 """Time without events or encoder samples after which they count as interrupted [s]."""
+REOPEN_S = 0.2
+"""Time between the end of a source and the first attempt to open it again [s]."""
 FIRST_S = 15.0
 """Longest wait for the first turn of the prism when a stream starts [s]."""
 
@@ -712,6 +714,8 @@ class RecentEvents:
         """Rate, losses and speed of the stream, from its last report."""
         self.ended = ""
         """Why the stream has ended; empty while it runs."""
+        self.segment = 1
+        """Number of the current segment; a new one begins when the source is opened again."""
         self.link: Link | None = None
         """Link to the controller that sends the encoder samples; None if they come with the events."""
         self._arrived_s = self._sampled_s = time.monotonic()
@@ -741,6 +745,15 @@ class RecentEvents:
                 while len(self._samples) > 1 and (self.sample_bytes > MOST_BYTES or self._samples[0][0][-1] < since):
                     t_us, angle = self._samples.popleft()
                     self.sample_bytes -= OVERHEAD + t_us.nbytes + angle.nbytes
+
+    def restart(self) -> None:
+        """Forget all events and encoder samples: those that follow may be on another clock."""
+        with self._lock:
+            self._events.clear()
+            self._samples.clear()
+            self.event_bytes = self.sample_bytes = 0
+            self.ended, self.segment = "", self.segment + 1
+            self._arrived_s = self._sampled_s = time.monotonic()
 
     @property
     def age_s(self) -> float:
@@ -794,13 +807,20 @@ def _silence(what: str, seconds: float) -> str:
 
 
 @contextlib.contextmanager
-def followed(source: Source, link: Link | None, recent: RecentEvents, say: Callable[[str], None]) -> Iterator[None]:
+def followed(
+    source: Source,
+    link: Link | None,
+    recent: RecentEvents,
+    say: Callable[[str], None],
+    reopen: Callable[[threading.Event], Source | None] = lambda _: None,
+) -> Iterator[None]:
     """Fill ``recent`` from a source, in a background thread, while the ``with`` block runs.
 
-    Waits for the first turn of the prism. Raises :class:`AmiwarpError` if it does not come in time, or the error of the
-    source.
+    Waits for the first turn of the prism. ``reopen`` gives the next source after the end of one, which begins a new
+    segment; it returns None if there is none, or once its event is set. Raises :class:`AmiwarpError` if the first turn
+    does not come in time, or the error of the source.
     """
-    stop, failures, recent.link = threading.Event(), [], link
+    over, stop, failures, recent.link = threading.Event(), threading.Event(), [], link
 
     def report(status: SessionStatus) -> None:
         recent.status = replace(status)
@@ -809,16 +829,34 @@ def followed(source: Source, link: Link | None, recent: RecentEvents, say: Calla
         recent.ended = text
         say(text)
 
-    def run() -> None:
-        session = Session(source, link=link, raw=[recent], policy=Policy.DROP_OLDEST, say=say)
+    def follow(part: Source) -> None:
+        nonlocal stop
+        stop = threading.Event()  # a session sets it at its end
+        if over.is_set():
+            return part.close()
+        session = Session(part, link=link, raw=[recent], policy=Policy.DROP_OLDEST, say=say)
         try:
             ended = session.run(stop, report)
-            problem = getattr(source, "problem", None)
+            problem = getattr(part, "problem", None)
             how = "has ended" if problem is None else f"broke off: {problem}"
-            end(f"{source.name}: the stream {how}; the last of its {ended.events:,} events are shown")
+            end(f"{part.name}: the stream {how}; the last of its {ended.events:,} events are shown")
         except Exception as error:
             failures.append(error)
             end(str(error))
+
+    def run() -> None:
+        follow(source)
+        if recent.recording() is None:
+            return
+        while not over.wait(REOPEN_S) and (part := reopen(over)) is not None:
+            if part.size == source.size:
+                recent.restart()
+                say(f"{part.name}: the stream is back: segment {recent.segment}, its times count anew")
+                follow(part)
+            else:
+                part.close()
+                sizes = f"{part.size[0]}x{part.size[1]} pixels, before it had {source.size[0]}x{source.size[1]}"
+                end(f"{part.name}: is back with a camera of {sizes}; start the command again")
 
     # No BackgroundLoop: the session has its own stop event, and its end is shown as text while the block runs.
     thread = threading.Thread(target=run, name="amiwarp-follow", daemon=True)
@@ -835,5 +873,6 @@ def followed(source: Source, link: Link | None, recent: RecentEvents, say: Calla
             time.sleep(0.05)
         yield
     finally:
+        over.set()
         stop.set()
         thread.join()

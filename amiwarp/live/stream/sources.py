@@ -7,7 +7,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from datetime import timedelta
 from importlib import import_module
@@ -255,7 +255,7 @@ class ReturningSource:
             raise AmiwarpError(
                 f"{spec}: --wait-for-source applies to sockets only, because a file or pipe cannot be reopened; {what}"
             )
-        self._wait_s, self._say, self._listens = wait_s, say, kind.endswith("-listen")
+        self._wait_s, self._say = wait_s, say
         source = self._source = open_stream(spec)
         self.name, self.size, self.camera, self.prism = spec, source.size, source.camera, source.prism
         self.has_encoder = source.has_encoder
@@ -320,8 +320,7 @@ class ReturningSource:
 
         :attr:`problem` is None if the sender returned.
         """
-        address = self.name.replace("-listen", "", 1)
-        attempts = (iter_accepted if self._listens else iter_connected)(address)
+        attempts = _attempts(self.name)
         try:
             for connection in attempts:
                 if connection is not None:
@@ -349,6 +348,12 @@ class ReturningSource:
         self._source.close()
         self._source, self.problem = source, None
         self.returns += 1
+
+
+def _attempts(spec: str) -> Generator[socket.socket | None, None, None]:
+    """Yield the connections of a socket's senders; None at least every second while there is none."""
+    iterate = iter_accepted if spec.partition(":")[0].endswith("-listen") else iter_connected
+    return iterate(spec.replace("-listen", "", 1))
 
 
 # Cameras: iniVation's through dv-processing, Prophesee's through Metavision or OpenEB. Both libraries are optional.
@@ -581,6 +586,10 @@ class EmulatedCamera(BackgroundLoop):
 
 # Opening of live sources by name.
 
+REOPEN_S = 1.0
+"""Interval between attempts to open a camera that is gone, and longest wait for the hello of a sender that returns [s].
+"""
+
 
 def open_source(
     spec: str,
@@ -612,3 +621,23 @@ def open_source(
     if kind == "prophesee":
         return PropheseeSource(rest or None, packet_us=packet_us)
     return FileSource(spec, pace=pace, packet_us=packet_us)
+
+
+def reopen_source(spec: str, stop: threading.Event) -> Source | None:
+    """Open a socket or a camera again as soon as it is there, until ``stop`` is set.
+
+    Returns None for files and pipes, which cannot be opened again, and after ``stop``.
+    """
+    kind = spec.partition(":")[0]
+    if kind in SOCKETS:
+        with contextlib.closing(_attempts(spec)) as attempts:
+            for connection in attempts:
+                if connection is not None:
+                    with contextlib.suppress(Unreachable):  # the sender left before its hello message
+                        return open_connection(spec, connection, hello_s=REOPEN_S)
+                if stop.is_set():
+                    return None
+    while kind in ("dv", "prophesee") and not stop.wait(REOPEN_S):
+        with contextlib.suppress(AmiwarpError):
+            return open_source(spec)
+    return None
