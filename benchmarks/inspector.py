@@ -40,7 +40,15 @@ from amiwarp import (
 )
 from amiwarp.choices import Axis, Colour
 from amiwarp.studies.cluster import machine
-from amiwarp.viewer.drawing import ImageKind, cloud_state, count_images, jpeg, make_images, prepare, scale_state
+from amiwarp.viewer.drawing import (
+    ImageKind,
+    cloud_state,
+    count_images,
+    make_images,
+    picture_state,
+    prepare,
+    scale_state,
+)
 from amiwarp.viewer.inspector import WINDOW_POINTS, Inspector, Selection
 from amiwarp.viewer.window import LEAST_POINTS, Window
 
@@ -134,7 +142,7 @@ def update(device: str, region: tuple[int, int, int, int] | None) -> dict[str, A
         images = count_images(shown)
         assert images.before is not None
         for image in (images.before, images.after):
-            jpeg(images.scale.rgb(image))
+            picture_state(image, images.scale)
         scale_state(images.scale)
 
     found, shown = timed(change), inspector.show()

@@ -5,6 +5,7 @@ import io
 import math
 import re
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
@@ -18,6 +19,7 @@ import pytest
 from PIL import Image
 
 from amiwarp import (
+    AmiwarpError,
     Calibration,
     Camera,
     MemoryEvents,
@@ -32,9 +34,10 @@ from amiwarp import (
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
 from amiwarp.live.stream.session import RecentEvents, followed
 from amiwarp.live.stream.sources import open_source, reopen_source
+from amiwarp.viewer import inspector as inspector_module
 from amiwarp.viewer import jobs
-from amiwarp.viewer.drawing import FOOT_PX, strip_share
-from amiwarp.viewer.inspector import Inspector, Library
+from amiwarp.viewer.drawing import FOOT_PX, ImageKind, make_images, strip_share
+from amiwarp.viewer.inspector import Inspector, Library, Source
 from amiwarp.viewer.jobs import JobCancelled, LiveFigures, LiveSource, estimate_phase
 from amiwarp.viewer.layout import KEYS, SETTABLE
 from tests.test_serve import WAIT_S, served, until
@@ -455,14 +458,13 @@ def test_bad_values_are_said_and_good_ones_make_the_page_go_on(page: Any, record
         ("length_ms", "0", "40", "a window of 0 ms; give a length above 0"),
         ("start_ms", "99999", "100", "no events from 99999.000 ms on for 40.000 ms"),
         ("start_ms", "-1e300", "50", "no events from"),
-        ("apex", "-1", "0.8", "apex"),
     ):
         ready(page)
         events, value = page.locator("#events").inner_text(), field(page, name)
         enter(page, name, bad)
         message(page, words)
         assert page.locator("#events").inner_text() == events
-        until(lambda name=name, value=value: name == "apex" or field(page, name) == value)  # what is still shown
+        until(lambda name=name, value=value: field(page, name) == value)  # what is still shown
         enter(page, name, good)
         page.locator("#message").wait_for(state="detached")
     page.locator("#region-left").fill("5000")
@@ -477,6 +479,86 @@ def test_bad_values_are_said_and_good_ones_make_the_page_go_on(page: Any, record
     enter(page, "start_ms", 0)
     enter(page, "length_ms", "1e300")
     page.locator("#events").filter(has_text=f"{len(recording.events):,} events, ").wait_for()
+
+
+def test_a_value_out_of_range_is_refused_at_its_field_in_its_unit(page: Any, kept: Any) -> None:
+    wrong, before = page.locator(".knob:has(#field-apex) .wrong"), sharpness(page)
+    for bad, words in (("60", "60 is refused: give 0 to 29.9 °"), ("-1", "-1 is refused"), ("", "This is refused")):
+        enter(page, "apex", bad)
+        wrong.filter(has_text=words).wait_for()
+        assert "1.2 is kept" in wrong.inner_text()
+        assert field(page, "apex") == NOMINAL_DEG
+        assert page.locator("#field-apex").get_attribute("aria-invalid") == "true"
+    assert (sharpness(page), page.locator("#message").count()) == (before, 0)
+    enter(page, "apex", 0.9)  # later changes work
+    until(lambda: sharpness(page) != before)
+    assert wrong.count() == 0
+    page.evaluate("trame.trigger('typed', ['apex', '60'])")  # not from the field
+    message(page, "apex angle: 60 ° is refused; give 0 to 29.9 °")
+    assert kept[1].state.apex == 0.9
+    page.locator("#message button").click()
+
+
+def test_a_value_that_the_model_refuses_leaves_the_last_good_one(
+    page: Any, kept: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ready(page)
+    before, show = sharpness(page), Inspector.show
+
+    def refused(inspector: Inspector, knobs: Any = None, **more: Any) -> Any:
+        if inspector.knobs.apex > math.radians(2.0):
+            raise AmiwarpError("total reflection")
+        return show(inspector, knobs, **more)
+
+    monkeypatch.setattr(Inspector, "show", refused)
+    enter(page, "apex", 2.5)
+    message(page, "total reflection")
+    until(lambda: field(page, "apex") == NOMINAL_DEG)
+    assert kept[1].inspector.sources["apex"] is not Source.HAND
+    enter(page, "phase", 20.0)
+    until(lambda: sharpness(page) != before)
+    page.locator("#message").wait_for(state="detached")
+
+
+def test_enter_leaves_a_field_and_later_keys_are_shortcuts(page: Any) -> None:
+    page.locator("#field-phase").click()
+    page.keyboard.press("Control+a")
+    page.keyboard.type("20")
+    page.keyboard.press("Enter")
+    page.keyboard.press("2")
+    page.locator("#view-x-y[aria-pressed=true]").wait_for()
+    ready(page)
+    assert field(page, "phase") == 20.0
+    page.locator("#field-phase").click()
+    page.keyboard.type("77")
+    page.keyboard.press("Escape")
+    assert field(page, "phase") == 20.0
+
+
+def test_a_server_that_does_not_answer_is_marked_within_a_second(page: Any, tabs: Tabs) -> None:
+    ready(page)
+    assert page.locator("#late").count() == 0
+    tabs.loop.call_soon_threadsafe(time.sleep, 4.0)
+    began = time.monotonic()
+    page.locator("#late").filter(has_text="The server has not answered").wait_for()
+    assert time.monotonic() - began < 1.5  # at most 1 s, and the time to look
+    page.locator("#late").wait_for(state="detached")
+
+
+def test_the_numbers_of_events_add_up_and_the_scope_is_the_chosen_one(
+    opened: Open, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inspector_module, "MOST_EVENTS", 64 * 40)
+    monkeypatch.setattr(inspector_module, "MOST_POINTS", 200)
+    page = opened()
+    pattern = r"([\d,]+) events, 2,560 of them read, ([\d,]+) of these selected, 200 of these drawn"
+    found = re.fullmatch(pattern, page.locator("#events").inner_text())
+    assert found is not None
+    assert int(found[1].replace(",", "")) > 2560 > int(found[2].replace(",", "")) > 200
+    page.locator("#calibrate-on").filter(has_text="x ").wait_for()
+    page.locator("#scope").select_option("whole recording")
+    expected = f"on the whole recording, {len(recording.events):,} events"
+    page.locator("#calibrate-on").filter(has_text=expected).wait_for()
 
 
 def test_downloads_leave_no_file_on_the_server(
@@ -604,6 +686,55 @@ def test_an_image_is_zoomed_and_moved_and_stays_in_its_frame(page: Any) -> None:
     assert under(box["x"] + 3 - x)[0] in (0, 1)  # the image ends at the edge of its frame
     page.mouse.dblclick(x, y)
     until(lambda: np.abs(drawn(page, "#image-overview") - image).mean() < 1.0)
+
+
+def pixel(page: Any, selector: str, x: int, y: int) -> tuple[float, float]:
+    """Return where an image that is not zoomed shows the middle of a pixel, in the window [px]."""
+    left, top, right, bottom = region(page)
+    box = page.locator(selector).bounding_box()
+    scale = min(box["width"] / (right - left), box["height"] / (bottom - top))
+    return (
+        box["x"] + box["width"] / 2 + (x + 0.5 - (left + right) / 2) * scale,
+        box["y"] + box["height"] / 2 + (y + 0.5 - (top + bottom) / 2) * scale,
+    )
+
+
+def test_counts_and_polarities_are_exact_in_image_colour_pointer_and_file(
+    page: Any, kept: Any, recording: Recording, tmp_path: Path
+) -> None:
+    page.locator("#kind").select_option("polarity")
+    page.locator(".colour-square").first.wait_for()
+    ready(page)
+    left, top, right, bottom = region(page)
+    loaded = kept[1].inspector.loaded
+    events = loaded.events
+    counts = np.zeros((2, 96, 128), np.int64)
+    np.add.at(counts, (events.p, events.y, events.x), 1)
+    inner = np.s_[top + 1 : bottom - 1, left + 1 : right - 1]
+    y, x = np.unravel_index(np.argmax(counts.min(axis=0)[inner]), counts[0][inner].shape)
+    x, y = int(x) + left + 1, int(y) + top + 1
+    off, on = counts[:, y, x].tolist()
+    assert min(off, on) > 0  # both polarities overlap here
+    at = pixel(page, "#image-before", x, y)
+    page.mouse.move(*at)
+    hover = page.locator(".tile small").first
+    hover.filter(has_text=f"x {x}, y {y} px: {off} OFF, {on} ON").wait_for()
+    page.mouse.move(2, 2)
+    shown = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), np.int16)[int(at[1]), int(at[0])]
+    images = make_images(kept[1].inspector, ImageKind.POLARITY)
+    assert images.before is not None
+    np.testing.assert_array_equal(images.before, counts[:, top:bottom, left:right])
+    assert np.abs(shown - images.scale.rgb(images.before)[y - top, x - left]).max() <= 1
+    page.locator("#kind").select_option("count")
+    page.locator(".colour-square").first.wait_for(state="detached")
+    ready(page)
+    page.mouse.move(*at)
+    hover.filter(has_text=f"x {x}, y {y} px: {off + on} events").wait_for()
+    with Image.open(download(page, "values", tmp_path)) as values:
+        found = np.asarray(values)
+    np.testing.assert_array_equal(found, np.rint(found))
+    page.mouse.move(*pixel(page, "#image-after", x, y))
+    hover.filter(has_text=f"x {x}, y {y} px: {found[y - top, x - left]:.0f} events").wait_for()
 
 
 def test_a_click_on_an_event_tells_all_about_it(page: Any, kept: Any, recording: Recording) -> None:

@@ -69,7 +69,7 @@ def test_the_window_starts_as_the_page_does(window: Window, recording: Recording
     assert window.inspector.window == Inspector(recording).first_window()
     assert set(window.sliders) == {"apex", "phase", "clock_offset", "tilt_x", "tilt_y", "start_ms", "length_ms"}
     check(window)
-    assert f"{window.shown.selected:,} selected" in window.scene._caption.input
+    assert f"{window.shown.selected:,} of these selected" in window.scene._caption.input
 
 
 @pytest.mark.parametrize(("name", "value"), [("apex", 0.7), ("phase", -30.0), ("clock_offset", 900.0), ("tilt_y", 5.0)])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 import enum
-import io
 import math
 import os
 import sys
@@ -24,7 +22,6 @@ from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.export import GAMMA, PERCENTILE, save_png
-from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.palette import BLUE, OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK, ORANGE, PINK, VERMILION
 from amiwarp.plotting.figures import instance_colours
 from amiwarp.reconstruction.picture import Picture, Reconstruction
@@ -39,6 +36,7 @@ from amiwarp.viewer.inspector import (
     Region,
     inside,
     read_span,
+    recorded_counts,
 )
 
 # Selected events of the inspector's window as a recording of a smaller camera.
@@ -184,10 +182,6 @@ def _wide(inspector: Inspector, window: LoadedWindow) -> Region:
     return max(left - m, 0), max(top - m, 0), min(right + m, width), min(bottom + m, height)
 
 
-SURFACE_GAMMA = 4.0
-"""Exponent of the tone curve of time surfaces, which shows the last quarter of the window in most of the colours."""
-
-
 class ImageKind(enum.StrEnum):
     """What the images show."""
 
@@ -214,7 +208,7 @@ class Scale:
     high: float
     """Value at the end of the colour bar. Higher values have the same colour."""
     colours: str
-    """Name of Matplotlib's colour map, or "polarity" for OFF and ON in two colours on black."""
+    """Name of Matplotlib's colour map, "polarity" for OFF and ON in two colours on black, or "difference"."""
     gamma: float = 1.0
     """Exponent of the tone curve: a colour's place on the bar is the share of the range to this power."""
 
@@ -231,42 +225,40 @@ class Scale:
 
         ``values``: shape ``(height, width)``, or ``(2, height, width)`` for OFF and ON.
         """
-        steps = _steps(values, self.low, self.high)
+        places = self.places(values)
         if self.colours == "polarity":
-            places = np.linspace(0.0, 1.0, STEPS)[steps] ** self.gamma
             both = places[0][..., None] * np.array(OFF_ON_BLACK) + places[1][..., None] * np.array(ON_ON_BLACK)
             return np.asarray(np.rint(255.0 * np.clip(both, 0.0, 1.0)), np.uint8)
-        colours = np.take(_table(self.colours, self.gamma), steps, axis=0)
-        if self.colours != "gray":
-            colours[np.isnan(values)] = 0
-        return colours
+        known = ~np.isnan(places)
+        return table_of(self.colours)[(255.0 * np.where(known, places, 0.0)).astype(np.uint8)] * known[..., None]
+
+    @property
+    def counts(self) -> bool:
+        """Whether the values are numbers of events, or their differences."""
+        return self.unit == "per pixel"
 
     def ticks(self) -> tuple[tuple[float, str], ...]:
         """Return the marks of the colour bar: their places, 0 to 1, and their texts."""
         from matplotlib.ticker import MaxNLocator
 
-        values = np.asarray(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]).tick_values(self.low, self.high), np.float64)
+        locator = MaxNLocator(4, steps=[1, 2, 2.5, 5, 10], integer=self.counts)
+        values = np.asarray(locator.tick_values(self.low, self.high), np.float64)
         values = values[(values >= self.low) & (values <= self.high)]
         return tuple((float(place), f"{v:g}") for place, v in zip(self.places(values), values, strict=True))
 
 
-STEPS = 1 << 16
-"""Number of steps into which the range of a scale is divided for its colours."""
-
-
-def _steps(values: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint16]:
-    """Return the steps of values in a range; 0 for NaN."""
-    share = (np.asarray(values, np.float32) - np.float32(low)) * np.float32((STEPS - 1) / (high - low))
-    return np.asarray(np.fmin(np.fmax(share, 0.0), STEPS - 1.0), np.uint16)
-
-
 @cache
-def _table(colours: str, gamma: float) -> NDArray[np.uint8]:
-    """Return the colours of all steps, of a colour map of Matplotlib after a tone curve, shape ``(STEPS, 3)``."""
+def table_of(colours: str) -> NDArray[np.uint8]:
+    """Return the 256 colours of a bar, shape ``(256, 3)``: of :data:`DIFFERENCES`, or a colour map of Matplotlib."""
     from matplotlib import colormaps
 
-    shares = np.linspace(0.0, 1.0, STEPS) ** gamma
-    return np.asarray(np.rint(255.0 * colormaps[colours](shares)[:, :3]), np.uint8)
+    shares = np.linspace(0.0, 1.0, 256)
+    if colours == "difference":
+        ends = np.linspace(0.0, 1.0, len(DIFFERENCES))
+        table = np.stack([np.interp(shares, ends, channel) for channel in DIFFERENCES.T], axis=1)
+    else:
+        table = 255.0 * colormaps[colours](shares)[:, :3]
+    return np.asarray(np.rint(table), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,6 +275,8 @@ class ShownImages:
     scale: Scale
     note: str = ""
     """What limits the images, for the page; empty if nothing does."""
+    after_scale: Scale | None = None
+    """Scale of the second image if it has one of its own."""
 
 
 def make_images(
@@ -300,10 +294,10 @@ def make_images(
         return _log_images(inspector, window, knobs, against)
     if kind is ImageKind.TIME_SURFACE:
         images = [_time_surface(inspector, window, k)[cut] for k in (against, knobs)]
-        scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, "viridis", SURFACE_GAMMA)
+        scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, "viridis")
         return ShownImages(kind, images[0], images[1], scale)
     per_polarity = kind is ImageKind.POLARITY
-    images = [_counts(inspector, window, k, per_polarity=per_polarity)[cut] for k in (against, knobs)]
+    images = [inspector.counts(window, k, per_polarity=per_polarity)[cut] for k in (against, knobs)]
     colours = "polarity" if per_polarity else "gray"
     scale = Scale("events", "per pixel", 0.0, _top(*images), colours, GAMMA)
     return ShownImages(kind, images[0], images[1], scale)
@@ -317,23 +311,20 @@ def count_images(shown: DisplayedWindow) -> ShownImages:
     return ShownImages(ImageKind.COUNT, images[0], images[1], scale)
 
 
+def with_difference(images: ShownImages) -> ShownImages:
+    """Return images of which the second shows the difference: after minus before, with a scale of its own."""
+    if images.before is None or images.kind is not ImageKind.COUNT:
+        return images
+    difference = images.after - images.before
+    most = max(float(np.abs(difference).max()), 1.0)
+    scale = Scale("difference of events", "per pixel", -most, most, "difference")
+    return replace(images, after=difference, after_scale=scale)
+
+
 def _top(*images: NDArray[np.float32]) -> float:
     """Return the count at the end of the scale of both images."""
     positive = [image[image > 0.0] for image in images]
-    return max([1.0, *(float(np.percentile(each, PERCENTILE)) for each in positive if each.size)])
-
-
-def _counts(
-    inspector: Inspector, window: LoadedWindow, knobs: Knobs | None, *, per_polarity: bool
-) -> NDArray[np.float32]:
-    """Return the events per pixel, with the place of each event dithered in its pixel."""
-    size = inspector.recording.events.size
-    votes = Votes(CanvasShape(*size, per_polarity=per_polarity, dither=True), inspector.device)
-    with inspector.lock:
-        model, events, drift_us = inspector.warped(window, knobs)
-        votes.add_events(model, events, drift=drift_us)
-        image = votes.take()
-    return image if per_polarity else image[0]
+    return math.ceil(max([1.0, *(float(np.percentile(each, PERCENTILE)) for each in positive if each.size)]))
 
 
 def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:
@@ -465,8 +456,8 @@ NEAR_PX = 2.0
 """Standard deviation of the Gaussian weights of the events near an event [px]."""
 WIDEST_PX = 3.0 * NEAR_PX
 """Largest residual [px]. Wider edges look the same as spread events."""
-VOTE_VARIANCE = 1.0 / 6.0 + 1.0 / 12.0
-"""Variance that bilinear votes and dither add to the place of an event in an image [px²]."""
+ROUNDING_VARIANCE = 1.0 / 12.0
+"""Variance that rounding to a pixel adds to the place of an event in an image [px²]."""
 WIDE_EVENTS = 2.0
 """Number of spread events that are assumed near each event, so that a lone event has a large residual."""
 
@@ -550,7 +541,7 @@ def colour_bar(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> ColourB
         return ColourBar(*axis_range(shown, Axis.TIME), "time", "ms", table)
     if colour is Colour.DENSITY:
         return ColourBar(0.0, density_top(shown), "events per pixel", "", table, 0.5)
-    return ColourBar(0.0, WIDEST_PX, "residual", "px", table)
+    return ColourBar(0.0, WIDEST_PX, "residual σ", "px", table)
 
 
 def density_top(shown: DisplayedWindow) -> float:
@@ -598,30 +589,34 @@ def residual(
     wide = np.full(image.shape, WIDEST_PX)
     spread = _spread_across_edges(image, where)
     # Gaussian weights of variance n² and an edge of variance w² give a spread of 1 / (1 / n² + 1 / w²).
-    width = spread * NEAR_PX**2 / np.maximum(NEAR_PX**2 - spread, 1e-6) - VOTE_VARIANCE
+    width = spread * NEAR_PX**2 / np.maximum(NEAR_PX**2 - spread, 1e-6) - ROUNDING_VARIANCE
     wide[where] = np.sqrt(np.clip(width, 1e-6, WIDEST_PX**2))
     found = at_pixels(wide, xy)
     return np.where(found > 0.0, found, WIDEST_PX)
 
 
 def _spread_across_edges(image: NDArray[np.float32], where: tuple[slice, slice]) -> NDArray[np.float64]:
-    """Return the smallest eigenvalue of the second moments of the weighted events about each pixel [px²].
+    """Return the smallest variance, over all directions, of the weighted events about each pixel [px²].
 
-    The moments with weights G of variance s are s G + s² G'', so they follow from derivatives of the smoothed image.
+    The variance is about the mean of these events, so that it is the same on both sides of an edge and on its middle.
+    Sums with weights G of variance s are s G' for the places, and s G + s² G'' for their squares, so they follow from
+    derivatives of the smoothed image.
     """
     from scipy.ndimage import gaussian_filter
 
-    reach = 4 * math.ceil(NEAR_PX)
+    reach, near = 4 * math.ceil(NEAR_PX), NEAR_PX**2
     rows, columns = (range(size)[axis] for size, axis in zip(image.shape, where, strict=True))
     top, left = max(rows.start - reach, 0), max(columns.start - reach, 0)
     part = image[top : rows.stop + reach, left : columns.stop + reach].astype(np.float64)
-    orders = ((0, 0), (2, 0), (1, 1), (0, 2))
-    smooth, yy, xy, xx = (gaussian_filter(part, NEAR_PX, order=order, mode="constant") for order in orders)
-    own_variance = NEAR_PX**2 + VOTE_VARIANCE
-    own = 1.0 / (math.tau * own_variance)
-    second = 0.5 * (xx + yy) + own / own_variance - np.hypot(0.5 * (xx - yy), xy)
+    orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
+    smooth, y, x, yy, xy, xx = (gaussian_filter(part, NEAR_PX, order=order, mode="constant") for order in orders)
+    own = 1.0 / (math.tau * near)
     density = np.maximum(smooth - own, 0.0) + WIDE_EVENTS * own
-    spread = np.clip(NEAR_PX**2 + NEAR_PX**4 * second / density, 0.0, NEAR_PX**2)
+    mean_y, mean_x = near * y / density, near * x / density
+    yy, xx = (near + near**2 * (second + own / near) / density for second in (yy, xx))
+    yy, xx = yy - mean_y**2, xx - mean_x**2
+    xy = near**2 * xy / density - mean_x * mean_y
+    spread = np.clip(0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy), 0.0, near)
     return np.asarray(spread[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left])
 
 
@@ -1142,13 +1137,14 @@ def ticks(low: float, high: float) -> NDArray[np.float64]:
 
 # What the browser draws of a window: points and colours as bytes, legends, and images as addresses.
 
-JPEG_QUALITY = 90
 LEGEND_ROWS = 8
 """Largest number of causes, instances or depths in a legend."""
 DIFFERENCES = np.array([[0, 114, 178], [255, 255, 255], [213, 94, 0]], np.float64)
 """Colours of fewer, equally many and more events in an image of differences."""
 STOPS = 16
 """Number of colours from which the browser draws a colour scale."""
+SQUARE = 32
+"""Width and height of the legend of two polarities [colours]."""
 
 
 def cloud_state(shown: DisplayedWindow, colour: Colour, axis: Axis, *, dark: bool) -> dict[str, Any]:
@@ -1187,28 +1183,35 @@ def gradient(table: NDArray[Any]) -> str:
 
 
 def scale_state(scale: Scale) -> dict[str, Any]:
-    """Return the colour bar of an image: its colours, its ticks from 0 to 1, and its title."""
-    title = f"{scale.title} [{scale.unit}]" if scale.unit else scale.title
-    values = scale.low + np.linspace(0.0, 1.0, 256) ** (1.0 / scale.gamma) * (scale.high - scale.low)
+    """Return the colour bar of an image: its colours, its ticks from 0 to 1, and its title.
+
+    OFF and ON have a square instead of a bar: OFF to the right, ON upwards.
+    """
+    title = f"{scale.title} {scale.unit}" if scale.counts else f"{scale.title} [{scale.unit or '1'}]"
+    ticks = [list(tick) for tick in scale.ticks()]
     if scale.colours != "polarity":
-        ticks = [list(tick) for tick in scale.ticks()]
-        return {"bar": gradient(scale.rgb(values[None])[0]), "ticks": ticks, "title": title}
-    off_on = np.concatenate([values[::-2], values[::2]])  # from many OFF events over none to many ON events
-    is_on = np.arange(len(off_on)) >= len(off_on) // 2
-    table = scale.rgb(np.where(is_on, [[0.0], [1.0]], [[1.0], [0.0]])[:, None] * off_on)[0]
-    ticks = [[0.0, f"{scale.high:.3g} OFF"], [0.5, "0"], [1.0, f"{scale.high:.3g} ON"]]
-    return {"bar": gradient(table), "ticks": ticks, "title": title}
+        return {"bar": gradient(table_of(scale.colours)), "ticks": ticks, "title": title, "square": None}
+    values = scale.low + np.linspace(0.0, 1.0, SQUARE) ** (1.0 / scale.gamma) * (scale.high - scale.low)
+    square = picture_state(np.stack(np.broadcast_arrays(values, values[::-1, None])), replace(scale, unit=""))
+    return {"bar": "", "ticks": ticks, "title": title, "square": square}
 
 
-def difference_state(before: NDArray[Any], after: NDArray[Any]) -> dict[str, Any]:
-    """Return the state variables of an image of differences: blue where ``after`` is lower, red where it is higher."""
-    most = max(float(np.abs(after - before).max()), 1.0)
-    share = (after - before) / (2.0 * most) + 0.5
-    ends = np.linspace(0.0, 1.0, len(DIFFERENCES))
-    colours = np.stack([np.interp(share, ends, DIFFERENCES[:, k]) for k in range(3)], axis=-1)
-    ticks = [[0.0, f"−{most:.3g}"], [0.5, "0"], [1.0, f"+{most:.3g}"]]
-    scale = {"bar": gradient(DIFFERENCES), "ticks": ticks, "title": "difference [events per pixel]"}
-    return {"after": jpeg(colours), "after_scale": scale}
+def picture_state(values: NDArray[Any], scale: Scale) -> dict[str, Any]:
+    """Return an image as the browser draws it: its values, and how they become colours as in :meth:`Scale.rgb`.
+
+    ``values``: shape ``(height, width)``, or ``(2, height, width)`` for OFF and ON.
+    """
+    height, width = values.shape[-2:]
+    kind = "float32"
+    if scale.counts and scale.low == 0.0 and (most := values.max(initial=0.0)) < 1 << 16:
+        kind = "uint8" if most < 1 << 8 else "uint16"
+    two = scale.colours == "polarity"
+    return {
+        "values": np.ascontiguousarray(values, kind).tobytes(), "kind": kind, "width": width, "height": height,
+        "low": scale.low, "high": scale.high, "gamma": scale.gamma, "unit": "events" if scale.counts else scale.unit,
+        "pair": [list(OFF_ON_BLACK), list(ON_ON_BLACK)] if two else None,
+        "table": b"" if two else _pixels(table_of(scale.colours)),
+    }  # fmt: skip
 
 
 def orbit_lines(inspector: Inspector, shown: DisplayedWindow, picked: int = -1) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -1228,25 +1231,10 @@ NO_ORBIT = {"orbit": b"", "column": b"", "has_orbit": False}
 """State variables without an orbit."""
 
 
-def whole_image(events: Events, size: tuple[int, int]) -> str:
-    """Return the image of events as recorded, as the address of a JPEG; brightness is the square root of the count."""
-    width, height = size
-    counts = np.bincount(events.y.astype(np.int64) * width + events.x, minlength=width * height)
-    positive = counts[counts > 0]
-    top = max(float(np.percentile(positive, 99.0)), 1.0) if len(positive) else 1.0
-    return jpeg(255.0 * np.sqrt(np.minimum(counts.reshape(height, width) / top, 1.0)))
-
-
-def jpeg(values: NDArray[Any]) -> str:
-    """Return an image as the address of a JPEG.
-
-    ``values``: from 0 to 255, shape ``(height, width)``, or ``(height, width, 3)`` for colours.
-    """
-    from PIL import Image
-
-    data = io.BytesIO()
-    Image.fromarray(values.astype(np.uint8)).save(data, "JPEG", quality=JPEG_QUALITY)
-    return "data:image/jpeg;base64," + base64.b64encode(data.getvalue()).decode()
+def whole_image(events: Events, size: tuple[int, int]) -> dict[str, Any]:
+    """Return the image of events as recorded, for the browser."""
+    counts = recorded_counts(events, size)
+    return picture_state(counts, Scale("events", "per pixel", 0.0, _top(counts), "gray", GAMMA))
 
 
 def event_text(shown: DisplayedWindow, k: int) -> str:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from amiwarp.calib.bad_pixels import strange_pixels, stretch
 from amiwarp.calib.parameters import build_model, nominal, optical_parameters
 from amiwarp.calib.result import Calibration, constant_speed
-from amiwarp.choices import Colour, Sharpness
+from amiwarp.choices import Colour, Sharpness, Vote
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, turn_between
@@ -287,7 +287,7 @@ class MeasuredImage:
     """Image of warped events with its sharpness in a region."""
 
     image: NDArray[np.float32]
-    """The whole image [events per pixel], shape ``(height, width)``."""
+    """Number of events at each pixel of the whole image, shape ``(height, width)``."""
     variance: float
     """Variance over mean of the smoothed region, as :attr:`amiwarp.Sharpness.VARIANCE`. It grows with the number of
     events."""
@@ -297,7 +297,7 @@ class MeasuredImage:
 
 
 class WindowImager:
-    """Makes images of warped events and measures their sharpness.
+    """Measures the sharpness of images of warped events, as calibration does: bilinear votes at dithered places.
 
     An imager owns its buffers, so only one thread may use it.
     """
@@ -306,8 +306,8 @@ class WindowImager:
         self._votes, self._device = Votes(CanvasShape(*size, dither=True), device), device
         self._meters: dict[tuple[int, int], SharpnessMeter] = {}
 
-    def measure(self, model: Model, events: UploadedEvents, offset_us: float, region: Region) -> MeasuredImage:
-        """Return the image, and its sharpness in the region.
+    def measure(self, model: Model, events: UploadedEvents, offset_us: float, region: Region) -> tuple[float, float]:
+        """Return variance and sharpness in the region, see :class:`MeasuredImage`.
 
         ``offset_us`` is added to the encoder's clock offset [us].
         """
@@ -317,13 +317,12 @@ class WindowImager:
         meter = self._meter(right - left, bottom - top)
         if meter.image.shape == self._votes.canvas.shape:
             self._votes.read(meter.image)
-            image = part = meter.image.numpy()[0]
+            part = meter.image.numpy()[0]
         else:
-            image = self._votes.take()[0]
-            part = image[top:bottom, left:right]
+            part = self._votes.take()[0][top:bottom, left:right]
             meter.image.write(part[None])
         variance, mean = meter.measure(), float(part.mean())
-        return MeasuredImage(image, variance, relative_variance(variance, mean, SMOOTHING_PX) if mean > 0.0 else 0.0)
+        return variance, relative_variance(variance, mean, SMOOTHING_PX) if mean > 0.0 else 0.0
 
     def _meter(self, width: int, height: int) -> SharpnessMeter:
         """Return the meter of images of this size. Only the last one is kept."""
@@ -332,6 +331,16 @@ class WindowImager:
             meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
             self._meters = {(width, height): meter}
         return self._meters[width, height]
+
+
+def recorded_counts(events: Events, size: tuple[int, int], *, per_polarity: bool = False) -> NDArray[np.float32]:
+    """Return the number of events at each pixel, shape ``(height, width)``; with polarities ``(2, height, width)``."""
+    width, height = size
+    layers, pixel = 1 + per_polarity, events.y.astype(np.int64) * width + events.x
+    if per_polarity:
+        pixel += events.p.astype(np.int64) * (width * height)
+    counts = np.bincount(pixel, minlength=layers * width * height).astype(np.float32)
+    return counts.reshape(layers, height, width) if per_polarity else counts.reshape(height, width)
 
 
 # Parameters of the prism and selection of events under which the inspector shows a recording.
@@ -484,9 +493,9 @@ class DisplayedWindow:
     theta: NDArray[np.float64]
     """Prism angles of the drawn events [rad], from 0 to 2π, shape ``(n,)``."""
     image_before: NDArray[np.float32]
-    """Image of the events as recorded [events per pixel], shape ``(height, width)``."""
+    """Number of events at each pixel as recorded, shape ``(height, width)``."""
     image_after: NDArray[np.float32]
-    """Image of the compensated events [events per pixel], shape ``(height, width)``."""
+    """Number of compensated events at each pixel, shape ``(height, width)``."""
     sharpness_before: float
     """Sharpness of ``image_before`` in the region: 0 for events at random, whatever their number."""
     sharpness_after: float
@@ -793,6 +802,7 @@ class Inspector:
         self.lock = Lock()
         """Lock for the events on the device and the buffers of their images."""
         self._imager, self._curve_imager = (WindowImager(source.size, device) for _ in range(2))
+        self._votes: dict[bool, Votes] = {}
         if calibration is not None:
             self.accept(calibration)
 
@@ -1021,7 +1031,7 @@ class Inspector:
                 on_device.clear()
                 on_device[rpm] = self._upload(w.curve_events, rpm)
             model, drift_us = self.model_of(given), self._drift_us(given)
-            return imager.measure(model, on_device[rpm], drift_us, w.region).sharpness
+            return imager.measure(model, on_device[rpm], drift_us, w.region)[1]
 
         return sharpness
 
@@ -1150,10 +1160,29 @@ class Inspector:
         theta = self._theta(w, knobs).astype(np.float32)
         return np.asarray(self.model_of(knobs).compensate_points(w.xy, theta), np.float32)
 
+    def counts(self, w: LoadedWindow, knobs: Knobs | None, *, per_polarity: bool = False) -> NDArray[np.float32]:
+        """Return the number of a window's events at each pixel, see :func:`recorded_counts`.
+
+        Compensated events count at the pixel in which they lie; ``knobs`` None counts the events as recorded.
+        """
+        size = self.recording.events.size
+        if knobs is None:
+            return recorded_counts(w.events, size, per_polarity=per_polarity)
+        with self.lock:
+            if per_polarity not in self._votes:
+                canvas = CanvasShape(*size, per_polarity=per_polarity, vote=Vote.NEAREST)
+                self._votes[per_polarity] = Votes(canvas, self.device)
+            votes = self._votes[per_polarity]
+            model, events, drift_us = self.warped(w, knobs)
+            votes.add_events(model, events, drift=drift_us)
+            image = votes.take()
+        return image if per_polarity else image[0]
+
     def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> MeasuredImage:
         """Return the image of a window with these parameters; as recorded if ``knobs`` is None."""
         with self.lock:
-            return self._imager.measure(*self.warped(w, knobs), w.region)
+            variance, sharpness = self._imager.measure(*self.warped(w, knobs), w.region)
+        return MeasuredImage(self.counts(w, knobs), variance, sharpness)
 
     def _unmoved(self, w: LoadedWindow) -> MeasuredImage:
         """Return the image of a window as recorded."""

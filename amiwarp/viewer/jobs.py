@@ -276,8 +276,10 @@ class FoundCalibration:
     """Sharpness of the shown region with the calibrated parameters."""
 
 
-def scope_text(inspector: Inspector) -> str:
-    """Return which events of the selection :func:`find_calibration` uses, for the page."""
+def scope_text(inspector: Inspector, *, whole: bool = False) -> str:
+    """Return which events :func:`find_calibration` uses, for the page."""
+    if whole:
+        return f"the whole recording, {len(inspector.recording.events):,} events"
     return _text(inspector, select_part(inspector, inspector.loaded, inspector.loaded.region))
 
 
@@ -290,8 +292,9 @@ def find_calibration(
     cannot determine the parameters.
     """
     recording, rpm = inspector.recording, inspector.knobs.rpm
-    scope = f"the whole recording, {len(recording.events):,} events"
-    if not whole:
+    if whole:
+        scope = scope_text(inspector, whole=True)
+    else:
         part = select_part(inspector, inspector.loaded, inspector.loaded.region)
         recording, scope = part.recording, _text(inspector, part)
     settings = settings or Settings()

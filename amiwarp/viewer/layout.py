@@ -141,11 +141,12 @@ class History:
 ANGLES = ("apex", "phase", *(name for name, p in OTHERS.items() if p.unit == "rad"))
 """Parameters that the address gives in degrees."""
 LIMITS = {
-    "apex": (0.0, 60.0), "phase": (-3600.0, 3600.0), "clock_offset": (-LARGEST_OFFSET_US, LARGEST_OFFSET_US),
+    "apex": (0.0, 29.9), "phase": (-3600.0, 3600.0), "clock_offset": (-LARGEST_OFFSET_US, LARGEST_OFFSET_US),
     **{name: p.limits for name, p in SLIDING.items()}, "rpm": (-LARGEST_RPM, LARGEST_RPM),
     **{name: p.limits for name, p in OTHERS.items()}, "focal_length": (0.1, 1e6),
 }  # fmt: skip
-"""Smallest and largest value of each parameter in an address: angles in degrees, others in their own units."""
+"""Smallest and largest value of each parameter in an address and a field: angles in degrees, others in their own units.
+"""
 CHOICES: dict[str, Any] = {"image": ImageKind, "colour": Colour, "axis": Axis, "view": View}
 POLARITIES = {"both": None, "on": 1, "off": 0}
 FLAGS = {"0": False, "1": True}
@@ -330,7 +331,7 @@ KEYS = (
 CALLS = (
     "key", "released", "choose", "typed", "edge", "draw", "whole", "suggest", "look_from", "step", "move_window",
     "resize_window", "take_from_curve", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline",
-    "undo", "redo", "reset", "restore", "keep_b", "swap_b", "compare_found", "export", "open_file",
+    "undo", "redo", "reset", "restore", "answer", "keep_b", "swap_b", "compare_found", "export", "open_file",
 )  # fmt: skip
 """Methods of the panel that the page may call."""
 SETTABLE: dict[str, Check] = {
@@ -345,9 +346,9 @@ SETTABLE: dict[str, Check] = {
 }  # fmt: skip
 """State variables that the page may set directly, with the check of their values. The page changes all others through
 :data:`CALLS`."""
-CLIENT_ONLY = ("hover", "measured", "tool")
+CLIENT_ONLY = ("hover", "measured", "tool", "late")
 """State variables that the browser keeps to itself."""
-NO_SCALE = {"bar": "", "ticks": [], "title": ""}
+NO_SCALE: dict[str, Any] = {"bar": "", "ticks": [], "title": "", "square": None}
 """Scale of an image before the first update."""
 
 
@@ -364,9 +365,11 @@ def template() -> str:
 
 def _knob(name: str) -> str:
     label, unit, (least, most, step), where = SLIDERS[name]
+    low, high = LIMITS[name]
     return (
         f'<KnobField v-if="{where}" name="{name}" label="{label}" unit="{unit}" :value="{name}" :least="{least}" '
-        f':most="{most}" :step="{step}" :truth="truths.{name}" :note="sources.{name}" @drag="{name} = $event" '
+        f':most="{most}" :step="{step}" :low="{low:g}" :high="{high:g}" :truth="truths.{name}" '
+        f':note="sources.{name}" @drag="{name} = $event" '
         f"@typed=\"trigger('typed', ['{name}', $event])\" "
         f"@chosen=\"trigger('choose', ['{name}'])\"></KnobField>"
     )
@@ -394,19 +397,20 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
         "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
         "views": [list(each) for each in VIEWS], "tool": "region", "tools": [list(each) for each in TOOLS],
-        "hover": "", "measured": "", "orbit_shown": True, "help_shown": False,
+        "hover": "", "measured": "", "late": 0, "orbit_shown": True, "help_shown": False,
         "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
         "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
         "rate_on": b"", "rate_off": b"", "rate_note": "", "picked_text": "",
         **dict.fromkeys(("cloud_before", "cloud_after", "cloud_third", "colours_before", "colours_after"), b""),
         "titles": [], "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
         "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
-        "overview": "", "before": "", "after": "", "kind": ImageKind.COUNT.value,
+        "overview": None, "before": None, "after": None, "kind": ImageKind.COUNT.value,
         "kinds": [each.value for each in ImageKind], "image_note": "", "image_slow": False, "image_scale": NO_SCALE,
         "after_scale": NO_SCALE, "difference": False, "against_title": "",
         "against_choices": [], "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
         "curve_mark": 0.0, "against": "recorded", "has_b": False, "b_text": "", "busy": "", "calibrating": False,
-        "progress": 0, "found": "", "surface": None, "scope": SCOPES[0], "scopes": list(SCOPES), "calibrate_on": "",
+        "progress": 0, "found": "", "surface": None, "scope": SCOPES[0], "scopes": list(SCOPES),
+        "calibrate_on": ["", ""],
     }  # fmt: skip
 
 
@@ -481,11 +485,13 @@ def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:
 
 
 def events_text(shown: DisplayedWindow) -> str:
-    """Return the numbers of events of the window, of those that were read, in the selection and drawn."""
+    """Return the numbers of events of the window, of those that were read, of these selected, and of these drawn."""
     total, read, drawn = shown.span.count, len(shown.span.events), len(shown.events)
-    thinned = "" if read == total else f", {read:,} of them read"
-    selected = "" if shown.selected == read else f", {shown.selected:,} selected"
-    return f"{total:,} events{thinned}{selected}, {'all' if drawn == shown.selected else f'{drawn:,}'} drawn"
+    parts = [f"{total:,} events"]
+    parts += [] if read == total else [f"{read:,} of them read"]
+    parts += [] if shown.selected == read else [f"{shown.selected:,} of these selected"]
+    whole = "all" if len(parts) == 1 else "all of these"
+    return ", ".join([*parts, f"{whole if drawn == shown.selected else f'{drawn:,} of these'} drawn"])
 
 
 def live_state(f: LiveFigures) -> dict[str, Any]:

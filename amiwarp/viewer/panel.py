@@ -157,6 +157,12 @@ class Panel:
         except ValueError:
             self.work.show_message(f"{text!r} is not a number; give a number such as 1.5", "error")
             return
+        if name in layout.LIMITS:
+            (low, high), (label, unit, *_) = layout.LIMITS[name], layout.SLIDERS[name]
+            if not low <= value <= high:
+                text = f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}"
+                self.work.show_message(text, "error")
+                return
         if name == "turns":
             name, value = "length_ms", value * float(self.state.turn_ms)
         self.state[name] = round(value, 4)
@@ -164,6 +170,9 @@ class Panel:
             self.state.knob = name
         self.request("knobs" if name in layout.NAMES else "window")
         self.released()
+
+    def answer(self) -> None:
+        """Do nothing: the page asks only whether the server answers."""
 
     def toggle(self, name: str) -> None:
         """Invert a state variable that is true or false."""
@@ -621,14 +630,20 @@ class Panel:
                     self._return_to_open_window()
                     raise
         with self.work.errors_shown("knobs"):
-            if "knobs" in todo:
-                self.set_knobs()
-            if self.shown is None:
-                self.remember("")
-            if "state" in todo:
-                await self._apply_wanted()
-            self.show_knobs()  # not after the computation: a value that is typed meanwhile would be lost
-            self.shown, values = await self.work.in_thread(self._compute)
+            good = self.inspector.knobs, dict(self.inspector.sources)
+            try:
+                if "knobs" in todo:
+                    self.set_knobs()
+                if self.shown is None:
+                    self.remember("")
+                if "state" in todo:
+                    await self._apply_wanted()
+                self.show_knobs()  # not after the computation: a value that is typed meanwhile would be lost
+                self.shown, values = await self.work.in_thread(self._compute)
+            except AmiwarpError:
+                self.inspector.knobs, self.inspector.sources = good
+                self.show_knobs()
+                raise
             state.update({**values, **layout.prism_state(self.inspector), "curve_mark": float(state[state.knob])})
             if not state.playing:
                 self.remember("" if todo & {"suggestion", "state"} else self._change)
@@ -696,10 +711,7 @@ class Panel:
         if kind is not ImageKind.COUNT:
             return {"image_slow": False, **self._other_images()}
         pair = drawing.count_images(shown)
-        values = {"image_slow": False, **_image_state(pair)}
-        if self.state.difference and pair.before is not None:
-            values |= drawing.difference_state(pair.before, pair.after)
-        return values
+        return {"image_slow": False, **_image_state(drawing.with_difference(pair) if self.state.difference else pair)}
 
     def _other_images(self) -> dict[str, Any]:
         return _image_state(drawing.make_images(self.inspector, ImageKind(self.state.kind), against=self._against))
@@ -718,7 +730,8 @@ class Panel:
 
     async def _curve(self) -> None:
         s, name = self.state, self.state.knob
-        s.calibrate_on = await self.work.in_thread(jobs.scope_text, self.inspector)
+        find = partial(jobs.scope_text, self.inspector)
+        s.calibrate_on = [await self.work.in_thread(find, whole=whole) for whole in (False, True)]
         if not self.compensates:
             return
         values, scores = await self.work.in_thread(self.inspector.curve, name)
@@ -740,16 +753,18 @@ class Panel:
         try:
             s.update(await self.work.in_thread(self._other_images))
         except AmiwarpError as error:
-            s.update({"before": "", "after": "", "image_note": str(error)})
+            s.update({"before": None, "after": None, "image_note": str(error)})
 
 
 def _image_state(pair: drawing.ShownImages) -> dict[str, Any]:
     """Return the state variables of the images of the region."""
-    scale = drawing.scale_state(pair.scale)
+    scales = pair.scale, pair.after_scale or pair.scale
     before, after = (
-        "" if image is None else drawing.jpeg(pair.scale.rgb(image)) for image in (pair.before, pair.after)
+        None if image is None else drawing.picture_state(image, scale)
+        for image, scale in zip((pair.before, pair.after), scales, strict=True)
     )
-    return {"before": before, "after": after, "image_scale": scale, "after_scale": scale, "image_note": pair.note}
+    first, second = map(drawing.scale_state, scales)
+    return {"before": before, "after": after, "image_scale": first, "after_scale": second, "image_note": pair.note}
 
 
 def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progress: Progress) -> Any:

@@ -2,25 +2,58 @@
 
 const { onMounted, ref, watch } = window.Vue;
 
-// Field that shows a value of the page. While a number is being typed, updates of the page leave it alone.
+const KEPT_MS = 1500; // after it, a field shows the page's value again if the server took another one
+
+// Field that shows a value of the page. While a number is being typed, updates of the page leave it alone. Enter leaves
+// the field, Escape also forgets what was typed. A number outside its limits is refused, and the value of the page kept.
 export const NumberField = {
-  props: { value: [Number, String] },
+  inheritAttrs: false,
+  props: { value: [Number, String], low: { type: Number, default: -Infinity }, high: { type: Number, default: Infinity }, unit: { type: String, default: '' } },
   emits: ['typed'],
-  template: '<input ref="box" type="number" step="any" @input="typing = true" @change="done" @blur="show"/>',
+  template: `<span class="number"><input ref="box" type="number" step="any" v-bind="$attrs" :aria-invalid="!!wrong"
+    @input="typed" @change="done" @blur="left" @keydown.enter="box.blur()" @keydown.esc="forget"/>
+    <span v-if="wrong" class="wrong" role="alert">{{ wrong }}</span></span>`,
   setup(props, { emit }) {
     const box = ref(null);
-    const typing = ref(false);
+    const wrong = ref('');
+    let state = 'shown'; // or 'typing' or 'sent'
+    let timer = 0;
     function show() {
-      typing.value = false;
-      box.value.value = props.value;
+      state = 'shown';
+      if (box.value) box.value.value = props.value;
+    }
+    function typed() {
+      state = 'typing';
+      wrong.value = '';
     }
     function done() {
-      typing.value = false;
-      emit('typed', box.value.value);
+      const text = box.value.value;
+      const value = Number(text);
+      if (text !== '' && value >= props.low && value <= props.high) {
+        state = 'sent';
+        window.clearTimeout(timer);
+        timer = window.setTimeout(() => state === 'sent' && show(), KEPT_MS);
+        emit('typed', text);
+        return;
+      }
+      const range = Number.isFinite(props.high) ? `${props.low} to ${props.high}` : 'a number';
+      wrong.value = `${text === '' ? 'This' : text} is refused: give ${range}${props.unit && ` ${props.unit}`}. ${props.value} is kept.`;
+      show();
+    }
+    function left() {
+      if (state !== 'sent') show();
+    }
+    function forget() {
+      show();
+      box.value.blur();
     }
     onMounted(show);
-    watch(() => props.value, () => typing.value || show());
-    return { box, typing, done, show };
+    watch(() => props.value, () => {
+      if (state === 'typing') return;
+      wrong.value = '';
+      show();
+    });
+    return { box, wrong, typed, done, left, forget };
   },
 };
 
@@ -29,7 +62,7 @@ export const NumberField = {
 export const KnobField = {
   components: { NumberField },
   props: { name: String, label: String, unit: String, value: Number, least: Number, most: Number, step: Number, truth: Number,
-    note: String },
+    note: String, low: Number, high: Number },
   emits: ['drag', 'typed', 'chosen'],
   template: `<div class="knob">
     <label :for="'slider-' + name">{{ label }} ({{ unit }})</label>
@@ -40,6 +73,7 @@ export const KnobField = {
       <i v-if="truth !== null && truth !== undefined" class="truth" :title="'known truth: ' + truth"
         :style="{ left: 'calc(8px + (100% - 16px) * ' + (truth - least) / (most - least) + ')' }"></i>
     </div>
-    <NumberField :id="'field-' + name" :aria-label="label + ', number'" :value="value" @typed="$emit('typed', $event)"/>
+    <NumberField :id="'field-' + name" :aria-label="label + ', number'" :value="value" :low="low" :high="high" :unit="unit"
+      @typed="$emit('typed', $event)"/>
   </div>`,
 };

@@ -10,6 +10,8 @@ import { RateTimeline } from './timeline.js';
 const { inject, nextTick, onBeforeUnmount, onMounted, ref, watch } = window.Vue;
 const FIELDS = 'input:not([type=range]):not([type=checkbox]):not([type=radio]), textarea, select';
 const RETRY_MS = 1500;
+const ASK_MS = 250; // interval between questions that the server answers at once, if it runs and is connected
+const LATE_MS = 750; // age of an unanswered question from which the page is marked
 const ADDRESS_MS = 300; // a change of the address costs the browser more than a drawn cloud: once, after a drag
 
 // Saves a file that the server sends, or that the page makes.
@@ -24,12 +26,29 @@ function download(name, content, type) {
 // Element around the page: keys, the state in the address, downloads, and the loss of the connection.
 const PageFrame = {
   props: { address: String, lost: String },
+  emits: ['late'],
   template: '<div ref="root"><slot/></div>',
-  setup(props) {
+  setup(props, { emit }) {
     const trame = inject('trame');
     const root = ref(null);
     let timer = 0;
     let changed = 0;
+    let asked = 0; // time of the question that is not answered yet
+    let asking = 0;
+
+    // Calls are answered in their order: an answer tells that the server has taken all changes before the question.
+    function ask() {
+      const now = performance.now();
+      if (asked) {
+        if (now - asked > LATE_MS) emit('late', Math.max(1, Math.round((now - asked) / 1000)));
+        return;
+      }
+      asked = now;
+      trame.trigger('answer').then(() => {
+        asked = 0;
+        emit('late', 0);
+      }, () => {});
+    }
 
     function pressed(event) {
       if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches(FIELDS)) return;
@@ -70,6 +89,7 @@ const PageFrame = {
       if (lost) timer = window.setInterval(retry, RETRY_MS);
     }, { immediate: true });
     onMounted(() => {
+      asking = window.setInterval(ask, ASK_MS);
       window.addEventListener('keydown', pressed);
       window.addEventListener('hashchange', restore);
       root.value.addEventListener('click', released);
@@ -80,6 +100,7 @@ const PageFrame = {
       window.removeEventListener('keydown', pressed);
       window.removeEventListener('hashchange', restore);
       window.clearInterval(timer);
+      window.clearInterval(asking);
       window.clearTimeout(changed);
     });
     return { root };

@@ -1,18 +1,65 @@
 // Component with an image of the sensor: zoom, pan, draw a region, measure a distance. Linked images move together.
 
+import { text as round } from './ticks.js';
+
 const { computed, onBeforeUnmount, onMounted, reactive, ref, watch } = window.Vue;
 const linked = {}; // zoom and place of linked images
 const KEYS = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const BLUE = '#56b4e9';
 const YELLOW = '#f0e442';
 
+const ARRAYS = { uint8: Uint8Array, uint16: Uint16Array, float32: Float32Array };
+
+function numbers({ values, kind }) {
+  return new ARRAYS[kind](values.slice().buffer);
+}
+
+// Return a canvas with a picture of the server: each value's place on its scale gives its colour.
+export function painted(picture) {
+  const { width, height, low, high, gamma, pair } = picture;
+  const values = numbers(picture);
+  const canvas = Object.assign(document.createElement('canvas'), { width, height });
+  const image = new ImageData(width, height);
+  const pixels = new Uint32Array(image.data.buffer);
+  const known = new Map();
+  const place = (value) => {
+    if (!known.has(value)) known.set(value, Math.max(0, Math.min(1, (value - low) / (high - low))) ** gamma);
+    return known.get(value);
+  };
+  const direct = (value) => Math.max(0, Math.min(1, (value - low) / (high - low)));
+  const at = gamma === 1 ? direct : place;
+  if (pair) {
+    const n = width * height;
+    for (let i = 0; i < n; i++) {
+      const [off, on] = [at(values[i]), at(values[n + i])];
+      const [r, g, b] = [0, 1, 2].map((k) => Math.round(255 * Math.min(1, off * pair[0][k] + on * pair[1][k])));
+      pixels[i] = (0xff000000 | (b << 16) | (g << 8) | r) >>> 0;
+    }
+  } else {
+    const table = new Uint32Array(picture.table.slice().buffer);
+    for (let i = 0; i < pixels.length; i++) pixels[i] = Number.isNaN(values[i]) ? 0xff000000 : table[Math.floor(255 * at(values[i]))];
+  }
+  canvas.getContext('2d').putImageData(image, 0, 0);
+  return canvas;
+}
+
+// Return the value of a picture at a pixel as text.
+function valueAt(picture, column, row) {
+  const values = numbers(picture);
+  const { width, height, unit, pair } = picture;
+  if (column < 0 || row < 0 || column >= width || row >= height) return '';
+  const k = row * width + column;
+  if (pair) return `${values[k]} OFF, ${values[width * height + k]} ON`;
+  return Number.isNaN(values[k]) ? 'no event' : `${round(values[k])} ${unit}`;
+}
+
 export const EventPicture = {
-  props: { src: String, label: String, size: Array, crop: Array, frame: Array, link: String, tool: String },
+  props: { picture: Object, label: String, size: Array, crop: Array, frame: Array, link: String, tool: String },
   emits: ['region', 'at', 'measured'],
   template: `<canvas ref="canvas" class="picture" tabindex="0" role="img" :aria-label="text"></canvas>`,
   setup(props, { emit }) {
     const canvas = ref(null);
-    const image = new Image();
+    let image = null;
     const view = (linked[props.link] ||= reactive({ zoom: 1, x: 0.5, y: 0.5 }));
     const text = computed(() => `${props.label}. Wheel or plus and minus to zoom, arrow keys to move, 0 for all.`);
     let drawn = null; // region or line that is being drawn [px of the sensor]
@@ -50,9 +97,7 @@ export const EventPicture = {
       context.scale(ratio, ratio);
       const [left, top, right, bottom] = area();
       context.imageSmoothingEnabled = scale() < 1;
-      if (image.complete && image.naturalWidth) {
-        context.drawImage(image, ...seen(left, top), (right - left) * scale(), (bottom - top) * scale());
-      }
+      if (image) context.drawImage(image, ...seen(left, top), (right - left) * scale(), (bottom - top) * scale());
       if (props.frame) rectangle(context, props.frame, BLUE);
       if (drawn && props.tool === 'measure') measure(context, drawn);
       else if (drawn) rectangle(context, drawn, YELLOW);
@@ -149,7 +194,14 @@ export const EventPicture = {
     function hovered(event) {
       const [x, y] = place(event).map(Math.floor);
       const inside = x >= 0 && y >= 0 && x < props.size[0] && y < props.size[1];
-      emit('at', inside ? `x ${x}, y ${y} px` : '');
+      const [left, top] = area();
+      emit('at', inside ? `x ${x}, y ${y} px: ${props.picture ? valueAt(props.picture, x - left, y - top) : ''}` : '');
+    }
+
+    function paint() {
+      image = props.picture ? painted(props.picture) : null;
+      draw();
+      canvas.value.dataset.images = Number(canvas.value.dataset.images || 0) + 1;
     }
 
     function typed(event) {
@@ -164,12 +216,6 @@ export const EventPicture = {
     }
 
     onMounted(() => {
-      image.onload = () => {
-        if (!canvas.value) return;
-        draw();
-        canvas.value.dataset.images = Number(canvas.value.dataset.images || 0) + 1;
-      };
-      image.src = props.src || '';
       observer = new window.ResizeObserver(() => window.requestAnimationFrame(draw));
       observer.observe(canvas.value);
       canvas.value.addEventListener('pointerdown', pressed);
@@ -177,15 +223,14 @@ export const EventPicture = {
       canvas.value.addEventListener('dblclick', () => zoom(0));
       canvas.value.addEventListener('contextmenu', (event) => event.preventDefault());
       canvas.value.addEventListener('keydown', typed);
+      paint();
       canvas.value.addEventListener('wheel', (event) => {
         event.preventDefault();
         zoom(Math.exp(-0.0015 * event.deltaY), ...share(place(event)));
       }, { passive: false });
     });
     onBeforeUnmount(() => observer.disconnect());
-    watch(() => props.src, (src) => {
-      image.src = src || '';
-    });
+    watch(() => props.picture, paint);
     watch(() => props.tool, () => {
       drawn = null;
       emit('measured', '');

@@ -1,5 +1,6 @@
 // Components with plots: the sharpness over a parameter, and the sharpness over two parameters as a map.
 
+import { painted } from './pictures.js';
 import { text, ticks } from './ticks.js';
 
 const LEAST_SHARE = 0.18; // of a colour bar between two numbers
@@ -97,11 +98,14 @@ export const CostSurface = {
 
 export const ColourBar = {
   props: { scale: Object },
-  template: `<small class="colour-bar"><span class="bar" :style="{ background: scale.bar }"></span>
-    <span v-for="t in apart" class="mark" :style="{ left: 100 * t[0] + '%', transform: 'translateX(' + -100 * t[0] + '%)' }">{{ t[1] }}</span><span class="title" :title="scale.title">{{ scale.title }}</span></small>`,
+  template: `<small class="colour-bar" v-if="!scale.square"><span class="bar" :style="{ background: scale.bar }"></span>
+    <span v-for="t in apart" class="mark" :style="{ left: 100 * t[0] + '%', transform: 'translateX(' + -100 * t[0] + '%)' }">{{ t[1] }}</span><span class="title" :title="scale.title">{{ scale.title }}</span></small>
+    <small class="colour-square" v-else><img :src="square" alt=""/><span>{{ scale.title }}<br/>right: OFF, 0 to {{ last }}<br/>up: ON, 0 to {{ last }}</span></small>`,
   setup(props) {
     const close = ([at], [before] = [-1]) => at - before < LEAST_SHARE;
     const apart = computed(() => props.scale.ticks.reduce((kept, tick) => (close(tick, kept.at(-1)) ? kept : [...kept, tick]), []));
-    return { apart };
+    const square = computed(() => props.scale.square && painted(props.scale.square).toDataURL());
+    const last = computed(() => props.scale.square && props.scale.square.high);
+    return { apart, square, last };
   },
 };
