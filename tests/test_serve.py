@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import os
+import socket
 import threading
 import time
 import weakref
@@ -15,6 +16,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from amiwarp import AmiwarpError
+from amiwarp.viewer import serve as serve_module
 from amiwarp.viewer.serve import Check, Session, number, serve
 
 pytest.importorskip("trame_client")
@@ -215,3 +217,43 @@ def test_sockets_of_other_sites_are_refused(origin: str | None) -> None:
         for given, status in ((origin, 403), (origin_of(url), 101)):
             assert asyncio.run_coroutine_threadsafe(connect(url, given), loop).result(WAIT_S) == status
     assert len(build.servers) == build.closed == 1
+
+
+def received(url: str, sent: bytes) -> bytes:
+    """Return what the server answers to bytes on a new connection, until it closes the connection."""
+    address = urlsplit(url)
+    with socket.create_connection((address.hostname, address.port), WAIT_S) as connection:
+        connection.sendall(sent)
+        return b"".join(iter(lambda: connection.recv(4096), b""))
+
+
+@pytest.mark.parametrize("hosts", [b"Host: localhost\r\nHost: evil.example\r\n", b""])
+def test_a_request_with_two_hosts_or_none_is_refused_without_a_traceback(
+    hosts: bytes, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    with served(Counters()) as (url, _):
+        assert b"400 Bad Request" in received(url, b"GET / HTTP/1.1\r\n" + hosts + b"\r\n")
+    assert caplog.records == []
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_connections_without_a_complete_request_are_closed(monkeypatch: pytest.MonkeyPatch, browser: Any) -> None:
+    monkeypatch.setattr(serve_module, "SILENT_S", 0.2)
+    with served(Counters()) as (url, _), browser.new_context() as context:
+        page = opened(context)
+        page.goto(url)
+        for sent in (b"", b"GET / HTTP/1.1\r\nHost: loc"):
+            assert received(url, sent) == b""
+        page.get_by_role("button").click()  # an open tab stays open
+        page.locator("#double").filter(has_text="2").wait_for()
+
+
+def test_a_page_may_load_only_from_its_server() -> None:
+    with served(Counters()) as (url, _):
+        connection = HTTPConnection(urlsplit(url).netloc, timeout=WAIT_S)
+        connection.request("GET", urlsplit(url).path)
+        policy = connection.getresponse().getheader("Content-Security-Policy")
+        connection.close()
+    assert policy is not None
+    assert "default-src 'none'" in policy
+    assert "http" not in policy

@@ -22,6 +22,8 @@ from amiwarp import (
     AmiwarpError,
     Calibration,
     Camera,
+    Encoder,
+    Events,
     MemoryEvents,
     Prism,
     PrismMotion,
@@ -794,6 +796,114 @@ def test_the_page_fits_windows_of_all_sizes(page: Any) -> None:
         assert page.evaluate("document.documentElement.scrollWidth <= 390")
     finally:
         page.set_viewport_size({"width": SIZES[0][0], "height": SIZES[0][1]})
+
+
+def test_at_a_zoom_of_200_percent_the_clouds_fill_the_window_and_the_rest_is_below(page: Any) -> None:
+    try:
+        page.set_viewport_size({"width": 683, "height": 384})
+        page.wait_for_timeout(150)
+        box = page.locator(".clouds canvas").bounding_box()
+        assert box["width"] * box["height"] > 0.35 * 683 * 384
+        assert box["y"] + box["height"] < 384
+        picture = cloud(page)
+        for half in np.split(picture[:, : picture.shape[1] // 2 * 2], 2, axis=1):
+            assert (half.max(axis=2) - half.min(axis=2) > 80).mean() > 0.01
+        for name in ("#image-after", "#curve", "#timeline canvas"):
+            page.locator(name).scroll_into_view_if_needed()
+            box = page.locator(name).bounding_box()
+            assert min(box["width"], box["height"]) > 40
+            assert box["y"] + box["height"] <= 384
+        assert page.evaluate("document.documentElement.scrollWidth <= 683")
+    finally:
+        page.set_viewport_size({"width": SIZES[0][0], "height": SIZES[0][1]})
+
+
+def test_a_large_sensor_is_shown_soon_in_squares_of_pixels(opened: Open) -> None:
+    rng, n, (width, height) = np.random.default_rng(0), 60_000, (4096, 2304)
+    x, y = rng.integers(0, width, n), rng.integers(0, height, n)
+    x[: n // 2] = 1000 + rng.normal(0.0, 2.0, n // 2).astype(np.int64)
+    events = Events.from_arrays(x, y, np.sort(rng.integers(0, 200_000, n)), rng.integers(0, 2, n))
+    turning = Encoder.constant_speed(720.0, -5000, 205_000)
+    made = Recording(MemoryEvents(events, width, height), Camera.from_fov(width, height, 1.0), turning, Prism(0.02))
+    page = opened(of=made)
+    left, _, right, _ = region(page)
+    assert right - left <= 120
+    assert abs((left + right) / 2 - 1000) < 150  # the line, or where the prism may have moved it from
+    page.mouse.move(*middle(page, "#image-overview"))
+    page.locator(".tile small").first.filter(has_text="events at most in 2×2 px").wait_for()
+
+
+def texts(page: Any, *, zoomed: bool) -> list[str]:
+    """Return the texts of the clouds at the present zoom, or after a turn of the wheel over the left one."""
+    page.evaluate("""() => {
+        window.drawnTexts = new Set();
+        window.writeText ||= CanvasRenderingContext2D.prototype.fillText;
+        CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
+            if (this.canvas.closest('.clouds')) window.drawnTexts.add(text);
+            return window.writeText.call(this, text, ...rest);
+        };
+    }""")
+    box = page.locator(".clouds canvas").bounding_box()
+    page.mouse.move(box["x"] + 0.25 * box["width"], box["y"] + 0.5 * box["height"])
+    page.mouse.wheel(0, -1200 if zoomed else -1)
+    page.wait_for_timeout(150)
+    found: list[str] = page.evaluate("[...window.drawnTexts]")
+    page.evaluate("CanvasRenderingContext2D.prototype.fillText = window.writeText; null")
+    return found
+
+
+@pytest.mark.parametrize("view", ["free", "x-y", "x-θ", "y-θ"])
+def test_ticks_stay_at_every_zoom_and_points_leave_title_and_ticks_alone(page: Any, view: str) -> None:
+    page.locator(f"#view-{view}").click()
+    page.locator("#do-whole").click()
+    page.wait_for_function("document.querySelector('#region-right').value === '128'")
+    ready(page)
+    number = re.compile(r"-?[\d.]+")
+    at_first, zoomed = texts(page, zoomed=False), texts(page, zoomed=True)
+    for found in (at_first, zoomed):
+        assert len([text for text in found if number.fullmatch(text)]) >= 4
+        assert "as recorded" in found
+    assert {text for text in zoomed if number.fullmatch(text)} != {text for text in at_first if number.fullmatch(text)}
+    picture = cloud(page)[:24]  # the titles
+    assert (picture.max(axis=2) - picture.min(axis=2)).max() < 40
+    if view != "free":
+        left = cloud(page)[30:-46, :50]  # titles and ticks of the upright axis
+        assert (left.max(axis=2) - left.min(axis=2)).max() < 40
+
+
+def test_a_message_does_not_cover_the_axes(page: Any) -> None:
+    page.evaluate("trame.trigger('typed', ['apex', 'x'])")
+    message(page, "is not a number")
+    canvas, text = (page.locator(name).bounding_box() for name in (".clouds canvas", "#message"))
+    assert text["y"] + text["height"] <= canvas["y"]
+    page.locator("#message button").click()
+
+
+def test_control_z_undoes_and_the_look_is_kept_on_reload(opened: Open) -> None:
+    page = opened()
+    try:
+        enter(page, "apex", 0.9)
+        ready(page)
+        page.keyboard.press("Control+z")
+        until(lambda: field(page, "apex") == NOMINAL_DEG)
+        page.keyboard.press("Control+Shift+Z")
+        until(lambda: field(page, "apex") == 0.9)
+        page.keyboard.press("d")
+        page.locator("[data-theme=dark]").wait_for()
+        page.locator("#point_size").fill("5")
+        page.wait_for_timeout(200)
+        page.reload()
+        ready(page)
+        page.locator("[data-theme=dark]").wait_for()
+        until(lambda: page.locator("#point_size").input_value() == "5")
+    finally:
+        page.evaluate("localStorage.clear()")
+
+
+def test_one_event_has_no_sharpness(opened: Open, recording: Recording) -> None:
+    one = MemoryEvents(recording.events.slice(20_000, 20_001), *recording.events.size)
+    page = opened(of=replace(recording, events=one, truth=None))
+    assert page.locator("#sharpness").inner_text() == "sharpness unknown: too few events"
 
 
 @pytest.mark.parametrize("dark", [False, True])

@@ -311,6 +311,28 @@ def test_every_parameter_has_a_source(recording: Recording, inspector: Inspector
         bare.take_truth()
 
 
+def test_a_closed_inspector_measures_no_longer(inspector: Inspector) -> None:
+    """So a server ends soon, even in the middle of a curve of a large sensor."""
+    measure = inspector.sharpness_meter()
+    measure(inspector.knobs)
+    inspector.closed = True
+    with pytest.raises(AmiwarpError, match="is closed"):
+        measure(inspector.knobs)
+
+
+def test_of_a_large_image_the_square_with_most_events_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    before = rng.poisson(1.0, (700, 900)).astype(np.float32)
+    before[320:640, 512:832] += 3.0
+    after = before.copy()
+    after[450:540, 600:700] = np.where(np.arange(100) % 10 < 2, 20.0, 0.0)
+    monkeypatch.setattr(viewer, "MOST_SEARCHED", 330**2)
+    assert viewer.busiest(before) == (512, 320, 832, 640)
+    left, top, right, bottom = suggest_region(before, after).region
+    assert 590 < left < right < 720
+    assert 440 < top < bottom < 560
+
+
 def test_two_sets_of_parameters_are_compared(inspector: Inspector) -> None:
     wrong = replace(inspector.knobs, phase=inspector.knobs.phase + math.pi)
     both = inspector.show(against=wrong)

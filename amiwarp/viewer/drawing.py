@@ -1143,6 +1143,8 @@ DIFFERENCES = np.array([[0, 114, 178], [255, 255, 255], [213, 94, 0]], np.float6
 """Colours of fewer, equally many and more events in an image of differences."""
 STOPS = 16
 """Number of colours from which the browser draws a colour scale."""
+MOST_SENT = 4_000_000
+"""Largest number of pixels of an image that the browser gets."""
 SQUARE = 32
 """Width and height of the legend of two polarities [colours]."""
 
@@ -1199,16 +1201,21 @@ def scale_state(scale: Scale) -> dict[str, Any]:
 def picture_state(values: NDArray[Any], scale: Scale) -> dict[str, Any]:
     """Return an image as the browser draws it: its values, and how they become colours as in :meth:`Scale.rgb`.
 
-    ``values``: shape ``(height, width)``, or ``(2, height, width)`` for OFF and ON.
+    ``values``: shape ``(height, width)``, or ``(2, height, width)`` for OFF and ON. Of an image with more than
+    :data:`MOST_SENT` pixels, the browser gets the largest values in squares of pixels.
     """
+    step, kind = math.ceil(math.sqrt(math.prod(values.shape[-2:]) / MOST_SENT)), "float32"
+    for axis in (-2, -1) if step > 1 else ():
+        values = np.fmax.reduceat(values, range(0, values.shape[axis], step), axis=axis)
     height, width = values.shape[-2:]
-    kind = "float32"
+    unit = "events" if scale.counts else scale.unit
     if scale.counts and scale.low == 0.0 and (most := values.max(initial=0.0)) < 1 << 16:
         kind = "uint8" if most < 1 << 8 else "uint16"
     two = scale.colours == "polarity"
     return {
         "values": np.ascontiguousarray(values, kind).tobytes(), "kind": kind, "width": width, "height": height,
-        "low": scale.low, "high": scale.high, "gamma": scale.gamma, "unit": "events" if scale.counts else scale.unit,
+        "low": scale.low, "high": scale.high, "gamma": scale.gamma, "step": step,
+        "unit": unit if step == 1 else f"{unit} at most in {step}×{step} px",
         "pair": [list(OFF_ON_BLACK), list(ON_ON_BLACK)] if two else None,
         "table": b"" if two else _pixels(table_of(scale.colours)),
     }  # fmt: skip

@@ -644,6 +644,9 @@ largest factor is chosen.
 
 The variance grows with the square of the number of events, so that nearly empty regions are no candidates.
 """
+MOST_SEARCHED, BLOCK_PX = 1 << 22, 64
+"""Largest number of pixels that are searched; of a larger image, the square with most events, in steps of
+:data:`BLOCK_PX` [px]."""
 LEAST_SHARE = 0.8
 """Smallest ratio of the number of recorded events to that of compensated events in a candidate: its edges do not come
 from outside."""
@@ -669,6 +672,12 @@ def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32], *, m
     orbit, no events of the region were outside of the image during a part of the turn.
     """
     rows, columns = before.shape
+    if before.size > MOST_SEARCHED:
+        left, top, right, bottom = busiest(before)
+        part = np.s_[top:bottom, left:right]
+        found = suggest_region(before[part], after[part], margin=margin)
+        x0, y0, x1, y1 = found.region
+        return replace(found, region=(left + x0, top + y0, left + x1, top + y1))
     width = min(columns, WIDEST, max(columns // 3, NARROWEST))
     while True:
         height = min(rows, max(1, round(width * min(rows / columns, 1.0))))
@@ -677,6 +686,19 @@ def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32], *, m
         if events <= CLEAR_EVENTS or width <= NARROWEST:
             return Suggestion((left, top, left + width, top + height), gains)
         width = max(NARROWEST, min(width - 1, int(width * (CLEAR_EVENTS / events) ** 0.5)))
+
+
+def busiest(image: NDArray[np.float32]) -> Region:
+    """Return the part of a large image, of at most :data:`MOST_SEARCHED` pixels, that has most events."""
+    side = math.isqrt(MOST_SEARCHED) // BLOCK_PX
+    rows, columns = (-(-size // BLOCK_PX) for size in image.shape)
+    blocks = np.add.reduceat(np.add.reduceat(image, range(0, image.shape[0], BLOCK_PX), axis=0),
+                             range(0, image.shape[1], BLOCK_PX), axis=1).astype(np.float64)  # fmt: skip
+    height, width = min(side, rows), min(side, columns)
+    means = _box_means(blocks, width, height)
+    top, left = (BLOCK_PX * int(k) for k in np.unravel_index(int(np.argmax(means)), means.shape))
+    right, bottom = min(left + BLOCK_PX * width, image.shape[1]), min(top + BLOCK_PX * height, image.shape[0])
+    return left, top, right, bottom
 
 
 def _best_box(
@@ -799,6 +821,8 @@ class Inspector:
         self._harmonics: tuple[float, ...] | None = None
         self._window: LoadedWindow | None = None
         self._span: Span | None = None
+        self.closed = False
+        """Whether nobody looks any more: measuring the sharpness then raises :class:`AmiwarpError`."""
         self.lock = Lock()
         """Lock for the events on the device and the buffers of their images."""
         self._imager, self._curve_imager = (WindowImager(source.size, device) for _ in range(2))
@@ -1025,6 +1049,8 @@ class Inspector:
         on_device: dict[float, UploadedEvents] = {}
 
         def sharpness(knobs: Knobs | None) -> float:
+            if self.closed:
+                raise AmiwarpError(f"{self.recording.name}: is closed")
             given = self._unprismed if knobs is None else knobs
             rpm = 0.0 if self.has_encoder else given.rpm
             if rpm not in on_device:

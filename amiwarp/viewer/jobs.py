@@ -33,7 +33,16 @@ from amiwarp.live.stream.session import RecentEvents
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.viewer.drawing import Look, Scene, SelectedPart, ShownImages, orbit_lines, select_part
-from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, DisplayedWindow, Inspector, Knobs, Source, kept
+from amiwarp.viewer.inspector import (
+    CURVE_HALF_WIDTH,
+    MOST_SEARCHED,
+    DisplayedWindow,
+    Inspector,
+    Knobs,
+    Source,
+    busiest,
+    kept,
+)
 
 # Work of one page: its threads, jobs and updates, and the messages about their errors.
 
@@ -233,7 +242,7 @@ def estimate_phase(inspector: Inspector) -> bool:
     """
     if inspector.sources["phase"] is not Source.ASSUMED or not math.isfinite(inspector.turn_us):
         return False
-    measure = inspector.sharpness_meter()
+    measure = _searched(inspector).sharpness_meter()
     sharpness: dict[float, float] = {}
 
     def best(phases: list[float]) -> float:
@@ -252,6 +261,19 @@ def estimate_phase(inspector: Inspector) -> bool:
     inspector.set(replace(inspector.knobs, phase=found))
     inspector.sources["phase"] = Source.ESTIMATED
     return True
+
+
+def _searched(inspector: Inspector) -> Inspector:
+    """Return the inspector, or one of the part of a large sensor with most events, so that the search stays short."""
+    width, height = inspector.recording.events.size
+    if width * height <= MOST_SEARCHED:
+        return inspector
+    window = inspector.loaded
+    part = select_part(inspector, window, busiest(inspector.counts(window, None)))
+    small = Inspector(part.recording, device=inspector.device)
+    small.set(inspector.knobs)
+    small.window = part.start_us, part.length_us
+    return small
 
 
 # Calibration on what the inspector shows, and the sharpness over two parameters.

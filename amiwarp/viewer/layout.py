@@ -8,12 +8,14 @@ from urllib.parse import parse_qsl, urlencode
 
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
+from amiwarp.imaging.metrics import random_variance
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.drawing import NO_ORBIT, ImageKind
 from amiwarp.viewer.inspector import (
     NO_ENCODER,
     OTHERS,
     SLIDING,
+    SMOOTHING_PX,
     DisplayedWindow,
     Inspector,
     Knobs,
@@ -317,8 +319,8 @@ KEYS = (
     ("o", ("toggle", "overlaid"), "side by side or overlaid"),
     ("d", ("toggle", "dark"), "light or dark"),
     ("l", ("toggle", "loop"), "play in a loop, or once"),
-    ("z", ("undo",), "undo"),
-    ("y", ("redo",), "redo"),
+    ("z", ("undo",), "undo; also Ctrl+Z"),
+    ("y", ("redo",), "redo; also Ctrl+Y"),
     ("r", ("reset",), "back to the first state"),
     ("b", ("keep_b",), "keep the parameters as B, to compare with"),
     ("c", ("calibrate",), "calibrate, or cancel"),
@@ -348,6 +350,10 @@ SETTABLE: dict[str, Check] = {
 :data:`CALLS`."""
 CLIENT_ONLY = ("hover", "measured", "tool", "late")
 """State variables that the browser keeps to itself."""
+PLACE_VARIANCE = 0.0025
+"""Relative variance of what one event adds to the variance of an image smoothed by 1 px, over its place in a pixel."""
+LEAST_CERTAIN = 0.05
+"""Standard deviation of the sharpness of random events below which any sharpness is shown."""
 NO_SCALE: dict[str, Any] = {"bar": "", "ticks": [], "title": "", "square": None}
 """Scale of an image before the first update."""
 
@@ -476,8 +482,18 @@ def caption(inspector: Inspector, shown: DisplayedWindow) -> str:
 
 
 def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:
-    """Return the sharpness of the images as text, with the gain if there are two images."""
+    """Return the sharpness of the images as text, with the gain if there are two images.
+
+    So few events that their sharpness may be that of random ones have none.
+    """
     before, after = shown.sharpness_before, shown.sharpness_after
+    left, top, right, bottom = shown.region
+    area = (right - left) * (bottom - top)
+    # for random events, the variance over mean varies by sqrt(2 / area) of itself, and with the places in the pixels
+    relative = math.sqrt(2.0 / area + PLACE_VARIANCE / shown.selected)
+    deviation = random_variance(SMOOTHING_PX) * area / shown.selected * relative
+    if deviation > LEAST_CERTAIN and max(abs(before), abs(after)) < 3.0 * deviation:
+        return "unknown: too few events"
     if not compensated:
         return f"{before:.3f}"
     gain = f" (×{after / before:.2f})" if before > 1e-3 and after > 0.0 else ""

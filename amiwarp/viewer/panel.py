@@ -33,8 +33,9 @@ BINS = 400
 """Number of points of the drawn event rates."""
 STEP_S = 0.2
 """Duration of counting events after which the timeline shows what is counted [s]."""
-PLAY_S, FOLLOW_S = 0.05, 0.25
-"""Shortest interval between two pictures while a recording is played, and while a live stream is followed [s]."""
+PLAY_S, FOLLOW_S, RATES_S = 0.05, 0.1, 1.0
+"""Shortest interval between two pictures while a recording is played, and while a live stream is followed, and between
+two counts of a live stream's events for the timeline [s]."""
 
 
 class Panel:
@@ -89,6 +90,7 @@ class Panel:
     def close(self) -> None:
         """Stop all work of the browser tab."""
         self.cancel()
+        self.inspector.closed = True
         self.work.close()
 
     def cancel(self) -> None:
@@ -304,15 +306,19 @@ class Panel:
     async def _follow(self) -> None:
         """Show the current events of a live stream, again and again."""
         await self.work.until_drawn()  # with the suggested region
+        loop, counted_s = asyncio.get_running_loop(), -math.inf
         while self.state.playing:
+            start_s = loop.time()
             with self.state:
                 with self.work.errors_shown("stream"):
                     self.inspector.renew()
                 self.state.update(layout.source_state(self.inspector))
-                self._count_events()
+                if start_s >= counted_s + RATES_S:
+                    counted_s = start_s
+                    self._count_events()
                 self._move(float(self.state.whole_ms))
             await self.work.until_drawn()
-            await asyncio.sleep(FOLLOW_S)
+            await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
 
     async def _watch(self, source: jobs.LiveSource) -> None:

@@ -319,8 +319,17 @@ LONGEST_CLEANUP_S = 30.0
 """Longest interval between two attempts to release closed tabs whose threads still run [s]."""
 FAILURE = '<main role="alert" style="white-space: pre-wrap; padding: 24px; font: 16px system-ui">{{ failure }}</main>'
 """Page that is shown if the inspector's page cannot be built."""
-HEADERS = {"Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}
+POLICY = (
+    "default-src 'none'; script-src 'self' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; img-src 'self' data: "
+    "blob:; font-src 'self' data:; connect-src 'self'; base-uri 'self'; form-action 'none'"
+)
+"""Content that the page may load: only from this server. Vue compiles the page's template, which needs eval."""
+HEADERS = {
+    "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff", "Content-Security-Policy": POLICY,
+}  # fmt: skip
 """Headers of every HTTP answer. The first one keeps the page's address, which contains the token, from other sites."""
+SILENT_S, IDLE_S = 10.0, 75.0
+"""Time after which a connection is closed that has sent no complete request, and one that sends no further one [s]."""
 
 
 async def serve(
@@ -345,9 +354,12 @@ async def serve(
         raise AmiwarpError("the token is empty: expected a secret, for example secrets.token_urlsafe()")
     if not normalised(host):
         raise AmiwarpError("the host is empty: expected a name or an address of this machine, such as 127.0.0.1")
-    application = _application(Tabs(build, settable), token, await asyncio.to_thread(HostNames, host))
-    runner = web.AppRunner(application, handle_signals=False, access_log=None, shutdown_timeout=5.0)
+    heard: set[Any] = set()
+    application = _application(Tabs(build, settable), token, await asyncio.to_thread(HostNames, host), heard)
+    runner = web.AppRunner(application, handle_signals=False, access_log=None, shutdown_timeout=5.0,
+                           keepalive_timeout=IDLE_S, logger=_request_logger())  # fmt: skip
     await runner.setup()
+    closing = asyncio.create_task(_close_silent(runner.server, heard))
     try:
         try:
             await web.TCPSite(runner, normalised(host), port).start()
@@ -358,7 +370,30 @@ async def serve(
             ready(address(bound if bound in ALL_INTERFACES else host, number, token))
         await asyncio.Event().wait()
     finally:
+        closing.cancel()
         await runner.cleanup()
+
+
+async def _close_silent(server: Any, heard: set[Any]) -> None:
+    """Close connections that have sent no complete request for :data:`SILENT_S` to twice that."""
+    before: set[Any] = set()
+    while True:
+        await asyncio.sleep(SILENT_S)
+        heard.intersection_update(server.connections)
+        silent = {*server.connections} - heard
+        for each in silent & before:
+            if each.transport is not None:
+                each.transport.abort()
+        before = silent
+
+
+def _request_logger() -> logging.Logger:
+    """Return a logger for errors of requests, without those that are the client's: it gets an answer, status 400."""
+    from aiohttp.http_exceptions import HttpProcessingError
+
+    logger = logging.getLogger(f"{__name__}.requests")
+    logger.filters[:] = [lambda record: not (record.exc_info and isinstance(record.exc_info[1], HttpProcessingError))]
+    return logger
 
 
 class Tabs:
@@ -427,12 +462,16 @@ def _refuse_tab(_: Any) -> Closing:
     raise AmiwarpError(TOO_MANY_TABS)
 
 
-def _application(tabs: Tabs, token: str, names: HostNames) -> web.Application:
-    """Return the application. It refuses unknown host names and requests with a body, and sets the headers."""
+def _application(tabs: Tabs, token: str, names: HostNames, heard: set[Any]) -> web.Application:
+    """Return the application. It refuses unknown host names and requests with a body, and sets the headers.
+
+    It adds the connections of complete requests to ``heard``.
+    """
     from aiohttp import web
 
     @web.middleware
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
+        heard.add(request.protocol)
         try:
             if not names.accept(request):
                 raise web.HTTPForbidden(text="Not allowed: unknown host name; open the URL that was printed.")

@@ -4,7 +4,7 @@ const VIEWS = {
   free: [Math.atan2(-1.35, 1), 0.42], 'x-y': [-Math.PI / 2, Math.PI / 2], 'x-θ': [-Math.PI / 2, 0], 'y-θ': [Math.PI, 0],
 };
 const PERSPECTIVE = 0.22; // strength of the perspective; views along an axis are parallel
-const MARGIN = { left: 66, right: 34, top: 30, bottom: 46 }; // space for labels [px]
+export const MARGIN = { left: 66, right: 34, top: 30, bottom: 46 }; // space for labels [px]
 
 export class Camera {
   constructor() {
@@ -37,6 +37,7 @@ export class Camera {
 
   // Return the projection of a box with the given half sizes onto a picture of width x height [px].
   project(half, width, height) {
+    const free = [width - MARGIN.left - MARGIN.right, height - MARGIN.top - MARGIN.bottom];
     const [ca, sa, ce, se] = [this.azimuth, this.elevation].flatMap((a) => [Math.cos(a), Math.sin(a)]);
     const away = [ce * ca, ce * sa, se];
     const right = [-sa, ca, 0];
@@ -44,17 +45,16 @@ export class Camera {
     const along = away.some((part) => Math.abs(part) > 0.9999);
     const depth = along ? 0 : PERSPECTIVE / Math.hypot(...half);
     let [wide, tall] = [1e-6, 1e-6];
-    for (const corner of corners(half)) {
+    for (const corner of corners([half.map((each) => -each), half])) {
       const w = 1 - depth * dot(away, corner);
       wide = Math.max(wide, Math.abs(dot(right, corner)) / w);
       tall = Math.max(tall, Math.abs(dot(up, corner)) / w);
     }
-    const free = [width - MARGIN.left - MARGIN.right, height - MARGIN.top - MARGIN.bottom];
     const scale = this.zoom * Math.max(1e-3, Math.min(free[0] / (2 * wide), free[1] / (2 * tall)));
     const x = MARGIN.left + free[0] / 2 + this.right;
     const y = MARGIN.top + free[1] / 2 + this.up;
     return {
-      away, right, up, depth, scale, x, y,
+      away, right, up, depth, scale, x, y, along, free, zoom: this.zoom, shift: [this.right, this.up],
       at(point) {
         const w = 1 - depth * dot(away, point);
         return [x + (scale * dot(right, point)) / w, y - (scale * dot(up, point)) / w, dot(away, point)];
@@ -63,9 +63,21 @@ export class Camera {
   }
 }
 
-export function corners(half) {
+// Return the corners [low, high] of the part of a box that is seen: its axes get the ticks at every zoom.
+export function seenPart(half, { right, up, along, free, scale, zoom, shift }) {
+  const reach = [0, 1, 2].map((k) => {
+    if (!along) return half[k] / Math.max(zoom, 1);
+    const wide = Math.abs(right[k]) > 0.5 ? free[0] : Math.abs(up[k]) > 0.5 ? free[1] : Infinity;
+    return wide / (2 * scale);
+  });
+  const middle = [0, 1, 2].map((k) => (up[k] * shift[1] - right[k] * shift[0]) / scale);
+  const low = middle.map((at, k) => Math.max(-half[k], Math.min(at - reach[k], half[k] - 1e-3)));
+  return [low, middle.map((at, k) => Math.min(half[k], Math.max(at + reach[k], low[k] + 1e-3)))];
+}
+
+export function corners([low, high]) {
   const out = [];
-  for (const x of [-1, 1]) for (const y of [-1, 1]) for (const z of [-1, 1]) out.push([x * half[0], y * half[1], z * half[2]]);
+  for (const x of [low[0], high[0]]) for (const y of [low[1], high[1]]) for (const z of [low[2], high[2]]) out.push([x, y, z]);
   return out;
 }
 

@@ -1,6 +1,6 @@
 // Component with the event clouds: draws the points in the browser, and lets the mouse and the keys turn them.
 
-import { Camera } from './camera.js';
+import { Camera, MARGIN, seenPart } from './camera.js';
 import { drawFrame } from './frame.js';
 import { Raster, nearest } from './raster.js';
 
@@ -8,7 +8,6 @@ const { onBeforeUnmount, onMounted, ref, watch } = window.Vue;
 const MOST_PIXELS = 3e6; // of the picture; a finer screen gets a coarser picture
 const HEIGHT = 0.75; // length of the third axis as a share of the width of the region
 const CLICK_PX = 3;
-const NARROW_PX = 480;
 const REACH_PX = 8;
 const GREY = 0xff909090;
 const ORBIT = '#009e73';
@@ -80,7 +79,7 @@ export const EventClouds = {
     function panes() {
       const [W, H] = [canvas.value.clientWidth, canvas.value.clientHeight];
       const count = props.overlaid ? 1 : props.titles.length;
-      const [across, down] = W < NARROW_PX ? [1, count] : [count, 1]; // on a phone, one cloud is below the other
+      const [across, down] = H > W ? [1, count] : [count, 1]; // on a phone, one cloud is below the other
       return Array.from({ length: count }, (_, k) => ({
         left: Math.round(((k % across) * W) / across), top: Math.round((Math.floor(k / across) * H) / down),
         width: Math.floor(W / across), height: Math.floor(H / down),
@@ -109,9 +108,10 @@ export const EventClouds = {
           const fine = { ...projection, scale: projection.scale * ratio, x: projection.x * ratio, y: projection.y * ratio };
           raster.resize(Math.max(1, Math.round(pane.width * ratio)), Math.max(1, Math.round(pane.height * ratio)));
           raster.clear(packed(paper));
+          const clip = clipOf(projection, pane).map((each) => Math.round(each * ratio));
           for (const k of pane.clouds) {
             const grey = pane.clouds.length > 1 && k === 0 ? GREY : 0;
-            raster.points(scene.places[k], scene.colours[k], fine, dot, props.opacity, grey);
+            raster.points(scene.places[k], scene.colours[k], fine, dot, props.opacity, clip, grey);
           }
           return raster.image;
         };
@@ -132,13 +132,24 @@ export const EventClouds = {
 
     function drawContent(context, projection, pane, [ink, paper], size) {
       const [left, top, right, bottom] = props.box;
+      const part = seenPart(scene.half, projection);
       const axes = [
-        { low: left, high: right, title: 'x (px)' }, { low: top, high: bottom, title: 'y (px)', flipped: true }, props.axis,
-      ];
-      drawFrame(context, projection, scene.half, axes, [ink, paper], size, [pane.width, pane.height]);
+        { low: left, high: right, title: 'x (px)' }, { low: bottom, high: top, title: 'y (px)' }, props.axis,
+      ].map(({ low, high, title }, k) => {
+        const at = (place) => low + ((place + scene.half[k]) / (2 * scene.half[k])) * (high - low);
+        const [from, to] = part.map((corner) => at(corner[k]));
+        return { low: Math.min(from, to), high: Math.max(from, to), title, flipped: from > to };
+      });
+      drawFrame(context, projection, part, axes, [ink, paper], size, [pane.width, pane.height]);
       context.strokeStyle = ORBIT;
       context.lineWidth = 2.5;
+      context.save();
+      context.beginPath();
+      const [x0, y0, x1, y1] = clipOf(projection, pane);
+      context.rect(x0, y0, x1 - x0, y1 - y0);
+      context.clip();
       for (const k of pane.clouds) line(context, scene.lines[k], projection);
+      context.restore();
       if (props.picked >= 0) {
         for (const k of pane.clouds) ring(context, scene.places[k], projection, ink);
       }
@@ -147,6 +158,14 @@ export const EventClouds = {
       context.textAlign = 'center';
       context.textBaseline = 'top';
       context.fillText(pane.title, pane.width / 2, 7);
+    }
+
+    // Return where points are drawn: below the title; in a view along an axis, within the frame, next to the ticks.
+    function clipOf(projection, pane) {
+      if (!projection.along) return [0, MARGIN.top - 4, pane.width, pane.height];
+      const ends = seenPart(scene.half, projection).map((corner) => projection.at(corner));
+      const [xs, ys] = [0, 1].map((k) => ends.map((end) => end[k]).sort((a, b) => a - b));
+      return [xs[0] - 2, ys[0] - 2, xs[1] + 3, ys[1] + 3];
     }
 
     function line(context, places, projection) {

@@ -5,10 +5,11 @@ import { text, ticks } from './ticks.js';
 
 const TICK_PX = [40, 32]; // least distance between two ticks along a flat and an upright axis
 
-// Draw the frame of a box. `axes` holds low, high and title of x, y and the third axis; y points down in images.
-export function drawFrame(context, projection, half, axes, [ink, paper], size, [width, height]) {
-  const places = corners(half).map((corner) => projection.at(corner));
-  const middle = projection.at([0, 0, 0]);
+// Draw the frame of a box between two corners. `axes` holds low, high and title of x, y and the third axis in the box; y
+// points down in images.
+export function drawFrame(context, projection, box, axes, [ink, paper], size, [width, height]) {
+  const places = corners(box).map((corner) => projection.at(corner));
+  const middle = projection.at([0, 1, 2].map((k) => (box[0][k] + box[1][k]) / 2));
   context.strokeStyle = context.fillStyle = ink;
   context.font = `${size}px system-ui, sans-serif`;
   context.lineWidth = 1;
@@ -80,9 +81,10 @@ function write(context, label, taken, tall, [W, H], paper) {
   if (turned) context.rotate(-Math.PI / 2);
   context.textAlign = 'center';
   context.textBaseline = 'middle';
-  context.strokeStyle = paper; // keeps the text readable on points
-  context.lineWidth = 3;
-  context.strokeText(label.text, 0, 0);
+  const fill = context.fillStyle;
+  context.fillStyle = paper; // points do not cover texts
+  context.fillRect(-width / 2 - 1, -tall / 2, width + 2, tall);
+  context.fillStyle = fill;
   context.fillText(label.text, 0, 0);
   context.restore();
   if (label.from) {

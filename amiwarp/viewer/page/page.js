@@ -9,6 +9,7 @@ import { RateTimeline } from './timeline.js';
 
 const { inject, nextTick, onBeforeUnmount, onMounted, ref, watch } = window.Vue;
 const FIELDS = 'input:not([type=range]):not([type=checkbox]):not([type=radio]), textarea, select';
+const LOOK = 'amiwarp-look';
 const RETRY_MS = 1500;
 const ASK_MS = 250; // interval between questions that the server answers at once, if it runs and is connected
 const LATE_MS = 750; // age of an unanswered question from which the page is marked
@@ -25,7 +26,7 @@ function download(name, content, type) {
 
 // Element around the page: keys, the state in the address, downloads, and the loss of the connection.
 const PageFrame = {
-  props: { address: String, lost: String },
+  props: { address: String, lost: String, look: Object },
   emits: ['late'],
   template: '<div ref="root"><slot/></div>',
   setup(props, { emit }) {
@@ -51,12 +52,38 @@ const PageFrame = {
     }
 
     function pressed(event) {
-      if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches(FIELDS)) return;
+      if (event.altKey || event.target.matches(FIELDS)) return;
+      if (event.ctrlKey || event.metaKey) {
+        const step = { z: event.shiftKey ? 'redo' : 'undo', y: 'redo' }[event.key.toLowerCase()];
+        if (!step) return;
+        event.preventDefault();
+        trame.trigger(step);
+        return;
+      }
       if (event.target.matches('button, summary, a, input') && [' ', 'Enter'].includes(event.key)) return;
       if (event.target.matches('input') && event.key.startsWith('Arrow')) return;
       if (!trame.state.get('keys').some(([key]) => key === event.key)) return;
       event.preventDefault();
       trame.trigger('key', [event.key]);
+    }
+
+    // The browser keeps how the page looks, where a frame of another site lets it.
+    function recall() {
+      try {
+        for (const [name, value] of Object.entries(JSON.parse(window.localStorage.getItem(LOOK) || '{}'))) {
+          if (name in props.look && value !== props.look[name]) trame.state.set(name, value);
+        }
+      } catch {
+        // no storage
+      }
+    }
+
+    function keep(look) {
+      try {
+        window.localStorage.setItem(LOOK, JSON.stringify(look));
+      } catch {
+        // no storage
+      }
     }
 
     // After a click, the keys belong to the page again and not to the control that was clicked.
@@ -95,6 +122,8 @@ const PageFrame = {
       root.value.addEventListener('click', released);
       root.value.addEventListener('change', (event) => event.target.matches('select') && event.target.blur());
       restore();
+      recall();
+      watch(() => JSON.stringify(props.look), () => keep(props.look));
     });
     onBeforeUnmount(() => {
       window.removeEventListener('keydown', pressed);

@@ -44,9 +44,10 @@ export function painted(picture) {
 }
 
 // Return the value of a picture at a pixel as text.
-function valueAt(picture, column, row) {
+function valueAt(picture, x, y) {
   const values = numbers(picture);
-  const { width, height, unit, pair } = picture;
+  const { width, height, unit, pair, step } = picture;
+  const [column, row] = [x, y].map((each) => Math.floor(each / step));
   if (column < 0 || row < 0 || column >= width || row >= height) return '';
   const k = row * width + column;
   if (pair) return `${values[k]} OFF, ${values[width * height + k]} ON`;
@@ -97,7 +98,10 @@ export const EventPicture = {
       context.scale(ratio, ratio);
       const [left, top, right, bottom] = area();
       context.imageSmoothingEnabled = scale() < 1;
-      if (image) context.drawImage(image, ...seen(left, top), (right - left) * scale(), (bottom - top) * scale());
+      if (image) {
+        const size = props.picture.step * scale(); // of the last row and column, a part may lie outside
+        context.drawImage(image, ...seen(left, top), image.width * size, image.height * size);
+      }
       if (props.frame) rectangle(context, props.frame, BLUE);
       if (drawn && props.tool === 'measure') measure(context, drawn);
       else if (drawn) rectangle(context, drawn, YELLOW);

@@ -16,11 +16,13 @@ export class Raster {
   }
 
   // Draw n points (x, y, z interleaved, NaN for none) as squares; the nearest point covers the others. With an opacity
-  // below 1, points are mixed in their order. `fixed` is one colour for all points.
-  points(places, colours, projection, size, opacity, fixed = 0) {
+  // below 1, points are mixed in their order. `fixed` is one colour for all points. Points that leave `clip` (left, top,
+  // right, bottom) are not drawn.
+  points(places, colours, projection, size, opacity, clip, fixed = 0) {
     const { pixels, depth, image } = this;
+    const [x0, y0, x1, y1] = [Math.max(clip[0], 0), Math.max(clip[1], 0), Math.min(clip[2], image.width), Math.min(clip[3], image.height)];
     const { away, right, up, depth: near, scale, x: cx, y: cy } = projection;
-    const [W, H, n, low] = [image.width, image.height, places.length / 3, Math.floor((size - 1) / 2)];
+    const [W, n, low] = [image.width, places.length / 3, Math.floor((size - 1) / 2)];
     const [r0, r1, u0, u1, u2, a0, a1, a2] = [...right.slice(0, 2), ...up, ...away];
     const mix = Math.round(256 * opacity);
     for (let i = 0, j = 0; i < n; i++, j += 3) {
@@ -29,7 +31,7 @@ export class Raster {
       const s = scale / (1 - near * d);
       const left = Math.round(cx + s * (r0 * x + r1 * y)) - low;
       const top = Math.round(cy - s * (u0 * x + u1 * y + u2 * z)) - low;
-      if (!(left >= 0 && top >= 0 && left + size <= W && top + size <= H)) continue;
+      if (!(left >= x0 && top >= y0 && left + size <= x1 && top + size <= y1)) continue;
       const colour = fixed || colours[i];
       for (let row = top * W + left, stop = row + size * W; row < stop; row += W) {
         for (let at = row; at < row + size; at++) {
