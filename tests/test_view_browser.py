@@ -33,11 +33,12 @@ from amiwarp import (
     save_recording,
     simulate,
 )
+from amiwarp.choices import Colour
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
 from amiwarp.live.stream.session import RecentEvents, followed
 from amiwarp.live.stream.sources import open_source, reopen_source
+from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer import inspector as inspector_module
-from amiwarp.viewer import jobs
 from amiwarp.viewer.drawing import FOOT_PX, ImageKind, make_images, strip_share
 from amiwarp.viewer.inspector import Inspector, Library, Source
 from amiwarp.viewer.jobs import JobCancelled, LiveFigures, LiveSource, estimate_phase
@@ -573,9 +574,6 @@ def test_downloads_leave_no_file_on_the_server(
     monkeypatch.setattr(jobs, "FRAMES", 4)
     with Image.open(download(page, "picture", tmp_path)) as picture:
         assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 20
-    left, top, right, bottom = region(page)
-    with Image.open(download(page, "image", tmp_path)) as image:
-        assert image.size == (right - left, bottom - top)
     plain, moved = (open_recording(download(page, name, tmp_path)).events for name in ("events", "compensated"))
     assert 0.5 * len(plain) < len(moved) <= len(plain)
 
@@ -596,6 +594,51 @@ def test_downloads_leave_no_file_on_the_server(
     page.locator("#against-title").filter(has_text="compensated with B").wait_for()
     assert film()[1] < 0.3 * apart
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
+
+
+def colours_in(picture: np.ndarray, colours: np.ndarray) -> float:
+    """Return the share of colours, shape (n, 3), that occur in a picture, each to within 4 levels of 255."""
+    pixels = np.unique(picture.reshape(-1, 3), axis=0).astype(np.int16)
+    return float(np.mean([np.abs(pixels - colour).max(axis=1).min() <= 4 for colour in colours.astype(np.int16)]))
+
+
+def test_pictures_have_legend_colour_bar_and_caption_and_images_the_difference(
+    page: Any, kept: Any, tmp_path: Path
+) -> None:
+    def picture(name: str) -> np.ndarray:
+        with Image.open(download(page, name, tmp_path)) as image:
+            return np.asarray(image.convert("RGB"))
+
+    inspector = kept[1].inspector
+    page.locator("#colour").select_option("residual")
+    ready(page)
+    height = page.locator(".clouds canvas").bounding_box()["height"]
+    below = picture("picture")[int(height) :]
+    assert colours_in(below, drawing.colour_table(Colour.RESIDUAL, dark=False)[10:-10:10]) > 0.95
+    words = layout.caption(inspector, inspector.show())
+    left, top, right, bottom = region(page)
+    assert f"x {left} to {right - 1}, y {top} to {bottom - 1} px" in words
+    assert " ms; " in words
+    ink = (below.max(axis=2) < 100).any(axis=1)  # rows of text
+    assert np.count_nonzero(np.diff(ink.astype(np.int8)) == 1) >= 4
+    page.locator("#difference").check()
+    page.locator("#after-title").filter(has_text="difference").wait_for()
+    ready(page)
+    pair = drawing.with_difference(make_images(inspector, ImageKind.COUNT))
+    assert pair.before is not None
+    assert pair.after_scale is not None
+    found, size = picture("image"), -(-320 // (right - left))
+    wide, tall = size * (right - left), size * (bottom - top)
+    for k, (values, scale) in enumerate(((pair.before, pair.scale), (pair.after, pair.after_scale))):
+        x = 12 + k * (wide + 12)
+        image = found[32 : 32 + tall : size, x : x + wide : size]
+        assert np.abs(image.astype(np.int16) - scale.rgb(values)).max() <= 1
+        bar = found[32 + tall + 8, x : x + wide]
+        assert colours_in(bar[None], drawing.table_of(scale.colours)[10:-10:10]) > 0.95
+    with Image.open(download(page, "values", tmp_path)) as image:
+        np.testing.assert_array_equal(np.asarray(image), pair.after)
+    assert len(np.genfromtxt(download(page, "csv", tmp_path), delimiter=",", names=True)) == inspector.loaded.selected
+    assert len(np.load(download(page, "npz", tmp_path))["t"]) == inspector.loaded.selected
 
 
 def test_keys_work_also_after_clicks_and_help_closes_by_key_and_button(page: Any) -> None:

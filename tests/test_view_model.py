@@ -790,19 +790,40 @@ def test_images_are_downloaded(inspector: Inspector, tmp_path: Path) -> None:
             io.BytesIO(as_bytes(".npy", lambda path, images=images: write_image(images, path, before=True)))
         )
         np.testing.assert_array_equal(values, images.before)
-        with Image.open(io.BytesIO(as_bytes(".png", lambda path, images=images: write_image(images, path)))) as picture:
-            np.testing.assert_array_equal(np.asarray(picture), images.scale.rgb(images.after))
         with Image.open(io.BytesIO(as_bytes(".tif", lambda path, images=images: write_image(images, path)))) as picture:
             assert picture.n_frames == (2 if kind is ImageKind.POLARITY else 1)
             first = images.after[0] if kind is ImageKind.POLARITY else images.after
             np.testing.assert_array_equal(np.asarray(picture), first)
-    with pytest.raises(AmiwarpError, match=r"\.png, \.tif or \.npy"):
+    with pytest.raises(AmiwarpError, match=r"\.tif or \.npy"):
         write_image(images, tmp_path / "image.jpg")
     with pytest.raises(AmiwarpError, match="no image of count before"):
-        write_image(replace(images, kind=ImageKind.COUNT, before=None), tmp_path / "image.png", before=True)
-    write_image(images, tmp_path / "image.png")
+        write_image(replace(images, kind=ImageKind.COUNT, before=None), tmp_path / "image.tif", before=True)
+    write_image(images, tmp_path / "image.tif")
     with pytest.raises(AmiwarpError, match="exists"):
-        write_image(images, tmp_path / "image.png")
+        write_image(images, tmp_path / "image.tif")
+
+
+def test_the_events_shown_are_downloaded_as_tables(
+    inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jobs, "BLOCK", 10_000)
+    inspector.open(*inspector.first_window(), Selection(region=(20, 10, 140, 110), polarity=1))
+    jobs.write_table(inspector, tmp_path / "events.csv")
+    jobs.write_table(inspector, tmp_path / "events.npz")
+    shown, text = inspector.show(), np.genfromtxt(tmp_path / "events.csv", delimiter=",", names=True)
+    table = np.load(tmp_path / "events.npz")
+    assert text.dtype.names == jobs.COLUMNS
+    assert len(text) == len(table["t"]) == shown.selected == len(shown.events)
+    for found in (text, table):
+        for name in ("t", "x", "y", "p"):
+            np.testing.assert_array_equal(found[name], getattr(shown.events, name))
+        np.testing.assert_allclose(found["theta"], shown.theta, atol=1e-5)
+        moved = np.column_stack([found["x_compensated"], found["y_compensated"]])
+        np.testing.assert_allclose(moved, shown.after, atol=2e-3)
+    again = open_recording(tmp_path / "events.npz").events
+    np.testing.assert_array_equal(again.slice(0, len(again)).t, shown.events.t)
+    with pytest.raises(AmiwarpError, match=r"\.csv or \.npz"):
+        jobs.write_table(inspector, tmp_path / "events.txt")
 
 
 def test_a_calibration_is_downloaded(inspector: Inspector) -> None:

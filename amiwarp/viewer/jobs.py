@@ -24,7 +24,7 @@ from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, rpm_between
 from amiwarp.events.recording import Events, Recording
-from amiwarp.imaging.export import encode_image, encode_png
+from amiwarp.imaging.export import encode_image
 from amiwarp.io import RecordingWriter
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.io.files import NewFile
@@ -456,8 +456,10 @@ class LiveSource:
 
 BLOCK = 1 << 20
 """Number of events that are written at a time."""
-IMAGE_SUFFIXES = (".png", ".tif", ".npy")
-"""Suffixes of image files: colours as on the page, values as float32, values as an array."""
+IMAGE_SUFFIXES = (".tif", ".npy")
+"""Suffixes of files with the values of an image, float32."""
+COLUMNS = ("t", "x", "y", "p", "theta", "x_compensated", "y_compensated")
+"""Columns of a table of events: time [us], pixel, polarity, prism angle [rad] and compensated place [px]."""
 
 
 def as_bytes(suffix: str, write: Callable[[Path], object]) -> bytes:
@@ -493,8 +495,37 @@ def write_events(inspector: Inspector, path: Path, *, compensated: bool) -> int:
         return len(writer)
 
 
+def write_table(inspector: Inspector, path: Path) -> None:
+    """Write all selected events of the window, with :data:`COLUMNS`, to a new .csv or .npz file.
+
+    Raises :class:`AmiwarpError` for another suffix, or if the file exists.
+    """
+    ending, encoder, knobs = (
+        check_ending(path, "tables are written", (".csv", ".npz")),
+        inspector.adjusted_encoder,
+        inspector.knobs,
+    )
+
+    def table(e: Events) -> tuple[NDArray[Any], ...]:
+        theta, moved = np.mod(encoder.angle_at(e.t), math.tau), inspector.positions(e, knobs)
+        return e.t, e.x, e.y, e.p, theta, moved[:, 0], moved[:, 1]
+
+    tables = map(table, _selected_blocks(inspector))
+    with NewFile(path) as new, open(new.part, "wb") as file:
+        if ending == ".npz":
+            columns: dict[str, Any] = {
+                name: np.concatenate(parts) for name, *parts in zip(COLUMNS, *tables, strict=True)
+            }
+            width, height = inspector.recording.events.size
+            np.savez_compressed(file, width=width, height=height, **columns)
+            return
+        file.write((",".join(COLUMNS) + "\n").encode())
+        for each in tables:
+            np.savetxt(file, np.column_stack(each), fmt="%d,%d,%d,%d,%.6f,%.3f,%.3f")
+
+
 def write_image(images: ShownImages, path: Path, *, before: bool = False) -> None:
-    """Write one of the images to a new file: .png with the page's colours, .tif or .npy with its values.
+    """Write the values of one of the images to a new file, .tif or .npy.
 
     ``before``: write the first image instead of the second. A .tif of two polarities has two pages, OFF and ON. Raises
     :class:`AmiwarpError` for another suffix, if the file exists, or if there is no such image.
@@ -504,11 +535,9 @@ def write_image(images: ShownImages, path: Path, *, before: bool = False) -> Non
     values = images.before if before else images.after
     if values is None:
         raise AmiwarpError(f"there is no image of {images.kind.value} before compensation; export the compensated one")
-    ending = check_ending(path, "images are written", IMAGE_SUFFIXES)
+    ending = check_ending(path, "values of images are written", IMAGE_SUFFIXES)
     with NewFile(path) as new:
-        if ending == ".png":
-            encode_png(new.part, images.scale.rgb(values))
-        elif ending == ".npy":
+        if ending == ".npy":
             with open(new.part, "wb") as file:
                 np.save(file, np.asarray(values, np.float32))
         else:
@@ -566,9 +595,10 @@ FRAMES, FPS = 90, 25.0
 FILM_SIZE = (1280, 560)
 """Width and height of a film [px]."""
 EXPORTS = {
-    "picture": ("picture", ".png", "image/png"), "image": ("image", ".png", "image/png"),
+    "picture": ("picture", ".png", "image/png"), "image": ("images", ".png", "image/png"),
     "values": ("image values", ".tif", "image/tiff"), "events": ("events", ".h5", "application/x-hdf5"),
     "compensated": ("compensated events", ".h5", "application/x-hdf5"),
+    "csv": ("events, CSV", ".csv", "text/csv"), "npz": ("events, NPZ", ".npz", "application/x-npz"),
     "calibration": ("calibration", ".json", "application/json"), "turntable": ("film, turning", ".mp4", "video/mp4"),
     "film": ("film from here", ".mp4", "video/mp4"),
 }  # fmt: skip

@@ -505,20 +505,22 @@ class Panel:
     def export(self, what: str) -> None:
         """Give the browser a file; ``what`` is a name in :data:`amiwarp.viewer.jobs.EXPORTS`."""
         s = self.state
-        if what == "picture":
-            words = [s.name, s.events, f"sharpness {s.sharpness}"]
-            self._server.js_call("page", "picture", jobs.download_name(self.inspector.recording.name, what), words)
-        elif what in jobs.EXPORTS and not (what in jobs.FILMS and s.busy):
+        if what in ("picture", "image") and self.shown is not None:
+            words = layout.caption(self.inspector, self.shown).split("; ")
+            self._server.js_call("page", what, jobs.download_name(self.inspector.recording.name, what), words)
+        elif what in jobs.EXPORTS and what not in ("picture", "image") and not (what in jobs.FILMS and s.busy):
             self.work.start_job(self._film(what) if what in jobs.FILMS else self._write(what))
 
     async def _write(self, what: str) -> None:
         inspector, kind, against = self.inspector, ImageKind(self.state.kind), self._against
+        difference = bool(self.state.difference)
 
         def write_image(path: Path) -> None:
-            jobs.write_image(drawing.make_images(inspector, kind, against=against), path)
+            images = drawing.make_images(inspector, kind, against=against)
+            jobs.write_image(drawing.with_difference(images) if difference else images, path)
 
         write: dict[str, Callable[[Path], object]] = {
-            "image": write_image, "values": write_image,
+            "values": write_image, **dict.fromkeys(("csv", "npz"), partial(jobs.write_table, inspector)),
             "events": partial(jobs.write_events, inspector, compensated=False),
             "compensated": partial(jobs.write_events, inspector, compensated=True),
             "calibration": lambda path: inspector.as_calibration().save(path),

@@ -4,7 +4,7 @@ import { EventClouds } from './clouds.js';
 import { KnobField, NumberField } from './fields.js';
 import { EventPicture } from './pictures.js';
 import { ColourBar, CostSurface, CurvePlot } from './plots.js';
-import { savePicture } from './snapshot.js';
+import { saveImages, savePicture } from './snapshot.js';
 import { RateTimeline } from './timeline.js';
 
 const { inject, nextTick, onBeforeUnmount, onMounted, ref, watch } = window.Vue;
@@ -106,7 +106,10 @@ const PageFrame = {
       }
     }
 
-    trame.refs.page = { download, picture: (name, words) => savePicture(name, words, download) };
+    trame.refs.page = {
+      download, picture: (name, words) => savePicture(name, words, trame.state, download),
+      image: (name, words) => saveImages(name, words, trame.state, download),
+    };
     watch(() => props.address, (address) => {
       window.clearTimeout(changed);
       if (address) changed = window.setTimeout(() => window.history.replaceState(null, '', `#${address}`), ADDRESS_MS);

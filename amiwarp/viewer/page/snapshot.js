@@ -1,41 +1,136 @@
-// Picture of the clouds as they are seen, with a caption and the legend.
+// Pictures to publish: the clouds or the images as they are seen, with title, legend, colour bars and a caption.
 
-const LINE = 20;
+import { painted } from './pictures.js';
 
-// Save the picture; `words` are the lines of the caption, `legend` rows come from the page.
-export async function savePicture(name, words, download) {
-  const canvas = document.querySelector('.clouds canvas');
-  const style = window.getComputedStyle(canvas);
-  const ratio = canvas.width / canvas.clientWidth;
-  const legend = [...document.querySelectorAll('#legend .row')];
-  const lines = words.length + (legend.length ? 1 : 0);
-  const out = document.createElement('canvas');
-  out.width = canvas.width;
-  out.height = canvas.height + Math.round((lines * LINE + 10) * ratio);
-  const context = out.getContext('2d');
-  context.fillStyle = style.getPropertyValue('--paper');
-  context.fillRect(0, 0, out.width, out.height);
-  context.drawImage(canvas, 0, 0);
+const LINE = 20; // height of a line of text [px]
+const GAP = 12;
+const BAR = 10;
+const LEAST_PX = 320; // width from which an image is not enlarged
+const FONT = '13px system-ui, sans-serif';
+
+function colours() {
+  const style = window.getComputedStyle(document.querySelector('.clouds canvas'));
+  return { ink: style.getPropertyValue('--ink').trim(), paper: style.getPropertyValue('--paper').trim() };
+}
+
+// Return a context of a new picture, filled with the background.
+function sheet(width, height, ratio = 1) {
+  const canvas = Object.assign(document.createElement('canvas'), { width: Math.round(width * ratio), height: Math.round(height * ratio) });
+  const context = canvas.getContext('2d');
+  context.fillStyle = colours().paper;
+  context.fillRect(0, 0, canvas.width, canvas.height);
   context.scale(ratio, ratio);
-  context.font = '13px system-ui, sans-serif';
-  const ink = style.getPropertyValue('--ink');
-  let y = canvas.clientHeight + LINE;
-  for (const line of words) {
-    context.fillStyle = ink;
-    context.fillText(line, 12, y);
-    y += LINE;
+  context.font = FONT;
+  context.fillStyle = colours().ink;
+  return context;
+}
+
+// Draw a gradient that CSS describes.
+function bar(context, css, x, y, width) {
+  const stops = css.match(/rgb\([^)]*\)/g) || [];
+  const fill = context.createLinearGradient(x, 0, x + width, 0);
+  stops.forEach((colour, k) => fill.addColorStop(k / (stops.length - 1), colour));
+  const before = context.fillStyle;
+  context.fillStyle = fill;
+  context.fillRect(x, y, width, BAR);
+  context.fillStyle = before;
+}
+
+// Return the lines of texts that are at most as wide as the picture.
+function wrapped(context, texts, width) {
+  const lines = [];
+  for (const text of texts) {
+    let line = '';
+    for (const word of text.split(' ')) {
+      if (line && context.measureText(`${line} ${word}`).width > width) {
+        lines.push(line);
+        line = word;
+      } else line = line ? `${line} ${word}` : word;
+    }
+    lines.push(line);
   }
-  let x = 12;
-  for (const row of legend) {
+  return lines;
+}
+
+function save(context, name, download) {
+  context.canvas.toBlob((blob) => download(name, blob, 'image/png'), 'image/png');
+}
+
+// Save the clouds as they are seen; `words` are the lines of the caption, the legend comes from the page.
+export function savePicture(name, words, state, download) {
+  const canvas = document.querySelector('.clouds canvas');
+  const ratio = canvas.width / canvas.clientWidth;
+  const width = canvas.clientWidth;
+  const lines = wrapped(sheet(1, 1), words, width - 2 * GAP);
+  const context = sheet(width, canvas.clientHeight + (lines.length + 1) * LINE + GAP, ratio);
+  context.drawImage(canvas, 0, 0, width, canvas.clientHeight);
+  let y = canvas.clientHeight + LINE;
+  let x = GAP;
+  const write = (text) => {
+    context.fillText(text, x, y);
+    x += context.measureText(text).width + 8;
+  };
+  const legend = state.get('legend');
+  write(legend.title);
+  if (legend.bar) {
+    write(legend.low);
+    bar(context, legend.bar, x, y - BAR, 160);
+    x += 168;
+    write(legend.high);
+  }
+  for (const row of document.querySelectorAll('#legend .row')) {
     const mark = row.querySelector('i');
     if (mark) {
+      const [ink, size] = [context.fillStyle, mark.getBoundingClientRect()];
       context.fillStyle = window.getComputedStyle(mark).backgroundColor;
-      context.fillRect(x, y - 10, 11, 11);
-      x += 16;
+      context.fillRect(x, y - 5 - size.height / 2, size.width, size.height);
+      context.fillStyle = ink;
+      x += size.width + 4;
     }
-    context.fillStyle = ink;
-    context.fillText(row.textContent.trim(), x, y);
-    x += context.measureText(row.textContent.trim()).width + 16;
+    write(row.textContent.trim());
+    x += 8;
   }
-  download(name, await new Promise((resolve) => out.toBlob(resolve, 'image/png')), 'image/png');
+  for (const line of lines) context.fillText(line, GAP, (y += LINE));
+  save(context, name, download);
+}
+
+// Save the images as they are seen, each pixel as a square, with their colour bars.
+export function saveImages(name, words, state, download) {
+  const both = state.get('has_model') ? [['before', 'image_scale']] : [];
+  const shown = [...both, ['after', 'after_scale']].filter(([key]) => state.get(key));
+  if (!shown.length) return;
+  const { width, height, step } = state.get('after');
+  const size = Math.max(1, Math.ceil(LEAST_PX / width));
+  const [w, h] = [width * size, height * size];
+  const whole = shown.length * (w + GAP) + GAP;
+  const lines = wrapped(sheet(1, 1), [...words, ...(step > 1 ? [`largest values in squares of ${step} px`] : [])], whole - 2 * GAP);
+  const top = LINE + GAP;
+  const context = sheet(whole, top + h + 4 * LINE + lines.length * LINE + GAP);
+  context.imageSmoothingEnabled = false;
+  shown.forEach(([key, scale], k) => {
+    const x = GAP + k * (w + GAP);
+    const title = key === 'before' ? 'against-title' : 'after-title';
+    context.fillText(document.getElementById(title).textContent.trim(), x, LINE);
+    context.drawImage(painted(state.get(key)), x, top, w, h);
+    const y = top + h + 6;
+    const { bar: css, ticks, title: quantity, square } = state.get(scale);
+    if (square) {
+      context.drawImage(painted(square), x, y, 3 * LINE, 3 * LINE);
+      [quantity, `right: OFF, 0 to ${square.high}`, `up: ON, 0 to ${square.high}`].forEach((text, row) => {
+        context.fillText(text, x + 3 * LINE + 8, y + 14 + row * LINE);
+      });
+      return;
+    }
+    bar(context, css, x, y, w);
+    let free = -Infinity;
+    for (const [at, text] of ticks) {
+      const wide = context.measureText(text).width;
+      const left = x + at * (w - wide);
+      if (left > free) context.fillText(text, left, y + BAR + 14);
+      free = Math.max(free, left + wide + 6);
+    }
+    context.fillText(quantity, x, y + BAR + 14 + LINE);
+  });
+  lines.forEach((line, k) => context.fillText(line, GAP, top + h + 4 * LINE + (k + 0.8) * LINE));
+  save(context, name, download);
 }
