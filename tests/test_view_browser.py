@@ -976,9 +976,52 @@ def test_without_encoder_there_is_one_cloud_until_the_speed_is_set(opened: Open,
     assert "no encoder" not in page.locator("#prism").inner_text()
     assert page.locator("#do-step").inner_text() == "turn ▶"
     page.locator("#curve-title").filter(has_text="speed of the prism").wait_for()
+    until(lambda: page.locator("#axis").input_value() == "angle")
     page.locator("#name").click()
     page.keyboard.press("t")
-    until(lambda: page.locator("#axis").input_value() == "angle")
+    until(lambda: page.locator("#axis").input_value() == "time")
+
+
+def test_a_recording_without_a_prism_is_played_fills_its_pane_and_gets_camera_and_prism(
+    opened: Open, recording: Recording, tmp_path: Path
+) -> None:
+    first = recording.events.slice(0, len(recording.events))
+    short = MemoryEvents(first[first.t < first.t[0] + 80_000], *recording.events.size)
+    page = opened(of=Recording(short, name="plain"))
+    page.locator("#do-whole").click()
+    ready(page)
+    picture = cloud(page)
+    rows, columns = np.nonzero(picture.max(axis=2) - picture.min(axis=2) > 80)
+    spread = np.ptp(np.percentile(rows, [0.1, 99.9])) * np.ptp(np.percentile(columns, [0.1, 99.9]))
+    assert spread > 0.45 * picture.shape[0] * picture.shape[1]
+    start = field(page, "start_ms")
+    page.keyboard.press(" ")
+    until(lambda: field(page, "start_ms") > start + 1.0)
+    page.keyboard.press(" ")
+    page.locator("#do-play").filter(has_text="play").wait_for()
+    enter(page, "start_ms", 0)
+    enter(page, "length_ms", 1000)
+    ready(page)
+    page.keyboard.press(" ")
+    message(page, "the window holds the whole recording")
+    enter(page, "fov_deg", 50)
+    enter(page, "index", 1.6)
+    until(lambda: "camera unknown" not in page.locator("#prism").inner_text())
+    enter(page, "rpm", RPM)
+    page.locator("#image-before").wait_for()
+    enter(page, "apex", 1.1)
+    ready(page)
+    assert field(page, "fov_deg") == 50.0
+    saved = open_recording(download(page, "events", tmp_path))
+    assert saved.camera == Camera.from_fov(128, 96, math.radians(50.0))
+    assert isinstance(saved.prism, Prism)
+    assert (math.degrees(saved.prism.apex), saved.prism.index) == (pytest.approx(1.1), 1.6)
+    assert saved.encoder is not None
+    assert saved.encoder.rpm == pytest.approx(RPM, rel=1e-4)
+    assert len(saved.events) == len(short)
+    again = opened(of=saved)
+    assert again.locator("#field-fov_deg").count() == 0
+    assert again.locator("#image-before").count() == 1
 
 
 def test_a_live_stream_is_followed_until_one_stops_it(opened: Open, tabs: Tabs, recording: Recording) -> None:

@@ -840,7 +840,7 @@ class PageState(dict[str, Any]):
 
 def test_a_number_that_is_typed_during_an_update_stays() -> None:
     """The page sets the variable while an update is computed in a thread; the end of the update once reset it."""
-    state = PageState(apex=1.0, knob="apex", playing=True)
+    state = PageState(apex=1.0, knob="apex", playing=True, has_model=False)
 
     async def compute_while_the_user_types(work: Any) -> tuple[None, dict[str, Any]]:
         state.apex = 2.5
@@ -849,7 +849,7 @@ def test_a_number_that_is_typed_during_an_update_stays() -> None:
     work = SimpleNamespace(errors_shown=lambda what: contextlib.nullcontext(), in_thread=compute_while_the_user_types)
     inspector = SimpleNamespace(turn_us=math.inf, knobs=Knobs(), sources={})
     panel = SimpleNamespace(
-        state=state, work=work, inspector=inspector, shown=None, set_knobs=lambda: None,
+        state=state, work=work, inspector=inspector, compensates=False, shown=None, set_knobs=lambda: None,
         show_knobs=lambda: state.update(apex=1.0), remember=lambda change: None, _compute=None,
     )  # fmt: skip
     asyncio.run(Panel.make(panel, {"knobs"}))  # type: ignore[arg-type]

@@ -31,6 +31,7 @@ from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_va
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, PHASE, Model, size_names
+from amiwarp.optics.prism import NominalPrism
 from amiwarp.reconstruction.picture import Picture, border_displacements
 
 # Rates of ON and OFF events over a recording at any zoom, counted once in bounded memory.
@@ -755,7 +756,7 @@ MOST_EVENTS = 2_000_000
 FOV_DEG = 60.0
 """Horizontal field of view that is assumed if the camera is unknown [deg]."""
 NO_ENCODER = "no encoder: set the prism's speed (rpm), or calibrate, to compensate its motion"
-NO_CAMERA = f"camera unknown: {FOV_DEG:g}° field of view assumed; give it with --fov-deg or --camera"
+NO_CAMERA = f"camera unknown: {FOV_DEG:g}° field of view assumed; set it, or give it with --fov-deg or --camera"
 CURVE_POINTS = 25
 """Number of points of a sharpness curve."""
 ORBIT_POINTS = 181
@@ -800,11 +801,12 @@ class Inspector:
         """What is missing to compensate the prism's motion, one sentence each."""
         self.sources = {
             "camera": Source.ASSUMED if recording.camera is None else Source.FILE,
+            "prism": Source.ASSUMED if recording.prism is None else Source.FILE,
             "apex": Source.ASSUMED if getattr(recording.prism, "apex", None) is None else Source.FILE,
             **dict.fromkeys(("model", "phase", *SLIDING), Source.ASSUMED),
             **({"rpm": Source.ASSUMED} if recording.encoder is None else {"clock_offset": Source.FILE}),
         }
-        """Where the value of each parameter that the page shows, and the camera, come from."""
+        """Where the value of each parameter that the page shows, the camera, and the prism's index come from."""
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
         self.recording, self.device, self.latest = recording, device, latest
@@ -835,6 +837,25 @@ class Inspector:
         """Camera of the calibration or of the recording; an assumed camera if both lack it."""
         assert self.recording.camera is not None
         return self.recording.camera
+
+    def set_camera(self, fov_deg: float) -> None:
+        """Set a camera with a horizontal field of view [deg], without distortion. The window is read again."""
+        camera = Camera.from_fov(*self.recording.events.size, math.radians(fov_deg))
+        self.recording, self.sources["camera"] = replace(self.recording, camera=camera), Source.HAND
+        self.notes = tuple(note for note in self.notes if note != NO_CAMERA)
+        self._window = None
+
+    def set_index(self, index: float) -> None:
+        """Set the refractive index of the prism."""
+        self.prism, self.sources["prism"] = replace(self.prism, index=index), Source.HAND
+
+    @property
+    def nominal_prism(self) -> NominalPrism | None:
+        """Prism of the recording, or the one that was set by hand; None if neither is known."""
+        given = self.recording.prism
+        if Source.HAND in (self.sources["prism"], None if given is not None else self.sources["apex"]):
+            return replace(self.prism, apex=self.knobs.apex)
+        return given
 
     @property
     def has_encoder(self) -> bool:
@@ -893,11 +914,13 @@ class Inspector:
     def first_window(self) -> tuple[int, int]:
         """Return start and length of one turn in the middle of the recording [us].
 
-        If the prism does not rotate, the length is :data:`WINDOW_US`.
+        If the prism does not rotate, the length is :data:`WINDOW_US`, and at most a fifth of the recording, so that it
+        can be played.
         """
         source = self.recording.events
         whole = source.t_last - source.t_first + 1
-        length = min(round(self.turn_us) if math.isfinite(self.turn_us) else WINDOW_US, whole)
+        still = min(WINDOW_US, max(1, whole // 5))
+        length = min(round(self.turn_us) if math.isfinite(self.turn_us) else still, whole)
         return source.t_first + (whole - length) // 2, length
 
     def renew(self) -> None:
@@ -967,7 +990,7 @@ class Inspector:
         if self.truth is None:
             raise AmiwarpError(f"{self.recording.name}: holds no true parameters of its prism; simulate a recording")
         self.set(self.truth)
-        known = set(self.sources) - {"camera", "rpm"}
+        known = set(self.sources) - {"camera", "prism", "rpm"}
         self.sources |= dict.fromkeys(known, Source.TRUTH)
 
     def as_calibration(self) -> Calibration:
@@ -989,7 +1012,7 @@ class Inspector:
 
     def set(self, knobs: Knobs) -> None:
         """Set the parameters of the prism. Parameters that change count as set by hand."""
-        shown = self.sources.keys() - {"camera"}
+        shown = self.sources.keys() - {"camera", "prism"}
         changed = {name for name in shown if knobs.value(name) != self.knobs.value(name)}
         self.sources |= dict.fromkeys(changed, Source.HAND)
         self.knobs = knobs

@@ -473,8 +473,9 @@ def as_bytes(suffix: str, write: Callable[[Path], object]) -> bytes:
 def write_events(inspector: Inspector, path: Path, *, compensated: bool) -> int:
     """Write all selected events of the window to a new native file, and return their number.
 
-    Compensated events get sub-pixel coordinates, with the parameters set on the page. A window with more events than
-    the page reads is written completely. Raises :class:`AmiwarpError` if the file exists.
+    Compensated events get sub-pixel coordinates, with the parameters set on the page. Camera, prism and encoder that
+    the recording lacks are those set on the page. A window with more events than the page reads is written completely.
+    Raises :class:`AmiwarpError` if the file exists.
     """
     recording, span, encoder = inspector.recording, inspector.loaded.span, inspector.adjusted_encoder
     width, height = recording.events.size
@@ -482,8 +483,8 @@ def write_events(inspector: Inspector, path: Path, *, compensated: bool) -> int:
     last_us = min(span.start_us + span.length_us, encoder.coverage[1])
     metadata = {**recording.metadata, **({"compensated_with": inspector.knobs.model} if compensated else {})}
     with RecordingWriter(
-        path, width=width, height=height, camera=inspector.camera, prism=recording.prism, metadata=metadata,
-        encoder=_cut(encoder, first_us, last_us) if inspector.has_encoder else None,
+        path, width=width, height=height, camera=inspector.camera, prism=inspector.nominal_prism, metadata=metadata,
+        encoder=_cut(encoder, first_us, last_us) if inspector.has_encoder or inspector.knobs.rpm else None,
     ) as writer:  # fmt: skip
         compensator = BlockCompensator(inspector.model, encoder, first_us, last_us, inspector.device)
         for block in _selected_blocks(inspector):

@@ -85,7 +85,8 @@ def apply_state(inspector: Inspector, state: ViewState) -> None:
     if (window, state.selection) != (inspector.window, inspector.selection):
         inspector.open(*window, state.selection)
     inspector.set(state.knobs)
-    inspector.sources = dict(state.sources)
+    given = {name: inspector.sources[name] for name in ("camera", "prism")}  # are no part of a state
+    inspector.sources = dict(state.sources) | given
 
 
 class History:
@@ -276,7 +277,11 @@ UNITS = {
 """Conversion from the page's units (angles in degrees) to the parameters' units (radians): factor per parameter."""
 NAMES = tuple(UNITS)
 """Names of the prism parameters that have a slider."""
-EDITABLE = ("start_ms", "length_ms", "turns", "noise_ms")
+GIVEN = {"fov_deg": ("field of view", "°", "gives_camera"), "index": ("refractive index", "", "gives_prism")}
+"""Properties of camera and prism that a recording may lack: label, unit, and the condition for showing the field."""
+FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, "fov_deg": (1.0, 170.0), "index": (1.01, 3.5)}
+"""Smallest and largest value of the fields of the prism and the camera, in the page's units."""
+EDITABLE = ("start_ms", "length_ms", "turns", "noise_ms", *GIVEN)
 """State variables with a number field, next to the prism's parameters."""
 SLIDERS = {
     "apex": ("apex angle", "°", ("0", "apex_most", "0.005"), "true"),
@@ -366,12 +371,22 @@ def cloud_titles(against: str, *, compensates: bool) -> tuple[str, ...]:
 
 def template() -> str:
     """Return the page's template with its sliders."""
-    return read_template().replace("@KNOBS@", "\n".join(map(_knob, SLIDERS)))
+    fields = "\n".join(map(_given, GIVEN))
+    return read_template().replace("@KNOBS@", "\n".join(map(_knob, SLIDERS))).replace("@GIVEN@", fields)
+
+
+def _given(name: str) -> str:
+    (label, unit, where), (low, high) = GIVEN[name], FIELD_LIMITS[name]
+    return (
+        f'<label v-if="{where}">{label}{unit and f" ({unit})"}<NumberField id="field-{name}" :low="{low}" '
+        f':high="{high}" unit="{unit}" :value="{name}" '
+        f"@typed=\"trigger('typed', ['{name}', $event])\"></NumberField></label>"
+    )
 
 
 def _knob(name: str) -> str:
     label, unit, (least, most, step), where = SLIDERS[name]
-    low, high = LIMITS[name]
+    low, high = FIELD_LIMITS[name]
     return (
         f'<KnobField v-if="{where}" name="{name}" label="{label}" unit="{unit}" :value="{name}" :least="{least}" '
         f':most="{most}" :step="{step}" :low="{low:g}" :high="{high:g}" :truth="truths.{name}" '
@@ -389,7 +404,8 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
     recording = inspector.recording
     size = recording.events.size
     return {
-        **source_state(inspector), **knob_state(inspector), **prism_state(inspector), **NO_ORBIT,
+        **source_state(inspector), **knob_state(inspector), **prism_state(inspector), **given_state(inspector),
+        **NO_ORBIT,
         "trame__title": f"amiwarp: {recording.name}", "trame_error_report_msg": "", "name": recording.name,
         "size": list(size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
         "has_encoder": inspector.has_encoder, "models": list(MODELS),
@@ -448,6 +464,16 @@ def prism_state(inspector: Inspector) -> dict[str, Any]:
     turns = math.isfinite(inspector.turn_us)
     return {"turn_ms": inspector.turn_us * 1e-3 if turns else 0.0, "has_model": turns,
             "step_name": "turn" if turns else "window"}  # fmt: skip
+
+
+def given_state(inspector: Inspector) -> dict[str, Any]:
+    """Return the state variables of the camera and the prism that can be set if the recording lacks them."""
+    fov = 2.0 * math.degrees(math.atan(0.5 * inspector.camera.width / inspector.camera.fx))
+    return {
+        "fov_deg": round(fov, 4), "index": round(inspector.prism.index, 4),
+        "gives_camera": inspector.sources["camera"] in (Source.ASSUMED, Source.HAND),
+        "gives_prism": inspector.sources["prism"] in (Source.ASSUMED, Source.HAND),
+    }  # fmt: skip
 
 
 def truths(inspector: Inspector) -> dict[str, float | None]:

@@ -159,8 +159,8 @@ class Panel:
         except ValueError:
             self.work.show_message(f"{text!r} is not a number; give a number such as 1.5", "error")
             return
-        if name in layout.LIMITS:
-            (low, high), (label, unit, *_) = layout.LIMITS[name], layout.SLIDERS[name]
+        if name in layout.FIELD_LIMITS:
+            (low, high), (label, unit, *_) = layout.FIELD_LIMITS[name], {**layout.SLIDERS, **layout.GIVEN}[name]
             if not low <= value <= high:
                 text = f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}"
                 self.work.show_message(text, "error")
@@ -168,9 +168,23 @@ class Panel:
         if name == "turns":
             name, value = "length_ms", value * float(self.state.turn_ms)
         self.state[name] = round(value, 4)
+        if name in layout.GIVEN:
+            self.work.start_job(self._give(name, value))
+            return
         if name in layout.NAMES:
             self.state.knob = name
         self.request("knobs" if name in layout.NAMES else "window")
+        self.released()
+
+    async def _give(self, name: str, value: float) -> None:
+        """Set the camera or the prism's index, which the recording lacks."""
+        await self.work.until_drawn()
+        with self.work.errors_shown("knobs"), self.state as state:
+            give = self.inspector.set_camera if name == "fov_deg" else self.inspector.set_index
+            give(value)
+            state.update(layout.given_state(self.inspector))
+        self.show_knobs()
+        self.request("window")
         self.released()
 
     def answer(self) -> None:
@@ -278,6 +292,10 @@ class Panel:
         state = self.state
         state.playing = not state.playing
         if not state.playing or self.plays:
+            return
+        if self.inspector.latest is None and float(state.length_ms) >= float(state.whole_ms):
+            state.playing = False
+            self.work.show_message("the window holds the whole recording; make it shorter to play", "info")
             return
         if self.inspector.latest is None and self._move(float(state.start_ms)):
             self._move(0.0)  # restart after the end
@@ -652,6 +670,9 @@ class Panel:
                 self.inspector.knobs, self.inspector.sources = good
                 self.show_knobs()
                 raise
+            if self.compensates != state.has_model:  # the speed of a prism was set, or set to 0
+                state.axis = (Axis.ANGLE if self.compensates else Axis.TIME).value
+                self.request("look")
             state.update({**values, **layout.prism_state(self.inspector), "curve_mark": float(state[state.knob])})
             if not state.playing:
                 self.remember("" if todo & {"suggestion", "state"} else self._change)

@@ -1,6 +1,6 @@
 // Camera that turns around a box: turntable angles, zoom and a shift on the screen. Both clouds share one camera.
 
-const VIEWS = {
+export const VIEWS = {
   free: [Math.atan2(-1.35, 1), 0.42], 'x-y': [-Math.PI / 2, Math.PI / 2], 'x-θ': [-Math.PI / 2, 0], 'y-θ': [Math.PI, 0],
 };
 const PERSPECTIVE = 0.22; // strength of the perspective; views along an axis are parallel

@@ -1,6 +1,6 @@
 // Component with the event clouds: draws the points in the browser, and lets the mouse and the keys turn them.
 
-import { Camera, MARGIN, seenPart } from './camera.js';
+import { Camera, MARGIN, VIEWS, seenPart } from './camera.js';
 import { drawFrame } from './frame.js';
 import { Raster, nearest } from './raster.js';
 
@@ -54,8 +54,10 @@ export const EventClouds = {
     let observer;
 
     function build() {
-      const frame = frameOf(props.box, props.axis);
-      const key = JSON.stringify([props.box, props.axis]);
+      const [W, H] = [canvas.value.clientWidth, canvas.value.clientHeight];
+      const alone = props.titles.length === 1 ? (H - MARGIN.top - MARGIN.bottom) / Math.max(W - MARGIN.left - MARGIN.right, 1) : 0;
+      const frame = frameOf(props.box, props.axis, alone);
+      const key = JSON.stringify([props.box, props.axis, frame.half]);
       scene.half = frame.half;
       scene.places = [props.before, props.after].map(
         (cloud, k) => places[k](() => place(frame, floats(cloud), floats(props.third)), cloud, props.third, key),
@@ -238,7 +240,7 @@ export const EventClouds = {
     }
 
     onMounted(() => {
-      observer = new window.ResizeObserver(ask);
+      observer = new window.ResizeObserver(() => (props.titles.length === 1 ? build() : ask()));
       observer.observe(canvas.value);
       canvas.value.addEventListener('pointerdown', pressed);
       canvas.value.addEventListener('wheel', wheeled, { passive: false });
@@ -248,9 +250,9 @@ export const EventClouds = {
       build();
     });
     onBeforeUnmount(() => observer.disconnect());
-    const content = ['before', 'after', 'third', 'coloursBefore', 'coloursAfter', 'box', 'axis', 'orbit', 'column'];
+    const content = ['before', 'after', 'third', 'coloursBefore', 'coloursAfter', 'box', 'axis', 'orbit', 'column', 'titles'];
     watch(content.map((name) => () => props[name]), build);
-    watch(['titles', 'dot', 'opacity', 'overlaid', 'dark', 'picked'].map((name) => () => props[name]), () => setTimeout(ask));
+    watch(['dot', 'opacity', 'overlaid', 'dark', 'picked'].map((name) => () => props[name]), () => setTimeout(ask));
     watch(() => props.view, ([view]) => {
       camera.look(view);
       ask();
@@ -259,9 +261,15 @@ export const EventClouds = {
   },
 };
 
-// Return half the size of the box around the points, its centre, and the stretch of the third axis.
-function frameOf([left, top, right, bottom], { low, high }) {
-  const tall = HEIGHT * Math.max(right - left, bottom - top);
+// Return half the size of the box around the points, its centre, and the stretch of the third axis. A single cloud is as
+// tall as its pane is (`aspect`: height over width), seen from the corner.
+function frameOf([left, top, right, bottom], { low, high }, aspect) {
+  const [width, height] = [right - left, bottom - top];
+  const side = Math.max(width, height);
+  const [azimuth, elevation] = VIEWS.free;
+  const [c, s] = [Math.abs(Math.cos(azimuth)), Math.abs(Math.sin(azimuth))];
+  const fills = (aspect * (width * s + height * c) - Math.sin(elevation) * (width * c + height * s)) / Math.cos(elevation);
+  const tall = aspect ? Math.max(0.4 * side, Math.min(1.6 * side, fills)) : HEIGHT * side;
   return {
     half: [(right - left) / 2, (bottom - top) / 2, tall / 2],
     centre: [(left + right) / 2, (top + bottom) / 2, (low + high) / 2],
