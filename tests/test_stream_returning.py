@@ -19,10 +19,11 @@ from typer.testing import CliRunner
 
 from amiwarp import AmiwarpError, Camera, Encoder, Events, Prism, open_recording
 from amiwarp.cli.app import app
+from amiwarp.live.stream import sources
 from amiwarp.live.stream.packets import Packet, encode_encoder, encode_end, encode_events, encode_hello, encode_triggers
 from amiwarp.live.stream.session import RecentEvents, followed
 from amiwarp.live.stream.sockets import close_listener, listen
-from amiwarp.live.stream.sources import open_source
+from amiwarp.live.stream.sources import open_source, reopen_source
 from reference.calibration_sample import exact_calibration
 from tests.test_stream_cli import start
 
@@ -235,6 +236,27 @@ def test_a_view_says_that_its_stream_broke_off(tmp_path: Path) -> None:
                 time.sleep(0.01)
     assert "the stream broke off: ended without an end packet" in said[0]
     assert "3,000 events" in said[0]
+
+
+def test_a_camera_is_opened_again_once_it_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    tries: list[str] = []
+
+    def opened(spec: str) -> str:
+        tries.append(spec)
+        if len(tries) < 3:
+            raise AmiwarpError("no such camera")
+        return f"source of {spec}"
+
+    monkeypatch.setattr(sources, "open_source", opened)
+    monkeypatch.setattr(sources, "REOPEN_S", 0.01)
+    stop = threading.Event()
+    assert reopen_source("dv:1", stop) == "source of dv:1"  # type: ignore[comparison-overlap]
+    assert tries == ["dv:1"] * 3
+    assert reopen_source("recording.h5", stop) is None  # would be played again and again
+    stop.set()
+    for spec in ("prophesee", f"unix:{os.devnull}", "tcp-listen:127.0.0.1:0"):
+        assert reopen_source(spec, stop) is None
+    assert len(tries) == 3
 
 
 def test_a_view_of_less_than_a_turn_says_how_it_ended(tmp_path: Path) -> None:
