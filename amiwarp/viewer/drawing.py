@@ -547,7 +547,7 @@ def colour_bar(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> ColourB
 def density_top(shown: DisplayedWindow) -> float:
     """Return the number of events per pixel at which the colour scale of the density ends, for both clouds."""
     image = shown.image_after
-    return max(float(np.percentile(image[image > 0], 99.0)) if (image > 0).any() else 1.0, 1.0)
+    return float(math.ceil(np.percentile(image[image > 0], 99.0))) if (image > 0).any() else 1.0
 
 
 def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> NDArray[np.float64]:
