@@ -1100,8 +1100,8 @@ def test_a_live_stream_comes_back_after_its_source_was_restarted(
             page = opened(of=latest(), latest=latest)
             page.locator("#stream-note").filter(has_text="the stream broke off").wait_for()
             assert page.locator("#live").filter(has_text="segment").count() == 0
-        with sender(tmp_path / "s", streams[1]):
-            page.locator("#live dl").filter(has_text="2, since the source came back").wait_for()
+        with sender(tmp_path / "s", streams[1], streams[1]):
+            page.locator("#live dl").filter(has_text="since the source came back").wait_for()
             until(lambda: latest().events.t_first < events.t[0])
             until(lambda: tabs.panels[-1].inspector.recording.events.t_first < events.t[0])
     assert any("the stream is back: segment 2" in text for text in said)
