@@ -565,6 +565,56 @@ def test_the_numbers_of_events_add_up_and_the_scope_is_the_chosen_one(
     page.locator("#calibrate-on").filter(has_text=expected).wait_for()
 
 
+AS_A_CARD = """
+const known = WebGL2RenderingContext.prototype.getParameter, made = HTMLCanvasElement.prototype.getContext;
+WebGL2RenderingContext.prototype.getParameter = function (name) {
+  return name === 0x9246 ? 'a graphics card' : known.call(this, name);
+};
+HTMLCanvasElement.prototype.getContext = function (kind, options) {
+  const context = made.call(this, kind, { ...options, failIfMajorPerformanceCaveat: false });
+  if (kind === 'webgl2' && context) window.card = context;
+  return context;
+};"""
+"""Program that makes a browser take the software that draws its WebGL for a graphics card."""
+
+
+def test_a_graphics_card_draws_more_points_and_the_same_picture(
+    browser: Any, opened: Open, tabs: Tabs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = opened()
+    expected = {}
+    for view in ("free", "x-y"):
+        page.locator(f"#view-{view}").click()
+        ready(page)
+        page.wait_for_timeout(200)
+        expected[view] = cloud(page)
+    monkeypatch.setattr(inspector_module, "MOST_POINTS", 500)
+    own = browser.new_context(viewport=page.viewport_size)
+    own.add_init_script(AS_A_CARD)
+    try:
+        drawn_by_card = tabs.open(own, tabs.make)
+        if not drawn_by_card.evaluate("Boolean(window.card)"):
+            pytest.skip("this browser has no WebGL 2")
+        drawn_by_card.locator("#events").filter(has_text="all of these drawn").wait_for()
+        for view, picture in expected.items():
+            drawn_by_card.locator(f"#view-{view}").click()
+            ready(drawn_by_card)
+            drawn_by_card.wait_for_timeout(200)
+            now = cloud(drawn_by_card)
+            assert (np.abs(now - picture).max(axis=2) > 40).mean() < 0.002
+        drawn_by_card.evaluate("window.card.getExtension('WEBGL_lose_context').loseContext()")
+        until(lambda: drawn_by_card.evaluate("window.card.isContextLost()"))
+        drawn_by_card.locator("#view-free").click()
+        drawn_by_card.wait_for_timeout(200)
+        assert (np.abs(cloud(drawn_by_card) - expected["free"]).max(axis=2) > 40).mean() < 0.002
+    finally:
+        closed = tabs.closed + 1
+        own.close()
+        until(lambda: tabs.closed == closed)
+        # the software that plays the card warns that it is slow
+        tabs.failures[:] = [each for each in tabs.failures if "GPU stall due to ReadPixels" not in each]
+
+
 def test_downloads_leave_no_file_on_the_server(
     page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recording: Recording
 ) -> None:

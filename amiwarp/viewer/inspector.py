@@ -810,7 +810,7 @@ class Inspector:
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
         self.recording, self.device, self.latest = recording, device, latest
-        self._most_events, self._most_points = most_events, most_points
+        self._most_events = most_events
         self.prism = nominal(recording.prism)
         """Nominal prism of the recording, with an assumed apex if it is unknown."""
         self.zero_us = (source.t_first + source.t_last) // 2
@@ -819,6 +819,8 @@ class Inspector:
         self.window: tuple[int, int] | None = None
         """Start and length of the time window [us]; None: that of :meth:`first_window`."""
         self.selection = Selection()
+        self.most_points = most_points or MOST_POINTS
+        """Largest number of points in each event cloud."""
         self._found: tuple[Knobs, Calibration] | None = None
         self._harmonics: tuple[float, ...] | None = None
         self._window: LoadedWindow | None = None
@@ -1165,7 +1167,7 @@ class Inspector:
     def _select(self, span: Span, selection: Selection) -> LoadedWindow:
         hot = self.hot if selection.hide_hot else None
         return load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot,
-                           most_points=self._most_points or MOST_POINTS)  # fmt: skip
+                           most_points=self.most_points)  # fmt: skip
 
     def _drift_us(self, knobs: Knobs) -> float:
         """Return how far the clock offset is from that of the recording's own encoder [us]."""

@@ -339,6 +339,7 @@ CALLS = (
     "key", "released", "choose", "typed", "edge", "draw", "whole", "suggest", "look_from", "step", "move_window",
     "resize_window", "take_from_curve", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline",
     "undo", "redo", "reset", "restore", "answer", "keep_b", "swap_b", "compare_found", "export", "open_file",
+    "use_card",
 )  # fmt: skip
 """Methods of the panel that the page may call."""
 SETTABLE: dict[str, Check] = {

@@ -25,10 +25,19 @@ from amiwarp.progress import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look, Scene
-from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection
+from amiwarp.viewer.inspector import (
+    DisplayedWindow,
+    EventRates,
+    Inspector,
+    Knobs,
+    Library,
+    Selection,
+)
 from amiwarp.viewer.jobs import SLOW, JobCancelled, JobProgress, PageWork
 from amiwarp.viewer.serve import finite, serve, use_page
 
+CARD_POINTS = 1_000_000
+"""Largest number of points in each cloud of a browser that draws with a graphics card."""
 BINS = 400
 """Number of points of the drawn event rates."""
 STEP_S = 0.2
@@ -57,7 +66,7 @@ class Panel:
         """Parameters that were kept as B."""
         self.plays = False
         """Whether the playback runs; after a stop it runs until it notices the stop."""
-        self._picked = -1
+        self._picked, self._card = -1, False
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
         self._history: layout.History | None = None
         self._wanted: layout.ViewState | str | None = None
@@ -72,6 +81,7 @@ class Panel:
         """Show an inspector from its first state."""
         self.inspector, self.shown, self.b, self.found, self._picked = inspector, None, None, None, -1
         self._history = self._wanted = None
+        self._give_points()
         inspector.renew()  # a live stream may have gone on since the inspector was made
         files = [] if self._library is None else self._library.files()
         folder = "" if self._library is None else str(self._library.folder)
@@ -186,6 +196,19 @@ class Panel:
         self.show_knobs()
         self.request("window")
         self.released()
+
+    def use_card(self, found: bool) -> None:
+        """Show more points if the browser has a graphics card to draw them."""
+        self._card = found
+        if self._give_points():
+            self.request("window")
+
+    def _give_points(self) -> bool:
+        """Give the inspector the number of points that a graphics card draws. Return whether it had fewer."""
+        more = self._card and self.inspector.most_points < CARD_POINTS
+        if more:
+            self.inspector.most_points = CARD_POINTS
+        return more
 
     def answer(self) -> None:
         """Do nothing: the page asks only whether the server answers."""

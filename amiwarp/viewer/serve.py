@@ -194,7 +194,7 @@ def _integer(value: Any) -> bool:
 
 
 flag = one_of(True, False)
-ARGUMENTS: Mapping[str, Check] = {"str": text(MOST_CHARACTERS), "float": number(), "int": _integer}
+ARGUMENTS: Mapping[str, Check] = {"str": text(MOST_CHARACTERS), "float": number(), "int": _integer, "bool": flag}
 """Checks of the arguments of functions that the page calls, by their annotation."""
 
 

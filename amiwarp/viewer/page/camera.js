@@ -43,7 +43,8 @@ export class Camera {
     const right = [-sa, ca, 0];
     const up = [-se * ca, -se * sa, ce];
     const along = away.some((part) => Math.abs(part) > 0.9999);
-    const depth = along ? 0 : PERSPECTIVE / Math.hypot(...half);
+    const reach = Math.hypot(...half);
+    const depth = along ? 0 : PERSPECTIVE / reach;
     let [wide, tall] = [1e-6, 1e-6];
     for (const corner of corners([half.map((each) => -each), half])) {
       const w = 1 - depth * dot(away, corner);
@@ -54,7 +55,7 @@ export class Camera {
     const x = MARGIN.left + free[0] / 2 + this.right;
     const y = MARGIN.top + free[1] / 2 + this.up;
     return {
-      away, right, up, depth, scale, x, y, along, free, zoom: this.zoom, shift: [this.right, this.up],
+      away, right, up, depth, reach, scale, x, y, along, free, zoom: this.zoom, shift: [this.right, this.up],
       at(point) {
         const w = 1 - depth * dot(away, point);
         return [x + (scale * dot(right, point)) / w, y - (scale * dot(up, point)) / w, dot(away, point)];

@@ -2,6 +2,7 @@
 
 import { Camera, MARGIN, VIEWS, seenPart } from './camera.js';
 import { drawFrame } from './frame.js';
+import { GpuRaster } from './gpu.js';
 import { Raster, nearest } from './raster.js';
 
 const { onBeforeUnmount, onMounted, ref, watch } = window.Vue;
@@ -22,6 +23,15 @@ function memory() {
   };
 }
 
+// Return what draws points: a graphics card if there is one.
+function newRaster() {
+  try {
+    return new GpuRaster();
+  } catch {
+    return new Raster();
+  }
+}
+
 export function floats(bytes) {
   if (!bytes || !bytes.byteLength) return new Float32Array(0);
   return new Float32Array(bytes.slice().buffer);
@@ -37,12 +47,12 @@ export const EventClouds = {
     box: Array, axis: Object, titles: Array, view: Array, dot: Number, opacity: Number, overlaid: Boolean,
     dark: Boolean, picked: Number,
   },
-  emits: ['pick'],
+  emits: ['pick', 'card'],
   template: `<div class="clouds"><canvas ref="canvas" tabindex="0" role="img" :aria-label="label"></canvas></div>`,
   setup(props, { emit }) {
     const canvas = ref(null);
     const camera = new Camera();
-    const rasters = [new Raster(), new Raster()];
+    const rasters = [newRaster(), newRaster()];
     const [pictures, places, colours] = [0, 1, 2].map(() => [memory(), memory()]);
     const scene = { places: [new Float32Array(0), new Float32Array(0)], colours: [], half: [1, 1, 1] };
     const label = window.Vue.computed(() => {
@@ -105,6 +115,7 @@ export const EventClouds = {
       const dot = Math.max(1, Math.round(props.dot * ratio * Math.max(1, Math.min(2.5, H / 420))));
       panes().forEach((pane, number) => {
         const projection = camera.project(scene.half, pane.width, pane.height);
+        if (rasters[number].lost) rasters[number] = new Raster();
         const raster = rasters[number];
         const fill = () => {
           const fine = { ...projection, scale: projection.scale * ratio, x: projection.x * ratio, y: projection.y * ratio };
@@ -115,12 +126,12 @@ export const EventClouds = {
             const grey = pane.clouds.length > 1 && k === 0 ? GREY : 0;
             raster.points(scene.places[k], scene.colours[k], fine, dot, props.opacity, clip, grey);
           }
-          return raster.image;
+          return raster;
         };
         const key = JSON.stringify([projection, pane.width, pane.height, ratio, paper, dot, props.opacity, pane.clouds]);
-        const image = pictures[number](fill, key, ...pane.clouds.flatMap((k) => [scene.places[k], scene.colours[k]]));
+        const picture = pictures[number](fill, raster, key, ...pane.clouds.flatMap((k) => [scene.places[k], scene.colours[k]]));
         context.setTransform(1, 0, 0, 1, 0, 0);
-        context.putImageData(image, Math.round(pane.left * ratio), Math.round(pane.top * ratio));
+        picture.show(context, Math.round(pane.left * ratio), Math.round(pane.top * ratio));
         context.setTransform(ratio, 0, 0, ratio, pane.left * ratio, pane.top * ratio);
         context.save();
         context.beginPath();
@@ -247,6 +258,7 @@ export const EventClouds = {
       canvas.value.addEventListener('keydown', typed);
       canvas.value.addEventListener('contextmenu', (event) => event.preventDefault());
       camera.look(props.view[0]);
+      emit('card', rasters[0] instanceof GpuRaster);
       build();
     });
     onBeforeUnmount(() => observer.disconnect());

@@ -1,6 +1,8 @@
 // Drawing of points into a picture by the processor. It needs no graphics card: on machines with software rendering it
 // is many times faster than WebGL, and it draws the same picture everywhere.
 
+export const FADE = 0.45; // share of the background in the colour of the farthest point, if the clouds are seen in depth
+
 export class Raster {
   // Set the size of the picture [px].
   resize(width, height) {
@@ -11,20 +13,26 @@ export class Raster {
   }
 
   clear(colour) {
+    this.paper = colour;
     this.pixels.fill(colour);
     this.depth.fill(-Infinity);
   }
 
-  // Draw n points (x, y, z interleaved, NaN for none) as squares; the nearest point covers the others. With an opacity
-  // below 1, points are mixed in their order. `fixed` is one colour for all points. Points that leave `clip` (left, top,
-  // right, bottom) are not drawn.
+  // Draw n points (x, y, z interleaved, NaN for none); the nearest point covers the others. With an opacity below 1,
+  // points are mixed in their order. `fixed` is one colour for all points. Points that leave `clip` (left, top, right,
+  // bottom) are not drawn.
   points(places, colours, projection, size, opacity, clip, fixed = 0) {
     const { pixels, depth, image } = this;
     const [x0, y0, x1, y1] = [Math.max(clip[0], 0), Math.max(clip[1], 0), Math.min(clip[2], image.width), Math.min(clip[3], image.height)];
-    const { away, right, up, depth: near, scale, x: cx, y: cy } = projection;
+    const { away, right, up, depth: near, scale, x: cx, y: cy, reach, along } = projection;
     const [W, n, low] = [image.width, places.length / 3, Math.floor((size - 1) / 2)];
     const [r0, r1, u0, u1, u2, a0, a1, a2] = [...right.slice(0, 2), ...up, ...away];
     const mix = Math.round(256 * opacity);
+    const fade = along ? 0 : 128 * FADE / reach; // by distance from the nearest corner
+    const ends = Array.from({ length: size }, (_, row) => {
+      const off = (2 * row + 1) / size - 1;
+      return Math.round((size * (1 + Math.sqrt(1 - off * off))) / 2);
+    }); // of the rows of a point
     for (let i = 0, j = 0; i < n; i++, j += 3) {
       const x = places[j], y = places[j + 1], z = places[j + 2];
       const d = a0 * x + a1 * y + a2 * z;
@@ -32,9 +40,9 @@ export class Raster {
       const left = Math.round(cx + s * (r0 * x + r1 * y)) - low;
       const top = Math.round(cy - s * (u0 * x + u1 * y + u2 * z)) - low;
       if (!(left >= x0 && top >= y0 && left + size <= x1 && top + size <= y1)) continue;
-      const colour = fixed || colours[i];
-      for (let row = top * W + left, stop = row + size * W; row < stop; row += W) {
-        for (let at = row; at < row + size; at++) {
+      const colour = mixed(fixed || colours[i], this.paper, (fade * (reach - d)) | 0);
+      for (let row = top * W + left, k = 0; k < size; row += W, k++) {
+        for (let at = row + size - ends[k]; at < row + ends[k]; at++) {
           if (mix < 256) {
             pixels[at] = mixed(pixels[at], colour, mix);
           } else if (d > depth[at]) {
@@ -44,6 +52,10 @@ export class Raster {
         }
       }
     }
+  }
+
+  show(context, left, top) {
+    context.putImageData(this.image, left, top);
   }
 }
 
