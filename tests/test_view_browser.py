@@ -1216,3 +1216,30 @@ def test_a_page_in_a_notebook_of_another_site_works_and_an_ended_server_is_said(
         inside.locator("#lost").filter(has_text="The server does not answer").wait_for()
         assert inside.locator(".clouds canvas").is_visible()
         notebook.shutdown()
+
+
+def test_a_slice_of_the_third_axis_is_drawn(page: Any) -> None:
+    page.locator("#view-x-θ").click()
+    page.locator("#orbit").uncheck()
+    ready(page)
+    before = cloud(page)
+    page.locator("#slice-from").fill("0.5")
+    after = seen_change(page, ".clouds canvas", before)
+    assert page.locator("label:has(#slice-from)").inner_text().split() == ["θ", "from", "180"]
+    height = before.shape[0]
+    coloured = [(np.ptp(each, axis=2) > 90)[:, : each.shape[1] // 2] for each in (before, after)]
+    lower = slice(int(0.55 * height), int(0.85 * height))
+    assert coloured[0][lower].any()
+    assert not coloured[1][lower].any()  # angles below 180 degrees
+    page.locator("#slice-from").fill("0")
+    assert np.array_equal(seen_change(page, ".clouds canvas", after), before)
+
+
+def test_statistics_of_the_region(page: Any, tabs: Tabs) -> None:
+    shown = page.locator("#statistics dd")
+    shown.filter(has_text="events/s").wait_for()
+    found = tabs.panels[-1].inspector.statistics()
+    assert f"{found.rate:,.0f} events/s" in shown.all_inner_texts()
+    assert f"{found.median_us:,.0f} µs" in shown.all_inner_texts()
+    page.locator("#polarity-ON").check()
+    shown.filter(has_text="100.0 %").wait_for()

@@ -58,7 +58,7 @@ The calibration of a small recording causes eighty per second, and the page woul
 _CUDA_LOCK = asyncio.Lock()
 """Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""
 QUICK = {**dict.fromkeys(("window", "suggestion", "state", "knobs"), ("clouds", "images")), "look": ("clouds",)}
-SLOW = ("curve", "picture")
+SLOW = ("curve", "picture", "statistics")
 """Updates that are made at once, with the parts of the page that wait for them, and updates that take longer."""
 
 

@@ -6,12 +6,15 @@ from dataclasses import dataclass, replace
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
+import numpy as np
+
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.imaging.metrics import random_variance
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.drawing import NO_ORBIT, ImageKind
 from amiwarp.viewer.inspector import (
+    INTERVALS_US,
     NO_ENCODER,
     OTHERS,
     SLIDING,
@@ -21,6 +24,7 @@ from amiwarp.viewer.inspector import (
     Knobs,
     Selection,
     Source,
+    Statistics,
     colours_on_offer,
     truth_text,
 )
@@ -354,7 +358,7 @@ SETTABLE: dict[str, Check] = {
 }  # fmt: skip
 """State variables that the page may set directly, with the check of their values. The page changes all others through
 :data:`CALLS`."""
-CLIENT_ONLY = ("hover", "measured", "tool", "late")
+CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice")
 """State variables that the browser keeps to itself."""
 PLACE_VARIANCE = 0.0025
 """Relative variance of what one event adds to the variance of an image smoothed by 1 px, over its place in a pixel."""
@@ -420,7 +424,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
         "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
         "views": [list(each) for each in VIEWS], "tool": "region", "tools": [list(each) for each in TOOLS],
-        "hover": "", "measured": "", "late": 0, "orbit_shown": True, "help_shown": False,
+        "hover": "", "measured": "", "late": 0, "slice": [0.0, 1.0], "orbit_shown": True, "help_shown": False,
         "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
         "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
         "rate_on": b"", "rate_off": b"", "rate_note": "", "picked_text": "",
@@ -433,7 +437,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "against_choices": [], "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
         "curve_mark": 0.0, "against": "recorded", "has_b": False, "b_text": "", "busy": "", "calibrating": False,
         "progress": 0, "found": "", "surface": None, "scope": SCOPES[0], "scopes": list(SCOPES),
-        "calibrate_on": ["", ""],
+        "calibrate_on": ["", ""], "statistics": {"rows": [], "x": [], "y": [], "median": None},
     }  # fmt: skip
 
 
@@ -535,6 +539,23 @@ def events_text(shown: DisplayedWindow) -> str:
     parts += [] if shown.selected == read else [f"{shown.selected:,} of these selected"]
     whole = "all" if len(parts) == 1 else "all of these"
     return ", ".join([*parts, f"{whole if drawn == shown.selected else f'{drawn:,} of these'} drawn"])
+
+
+def statistics_state(found: Statistics) -> dict[str, Any]:
+    """Return statistics for the page: rows of name and value, and the histogram of the intervals."""
+    n, known = found.on + found.off, bool(found.intervals.any())
+    rows = [
+        ("rate", f"{found.rate:,.0f} events/s"), ("events per pixel", f"{n / found.area:.3g}"),
+        ("ON", f"{100.0 * found.on_share:.1f} %"),
+        ("pixels with events", f"{100.0 * found.pixels / found.area:.1f} %"),
+        ("median interval of a pixel", f"{found.median_us:,.0f} µs" if known else "–"),
+    ]  # fmt: skip
+    decades = np.log10(INTERVALS_US)
+    return {
+        "rows": [list(row) for row in rows], "x": (0.5 * (decades[1:] + decades[:-1])).tolist() if known else [],
+        "y": (100.0 * found.intervals / max(1, found.intervals.sum())).tolist(),
+        "median": math.log10(max(found.median_us, 1.0)) if known else None,
+    }  # fmt: skip
 
 
 def live_state(f: LiveFigures) -> dict[str, Any]:

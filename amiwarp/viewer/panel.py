@@ -701,9 +701,11 @@ class Panel:
                 self.remember("" if todo & {"suggestion", "state"} else self._change)
 
     async def make_slow(self, name: str) -> None:
-        """Make a slow update: "curve", "picture", or "preparation" of the first picture."""
+        """Make a slow update: "curve", "picture", "statistics", or "preparation" of the first picture."""
         if name == "preparation":
             await self.work.in_thread(drawing.prepare, self.inspector)
+        elif name == "statistics":
+            self.state.statistics = layout.statistics_state(await self.work.in_thread(self.inspector.statistics))
         else:
             await (self._curve() if name == "curve" else self._picture())
 

@@ -45,7 +45,7 @@ export const EventClouds = {
   props: {
     before: null, after: null, third: null, coloursBefore: null, coloursAfter: null, orbit: null, column: null,
     box: Array, axis: Object, titles: Array, view: Array, dot: Number, opacity: Number, overlaid: Boolean,
-    dark: Boolean, picked: Number,
+    dark: Boolean, picked: Number, slice: Array,
   },
   emits: ['pick', 'card'],
   template: `<div class="clouds"><canvas ref="canvas" tabindex="0" role="img" :aria-label="label"></canvas></div>`,
@@ -100,6 +100,13 @@ export const EventClouds = {
       }));
     }
 
+    // Return the projection of a pane, with the slice of the third axis that is drawn.
+    function projected(pane) {
+      const [from, to] = props.slice;
+      const [low, high] = [from > 0 ? from : -1e9, to < 1 ? to : 1e9].map((share) => scene.half[2] * (2 * share - 1));
+      return { ...camera.project(scene.half, pane.width, pane.height), low, high };
+    }
+
     function draw() {
       const view = canvas.value;
       const [W, H] = [view.clientWidth, view.clientHeight];
@@ -114,7 +121,7 @@ export const EventClouds = {
       const context = view.getContext('2d');
       const dot = Math.max(1, Math.round(props.dot * ratio * Math.max(1, Math.min(2.5, H / 420))));
       panes().forEach((pane, number) => {
-        const projection = camera.project(scene.half, pane.width, pane.height);
+        const projection = projected(pane);
         if (rasters[number].lost) rasters[number] = new Raster();
         const raster = rasters[number];
         const fill = () => {
@@ -199,7 +206,7 @@ export const EventClouds = {
     function pick(x, y) {
       const pane = paneAt(x, y);
       const cloud = pane.clouds[pane.clouds.length - 1];
-      const projection = camera.project(scene.half, pane.width, pane.height);
+      const projection = projected(pane);
       emit('pick', nearest(scene.places[cloud], projection, x - pane.left, y - pane.top, REACH_PX));
     }
 
@@ -264,7 +271,7 @@ export const EventClouds = {
     onBeforeUnmount(() => observer.disconnect());
     const content = ['before', 'after', 'third', 'coloursBefore', 'coloursAfter', 'box', 'axis', 'orbit', 'column', 'titles'];
     watch(content.map((name) => () => props[name]), build);
-    watch(['dot', 'opacity', 'overlaid', 'dark', 'picked'].map((name) => () => props[name]), () => setTimeout(ask));
+    watch(['dot', 'opacity', 'overlaid', 'dark', 'picked', 'slice'].map((name) => () => props[name]), () => setTimeout(ask));
     watch(() => props.view, ([view]) => {
       camera.look(view);
       ask();

@@ -7,6 +7,7 @@ uniform vec3 right, up, away, paper;
 uniform vec4 centre; // x, y, scale [px], strength of the perspective
 uniform vec4 picture; // width, height [px], diameter of a point [px], reach of the box
 uniform float fade, opacity;
+uniform vec2 slice;
 in vec3 place;
 in vec4 colour;
 out vec4 shade;
@@ -16,7 +17,7 @@ void main() {
   float low = floor((picture.z - 1.0) / 2.0);
   vec2 corner = floor(vec2(centre.x + scale * dot(right, place), centre.y - scale * dot(up, place)) + 0.5) - low;
   vec2 at = 2.0 * (corner + 0.5 * picture.z) / picture.xy - 1.0;
-  bool known = abs(depth) < 1e9;
+  bool known = abs(depth) < 1e9 && place.z >= slice.x && place.z <= slice.y;
   gl_Position = known ? vec4(at.x, -at.y, -0.99 * depth / picture.w, 1.0) : vec4(2.0, 2.0, 2.0, 1.0);
   gl_PointSize = picture.z;
   shade = vec4(mix(colour.rgb, paper, fade * (0.5 - 0.5 * depth / picture.w)), opacity);
@@ -30,7 +31,7 @@ void main() {
   if (dot(off, off) > 1.0) discard;
   pixel = shade;
 }`;
-const UNIFORMS = ['right', 'up', 'away', 'paper', 'centre', 'picture', 'fade', 'opacity'];
+const UNIFORMS = ['right', 'up', 'away', 'paper', 'centre', 'picture', 'fade', 'opacity', 'slice'];
 
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i; // renderers slower than Raster
 
@@ -83,11 +84,12 @@ export class GpuRaster {
   // Draw points as Raster does. Those at the border of `clip` are drawn in part.
   points(places, colours, projection, size, opacity, clip, fixed = 0) {
     const { gl, at } = this;
-    const { away, right, up, depth, scale, x, y, reach, along } = projection;
+    const { away, right, up, depth, scale, x, y, reach, along, low, high } = projection;
     const [x0, y0, x1, y1] = clip;
     gl.enable(gl.SCISSOR_TEST);
     gl.scissor(x0, this.height - y1, Math.max(0, x1 - x0), Math.max(0, y1 - y0));
     for (const [name, value] of Object.entries({ right, up, away, paper: this.paper })) gl.uniform3fv(at[name], value);
+    gl.uniform2f(at.slice, low, high);
     gl.uniform4f(at.centre, x, y, scale, depth);
     gl.uniform4f(at.picture, this.width, this.height, size, reach);
     gl.uniform1f(at.fade, along ? 0 : FADE);

@@ -20,11 +20,11 @@ export class Raster {
 
   // Draw n points (x, y, z interleaved, NaN for none); the nearest point covers the others. With an opacity below 1,
   // points are mixed in their order. `fixed` is one colour for all points. Points that leave `clip` (left, top, right,
-  // bottom) are not drawn.
+  // bottom) or the slice of the projection are not drawn.
   points(places, colours, projection, size, opacity, clip, fixed = 0) {
     const { pixels, depth, image } = this;
     const [x0, y0, x1, y1] = [Math.max(clip[0], 0), Math.max(clip[1], 0), Math.min(clip[2], image.width), Math.min(clip[3], image.height)];
-    const { away, right, up, depth: near, scale, x: cx, y: cy, reach, along } = projection;
+    const { away, right, up, depth: near, scale, x: cx, y: cy, reach, along, low: z0, high: z1 } = projection;
     const [W, n, low] = [image.width, places.length / 3, Math.floor((size - 1) / 2)];
     const [r0, r1, u0, u1, u2, a0, a1, a2] = [...right.slice(0, 2), ...up, ...away];
     const mix = Math.round(256 * opacity);
@@ -35,6 +35,7 @@ export class Raster {
     }); // of the rows of a point
     for (let i = 0, j = 0; i < n; i++, j += 3) {
       const x = places[j], y = places[j + 1], z = places[j + 2];
+      if (!(z >= z0 && z <= z1)) continue;
       const d = a0 * x + a1 * y + a2 * z;
       const s = scale / (1 - near * d);
       const left = Math.round(cx + s * (r0 * x + r1 * y)) - low;
@@ -70,6 +71,7 @@ function mixed(below, above, share) {
 export function nearest(places, projection, x, y, reach) {
   let [best, least, front] = [-1, reach, -Infinity];
   for (let i = 0; i < places.length / 3; i++) {
+    if (!(places[3 * i + 2] >= projection.low && places[3 * i + 2] <= projection.high)) continue;
     const [px, py, d] = projection.at([places[3 * i], places[3 * i + 1], places[3 * i + 2]]);
     const distance = Math.hypot(px - x, py - y);
     if (distance < least - 2 || (distance < least + 2 && distance <= reach && d > front)) {
