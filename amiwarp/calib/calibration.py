@@ -220,7 +220,8 @@ class Calibrator:
         """Calibrate once by the stages of the settings, with the free parameters that they name.
 
         The attempt fails early if its image is not clearly sharper than that of a ``rival``, another attempt, or if it
-        does not come to a clearly lower cost. With ``angles_hold``, no error of the prism's angles is looked for.
+        does not come to a clearly lower cost. With ``angles_hold``, an error of the prism's angles is looked for only
+        after corrections of the camera and the prism, and refused.
         """
         began, search = time.perf_counter(), None
         try:
@@ -356,7 +357,9 @@ class Calibrator:
                 continue
             corrected = replace(encoder, angle=encoder.angle / each, index_t=None)
             again = replace(self, recording=replace(self.recording, encoder=corrected)).attempt(tried)
-            if not again.accepted or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
+            # a slipping index remains as an error that repeats every turn
+            explains = again.accepted or (again.photometric is not None and again.photometric.harmonics)
+            if not explains or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
                 continue
             if each < 0.0:
                 return again.cost, checks.wrong_direction(name, tried.cost, again.cost)

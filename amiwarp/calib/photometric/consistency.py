@@ -298,6 +298,9 @@ LEAST_ANGLE_GAIN = 0.01
 SHAKE_SHARE = 0.75
 """A shake counts if it explains this share of what all causes together explain, with fewer unknowns. Eight wrong lenses
 left 0.02 to 0.62 of it, shakes by 30 % of the prism's motion 0.84 to 1.7."""
+LEAST_SHAKE_GAIN = 0.01
+"""Smallest share of the squared residuals that a shake must explain beyond all causes together. A wrong index, which no
+cause frees, leaves 0.0013 to it, shakes by 30 % of the prism's motion 0.027 or more."""
 LEAST_FURTHER_GAIN = 0.0005
 """Smallest share that a further cause must remove once the given lens has turned out to be wrong."""
 LEAST_MOVE_PX = 0.005
@@ -648,15 +651,16 @@ def px_per_rad(space: ParameterSpace, best: Vector) -> float:
 
 
 def _shake(space: ParameterSpace, fit: LinearFit) -> float:
-    """Return the amplitude of a shake that explains nearly as much as all causes together [px]; 0 if none does."""
+    """Return the amplitude of a shake that explains much of what all causes together leave [px]; 0 if none does."""
     if not {*SHAKE} <= {*fit.names}:
         return 0.0
-    unknown = [n for cause in CAUSES for n in cause.names if n in fit.names and n not in space.names]
+    causes = tuple(n for cause in CAUSES for n in cause.names if n in fit.names and n not in space.names)
     # a wrong fy / fx bends the orbit as a shake on an ellipse does: it is freed for both
-    free = (*space.names, *(n for n in unknown if n in ASPECT.names))
+    free = (*space.names, *(n for n in causes if n in ASPECT.names))
     estimate, significance, gain = fit.adding(free, SHAKE)
-    others = fit.adding(free, tuple(n for n in unknown if n not in free))[2]
-    if significance < SIGNIFICANT or gain < max(LEAST_ANGLE_GAIN, SHAKE_SHARE * others):
+    others = fit.adding(free, tuple(n for n in causes if n not in free))[2]
+    _, _, left = fit.adding((*space.names, *causes), SHAKE)
+    if significance < SIGNIFICANT or gain < SHAKE_SHARE * others or left < LEAST_SHAKE_GAIN:
         return 0.0
     return float(np.linalg.norm(estimate.change[-len(SHAKE) :]) / math.sqrt(2.0))
 

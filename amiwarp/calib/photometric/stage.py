@@ -61,16 +61,10 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
     rad_per_us, direction, delay = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm), list[str]()
     examined = can_be_examined(answer, found.answers.cost) and bool(rpm)
     missing = missing_step(found.answers.cost) if examined else 0.0
-    error = find_angle_error(found.answers, answer.stage.x) if examined and not search.angles_hold else None
-    if error is not None:
-        space, v = found.answers.cost.space, answer.stage.x
-        px = skew_px(space.camera, error, consistency.px_per_rad(space, v))
-        late_us = -direction / rad_per_us * error[4:]
-        if error[:4].any() or px >= LARGEST_SKEW_PX:
-            harmonics = tuple(error[:4].tolist()) if error[:4].any() else ()
-            answer = replace(answer, result=replace(answer.result, harmonics=harmonics))
-            return found.finished(answer.judged(False, angle_error_in_words(error, px, late_us)))
-        delay = [skew_in_words(late_us, px)] if px >= NOTABLE_SKEW_PX else []
+    if examined and not search.angles_hold:
+        judged, delay = without_angle_error(found.answers, answer, direction * rad_per_us)
+        if judged is not answer:
+            return found.finished(judged)
     if examined:
         v = answer.stage.x
         pause, lag = timing_steps(found.answers.cost, v, direction)
@@ -88,6 +82,8 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
     answers = found.answers
     answer = checked(answers, answer).judged(*judge_lag(time_constant * rad_per_us))
     answer = answer.judged(*judge_losses(missing)) if examined else answer
+    if examined and search.angles_hold and answer.result.accepted:
+        answer, delay = without_angle_error(answers, answer, direction * rad_per_us)
     notes = (
         *timing_notes(sensor.refractory_us - given.refractory_us, time_constant),
         *loss_notes(found.silent_share, missing), *delay, *answer.result.warnings,
@@ -712,6 +708,24 @@ LEAST_ANGLE_PX = 0.003
 NOTABLE_SKEW_PX, LARGEST_SKEW_PX = 0.02, 0.04
 """Errors by pixels that are read one after another, from which on they are reported and refused [px rms]. Compensation
 does not correct them."""
+
+
+def without_angle_error(search: AnswerSearch, answer: Answer, rad_per_us: float) -> tuple[Answer, list[str]]:
+    """Return the answer, rejected if its angles have an error, and a sentence about a small delay of the read-out.
+
+    ``rad_per_us`` is the speed of the prism. The result holds an error that repeats every turn, so that it can be
+    corrected.
+    """
+    space, v = search.cost.space, answer.stage.x
+    error = find_angle_error(search, v)
+    if error is None:
+        return answer, []
+    px, late_us = skew_px(space.camera, error, consistency.px_per_rad(space, v)), -error[4:] / rad_per_us
+    if not error[:4].any() and px < LARGEST_SKEW_PX:
+        return answer, [skew_in_words(late_us, px)] if px >= NOTABLE_SKEW_PX else []
+    harmonics = tuple(error[:4].tolist()) if error[:4].any() else ()
+    answer = replace(answer, result=replace(answer.result, harmonics=harmonics))
+    return answer.judged(False, angle_error_in_words(error, px, late_us)), []
 
 
 def find_angle_error(search: AnswerSearch, v: Vector) -> Vector | None:
