@@ -65,6 +65,17 @@ def test_a_wrong_direction_of_the_encoder_is_named(still: Recording) -> None:
         calibrate(scaled(still, -1.0), **SMALL)
 
 
+def test_an_encoder_that_slips_at_every_half_turn_is_no_turning_camera(texture: np.ndarray) -> None:
+    camera = Camera.from_fov(160, 120, math.radians(60.0))
+    recording = simulate(texture, camera, TRUE_PRISM, duration_s=0.34, seed=3)
+    assert recording.encoder is not None
+    angle = recording.encoder.angle
+    half_turns = np.floor(angle / math.pi)
+    slipped = Encoder(recording.encoder.t, angle - math.radians(3.75) * (half_turns - half_turns[0]))
+    with pytest.raises(AmiwarpError, match=r"the events repeat every 0\.9\d+ turns of the encoder"):
+        calibrate(replace(recording, encoder=slipped), model="exact", photometric=COARSE)
+
+
 def test_an_apex_beyond_the_bound_is_refused_with_the_bound(still: Recording) -> None:
     small = replace(still, prism=Prism(0.4 * TRUE_PRISM.apex))
     bound = math.degrees(0.8 * TRUE_PRISM.apex)

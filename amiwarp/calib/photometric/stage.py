@@ -527,7 +527,8 @@ def judge_shake(amplitude_px: float) -> tuple[bool, str]:
     """Return that an answer is rejected whose camera shakes with the prism, and the reason."""
     return False, (
         f"the camera shakes with the prism, by {amplitude_px:.2f} px or more, which looks like a weaker or stronger "
-        "prism; mount the camera apart from the motor, or balance the prism"
+        "prism; mount the camera apart from the motor, or balance the prism; a given refractive index that is wrong by "
+        "0.1 or more looks alike"
     )
 
 
