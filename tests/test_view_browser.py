@@ -29,6 +29,7 @@ from amiwarp import (
     Prism,
     PrismMotion,
     Recording,
+    SensorModel,
     calibrate,
     open_recording,
     save_recording,
@@ -1243,3 +1244,36 @@ def test_statistics_of_the_region(page: Any, tabs: Tabs) -> None:
     assert f"{found.median_us:,.0f} µs" in shown.all_inner_texts()
     page.locator("#polarity-ON").check()
     shown.filter(has_text="100.0 %").wait_for()
+
+
+def test_another_recording_is_shown_on_the_left(
+    context: Any, tabs: Tabs, recording: Recording, nothing_fails: None
+) -> None:
+    still = simulate(
+        np.full((96, 128), 128, np.uint8), recording.camera, recording.prism, duration_s=4 * 60 / RPM,
+        motion=PrismMotion(RPM), sensor=SensorModel(shot_noise_hz=20.0), seed=1,
+    )  # fmt: skip
+    noise = replace(still, encoder=None, truth=None, name="noise")
+
+    def make() -> Inspector:
+        made = Inspector(recording)
+        made.take_truth()
+        made.put_beside(noise)
+        return made
+
+    page = tabs.open(context, make)
+    try:
+        assert page.locator("#against-title").inner_text() == "noise (other recording)"
+        picture = cloud(page)
+        half = picture.shape[1] // 2
+        coloured = [(np.ptp(each, axis=2) > 60).mean() for each in (picture[:, :half], picture[:, half:])]
+        assert 0.0 < coloured[0] < 0.3 * coloured[1]
+        x, y = middle(page, ".clouds canvas")
+        for dx in range(-8, 9, 2):  # no event of the other recording can be picked
+            page.mouse.click(x - half / 2 + 4 * dx, y)
+        ready(page)
+        assert page.locator("#picked").count() == 0
+    finally:
+        closed = tabs.closed + 1
+        page.close()
+        until(lambda: tabs.closed == closed)

@@ -888,3 +888,36 @@ def test_intervals_between_two_runs_are_not_counted(monkeypatch: pytest.MonkeyPa
     assert found.on + found.off == 3200
     assert found.duration_us == 50_000
     assert found.intervals.sum() == 3200 - 2 * viewer.RUNS
+
+
+def test_another_recording_is_shown_beside(recording: Recording, inspector: Inspector, tmp_path: Path) -> None:
+    """A compensated one, on another clock, and without an encoder: its events lie where the inspector puts its own."""
+    assert recording.encoder is not None
+    events = recording.events.slice(0, len(recording.events))  # type: ignore[attr-defined]
+    moved = compensate_events(events, inspector.model, recording.encoder)
+    inside = (np.abs(moved + 0.5 - np.array([80, 60])) < np.array([80, 60])).all(axis=1)
+    compensated = Events(moved[inside, 0], moved[inside, 1], events.t[inside] + 7_000_000, events.p[inside])
+    other = replace(recording, events=MemoryEvents(compensated, 160, 120), encoder=None, truth=None, name="other")
+    inspector.put_beside(other)
+    first = int(events.t[inside][0]) - recording.events.t_first  # the times count from the first events
+    inspector.open(50_000, 80_000, Selection(region=(20, 15, 140, 105)))
+    shown = inspector.show()
+    assert shown.beside is not None
+    t = shown.first.events.t - compensated.t[0] + first
+    within = (t >= 50_000 - recording.events.t_first) & (t < 130_000 - recording.events.t_first + first)
+    assert within.all()
+    order = {tuple(row) for row in np.column_stack([shown.events.t - recording.events.t_first, shown.after]).tolist()}
+    same = [tuple(row) in order for row in np.column_stack([t, shown.first.before]).tolist()]
+    assert np.mean(same) > 0.9  # the others came over the border of the region
+    state = drawing.cloud_state(shown, Colour.CAUSE, Axis.ANGLE, dark=False)
+    theta = np.frombuffer(state["third_before"], np.float32)
+    expected = np.degrees(np.mod(recording.encoder.angle_at(t + recording.events.t_first), math.tau))
+    np.testing.assert_allclose(theta, expected, atol=0.2)
+    assert shown.sharpness_before == pytest.approx(shown.sharpness_after, rel=0.1)
+    assert inspector.show(against=inspector.knobs).beside is None
+    alone = MemoryEvents(Events(*moved[inside].T, events.t[inside], compensated.p), 160, 120)
+    with pytest.raises(AmiwarpError, match="already compensated"):
+        Inspector(replace(other, events=alone)).show()
+    small = MemoryEvents(random_events(10, 8, 8), 8, 8)
+    with pytest.raises(AmiwarpError, match="8x8 pixels, simulation has 160x120"):
+        inspector.put_beside(Recording(small))

@@ -199,6 +199,13 @@ class StartOptions:
             "model, or exact.",
         ),
     ] = None
+    beside: Annotated[
+        Path | None,
+        typer.Option(
+            help="Another recording with as many pixels. The left cloud shows it, as recorded, at the same time after "
+            "its first event. Default: none."
+        ),
+    ] = None
 
     def build(
         self, recording: Recording, device: str, latest: Callable[[], Recording] | None, most_points: int | None
@@ -222,6 +229,8 @@ class StartOptions:
             events = inspector.recording.events
             low, high = span(self.window, events.t_first, events.t_last)
             inspector.window = low, high - low
+        if self.beside is not None:
+            inspector.put_beside(open_recording(self.beside))
         return inspector
 
 

@@ -34,6 +34,7 @@ from amiwarp.viewer.inspector import (
     Knobs,
     LoadedWindow,
     Region,
+    colours_on_offer,
     inside,
     read_span,
     recorded_counts,
@@ -292,12 +293,14 @@ def make_images(
     cut = np.s_[..., top:bottom, left:right]
     if kind is ImageKind.LOG_INTENSITY:
         return _log_images(inspector, window, knobs, against)
+    first = inspector.beside if against is None and inspector.beside is not None else inspector
+    pair = (first, first.loaded, against), (inspector, window, knobs)
     if kind is ImageKind.TIME_SURFACE:
-        images = [_time_surface(inspector, window, k)[cut] for k in (against, knobs)]
+        images = [_time_surface(*each)[cut] for each in pair]
         scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, "viridis")
         return ShownImages(kind, images[0], images[1], scale)
     per_polarity = kind is ImageKind.POLARITY
-    images = [inspector.counts(window, k, per_polarity=per_polarity)[cut] for k in (against, knobs)]
+    images = [each.counts(w, k, per_polarity=per_polarity)[cut] for each, w, k in pair]
     colours = "polarity" if per_polarity else "gray"
     scale = Scale("events", "per pixel", 0.0, _top(*images), colours, GAMMA)
     return ShownImages(kind, images[0], images[1], scale)
@@ -485,6 +488,8 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
     if look.colour is Colour.POLARITY:
         two = np.array([to_rgb(OFF_COLOUR), to_rgb(ON_COLOUR)])
         return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
+    if look.colour in STORES and look.colour not in colours_on_offer(shown.truth.truth):  # of a recording beside
+        return np.full((len(shown.events), 3), 128, np.uint8)
     if look.colour in STORES:
         return truth_colours(shown.truth, look.colour)
     bar = colour_bar(shown, look.colour, dark=look.dark)
@@ -872,8 +877,8 @@ class Scene:
         """
         before = self.box
         self.box = Box(*shown.region, *axis_range(shown, look.axis))
-        for k, xy in enumerate((shown.before, shown.after)):
-            self._cloud(k, xy, shown, look)
+        self._cloud(0, shown.first.before, shown.first, look)
+        self._cloud(1, shown.after, shown, look)
         self._draw_frame(look)
         self._draw_lines(lines, look)
         self._draw_legend(shown, look, caption)
@@ -1154,11 +1159,13 @@ def cloud_state(shown: DisplayedWindow, colour: Colour, axis: Axis, *, dark: boo
     look, (low, high) = Look(colour, axis, dark=dark), axis_range(shown, axis)
     title = "prism angle θ (°)" if axis is Axis.ANGLE else "time (ms)"
     colours = _pixels(colours_of(shown, look, after=True))
-    differ = colour in (Colour.DENSITY, Colour.RESIDUAL)  # depend on the places of the points
+    # the colours of density and residual depend on the places of the points
+    first, differ = shown.first, shown.beside is not None or colour in (Colour.DENSITY, Colour.RESIDUAL)
+    third = float_bytes(third_axis(shown, axis))
     return {
-        "cloud_before": float_bytes(shown.before), "cloud_after": float_bytes(shown.after),
-        "cloud_third": float_bytes(third_axis(shown, axis)),
-        "colours_before": _pixels(colours_of(shown, look, after=False)) if differ else colours,
+        "cloud_before": float_bytes(first.before), "cloud_after": float_bytes(shown.after), "cloud_third": third,
+        "third_before": third if shown.beside is None else float_bytes(third_axis(first, axis)),
+        "colours_before": _pixels(colours_of(first, look, after=False)) if differ else colours,
         "colours_after": colours,
         "third_axis": {"low": low, "high": high, "title": title}, "region": list(shown.region),
         "legend": legend(shown, colour, dark=dark),

@@ -164,6 +164,8 @@ class Span:
     """All events of the window, or evenly spaced runs of them."""
     runs: tuple[slice, ...]
     """Indices of these events in the recording."""
+    places: NDArray[np.float32] | None = None
+    """Places of the events of a compensated recording [px], shape ``(n, 2)``; ``events`` has their pixels then."""
 
     @property
     def start_ms(self) -> float:
@@ -188,6 +190,16 @@ def read_span(source: EventSource, start_us: int, length_us: int, *, most_events
     runs = tuple(slice(k, k + length) for k in starts)
     events = Events.concatenate(list(_runs(source, starts, length)))
     return Span(source.t_first, start_us, length_us, count, events, runs)
+
+
+def _in_pixels(span: Span, size: tuple[int, int]) -> Span:
+    """Return the span with the pixels of its events, also if these were compensated and lie anywhere."""
+    e = span.events
+    if not np.issubdtype(e.x.dtype, np.floating):
+        return span
+    x, y = (np.clip(np.rint(v), 0, n - 1).astype(np.uint16) for v, n in zip((e.x, e.y), size, strict=True))
+    places = np.stack([e.x, e.y], axis=1).astype(np.float32)
+    return replace(span, events=Events(x, y, e.t, e.p), places=places)
 
 
 def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Events]:
@@ -501,6 +513,13 @@ class DisplayedWindow:
     """Sharpness of ``image_before`` in the region: 0 for events at random, whatever their number."""
     sharpness_after: float
     """Sharpness of ``image_after`` in the region."""
+    beside: DisplayedWindow | None = None
+    """The same time of another recording, whose events, as recorded, the first cloud and image show instead."""
+
+    @property
+    def first(self) -> DisplayedWindow:
+        """What the first cloud shows."""
+        return self.beside or self
 
     def every(self, step: int) -> DisplayedWindow:
         """Return the window with every ``step``-th point."""
@@ -590,6 +609,9 @@ def load_window(
     left, top, right, bottom = region
     wide = (left - margin_px, top - margin_px, right + margin_px, bottom + margin_px)
     keep = kept(recording, span.events, selection, wide, hot)
+    if span.places is not None:  # compensated events outside of the image have no pixel
+        half = np.array(recording.events.size) / 2.0
+        keep &= (np.abs(span.places + 0.5 - half) <= half).all(axis=1)
     near = None if keep.all() else np.flatnonzero(keep)  # None stands for all
     events = span.events if near is None else span.events[near]
     within = np.flatnonzero(inside(events, region)) if selection.region else None
@@ -602,6 +624,7 @@ def load_window(
     thin = thin if within is None else within[thin]
     drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
     xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
+    xy = xy if span.places is None else span.places[truth.positions]
     curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
     return LoadedWindow(span, region, n, drawn, truth, xy, events, curve_events)
 
@@ -821,6 +844,9 @@ class Inspector:
         self.selection = Selection()
         self.most_points = most_points or MOST_POINTS
         """Largest number of points in each event cloud."""
+        self.beside: Inspector | None = None
+        """Another recording that is shown beside this one, see :meth:`put_beside`."""
+        self._is_beside = False
         self._found: tuple[Knobs, Calibration] | None = None
         self._harmonics: tuple[float, ...] | None = None
         self._window: LoadedWindow | None = None
@@ -1037,19 +1063,49 @@ class Inspector:
         orbit_px = np.abs(border_displacements(self.model)).max(initial=0.0)
         return suggest_region(before, after, margin=math.ceil(orbit_px))
 
+    def put_beside(self, recording: Recording) -> None:
+        """Show another recording beside this one: its events, as recorded, at the same time after its first event.
+
+        Without an encoder it gets the prism's angles of this recording at these times. Raises :class:`AmiwarpError` if
+        it has no events, or another number of pixels.
+        """
+        source, size = recording.events, self.recording.events.size
+        if source.size != size:
+            raise AmiwarpError(
+                f"{recording.name}: has {source.size[0]}x{source.size[1]} pixels, {self.recording.name} has "
+                f"{size[0]}x{size[1]}; give two recordings of one size"
+            )
+        own = self.recording.encoder
+        if recording.encoder is None and own is not None and len(source):
+            shift = source.t_first - self.recording.events.t_first
+            recording = replace(recording, encoder=Encoder(own.t + shift, own.angle))
+        self.beside = Inspector(recording, device=self.device, most_points=self.most_points)
+        self.beside._is_beside = True
+
+    def _show_beside(self, other: Inspector, span: Span) -> DisplayedWindow:
+        """Return what a recording beside shows in the time of ``span``."""
+        window = span.start_us - span.first_us + other.recording.events.t_first, span.length_us
+        if (window, self.selection) != (other.window, other.selection):
+            other.open(*window, self.selection)
+        return other.show()
+
     def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:
         """Return the time window's images and points.
 
         ``knobs``: parameters to show, by default the current ones. ``against``: parameters to compare with; they
-        replace the recorded events as the first of the two clouds and images.
+        replace the recorded events as the first of the two clouds and images. Without them, the first ones show the
+        recording beside, if there is one.
         """
         w, knobs = self.loaded, knobs or self.knobs
         first = self._unmoved(w) if against is None else self._measured(w, against)
         xy = w.xy if against is None else self._moved(w, against)
         second, theta = self._measured(w, knobs), self._wrapped(w, knobs)
+        other = None if self.beside is None or against is not None else self._show_beside(self.beside, w.span)
+        other = None if other is None else replace(other, image_after=second.image)  # which sets the scale of colours
+        before = (first.image, first.sharpness) if other is None else (other.image_before, other.sharpness_before)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), theta, first.image, second.image,
-            first.sharpness, second.sharpness,
+            w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), theta, before[0], second.image,
+            before[1], second.sharpness, other,
         )  # fmt: skip
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -1155,9 +1211,9 @@ class Inspector:
     def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:
         """Read and select the events of a time window. The events of the last one are not read again."""
         if self._span is None or (self._span.start_us, self._span.length_us) != (start_us, length_us):
-            self._span = read_span(
-                self.recording.events, start_us, length_us, most_events=self._most_events or MOST_EVENTS
-            )
+            most = self._most_events or MOST_EVENTS
+            span = read_span(self.recording.events, start_us, length_us, most_events=most)
+            self._span = _in_pixels(span, self.recording.events.size) if self._is_beside else span
         return self._select(self._span, selection)
 
     def select(self, span: Span) -> Events:

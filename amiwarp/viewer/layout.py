@@ -368,10 +368,19 @@ NO_SCALE: dict[str, Any] = {"bar": "", "ticks": [], "title": "", "square": None}
 """Scale of an image before the first update."""
 
 
-def cloud_titles(against: str, *, compensates: bool) -> tuple[str, ...]:
+def against_title(inspector: Inspector, against: str) -> str:
+    """Return the title of what the left cloud shows, by its name in :data:`AGAINST`."""
+    beside = inspector.beside if against == "recorded" else None
+    return AGAINST[against] if beside is None else f"{beside.recording.name} (other recording)"
+
+
+def cloud_titles(inspector: Inspector, against: str) -> tuple[str, ...]:
     """Return the titles of the clouds. ``against``: name of what the left one shows, see :data:`AGAINST`."""
-    pair = AGAINST[against], "compensated" if against == "recorded" else "compensated with A"
-    return pair if compensates else (RECORDED,)
+    if math.isfinite(inspector.turn_us):
+        return against_title(inspector, against), "compensated" if against == "recorded" else "compensated with A"
+    if inspector.beside is not None:
+        return against_title(inspector, "recorded"), f"{inspector.recording.name}, as recorded"
+    return (RECORDED,)
 
 
 def template() -> str:
@@ -428,7 +437,8 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
         "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
         "rate_on": b"", "rate_off": b"", "rate_note": "", "picked_text": "",
-        **dict.fromkeys(("cloud_before", "cloud_after", "cloud_third", "colours_before", "colours_after"), b""),
+        **dict.fromkeys(("cloud_before", "cloud_after", "cloud_third", "third_before"), b""),
+        **dict.fromkeys(("colours_before", "colours_after"), b""), "beside": inspector.beside is not None,
         "titles": [], "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
         "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
         "overview": None, "before": None, "after": None, "kind": ImageKind.COUNT.value,
@@ -506,9 +516,10 @@ def caption(inspector: Inspector, shown: DisplayedWindow) -> str:
     left, top, right, bottom = shown.region
     end_ms = shown.span.start_ms + shown.span.length_us * 1e-3
     sharpness = sharpness_text(shown, compensated=math.isfinite(inspector.turn_us))
+    beside = "" if shown.beside is None or inspector.beside is None else f"; left: {inspector.beside.recording.name}"
     return (
         f"{inspector.recording.name}: {shown.span.start_ms:.3f} to {end_ms:.3f} ms; x {left} to {right - 1}, "
-        f"y {top} to {bottom - 1} px; {events_text(shown)}; sharpness {sharpness}"
+        f"y {top} to {bottom - 1} px; {events_text(shown)}; sharpness {sharpness}{beside}"
     )
 
 

@@ -479,8 +479,8 @@ class Panel:
 
     def _against_choices(self) -> list[list[str]]:
         """Return names and titles of what the left cloud can show now."""
-        known = layout.AGAINST.items()
-        return [[name, title] for name, title in known if name == "recorded" or self._compared(name) is not None]
+        known = [name for name in layout.AGAINST if name == "recorded" or self._compared(name) is not None]
+        return [[name, layout.against_title(self.inspector, name)] for name in known]
 
     # Calibration
 
@@ -572,6 +572,8 @@ class Panel:
     async def _film(self, what: str) -> None:
         s, inspector = self.state, Inspector(self.inspector.recording, device=self.inspector.device)
         inspector.set(self.inspector.knobs)
+        if self.inspector.beside is not None:
+            inspector.put_beside(self.inspector.beside.recording)
         inspector.window, inspector.selection = self.inspector.window, self.inspector.selection
         look = drawing.Look(Colour(s.colour), Axis(s.axis), float(s.point_size), float(s.opacity), dark=bool(s.dark),
                            overlaid=bool(s.overlaid)).for_clouds([title for _, title in s.titles])  # fmt: skip
@@ -749,12 +751,12 @@ class Panel:
         if before is None or shown.span is not before.span:
             values["overview"] = drawing.whole_image(shown.span.events, self.inspector.recording.events.size)
         left = "recorded" if against is None else s.against
-        titles = layout.cloud_titles(left, compensates=self.compensates)
+        titles = layout.cloud_titles(self.inspector, left)
         return shown, {
             **values, "titles": [list(each) for each in enumerate(titles)], "events": layout.events_text(shown),
             "sharpness": layout.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
             "picked_text": "" if self._picked < 0 else drawing.event_text(shown, self._picked),
-            "against_title": layout.AGAINST[left], "against_choices": self._against_choices(),
+            "against_title": layout.against_title(self.inspector, left), "against_choices": self._against_choices(),
         }  # fmt: skip
 
     def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
@@ -779,7 +781,7 @@ class Panel:
         if not self._orbit_drawn:
             return drawing.NO_ORBIT
         orbit, column = map(drawing.float_bytes, drawing.orbit_lines(self.inspector, shown, self._picked))
-        recorded = self._against is None  # otherwise, both clouds are compensated
+        recorded = self._against is None and self.inspector.beside is None  # otherwise, it moves in neither cloud
         return {"orbit": orbit if recorded else column, "column": column, "has_orbit": True}
 
     async def _curve(self) -> None:
@@ -904,6 +906,7 @@ def view(
     recording: Recording,
     calibration: Calibration | None = None,
     *,
+    beside: Recording | None = None,
     device: Any = "cpu",
     height: int = 700,
 ) -> NotebookPage:
@@ -915,6 +918,9 @@ def view(
         Events to show. Encoder, camera and prism may be missing.
     calibration : Calibration or None
         Parameters of the prism at the start. Without it, the page starts with the nominal prism.
+    beside : Recording or None
+        Another recording with as many pixels, which the left cloud shows as recorded, at the same time after its first
+        event.
     device : str or warp.Device
         Device that compensates the events.
     height : int
@@ -928,7 +934,7 @@ def view(
     Raises
     ------
     AmiwarpError
-        If the recording holds no events, or the calibration belongs to a camera of another size.
+        If a recording holds no events, or the calibration or the recording beside belongs to a camera of another size.
 
     Examples
     --------
@@ -944,8 +950,14 @@ def view(
     from amiwarp.kernels.launch import start_quietly
 
     start_quietly()
-    Inspector(recording, calibration, device=device)  # raises errors in the cell, before the page is served
-    make_inspector = partial(Inspector, recording, calibration, device=device)
+
+    def make_inspector() -> Inspector:
+        made = Inspector(recording, calibration, device=device)
+        if beside is not None:
+            made.put_beside(beside)
+        return made
+
+    make_inspector()  # raises errors in the cell, before the page is served
     serving = _serve(make_inspector, None, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
     return NotebookPage(loop.create_task(serving))
 
@@ -956,9 +968,7 @@ def save_screenshot(
     """Write a picture of both event clouds as PNG; ``size`` is its width and height [px]."""
 
     check_output(path)
-    look = look or Look()
-    if not math.isfinite(inspector.turn_us):
-        look = look.for_clouds([layout.RECORDED])
+    look = (look or Look()).for_clouds(layout.cloud_titles(inspector, "recorded"))
     clouds = inspector.show()
     with (
         interrupts_later(),

@@ -391,7 +391,7 @@ class Window:
     @property
     def _look(self) -> Look:
         against = "recorded" if self.b is None else "B"
-        return self.look.for_clouds(layout.cloud_titles(against, compensates=self.compensates))
+        return self.look.for_clouds(layout.cloud_titles(self.inspector, against))
 
     @property
     def _whole_us(self) -> int:
@@ -534,7 +534,8 @@ class Window:
         if self.compensates:
             orbit, column = orbit_lines(self.inspector, shown, self._picked)
             self._plot_orbit(orbit, column)
-            lines = (orbit if self.b is None else column, column) if look.axis is Axis.ANGLE else ()
+            moves = self.b is None and shown.beside is None
+            lines = (orbit if moves else column, column) if look.axis is Axis.ANGLE else ()
         caption = layout.caption(self.inspector, shown)
         self.scene.show(shown, look, lines, caption)
         for name in self.curves:

@@ -43,9 +43,9 @@ function words(bytes) {
 
 export const EventClouds = {
   props: {
-    before: null, after: null, third: null, coloursBefore: null, coloursAfter: null, orbit: null, column: null,
+    before: null, after: null, third: null, thirdBefore: null, coloursBefore: null, coloursAfter: null, orbit: null, column: null,
     box: Array, axis: Object, titles: Array, view: Array, dot: Number, opacity: Number, overlaid: Boolean,
-    dark: Boolean, picked: Number, slice: Array,
+    dark: Boolean, picked: Number, slice: Array, beside: Boolean,
   },
   emits: ['pick', 'card'],
   template: `<div class="clouds"><canvas ref="canvas" tabindex="0" role="img" :aria-label="label"></canvas></div>`,
@@ -70,7 +70,10 @@ export const EventClouds = {
       const key = JSON.stringify([props.box, props.axis, frame.half]);
       scene.half = frame.half;
       scene.places = [props.before, props.after].map(
-        (cloud, k) => places[k](() => place(frame, floats(cloud), floats(props.third)), cloud, props.third, key),
+        (cloud, k) => {
+          const third = k ? props.third : props.thirdBefore;
+          return places[k](() => place(frame, floats(cloud), floats(third)), cloud, third, key);
+        },
       );
       scene.colours = [props.coloursBefore, props.coloursAfter].map((bytes, k) => colours[k](() => words(bytes), bytes));
       const turns = floats(props.orbit).filter((_, k) => k % 3 === 2);
@@ -171,7 +174,7 @@ export const EventClouds = {
       for (const k of pane.clouds) line(context, scene.lines[k], projection);
       context.restore();
       if (props.picked >= 0) {
-        for (const k of pane.clouds) ring(context, scene.places[k], projection, ink);
+        for (const k of pane.clouds.filter((cloud) => cloud || !props.beside)) ring(context, scene.places[k], projection, ink);
       }
       context.fillStyle = ink;
       context.font = `600 ${size + 1}px system-ui, sans-serif`;
@@ -206,6 +209,7 @@ export const EventClouds = {
     function pick(x, y) {
       const pane = paneAt(x, y);
       const cloud = pane.clouds[pane.clouds.length - 1];
+      if (!cloud && props.beside) return; // events of another recording
       const projection = projected(pane);
       emit('pick', nearest(scene.places[cloud], projection, x - pane.left, y - pane.top, REACH_PX));
     }
@@ -269,7 +273,7 @@ export const EventClouds = {
       build();
     });
     onBeforeUnmount(() => observer.disconnect());
-    const content = ['before', 'after', 'third', 'coloursBefore', 'coloursAfter', 'box', 'axis', 'orbit', 'column', 'titles'];
+    const content = ['before', 'after', 'third', 'thirdBefore', 'coloursBefore', 'coloursAfter', 'box', 'axis', 'orbit', 'column', 'titles'];
     watch(content.map((name) => () => props[name]), build);
     watch(['dot', 'opacity', 'overlaid', 'dark', 'picked', 'slice'].map((name) => () => props[name]), () => setTimeout(ask));
     watch(() => props.view, ([view]) => {
