@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 
 Choice = TypeVar("Choice", bound=enum.StrEnum)
+Number = TypeVar("Number", int, float)
 Kind = TypeVar("Kind")
 Target = TypeVar("Target", bound=Callable[..., Any])
 """Type variables: an enumeration whose members have names, any class, and any function or class."""
@@ -109,7 +110,7 @@ def whole(value: object, what: str, low: int, high: int, hint: str = "") -> int:
     return int(plain)
 
 
-def vector(value: object, count: int, what: str, check: Callable[[object, str], float]) -> tuple[float, ...]:
+def vector(value: object, count: int, what: str, check: Callable[[object, str], Number]) -> tuple[Number, ...]:
     """Return a sequence of ``count`` numbers, each checked by the function ``check``.
 
     Raises :class:`AmiwarpError` for any other value.

@@ -1236,10 +1236,10 @@ def test_a_slice_of_the_third_axis_is_drawn(page: Any) -> None:
     assert np.array_equal(seen_change(page, ".clouds canvas", after), before)
 
 
-def test_statistics_of_the_region(page: Any, tabs: Tabs) -> None:
+def test_statistics_of_the_region(page: Any, kept: tuple[Any, Any, dict[str, Any]]) -> None:
     shown = page.locator("#statistics dd")
     shown.filter(has_text="events/s").wait_for()
-    found = tabs.panels[-1].inspector.statistics()
+    found = kept[1].inspector.statistics()
     assert f"{found.rate:,.0f} events/s" in shown.all_inner_texts()
     assert f"{found.median_us:,.0f} µs" in shown.all_inner_texts()
     page.locator("#polarity-ON").check()

@@ -11,7 +11,7 @@ from amiwarp.calib import Calibration
 from amiwarp.choices import Axis
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.validation import choice, guarded
+from amiwarp.validation import choice, guarded, vector, whole
 from amiwarp.viewer.drawing import Box, axis_range, residuals, third_axis
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector, Selection
 
@@ -98,17 +98,22 @@ def event_clouds(
     inspector = Inspector(
         recording, calibration, device=device, most_events=max(len(source), 1), most_points=max(len(source), 1)
     )
-    start, stop = (source.t_first, source.t_last + 1) if window is None else window
+    whole_window, whole_image = (source.t_first, source.t_last + 1), (0, 0, *source.size)
+    start, stop = vector(whole_window if window is None else window, 2, "window", _whole)
     if stop <= start:
         raise AmiwarpError(f"window is {window}; give start and end [us], the end after the start")
     width, height = source.size
-    left, top, right, bottom = region or (0, 0, width, height)
+    left, top, right, bottom = vector(whole_image if region is None else region, 4, "region", _whole)
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):
         raise AmiwarpError(f"region is {region}; give left, top, right and bottom in an image of {width}x{height} px")
-    inspector.open(start, stop - start, Selection(region=region))
+    inspector.open(start, stop - start, Selection(region=None if region is None else (left, top, right, bottom)))
     shown = inspector.show()
     before, after = (_cloud(shown, third, after=after) for after in (False, True))
     return before, after
+
+
+def _whole(value: object, what: str) -> int:
+    return whole(value, what, -(2**62), 2**62)
 
 
 def _cloud(shown: DisplayedWindow, axis: Axis, *, after: bool) -> pyvista.PolyData:

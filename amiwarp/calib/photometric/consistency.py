@@ -298,9 +298,9 @@ LEAST_ANGLE_GAIN = 0.01
 SHAKE_SHARE = 0.75
 """A shake counts if it explains this share of what all causes together explain, with fewer unknowns. Eight wrong lenses
 left 0.02 to 0.62 of it, shakes by 30 % of the prism's motion 0.84 to 1.7."""
-LEAST_SHAKE_GAIN = 0.01
-"""Smallest share of the squared residuals that a shake must explain beyond all causes together. A wrong index, which no
-cause frees, leaves 0.0013 to it, shakes by 30 % of the prism's motion 0.027 or more."""
+LEAST_SHAKE_GAIN = 0.0025
+"""Smallest share of the squared residuals that a shake must explain beyond all causes together. An index that is wrong
+by 0.06, which no cause frees, leaves 0.0013 to it at most, shakes by 30 % of the prism's motion 0.0048 or more."""
 LEAST_FURTHER_GAIN = 0.0005
 """Smallest share that a further cause must remove once the given lens has turned out to be wrong."""
 LEAST_MOVE_PX = 0.005
