@@ -1251,7 +1251,7 @@ def test_another_recording_is_shown_on_the_left(
 ) -> None:
     still = simulate(
         np.full((96, 128), 128, np.uint8), recording.camera, recording.prism, duration_s=4 * 60 / RPM,
-        motion=PrismMotion(RPM), sensor=SensorModel(shot_noise_hz=20.0), seed=1,
+        motion=PrismMotion(RPM), sensor=SensorModel(shot_noise_hz=3.0), seed=1,
     )  # fmt: skip
     noise = replace(still, encoder=None, truth=None, name="noise")
 
