@@ -488,7 +488,7 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
     if look.colour is Colour.POLARITY:
         two = np.array([to_rgb(OFF_COLOUR), to_rgb(ON_COLOUR)])
         return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
-    if look.colour in STORES and look.colour not in colours_on_offer(shown.truth.truth):  # of a recording beside
+    if shown.is_beside and look.colour not in colours_on_offer(shown.truth.truth):
         return np.full((len(shown.events), 3), 128, np.uint8)
     if look.colour in STORES:
         return truth_colours(shown.truth, look.colour)

@@ -516,6 +516,9 @@ class DisplayedWindow:
     beside: DisplayedWindow | None = None
     """The same time of another recording, whose events, as recorded, the first cloud and image show instead."""
 
+    is_beside: bool = False
+    """Whether this is another recording, of which less may be known."""
+
     @property
     def first(self) -> DisplayedWindow:
         """What the first cloud shows."""
@@ -1082,12 +1085,12 @@ class Inspector:
         self.beside = Inspector(recording, device=self.device, most_points=self.most_points)
         self.beside._is_beside = True
 
-    def _show_beside(self, other: Inspector, span: Span) -> DisplayedWindow:
+    def _show_beside(self, inspector: Inspector, span: Span) -> DisplayedWindow:
         """Return what a recording beside shows in the time of ``span``."""
-        window = span.start_us - span.first_us + other.recording.events.t_first, span.length_us
-        if (window, self.selection) != (other.window, other.selection):
-            other.open(*window, self.selection)
-        return other.show()
+        window = span.start_us - span.first_us + inspector.recording.events.t_first, span.length_us
+        if (window, self.selection) != (inspector.window, inspector.selection):
+            inspector.open(*window, self.selection)
+        return inspector.show()
 
     def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:
         """Return the time window's images and points.
@@ -1101,7 +1104,8 @@ class Inspector:
         xy = w.xy if against is None else self._moved(w, against)
         second, theta = self._measured(w, knobs), self._wrapped(w, knobs)
         other = None if self.beside is None or against is not None else self._show_beside(self.beside, w.span)
-        other = None if other is None else replace(other, image_after=second.image)  # which sets the scale of colours
+        if other is not None:  # the second image sets the scale of colours
+            other = replace(other, image_after=second.image, is_beside=True)
         before = (first.image, first.sharpness) if other is None else (other.image_before, other.sharpness_before)
         return DisplayedWindow(
             w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), theta, before[0], second.image,
