@@ -415,8 +415,8 @@ class Calibrator:
     def _confirmed(self, turning: Attempt) -> bool:
         """Return whether the last or the first turns of the recording give the same answer as those in the middle.
 
-        A motion with frequencies near that of the prism changes the orbit, at each time otherwise. Where there is no
-        other answer, a low cost must do.
+        A motion with frequencies near that of the prism changes the orbit by another amount at each time. Where there
+        is no other answer, a low cost must do.
         """
         source, encoder = self.recording.events, self.recording.encoder
         assert encoder is not None

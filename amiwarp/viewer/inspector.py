@@ -1100,16 +1100,18 @@ class Inspector:
         recording beside, if there is one.
         """
         w, knobs = self.loaded, knobs or self.knobs
-        first = self._unmoved(w) if against is None else self._measured(w, against)
         xy = w.xy if against is None else self._moved(w, against)
         second, theta = self._measured(w, knobs), self._wrapped(w, knobs)
         other = None if self.beside is None or against is not None else self._show_beside(self.beside, w.span)
         if other is not None:  # the second image sets the scale of colours
             other = replace(other, image_after=second.image, is_beside=True)
-        before = (first.image, first.sharpness) if other is None else (other.image_before, other.sharpness_before)
+            image, sharpness = other.image_before, other.sharpness_before
+        else:
+            first = self._unmoved(w) if against is None else self._measured(w, against)
+            image, sharpness = first.image, first.sharpness
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), theta, before[0], second.image,
-            before[1], second.sharpness, other,
+            w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), theta, image, second.image,
+            sharpness, second.sharpness, other,
         )  # fmt: skip
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
