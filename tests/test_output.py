@@ -90,6 +90,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         MemoryEvents(events(), *SIZE), CAMERA, Encoder.constant_speed(720.0, -1000, 201_000), Prism(math.radians(2.0))
     )
     save_recording(folder / "a.h5", recording)
+    shutil.copy(folder / "a.h5", folder / "b.h5")
     with open_recording(folder / "a.h5").events.path.open("rb") as file:
         assert file.read(4) == b"\x89HDF"
     values = {"apex": math.radians(2.0), "index": 1.5168, "phase": 0.0, "tilt_x": 0.0, "tilt_y": 0.0}
@@ -167,6 +168,7 @@ OVER_INPUTS = (
     ("view a.h5 --screenshot {}", "a.h5"),
     ("view a.h5 --calibration cal.json --screenshot {}", "cal.json"),
     ("view a.h5 --camera cam.json --screenshot {}", "cam.json"),
+    ("view a.h5 --beside b.h5 --screenshot {}", "b.h5"),
 )
 
 
@@ -539,6 +541,7 @@ ENDLESS = (
     "calibrate a.h5 out.json --camera {}.json",
     "truth {} out --flow dsec",
     "view a.h5 --camera {}.json --screenshot out.png",
+    "view a.h5 --beside {} --screenshot out.png",
 )
 
 
