@@ -249,6 +249,57 @@ def test_impossible_field_of_view_is_refused(fov: float) -> None:
         Camera.from_fov(640, 480, fov)
 
 
+MATRIX = np.array([[520.0, 0.0, 322.0], [0.0, 521.5, 236.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize("count", [0, 4, 5])
+def test_opencv_projects_what_the_camera_projects(count: int) -> None:
+    cv2 = pytest.importorskip("cv2")
+    dist = np.array([-0.3, 0.12, 1e-3, -2e-3, -0.02])[:count]
+    cam = Camera.from_opencv(MATRIX, dist[:, None] if count else None, (640, 480))
+    assert (cam.distortion is None) == (count == 0)
+    _check_projection(cam, lambda p, k, d: cv2.projectPoints(p, np.zeros(3), np.zeros(3), k, d)[0])
+
+
+def test_opencv_projects_what_the_fisheye_projects() -> None:
+    cv2 = pytest.importorskip("cv2")
+    cam = Camera.from_opencv(MATRIX * [[0.5], [0.5], [1.0]], [[0.02, -0.01, 0.003, -0.001]], (320, 240), fisheye=True)
+    assert cam.distortion == Fisheye(0.02, -0.01, 0.003, -0.001)
+    _check_projection(cam, lambda p, k, d: cv2.fisheye.projectPoints(p, np.zeros(3), np.zeros(3), k, d)[0])
+
+
+def _check_projection(cam: Camera, project: Any) -> None:
+    """The reference camera equals OpenCV's to 1e-6 px, the camera's own float32 kernels within their accuracy."""
+    matrix, dist = cam.to_opencv()
+    xy = pixels(cam, count=500)
+    rays = oracle.pixels_to_rays(cam, xy)
+    there = project((rays / rays[:, 2:])[:, None], matrix, dist)[:, 0]
+    assert distance(there, xy).max() < 1e-6  # px
+    assert distance(cam.rays_to_pixels(rays), there).max() < ATOL
+    assert distance(cam.pixels_to_rays(xy), rays).max() < ATOL / cam.fx
+    again = Camera.from_opencv(matrix, dist, (cam.width, cam.height), fisheye=isinstance(cam.distortion, Fisheye))
+    assert again == cam
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"K": np.eye(2)}, r"K has shape \(2, 2\); expected \(3, 3\)"),
+        ({"K": MATRIX + 0.5 * np.eye(3, k=1) * [[1.0], [0.0], [0.0]]}, "skew of 0.5 px; calibrate without skew"),
+        ({"K": MATRIX.T}, r"expected \[\[fx, 0, cx\]"),
+        ({"dist": np.zeros(6)}, "6 distortion coefficients; expected 4, 5 or 8"),
+        ({"dist": np.zeros((2, 2))}, r"shape \(2, 2\); expected \(n,\)"),
+        ({"dist": [*np.zeros(11), 1e-3]}, "thin-prism"),
+        ({"dist": np.zeros(5), "fisheye": True}, "fisheye lens has 5 distortion coefficients; expected k1 k2 k3 k4"),
+        ({"dist": [0.1, np.nan, 0.0, 0.0]}, "distortion k2 = nan"),
+        ({"size": (0, 480)}, "camera width = 0"),
+    ],
+)
+def test_impossible_opencv_cameras_are_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(AmiwarpError, match=message):
+        Camera.from_opencv(**{"K": MATRIX, "dist": None, "size": (640, 480)} | change)
+
+
 @pytest.mark.parametrize("apex_deg", [1.0, 2.0])
 def test_lens_calibrations_through_a_standing_prism_average_to_the_camera(apex_deg: float) -> None:
     """OpenCV calibrates the lens from a board seen through the prism at four angles a quarter turn apart."""

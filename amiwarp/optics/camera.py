@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.validation import INT64, array, guarded, real, shown, whole
@@ -89,6 +89,8 @@ def _check_coefficients(lens: Distortion) -> None:
         object.__setattr__(lens, field.name, value)
 
 
+OPENCV_COUNTS = (4, 5, 8, 12, 14)
+"""Numbers of coefficients that OpenCV's radial-tangential model can have."""
 LARGEST_SIZE = 65536
 """Largest width and height of a sensor [px], because columns and rows of events are uint16."""
 LEAST_FOCAL = 1e-3
@@ -190,6 +192,73 @@ class Camera:
         focal = width / (2.0 * math.tan(fov / 2.0))
         return cls(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0, distortion)
 
+    @classmethod
+    def from_opencv(
+        cls, K: ArrayLike, dist: ArrayLike | None, size: tuple[int, int], *, fisheye: bool = False
+    ) -> Camera:
+        """Create a camera from OpenCV's camera matrix and distortion coefficients.
+
+        Parameters
+        ----------
+        K : array_like
+            Camera matrix [px], shape (3, 3), without skew.
+        dist : array_like or None
+            Distortion coefficients, in any shape with one dimension longer than 1: k1 k2 p1 p2 [k3] of OpenCV's
+            radial-tangential model, or the four of its fisheye model. None stands for no distortion. Coefficients after
+            the fifth must be 0.
+        size : tuple of int
+            Width and height of the image [px].
+        fisheye : bool, default False
+            Whether the coefficients are those of ``cv2.fisheye``.
+
+        Returns
+        -------
+        Camera
+            The camera. A radial-tangential lens whose coefficients are all 0 becomes a pinhole camera.
+
+        Raises
+        ------
+        AmiwarpError
+            If a shape is wrong, the matrix has skew, or the number of coefficients is none of these.
+
+        Examples
+        --------
+        >>> K = [[500.0, 0.0, 319.5], [0.0, 501.0, 239.5], [0.0, 0.0, 1.0]]
+        >>> amiwarp.Camera.from_opencv(K, [-0.3, 0.1, 0.0, 0.0], (640, 480)).distortion
+        RadialTangential(k1=-0.3, k2=0.1, p1=0.0, p2=0.0, k3=0.0)
+        """
+        matrix = array(K, "camera matrix K").astype(np.float64)
+        if matrix.shape != (3, 3):
+            raise AmiwarpError(f"camera matrix K has shape {matrix.shape}; expected (3, 3)")
+        if matrix[0, 1] != 0.0:
+            raise AmiwarpError(f"camera matrix K has a skew of {matrix[0, 1]:g} px; calibrate without skew")
+        if matrix[1, 0] != 0.0 or matrix[2].tolist() != [0.0, 0.0, 1.0]:
+            raise AmiwarpError(
+                f"camera matrix K is {shown(matrix.tolist())}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+            )
+        fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        return cls(*size, fx, fy, cx, cy, _opencv_distortion(dist, fisheye=fisheye))
+
+    def to_opencv(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return OpenCV's camera matrix and distortion coefficients.
+
+        Returns
+        -------
+        K : numpy.ndarray
+            Camera matrix [px], shape (3, 3).
+        dist : numpy.ndarray
+            Coefficients k1 k2 p1 p2 k3, shape (5,), for the functions of ``cv2``, zeros for a pinhole camera; or those
+            of a :class:`Fisheye`, shape (4,), for the functions of ``cv2.fisheye``.
+
+        Examples
+        --------
+        >>> camera = amiwarp.Camera(640, 480, 500.0, 501.0, 319.5, 239.5, amiwarp.Fisheye(0.02))
+        >>> camera.to_opencv()[1]
+        array([0.02, 0.  , 0.  , 0.  ])
+        """
+        matrix = np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+        return matrix, np.array(astuple(self.distortion or RadialTangential()))
+
     @property
     def fov(self) -> float:
         """Horizontal field of view without distortion [rad]."""
@@ -241,6 +310,28 @@ class Camera:
             If the array has another shape or does not hold numbers.
         """
         return _run("rays_to_pixels", self, rays, (3, 2))
+
+
+def _opencv_distortion(dist: ArrayLike | None, *, fisheye: bool) -> Distortion | None:
+    """Return the lens of OpenCV's coefficients, or None if it does not distort."""
+    if dist is None:
+        return Fisheye() if fisheye else None
+    given = array(dist, "distortion coefficients").astype(np.float64)
+    if given.size != max(given.shape, default=0):
+        raise AmiwarpError(f"distortion coefficients have shape {given.shape}; expected (n,), (1, n) or (n, 1)")
+    k = given.ravel().tolist()
+    if fisheye:
+        if len(k) != 4:
+            raise AmiwarpError(f"a fisheye lens has {len(k)} distortion coefficients; expected k1 k2 k3 k4")
+        return Fisheye(*k)
+    if len(k) not in OPENCV_COUNTS:
+        raise AmiwarpError(f"the lens has {len(k)} distortion coefficients; expected 4, 5 or 8 in OpenCV's order")
+    if any(k[5:]):
+        raise AmiwarpError(
+            f"distortion coefficients {shown(k)} go beyond k3; calibrate without the rational, thin-prism and "
+            "tilt models"
+        )
+    return RadialTangential(*k[:5]) if any(k) else None
 
 
 def check_size(width: float, height: float, where: object) -> None:
