@@ -25,11 +25,19 @@ def polynomial(radius: Array, *k: float) -> Array:
     return radius * factor
 
 
-def monotonic_limit(*k: float, largest: float) -> float:
-    """Return the largest radius up to which r (1 + k1 r² + …) grows, by a scan and bisection of its slope."""
+def monotonic_limit(*k: float, below: tuple[float, ...] = (), largest: float) -> float:
+    """Return the largest radius up to which r (1 + k1 r² + …) / (1 + below1 r² + …) grows.
+
+    By a scan and bisection of its slope, which ends where the denominator does.
+    """
+
+    def terms(r: Array, *k: float, slope: int = 0) -> Array:
+        return np.sum([(slope * 2 * i + 1) * value * r ** (2 * i) for i, value in enumerate((1.0, *k))], axis=0)
 
     def slope(r: Array) -> Array:
-        return np.sum([(2 * i + 1) * value * r ** (2 * i) for i, value in enumerate((1.0, *k))], axis=0)
+        n, d = terms(r, *k), terms(r, *below)
+        rising = terms(r, *k, slope=1) * d - n * (terms(r, *below, slope=1) - d)
+        return np.where(d > 0.0, rising, -1.0)
 
     radii = np.concatenate([np.linspace(0.0, 5.0, 20_001), np.linspace(5.0, 100.0, 10_001)[1:]])
     falling = np.flatnonzero(slope(radii) <= 0.0)
@@ -42,14 +50,18 @@ def monotonic_limit(*k: float, largest: float) -> float:
     return float(low)
 
 
-def invert_polynomial(value: Array, *k: float, limit: float) -> Array:
+def invert_polynomial(value: Array, *k: float, limit: float, below: tuple[float, ...] = ()) -> Array:
     """Return the radius in [0, limit] at which the polynomial equals ``value``, by bisection; NaN if there is none."""
+
+    def ratio(r: Array) -> Array:
+        return polynomial(r, *k) * r / np.maximum(polynomial(r, *below), 1e-300)
+
     low, high = np.zeros_like(value), np.full_like(value, limit)
     for _ in range(56):
         middle = 0.5 * (low + high)
-        below = polynomial(middle, *k) < value
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    return np.where(value <= polynomial(np.array(limit), *k), 0.5 * (low + high), np.nan)
+        short = ratio(middle) < value
+        low, high = np.where(short, middle, low), np.where(short, high, middle)
+    return np.where(value <= ratio(np.array(limit)), 0.5 * (low + high), np.nan)
 
 
 @cache
@@ -58,14 +70,14 @@ def lens_limit(camera: Camera) -> float:
     d = camera.distortion
     if isinstance(d, Fisheye):
         return monotonic_limit(d.k1, d.k2, d.k3, d.k4, largest=0.999 * np.pi / 2)
-    return monotonic_limit(d.k1, d.k2, d.k3, largest=100.0) if d else np.inf
+    return monotonic_limit(d.k1, d.k2, d.k3, below=(d.k4, d.k5, d.k6), largest=100.0) if d else np.inf
 
 
 def distort_radial_tangential(d: RadialTangential, p: Array) -> Array:
     """Return x'' and y'' from x' and y' (tangents), shape (n, 2). OpenCV, Camera Calibration and 3D Reconstruction."""
     x, y = p.T
     r2 = x**2 + y**2
-    radial = 1.0 + d.k1 * r2 + d.k2 * r2**2 + d.k3 * r2**3
+    radial = (1.0 + d.k1 * r2 + d.k2 * r2**2 + d.k3 * r2**3) / (1.0 + d.k4 * r2 + d.k5 * r2**2 + d.k6 * r2**3)
     return np.stack(
         [
             x * radial + 2.0 * d.p1 * x * y + d.p2 * (r2 + 2.0 * x**2),
@@ -78,8 +90,9 @@ def distort_radial_tangential(d: RadialTangential, p: Array) -> Array:
 def undistort_radial_tangential(d: RadialTangential, distorted: Array, limit: float) -> Array:
     """Invert: the radial part by bisection, then Newton steps, each halved until the residual drops; shape (n, 2)."""
     radius = np.linalg.norm(distorted, axis=1)
-    largest = polynomial(np.array(limit), d.k1, d.k2, d.k3)
-    start = invert_polynomial(np.minimum(radius, 0.9999 * largest), d.k1, d.k2, d.k3, limit=limit)
+    k, below = (d.k1, d.k2, d.k3), (d.k4, d.k5, d.k6)
+    largest = polynomial(np.array(limit), *k) * limit / polynomial(np.array(limit), *below)
+    start = invert_polynomial(np.minimum(radius, 0.9999 * largest), *k, limit=limit, below=below)
     p = distorted * (start / np.maximum(radius, 1e-300))[:, None]
     for _ in range(20):
         error = distort_radial_tangential(d, p) - distorted

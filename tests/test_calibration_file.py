@@ -26,7 +26,10 @@ def test_units_are_said(calibration: Calibration) -> None:
     assert apex["std"] > 0
 
 
-@pytest.mark.parametrize("distortion", [None, RadialTangential(-0.3, 0.1, 1e-3, 2e-3, 0.01), Fisheye(0.1, 0.02)])
+@pytest.mark.parametrize(
+    "distortion",
+    [None, RadialTangential(-0.3, 0.1, 1e-3, 2e-3, 0.01), RadialTangential(k1=0.3, k6=0.1), Fisheye(0.1, 0.02)],
+)
 def test_cameras(distortion: RadialTangential | Fisheye | None) -> None:
     camera = Camera(640, 480, 500.0, 501.0, 320.0, 240.0, distortion)
     assert camera_from_json(json.loads(json.dumps(camera_to_json(camera)))) == camera

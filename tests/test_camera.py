@@ -27,6 +27,7 @@ LENSES: list[Distortion | None] = [
     DAVIS.distortion,
     RadialTangential(-0.4, 0.2, 1e-3, -2e-3, -0.05),
     RadialTangential(0.3, 0.5, -5e-3, 5e-3, 0.5),
+    RadialTangential(0.9, 0.2, 1e-3, -2e-3, 0.01, 1.2, 0.4, 0.03),
     Fisheye(-0.01, 0.005, -0.002, 0.0003),
     Fisheye(0.3, 0.1, 0.0, 0.0),
 ]
@@ -105,6 +106,7 @@ def test_inverse_agrees_with_bisection_for_wild_lenses(seed: int) -> None:
     rng = np.random.default_rng(seed)
     lenses: list[Distortion] = [
         RadialTangential(*(rng.uniform(-1, 1, 5) * [0.6, 0.5, 0.01, 0.01, 0.3])),
+        RadialTangential(*(rng.uniform(-1, 1, 8) * [0.6, 0.5, 0.01, 0.01, 0.3, 0.6, 0.5, 0.3])),
         Fisheye(*(rng.uniform(-1, 1, 4) * [0.4, 0.3, 0.2, 0.1])),
     ]
     for lens in lenses:
@@ -132,6 +134,10 @@ def test_fold_is_the_first_root_of_the_slope() -> None:
     assert fold_radius(-0.368, 0.151, 0.0, largest=100.0) == 100.0  # the slope's smallest value is 0.6
     assert fold_radius(0.0, 0.0, 0.0, largest=1.5) == 1.5
     assert fold_radius(-0.4, 0.0, 5e-324, largest=100.0) == pytest.approx(1.0 / math.sqrt(1.2), abs=1e-12)
+    for below in ((-0.3, 0.1, 0.0), (1.2, 0.4, 0.03), (0.0, 0.0, -0.1)):  # the last two fold, and have a pole
+        assert fold_radius(0.1, -0.1, 0.02, below=below, largest=10.0) == pytest.approx(
+            oracle.monotonic_limit(0.1, -0.1, 0.02, below=below, largest=10.0), abs=1e-9
+        )
     k = (0.3, -0.5, 0.01)
     assert fold_radius(*k, largest=100.0) == pytest.approx(oracle.monotonic_limit(*k, largest=100.0), abs=1e-9)
 
@@ -252,10 +258,10 @@ def test_impossible_field_of_view_is_refused(fov: float) -> None:
 MATRIX = np.array([[520.0, 0.0, 322.0], [0.0, 521.5, 236.0], [0.0, 0.0, 1.0]])
 
 
-@pytest.mark.parametrize("count", [0, 4, 5])
+@pytest.mark.parametrize("count", [0, 4, 5, 8])
 def test_opencv_projects_what_the_camera_projects(count: int) -> None:
     cv2 = pytest.importorskip("cv2")
-    dist = np.array([-0.3, 0.12, 1e-3, -2e-3, -0.02])[:count]
+    dist = np.array([-0.3, 0.12, 1e-3, -2e-3, -0.02, -0.1, 0.05, -0.02])[:count]
     cam = Camera.from_opencv(MATRIX, dist[:, None] if count else None, (640, 480))
     assert (cam.distortion is None) == (count == 0)
     _check_projection(cam, lambda p, k, d: cv2.projectPoints(p, np.zeros(3), np.zeros(3), k, d)[0])

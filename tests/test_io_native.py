@@ -34,6 +34,7 @@ from amiwarp import (
 )
 from amiwarp.cpu_threads import in_order
 from amiwarp.io.hdf5_files import CHUNK, StoredColumn, checksum, decode, encode
+from amiwarp.io.rig_files import camera_attributes, read_camera
 from amiwarp.kernels.checksum import Checksums
 
 SIZE = (320, 240)
@@ -63,7 +64,13 @@ def assert_nothing_left(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "distortion", [None, RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.01), Fisheye(0.1, 0.2, 0.3, 0.4)]
+    "distortion",
+    [
+        None,
+        RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.01),
+        RadialTangential(k6=0.1),
+        Fisheye(0.1, 0.2, 0.3, 0.4),
+    ],
 )
 def test_everything_comes_back(tmp_path, distortion):
     events = make(3 * CHUNK + 17)
@@ -93,6 +100,18 @@ def test_everything_comes_back(tmp_path, distortion):
     assert back.truth.parameters == recording.truth.parameters
     np.testing.assert_array_equal(back.truth.points(70_000, 70_010), points[70_000:70_010], strict=True)
     assert sorted(os.listdir(tmp_path)) == ["whole.h5"]
+
+
+@pytest.mark.parametrize(
+    ("lens", "count"), [(RadialTangential(-0.3), 5), (RadialTangential(k6=0.1), 8), (Fisheye(0.1), 4)]
+)
+def test_a_lens_has_the_coefficients_of_its_model(lens, count):
+    attributes = camera_attributes(Camera(*SIZE, 200.5, 201.5, 150.25, 110.75, lens))
+    assert len(attributes["distortion"]) == count
+    assert read_camera(attributes, "here").distortion == lens
+    lengths = "4" if count == 4 else "5 or 8"
+    with pytest.raises(AmiwarpError, match=f"expected {lengths} numbers"):
+        read_camera({**attributes, "distortion": [0.1] * 6}, "here")
 
 
 def test_only_events_are_needed(tmp_path):

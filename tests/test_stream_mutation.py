@@ -78,7 +78,7 @@ def test_deep_nesting_is_refused(text: str) -> None:
         ("cy", True, "attribute 'cy' is true"),
         ("fy", None, "no attribute 'fy'"),
         ("width", 64.0, "attribute 'width' is 64.0"),
-        ("distortion", [0.1] * 6, "attribute 'distortion' is"),
+        ("distortion", [0.1] * 9, "attribute 'distortion' is"),
         ("distortion", [0.1, "a"], "attribute 'distortion' is"),
         ("distortion_model", "a\nb", "attribute 'distortion_model' is"),
         ("distortion_model", 5, "attribute 'distortion_model' is 5"),

@@ -4,7 +4,6 @@ import contextlib
 import os
 from array import array
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from amiwarp.events.encoder import TWO_PI, Encoder, UnwrapError
 from amiwarp.io.files import errors_name, text_lines
 from amiwarp.io.formats import TRIGGERS, Format, detect_format, io_function
 from amiwarp.io.json_files import LARGEST_INTEGER, build, fields_of
-from amiwarp.optics.camera import CAMERA_NUMBERS, DISTORTIONS, Camera, Distortion
+from amiwarp.optics.camera import CAMERA_NUMBERS, COEFFICIENTS, DISTORTIONS, Camera, Distortion, coefficients
 from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
 from amiwarp.validation import array as as_numbers
 from amiwarp.validation import instance, one_of, real, shown, whole
@@ -29,7 +28,7 @@ def camera_to_json(camera: Camera) -> dict[str, Any]:
     out = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
     if camera.distortion is not None:
         [kind] = (name for name, lens in DISTORTIONS.items() if isinstance(camera.distortion, lens))
-        out["distortion"] = {"kind": kind, **asdict(camera.distortion)}
+        out["distortion"] = {"kind": kind, **coefficients(camera.distortion)}
     return out
 
 
@@ -89,11 +88,12 @@ def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
                    f"{where} attribute 'distortion_model'")  # fmt: skip
     distortion: Distortion | None = None
     if model in DISTORTIONS:
-        length = len(fields(DISTORTIONS[model]))
-        coefficients = as_numbers(attributes.get("distortion", ()), f"{where} attribute 'distortion'")
-        if coefficients.shape != (length,):
-            raise AmiwarpError(f"camera distortion is {shown(coefficients)}; expected {length} numbers for {model}")
-        distortion = DISTORTIONS[model](*coefficients.tolist())
+        lens, lengths = DISTORTIONS[model], COEFFICIENTS[model]
+        k = as_numbers(attributes.get("distortion", ()), f"{where} attribute 'distortion'")
+        if k.ndim != 1 or len(k) not in lengths:
+            expected = " or ".join(map(str, lengths))
+            raise AmiwarpError(f"camera distortion is {shown(k)}; expected {expected} numbers for {model}")
+        distortion = lens(*k.tolist())
     kinds = dict(zip(CAMERA_NUMBERS, (int, int, float, float, float, float), strict=True))
     numbers = {name: attribute(attributes, where, name, kind) for name, kind in kinds.items()}
     return Camera(**numbers, distortion=distortion)

@@ -7,6 +7,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 PINHOLE = wp.constant(0)
 RADIAL_TANGENTIAL = wp.constant(1)
 FISHEYE = wp.constant(2)
+RATIONAL = wp.constant(3)  # radial-tangential with a denominator; apart, so that a lens without one needs no division
 
 NEWTON_STEPS = wp.constant(12)
 LARGEST_RESIDUAL = wp.constant(
@@ -17,7 +18,7 @@ NAN = wp.constant(float("nan"))
 
 @wp.struct
 class CameraParams:
-    """Camera parameters. ``k`` holds k1 k2 p1 p2 k3 (radial-tangential) or k1 .. k4 (fisheye)."""
+    """Camera parameters. ``k`` holds k1 k2 p1 p2 k3 k4 k5 k6 (radial-tangential) or k1 .. k4 (fisheye)."""
 
     fx: float
     fy: float
@@ -26,7 +27,7 @@ class CameraParams:
     width: int
     height: int
     kind: int
-    k: wp.types.vector(length=5, dtype=float)
+    k: wp.types.vector(length=8, dtype=float)
     limit: float  # largest tangent (radial-tangential) or angle (fisheye) with one-to-one distortion
     rays: wp.array2d(dtype=wp.vec3)  # bearing of each pixel centre, NaN if invalid; empty for a pinhole
 
@@ -60,6 +61,8 @@ def distort_radial_tangential(c: CameraParams, p: wp.vec2) -> wp.vec2:
     """Distort normalised (tangent) coordinates by OpenCV's radial-tangential model."""
     r2 = wp.dot(p, p)
     radial = 1.0 + r2 * (c.k[0] + r2 * (c.k[1] + r2 * c.k[4]))
+    if c.kind == RATIONAL:
+        radial = radial / (1.0 + r2 * (c.k[5] + r2 * (c.k[6] + r2 * c.k[7])))
     x = p[0] * radial + 2.0 * c.k[2] * p[0] * p[1] + c.k[3] * (r2 + 2.0 * p[0] * p[0])
     y = p[1] * radial + c.k[2] * (r2 + 2.0 * p[1] * p[1]) + 2.0 * c.k[3] * p[0] * p[1]
     return wp.vec2(x, y)
@@ -71,6 +74,10 @@ def jacobian_radial_tangential(c: CameraParams, p: wp.vec2) -> wp.mat22:
     r2 = wp.dot(p, p)
     radial = 1.0 + r2 * (c.k[0] + r2 * (c.k[1] + r2 * c.k[4]))
     slope = 2.0 * (c.k[0] + r2 * (2.0 * c.k[1] + r2 * 3.0 * c.k[4]))
+    if c.kind == RATIONAL:
+        below = 1.0 + r2 * (c.k[5] + r2 * (c.k[6] + r2 * c.k[7]))
+        radial = radial / below
+        slope = (slope - radial * 2.0 * (c.k[5] + r2 * (2.0 * c.k[6] + r2 * 3.0 * c.k[7]))) / below
     xx = radial + slope * p[0] * p[0] + 2.0 * c.k[2] * p[1] + 6.0 * c.k[3] * p[0]
     xy = slope * p[0] * p[1] + 2.0 * c.k[2] * p[0] + 2.0 * c.k[3] * p[1]
     yy = radial + slope * p[1] * p[1] + 6.0 * c.k[2] * p[1] + 2.0 * c.k[3] * p[0]
@@ -135,10 +142,10 @@ def undistort_fisheye(c: CameraParams, d: wp.vec2) -> wp.vec3:
 def solve_ray(c: CameraParams, xy: wp.vec2) -> wp.vec3:
     """Return the unit bearing of a pixel, computed without the table."""
     d = wp.vec2((xy[0] - c.cx) / c.fx, (xy[1] - c.cy) / c.fy)
-    if c.kind == RADIAL_TANGENTIAL:
-        return undistort_radial_tangential(c, d)
     if c.kind == FISHEYE:
         return undistort_fisheye(c, d)
+    if c.kind != PINHOLE:
+        return undistort_radial_tangential(c, d)
     ray = wp.vec3(d[0], d[1], 1.0)
     return ray / wp.length(ray)  # wp.normalize would return zero, not NaN, for a NaN pixel
 
@@ -175,7 +182,7 @@ def ray_to_pixel(c: CameraParams, ray: wp.vec3) -> wp.vec2:
     p = wp.vec2(ray[0] / ray[2], ray[1] / ray[2])
     if c.kind == FISHEYE:
         p = distort_fisheye(c, ray)
-    if c.kind == RADIAL_TANGENTIAL:
+    elif c.kind != PINHOLE:
         if wp.length(p) > c.limit:
             return invalid_pixel()
         p = distort_radial_tangential(c, p)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, fields
+from dataclasses import asdict, astuple, dataclass, fields
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -26,12 +26,14 @@ LARGEST_COEFFICIENT = 1e6
 @guarded
 @dataclass(frozen=True, slots=True)
 class RadialTangential:
-    """OpenCV's radial-tangential distortion. The coefficients are in OpenCV's order.
+    """OpenCV's radial-tangential distortion, also with its rational model. The coefficients are in OpenCV's order.
+
+    The radial factor is (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶).
 
     Examples
     --------
     >>> amiwarp.RadialTangential(k1=-0.3, k2=0.1)
-    RadialTangential(k1=-0.3, k2=0.1, p1=0.0, p2=0.0, k3=0.0)
+    RadialTangential(k1=-0.3, k2=0.1, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0)
     """
 
     k1: float = 0.0
@@ -44,6 +46,12 @@ class RadialTangential:
     """Second tangential coefficient."""
     k3: float = 0.0
     """Radial coefficient of r⁶."""
+    k4: float = 0.0
+    """Coefficient of r² in the denominator."""
+    k5: float = 0.0
+    """Coefficient of r⁴ in the denominator."""
+    k6: float = 0.0
+    """Coefficient of r⁶ in the denominator."""
 
     def __post_init__(self) -> None:
         _check_coefficients(self)
@@ -80,6 +88,19 @@ DISTORTIONS: dict[str, type[RadialTangential] | type[Fisheye]] = {
     "fisheye": Fisheye,
 }
 """Distortion classes by their names in files and streams. The fields of a class are in the files' order."""
+COEFFICIENTS = {"radial_tangential": (5, 8), "fisheye": (4,)}
+"""Numbers of coefficients that files and streams hold for each distortion class."""
+
+RATIONAL = ("k4", "k5", "k6")
+"""Coefficients of :class:`RadialTangential` that files and arrays leave out if all are 0."""
+
+
+def coefficients(lens: Distortion) -> dict[str, float]:
+    """Return the coefficients of a lens by name, in the files' order."""
+    given = asdict(lens)
+    if isinstance(lens, RadialTangential) and not any(given[name] for name in RATIONAL):
+        return {name: value for name, value in given.items() if name not in RATIONAL}
+    return given
 
 
 def _check_coefficients(lens: Distortion) -> None:
@@ -204,8 +225,8 @@ class Camera:
             Camera matrix [px], shape (3, 3), without skew.
         dist : array_like or None
             Distortion coefficients, in any shape with one dimension longer than 1: k1 k2 p1 p2 [k3] of OpenCV's
-            radial-tangential model, or the four of its fisheye model. None stands for no distortion. Coefficients after
-            the fifth must be 0.
+            radial-tangential model, these and k4 k5 k6 of its rational model, or the four of its fisheye model. None
+            stands for no distortion. Coefficients after the eighth must be 0.
         size : tuple of int
             Width and height of the image [px].
         fisheye : bool, default False
@@ -225,7 +246,7 @@ class Camera:
         --------
         >>> K = [[500.0, 0.0, 319.5], [0.0, 501.0, 239.5], [0.0, 0.0, 1.0]]
         >>> amiwarp.Camera.from_opencv(K, [-0.3, 0.1, 0.0, 0.0], (640, 480)).distortion
-        RadialTangential(k1=-0.3, k2=0.1, p1=0.0, p2=0.0, k3=0.0)
+        RadialTangential(k1=-0.3, k2=0.1, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0)
         """
         matrix = array(K, "camera matrix K").astype(np.float64)
         if matrix.shape != (3, 3):
@@ -247,8 +268,8 @@ class Camera:
         K : numpy.ndarray
             Camera matrix [px], shape (3, 3).
         dist : numpy.ndarray
-            Coefficients k1 k2 p1 p2 k3, shape (5,), for the functions of ``cv2``, zeros for a pinhole camera; or those
-            of a :class:`Fisheye`, shape (4,), for the functions of ``cv2.fisheye``.
+            Coefficients k1 k2 p1 p2 k3, shape (5,), or with the rational k4 k5 k6, shape (8,), for the functions of
+            ``cv2``, zeros for a pinhole camera; or those of a :class:`Fisheye`, shape (4,), for ``cv2.fisheye``.
 
         Examples
         --------
@@ -257,7 +278,7 @@ class Camera:
         array([0.02, 0.  , 0.  , 0.  ])
         """
         matrix = np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
-        return matrix, np.array(astuple(self.distortion or RadialTangential()))
+        return matrix, np.array([*coefficients(self.distortion or RadialTangential()).values()])
 
     @property
     def fov(self) -> float:
@@ -326,12 +347,11 @@ def _opencv_distortion(dist: ArrayLike | None, *, fisheye: bool) -> Distortion |
         return Fisheye(*k)
     if len(k) not in OPENCV_COUNTS:
         raise AmiwarpError(f"the lens has {len(k)} distortion coefficients; expected 4, 5 or 8 in OpenCV's order")
-    if any(k[5:]):
+    if any(k[8:]):
         raise AmiwarpError(
-            f"distortion coefficients {shown(k)} go beyond k3; calibrate without the rational, thin-prism and "
-            "tilt models"
+            f"distortion coefficients {shown(k)} go beyond k6; calibrate without the thin-prism and tilt models"
         )
-    return RadialTangential(*k[:5]) if any(k) else None
+    return RadialTangential(*k[:8]) if any(k) else None
 
 
 def check_size(width: float, height: float, where: object) -> None:
@@ -382,12 +402,13 @@ def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
         c.rays = wp.empty((0, 0), dtype=wp.vec3, device=device)
         return c
     if isinstance(d, RadialTangential):
-        coefficients = (d.k1, d.k2, d.p1, d.p2, d.k3)
-        c.kind, c.limit = int(kernels.RADIAL_TANGENTIAL), fold_radius(d.k1, d.k2, d.k3, largest=100.0)
+        below = (d.k4, d.k5, d.k6)
+        c.kind = int(kernels.RATIONAL if any(below) else kernels.RADIAL_TANGENTIAL)
+        c.limit = fold_radius(d.k1, d.k2, d.k3, below=below, largest=100.0)
     elif isinstance(d, Fisheye):
-        coefficients = (d.k1, d.k2, d.k3, d.k4, 0.0)
         c.kind, c.limit = int(kernels.FISHEYE), fold_radius(d.k1, d.k2, d.k3, d.k4, largest=0.999 * math.pi / 2)
-    c.k = type(c.k)(*coefficients)
+    k = astuple(d)
+    c.k = type(c.k)(*k, *(0.0,) * (8 - len(k)))
     rays = wp.empty((camera.height, camera.width), dtype=wp.vec3, device=device)
     wp.launch(kernels.fill_rays, dim=rays.shape, inputs=[c], outputs=[rays], device=device)
     c.rays = rays
@@ -407,13 +428,18 @@ def pinhole_params(camera: Camera) -> kernels.PinholeParams | None:
     return c
 
 
-def fold_radius(*k: float, largest: float) -> float:
+def fold_radius(*k: float, below: tuple[float, ...] = (), largest: float) -> float:
     """Return the radius up to which the distorted radius r(1 + k1 r² + k2 r⁴ + …) increases with r.
 
-    It is the first root of the slope, or ``largest`` if there is none below. The polynomial in 1/r² is monic, so a last
-    coefficient of zero causes no division by zero.
+    ``below`` holds the coefficients of a denominator 1 + k4 r² + … It is the first root of the slope or of the
+    denominator, or ``largest`` if there is none below. The polynomials in 1/r² are monic, so a last coefficient of zero
+    causes no division by zero.
     """
-    roots = np.roots([1.0, *((2 * i + 3) * value for i, value in enumerate(k))])
+    slope = np.array([1.0, *((2 * i + 3) * value for i, value in enumerate(k))])
+    if any(below):  # the numerator of the slope of r·n/d is n_slope·d − n·r·d′
+        d = np.array([1.0, *below])
+        slope = np.convolve(slope, d) - np.convolve([1.0, *k], 2.0 * np.arange(len(d)) * d)
+    roots = np.concatenate([np.roots(slope), np.roots([1.0, *below])])
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0.0)]
     return min(largest, 1.0 / math.sqrt(real.max())) if len(real) else largest
 

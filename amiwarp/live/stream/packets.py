@@ -23,7 +23,7 @@ from amiwarp.optics.prism import NominalPrism
 
 LARGEST = 1e9
 """Largest accepted absolute value of all numbers other than sizes."""
-MOST_COEFFICIENTS = 5
+MOST_COEFFICIENTS = 8
 """Largest accepted number of distortion coefficients."""
 SHOWN = 60
 """Largest number of characters of a wrong value that are shown in a message."""
