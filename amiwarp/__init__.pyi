@@ -57,6 +57,8 @@ from .imaging.metrics import edge_blur as edge_blur
 from .imaging.metrics import model_error as model_error
 from .imaging.metrics import sharpness as sharpness
 from .imaging.metrics import truth_model as truth_model
+from .io.camera_files import load_camera as load_camera
+from .io.camera_files import save_camera as save_camera
 from .io.export import ConversionSummary as ConversionSummary
 from .io.export import convert as convert
 from .io.export import save_flow_dsec as save_flow_dsec

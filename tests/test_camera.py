@@ -298,7 +298,8 @@ def _check_projection(cam: Camera, project: Any) -> None:
         ({"dist": [*np.zeros(11), 1e-3]}, "thin-prism"),
         ({"dist": np.zeros(5), "fisheye": True}, "fisheye lens has 5 distortion coefficients; expected k1 k2 k3 k4"),
         ({"dist": [0.1, np.nan, 0.0, 0.0]}, "distortion k2 = nan"),
-        ({"size": (0, 480)}, "camera width = 0"),
+        ({"size": (0, 480)}, "size"),
+        ({"size": None}, "size"),
     ],
 )
 def test_impossible_opencv_cameras_are_refused(change: dict[str, Any], message: str) -> None:

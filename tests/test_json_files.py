@@ -10,16 +10,15 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from amiwarp import AmiwarpError, Calibration, Camera
+from amiwarp import AmiwarpError, Calibration, Camera, load_camera
 from amiwarp.calib.presets import Preset
-from amiwarp.cli.options import read_camera
 from amiwarp.io.json_files import MOST_BYTES, read_json
 from amiwarp.simulation.pictures import open_pictures
 
 READERS: dict[str, Callable[[Path], Any]] = {
     "calibration": Calibration.load,
     "preset": lambda path: Preset.load(path, "calibration"),
-    "camera": lambda path: read_camera(path, 4, 3),
+    "camera": lambda path: load_camera(path, (4, 3)),
     "any": lambda path: read_json(path, "a file"),
 }
 
@@ -184,7 +183,7 @@ def test_damage_in_a_camera_is_named(tmp_path: Path, data: dict[str, Any], messa
     path = tmp_path / "camera.json"
     path.write_text(json.dumps(data))
     with pytest.raises(AmiwarpError, match=rf"camera\.json: .*{message}"):
-        read_camera(path, 4, 3)
+        load_camera(path, (4, 3))
 
 
 def test_a_camera_s_file_is_read(tmp_path: Path) -> None:
@@ -192,7 +191,7 @@ def test_a_camera_s_file_is_read(tmp_path: Path) -> None:
     plain = {"width": 4, "height": 3, "fx": 3, "fy": 3.5, "cx": 1, "cy": 1}
     for data in (plain, {"camera": plain, "format": "amiwarp-calibration"}):
         path.write_text(json.dumps(data))
-        assert read_camera(path, 9, 9) == Camera(4, 3, 3.0, 3.5, 1.0, 1.0)
+        assert load_camera(path, (9, 9)) == Camera(4, 3, 3.0, 3.5, 1.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -211,7 +210,7 @@ def test_damage_in_calib_txt_is_named(tmp_path: Path, content: bytes, message: s
     path = tmp_path / "calib.txt"
     path.write_bytes(content)
     with pytest.raises(AmiwarpError, match=rf"calib\.txt: .*{message}"):
-        read_camera(path, 240, 180)
+        load_camera(path, (240, 180))
 
 
 @pytest.mark.parametrize(

@@ -16,10 +16,8 @@ import typer
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io import files as output
-from amiwarp.io.files import check_regular, errors_name
-from amiwarp.io.json_files import read_json
-from amiwarp.io.plain_files import read_calib
-from amiwarp.io.rig_files import camera_from_json
+from amiwarp.io.camera_files import load_camera
+from amiwarp.io.files import check_regular
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, NominalPrism, UnsizedPrism
 
@@ -43,8 +41,8 @@ class CameraOptions:
     camera: Annotated[
         Path | None,
         _in_camera(
-            help="Camera intrinsics: JSON (width, height, fx, fy, cx, cy, distortion), a calibration file, or "
-            "calib.txt (fx fy cx cy k1 k2 p1 p2 k3)."
+            help="Camera intrinsics: JSON (width, height, fx, fy, cx, cy, distortion), a calibration file, YAML of ROS "
+            "or Kalibr, or calib.txt (fx fy cx cy k1 k2 p1 p2 k3)."
         ),
     ] = None
 
@@ -60,24 +58,11 @@ class CameraOptions:
             return Camera.from_fov(width, height, math.radians(self.fov_deg))
         if self.camera is None:
             return None
-        camera = read_camera(self.camera, width, height)
+        camera = load_camera(self.camera, (width, height))
         if fixed and (camera.width, camera.height) != (width, height):
             sizes = f"{camera.width}x{camera.height} px, the events are {width}x{height} px"
             raise AmiwarpError(f"{self.camera}: the intrinsics are for {sizes}; give the intrinsics of this camera")
         return camera
-
-
-def read_camera(path: Path, width: int, height: int) -> Camera:
-    """Read a camera from a JSON file, a calibration file or ``calib.txt``.
-
-    ``width`` and ``height`` [px] are used for ``calib.txt`` only, which holds no size. Raises :class:`AmiwarpError`
-    naming file and field.
-    """
-    if path.suffix.lower() != ".json":
-        return read_calib(path, width, height)
-    data = read_json(path, "a camera")
-    with errors_name(path, lambda: "is not a camera file"):
-        return camera_from_json(data["camera"], "camera") if "camera" in data else camera_from_json(data)
 
 
 @dataclass(frozen=True)

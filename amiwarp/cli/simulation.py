@@ -13,9 +13,10 @@ import typer
 
 from amiwarp.choices import Seeing
 from amiwarp.cli.console import choose_device, progress, report
-from amiwarp.cli.options import OUTPUT, Common, numbers, parse_size, read_camera
+from amiwarp.cli.options import OUTPUT, Common, numbers, parse_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
+from amiwarp.io.camera_files import load_camera
 from amiwarp.io.files import text_lines
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.camera import Camera
@@ -89,7 +90,7 @@ class RigOptions:
             return Camera.from_fov(width, height, math.radians(60.0 if self.fov_deg is None else self.fov_deg))
         if self.fov_deg is not None:
             raise AmiwarpError("--fov-deg and --camera both describe the camera; give one of them")
-        return read_camera(self.camera, width, height)
+        return load_camera(self.camera, (width, height))
 
     def build_prism(self) -> Prism:
         """Return the prism with its true parameters."""

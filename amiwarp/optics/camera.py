@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import INT64, array, guarded, real, shown, whole
+from amiwarp.validation import INT64, array, guarded, real, shown, vector, whole
 
 if TYPE_CHECKING:
     from amiwarp.kernels import camera as kernels
@@ -258,7 +258,8 @@ class Camera:
                 f"camera matrix K is {shown(matrix.tolist())}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
             )
         fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-        return cls(*size, fx, fy, cx, cy, _opencv_distortion(dist, fisheye=fisheye))
+        width, height = vector(size, 2, "size", lambda value, what: whole(value, what, 1, LARGEST_SIZE, " pixels"))
+        return cls(width, height, fx, fy, cx, cy, _opencv_distortion(dist, fisheye=fisheye))
 
     def to_opencv(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return OpenCV's camera matrix and distortion coefficients.

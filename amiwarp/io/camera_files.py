@@ -1,0 +1,227 @@
+"""Files of cameras: JSON of this package, YAML of ROS and of Kalibr, and ``calib.txt``.
+
+ROS's layout is that of `camera_calibration_parsers <https://wiki.ros.org/camera_calibration_parsers>`_, with the
+distortion models of ``sensor_msgs/CameraInfo``; Kalibr's is its `camchain
+<https://github.com/ethz-asl/kalibr/wiki/yaml-formats>`_.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.files import errors_name, open_input, write_text
+from amiwarp.io.formats import check_ending
+from amiwarp.io.json_files import LARGEST_INTEGER, read_json
+from amiwarp.io.plain_files import read_calib
+from amiwarp.io.rig_files import camera_from_json, camera_to_json
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
+from amiwarp.validation import guarded, one_of, real, shown, vector, whole
+
+ROS_MODELS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4, "fisheye": 4}
+"""Distortion models of ROS that this package has, with their numbers of coefficients."""
+KALIBR_MODELS = {"radtan": 4, "equidistant": 4, "none": 0}
+"""Distortion models of Kalibr's pinhole camera that this package has, with their numbers of coefficients."""
+FISHEYES = ("equidistant", "fisheye")
+"""Names of OpenCV's fisheye model in these files."""
+MOST_YAML_BYTES = 1 << 16
+"""Largest YAML file that is read [bytes], because PyYAML parses only 100 kB in a second. A camera takes 1 kB."""
+
+
+@guarded
+def load_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> Camera:
+    """Read a camera from a file.
+
+    Parameters
+    ----------
+    path : path
+        A file ``.json`` (a camera or a calibration), ``.yaml`` or ``.yml`` (ROS's camera info, or Kalibr's camchain
+        with one camera), or with any other extension a ``calib.txt`` (fx fy cx cy k1 k2 p1 p2 k3).
+    size : tuple of int, optional
+        Width and height of the image [px], which ``calib.txt`` does not hold.
+
+    Returns
+    -------
+    Camera
+        The camera.
+
+    Raises
+    ------
+    AmiwarpError
+        If the file cannot be read, or holds a lens of another model. The message names the file and the field.
+
+    Examples
+    --------
+    >>> amiwarp.save_camera("kalibr.yaml", amiwarp.Camera.from_fov(640, 480, 1.0), layout="kalibr")
+    >>> amiwarp.load_camera("kalibr.yaml").width
+    640
+    """
+    path = Path(path)
+    ending = path.suffix.lower()
+    if ending == ".json":
+        data = read_json(path, "a camera")
+        with errors_name(path, lambda: "is not a camera file"):
+            return camera_from_json(data["camera"], "camera") if "camera" in data else camera_from_json(data)
+    if ending in (".yaml", ".yml"):
+        with errors_name(path, lambda: "is not a camera file"):
+            return _camera_from_yaml(_read_yaml(path))
+    if size is None:
+        raise AmiwarpError(f"{path}: holds no size of the image; give size=(width, height)")
+    return read_calib(path, *size)
+
+
+@guarded
+def save_camera(path: str | os.PathLike[str], camera: Camera, *, layout: str = "ros", overwrite: bool = False) -> None:
+    """Write a camera to a file.
+
+    Parameters
+    ----------
+    path : path
+        The file, which ends in ``.json``, ``.yaml`` or ``.yml``.
+    camera : Camera
+        The camera.
+    layout : str, default "ros"
+        Layout of a YAML file: "ros" (camera info) or "kalibr" (camchain).
+    overwrite : bool, default False
+        Whether to replace an existing file.
+
+    Raises
+    ------
+    AmiwarpError
+        If the layout cannot hold the lens, the file has another extension, exists and ``overwrite`` is False, or cannot
+        be written.
+
+    Examples
+    --------
+    >>> amiwarp.save_camera("ros.yaml", amiwarp.Camera.from_fov(640, 480, 1.0))
+    """
+    path = Path(path)
+    one_of(layout, ("ros", "kalibr"), "layout")
+    if check_ending(path, "cameras are written", [".json", ".yaml", ".yml"]) == ".json":
+        text = json.dumps(camera_to_json(camera), indent=1, allow_nan=False) + "\n"
+    else:
+        import yaml
+
+        data = _to_ros(camera, path.stem) if layout == "ros" else _to_kalibr(camera)
+        text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120)
+    write_text(path, text, overwrite=overwrite)
+
+
+def _read_yaml(path: Path) -> Any:
+    import yaml
+
+    with open_input(path) as file:
+        text = file.read(MOST_YAML_BYTES + 1)
+    if len(text) > MOST_YAML_BYTES:
+        raise AmiwarpError(f"{path}: is larger than {MOST_YAML_BYTES >> 10} KiB, so it is no camera; give another file")
+    try:
+        return yaml.safe_load(text)
+    except RecursionError as error:
+        raise AmiwarpError(f"{path}: is nested too deeply, so it is no camera; give another file") from error
+    except yaml.MarkedYAMLError as error:
+        line = "" if error.problem_mark is None else f" in line {error.problem_mark.line + 1}"
+        raise AmiwarpError(f"{path}: is not YAML: {error.problem}{line}; correct it") from error
+
+
+def _camera_from_yaml(data: Any) -> Camera:
+    """Return the camera of the content of a YAML file, in ROS's or in Kalibr's layout."""
+    if isinstance(data, dict) and "camera_matrix" in data:
+        return _from_ros(data)
+    chain = {name: given for name, given in data.items() if _has_model(given)} if isinstance(data, dict) else {}
+    if len(chain) > 1:
+        raise AmiwarpError(f"holds {len(chain)} cameras ({', '.join(map(str, chain))}); leave one of them in the file")
+    for name, given in chain.items():
+        return _from_kalibr(given, str(name))
+    raise AmiwarpError("holds neither camera_matrix (ROS) nor cam0.camera_model (Kalibr); give a file of one of them")
+
+
+def _has_model(given: Any) -> bool:
+    return isinstance(given, dict) and "camera_model" in given
+
+
+def _from_ros(data: dict[str, Any]) -> Camera:
+    size = [whole(_field(data, name), f"field {name}", 1, LARGEST_INTEGER) for name in ("image_width", "image_height")]
+    matrix = np.reshape(_numbers(data, "camera_matrix", (9,)), (3, 3))
+    # Files that name no model are older than the field, and plumb_bob was the only one then.
+    model = one_of(data.get("distortion_model", "plumb_bob"), ROS_MODELS, "field distortion_model")
+    counts = (4, 5) if model == "plumb_bob" else (ROS_MODELS[model],)
+    k = _numbers(data, "distortion_coefficients", counts)
+    return Camera.from_opencv(matrix, k, (size[0], size[1]), fisheye=model in FISHEYES)
+
+
+def _from_kalibr(data: dict[str, Any], name: str) -> Camera:
+    one_of(data["camera_model"], ("pinhole",), f"field {name}.camera_model")
+    model = one_of(data.get("distortion_model", "none"), KALIBR_MODELS, f"field {name}.distortion_model")
+    fx, fy, cx, cy = _numbers(data, "intrinsics", (4,), name)
+    given = _field(data, "resolution", f"{name}.")
+    width, height = vector(given, 2, f"field {name}.resolution", lambda v, what: whole(v, what, 1, LARGEST_INTEGER))
+    k = _numbers(data, "distortion_coeffs", (KALIBR_MODELS[model],), name) if KALIBR_MODELS[model] else None
+    matrix = [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+    return Camera.from_opencv(matrix, k, (width, height), fisheye=model in FISHEYES)
+
+
+def _field(data: dict[str, Any], name: str, prefix: str = "") -> Any:
+    if data.get(name) is None:
+        raise AmiwarpError(f"field {prefix}{name} is missing; add this field")
+    return data[name]
+
+
+def _numbers(data: dict[str, Any], name: str, counts: tuple[int, ...], where: str = "") -> list[float]:
+    """Return a list of numbers, or those of a matrix with ``data``, whose count is one of ``counts``."""
+    prefix = f"{where}." if where else ""
+    given, full = _field(data, name, prefix), f"{prefix}{name}"
+    if isinstance(given, dict):
+        given, full = _field(given, "data", f"{full}."), f"{full}.data"
+    if not isinstance(given, list) or len(given) not in counts:
+        expected = " or ".join(map(str, counts))
+        raise AmiwarpError(f"field {full} is {shown(given)}; expected a list of {expected} numbers")
+    return [_number(value, f"field {full}") for value in given]
+
+
+def _number(value: Any, what: str) -> float:
+    """Return a number. PyYAML takes those without a point, such as 1e-05 of ROS, for text."""
+    try:
+        return real(float(value) if isinstance(value, str) else value, what)
+    except ValueError:
+        return real(value, what)
+
+
+def _matrix(values: Sequence[float], columns: int) -> dict[str, Any]:
+    return {"rows": len(values) // columns, "cols": columns, "data": list(values)}
+
+
+def _to_ros(camera: Camera, name: str) -> dict[str, Any]:
+    matrix, k = camera.to_opencv()
+    model = {4: "equidistant", 5: "plumb_bob", 8: "rational_polynomial"}[len(k)]
+    return {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": name,
+        "camera_matrix": _matrix(matrix.ravel().tolist(), 3),
+        "distortion_model": model,
+        "distortion_coefficients": _matrix(k.tolist(), len(k)),
+        "rectification_matrix": _matrix(np.eye(3).ravel().tolist(), 3),
+        "projection_matrix": _matrix(np.c_[matrix, np.zeros(3)].ravel().tolist(), 4),
+    }
+
+
+def _to_kalibr(camera: Camera) -> dict[str, Any]:
+    lens = camera.distortion
+    k = [] if lens is None else camera.to_opencv()[1].tolist()
+    if isinstance(lens, RadialTangential) and any(k[4:]):
+        raise AmiwarpError(f"Kalibr's radtan has no coefficients after p2, the lens has {lens}; write layout='ros'")
+    return {
+        "cam0": {
+            "camera_model": "pinhole",
+            "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+            "distortion_model": "none" if lens is None else "equidistant" if isinstance(lens, Fisheye) else "radtan",
+            "distortion_coeffs": k[:4],
+            "resolution": [camera.width, camera.height],
+        }
+    }
