@@ -72,6 +72,7 @@ from .io.formats import Rounding as Rounding
 from .io.formats import open_recording as open_recording
 from .io.native_writer import RecordingWriter as RecordingWriter
 from .io.native_writer import save_recording as save_recording
+from .io.pixel_map import PixelMap as PixelMap
 from .optics.camera import Camera as Camera
 from .optics.camera import CameraRotation as CameraRotation
 from .optics.camera import Distortion as Distortion
@@ -95,6 +96,7 @@ from .progress import Progress as Progress
 from .reconstruction.picture import Picture as Picture
 from .reconstruction.picture import Reconstruction as Reconstruction
 from .reconstruction.picture import reconstruct as reconstruct
+from .reconstruction.pixels import pixel_thresholds as pixel_thresholds
 from .simulation.description import CameraMotion as CameraMotion
 from .simulation.description import EncoderModel as EncoderModel
 from .simulation.description import Frames as Frames

@@ -33,6 +33,7 @@ def _all(record: Any) -> dict[str, Any]:
 RANDOM = np.random.default_rng(0)
 CAMERA = aw.Camera.from_fov(4, 3, 1.0)
 TABLE = np.zeros((3, 4, 2), np.float32)
+PIXELS = aw.PixelMap(*np.ones((8, 3, 4)))
 EVENTS = aw.Events.from_arrays([1, 2, 1], [0, 1, 2], [0, 400, 900], [1, 0, 1])
 ON_DEVICE = aw.DeviceEvents.from_arrays(EVENTS.x, EVENTS.y, EVENTS.t, EVENTS.p)
 SOURCE = aw.MemoryEvents(EVENTS, 4, 3)
@@ -261,6 +262,10 @@ OWN: dict[str, dict[str, Any]] = {
     "convert": {"source_path": "in.h5"},
     "load_camera": {"path": "none.json"},
     "save_camera": {"path": _new(".json"), "camera": CAMERA},
+    "PixelMap": _all(PIXELS),
+    "PixelMap.load": {"path": "none.npz"},
+    "PixelMap.save": {"path": _new(".npz")},
+    "pixel_thresholds": {"model": MODEL},
     "open_recording": {"path": "in.h5"},
     "RecordingWriter.append_frame": {"frame": FRAME},
     "RecordingWriter.append_image": {"t_us": 0, "image": np.zeros((3, 4), np.uint8)},
@@ -382,6 +387,7 @@ OBJECTS: dict[str, Any] = {
     "ExactModel": MODEL,
     "UnsizedPrism": aw.UnsizedPrism(),
     "Picture": PICTURE,
+    "PixelMap": PIXELS,
     "CameraMotion": aw.CameraMotion(),
     "EncoderModel": aw.EncoderModel(),
     "PrismMotion": aw.PrismMotion(),
@@ -415,6 +421,8 @@ REFUSED = {
     "PictureFolder.read": "no such file",
     "VideoFile.read": "v.mp4",
     "load_camera": "no such file",
+    "PixelMap.load": "no such file",
+    "pixel_thresholds": "no pixel fires twice",
     "load_world": "no such file",
     "plan_dataset": "no such file",
     "make_dataset": "no such file",

@@ -103,6 +103,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pictures.mkdir()
     for k in range(3):
         shutil.copy(folder / "pic.png", pictures / f"{k}.png")
+    amiwarp.PixelMap(*np.ones((8, 48, 64))).save(folder / "map.npz")
     np.save(folder / "v.npy", np.zeros((4, 48, 64), np.float32))
     text = folder / "text"
     text.mkdir()
@@ -142,9 +143,12 @@ OVER_INPUTS = (
     ("compensate a.h5 {} --calibration cal.json --encoder enc.csv", "enc.csv"),
     ("reconstruct a.h5 {} --calibration cal.json", "a.h5"),
     ("reconstruct a.h5 out.png --calibration cal.json --mask {}", "cal.json"),
+    ("pixels a.h5 cal.json {}", "a.h5"),
+    ("pixels a.h5 cal.json {}", "cal.json"),
     ("simulate {} --picture pic.png --duration 0.01", "pic.png"),
     ("simulate {} --picture pic.png --camera cam.json --duration 0.01", "cam.json"),
     ("simulate {} --picture pic.png --speed speed.txt --duration 0.01", "speed.txt"),
+    ("simulate {} --picture pic.png --pixels map.npz --size 64x48 --duration 0.01", "map.npz"),
     ("simulate out.h5 --world room --camera cam.json --duration 0.01 --preview {}", "cam.json"),
     ("simulate {} --world room --trajectory tr.tum --size 64x48 --duration 0.01", "tr.tum"),
     *(
@@ -287,6 +291,7 @@ NAMES: dict[tuple[str, str], tuple[str, tuple[str, ...]]] = {
     ("live", "out"): ("live a.h5 --fast --calibration cal.json --out {}", ("npz", "txt", *NOT_WRITTEN)),
     ("live", "record"): ("live a.h5 --fast --calibration cal.json --record {}", ("npz", "txt", *NOT_WRITTEN)),
     ("reconstruct", "out"): ("reconstruct a.h5 {} --calibration cal.json", ("h5", *NOT_WRITTEN)),
+    ("pixels", "out"): ("pixels a.h5 cal.json {}", ("h5", "npy", *NOT_WRITTEN)),
     ("reconstruct", "mask"): (
         "reconstruct a.h5 new.png --calibration cal.json --mask {}", ("h5", "mp4", *NOT_WRITTEN),
     ),
@@ -354,6 +359,7 @@ def test_commands_that_write_native_recordings_name_the_conversion(place: Path) 
 
 CALLS: dict[str, Callable[[Path, Any], object]] = {
     "Calibration.save": lambda path, given: given.calibration.save(path),
+    "PixelMap.save": lambda path, _: amiwarp.PixelMap(*np.ones((8, 3, 4))).save(path),
     "RecordingWriter": lambda path, _: amiwarp.RecordingWriter(path, width=64, height=48).__enter__(),
     "Simulation.write": lambda path, given: given.simulation.write(path),
     "Trajectory.save_tum": lambda path, _: amiwarp.Trajectory.still([0, 0, 0], look_at=[0, 1, 0]).save_tum(path),
@@ -516,7 +522,10 @@ ENDLESS = (
     "reconstruct {} out.png --calibration cal.json",
     "reconstruct a.h5 out.png --calibration {}",
     "simulate out.h5 --picture {}",
+    "pixels {} cal.json out.npz",
+    "pixels a.h5 {} out.npz",
     "simulate out.h5 --picture pic.png --speed {}",
+    "simulate out.h5 --picture pic.png --pixels {}",
     "translate {} out.h5 --fps 100",
     "translate {}.npy out.h5 --fps 100",
     "record {} out.h5 --fast",

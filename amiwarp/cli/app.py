@@ -84,6 +84,11 @@ COMMANDS = {
         "Reconstruct a picture of the scene from the events of a window, or a video from a sliding window.",
         "amiwarp reconstruct recording.h5 picture.png --calibration calibration.json --turns 1",
     ),
+    "pixels": Command(
+        "calibration",
+        "Measure the ON and OFF threshold of every pixel, and find hot and dead pixels, from a calibrated recording.",
+        "amiwarp pixels recording.h5 calibration.json pixels.npz",
+    ),
     "chart": Command(
         "studies",
         "Measure speed and error of the settings on a recording with ground truth, and draw both Pareto fronts.",

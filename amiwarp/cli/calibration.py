@@ -1,4 +1,4 @@
-"""Calibration and its use: ``amiwarp calibrate``, ``amiwarp compensate`` and ``amiwarp reconstruct``."""
+"""Calibration and its use: ``amiwarp calibrate``, ``compensate``, ``reconstruct`` and ``pixels``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from amiwarp.choices import CONTRAST, OPTICAL_MODELS, Fill, Layers, Sharpness, Tone
@@ -681,3 +682,85 @@ def _reconstructed_line(d: dict[str, Any]) -> str:
     if "fps" in d:
         return f"{d['file']}: {d['frames']} frames of {window} at {d['fps']:g}/s, {speed}"
     return f"{d['file']}: {window}, {speed}; {100.0 * d['known']:.0f} % of the picture determined by events"
+
+
+# ``amiwarp pixels``: thresholds of every pixel, hot and dead pixels.
+
+MOST_NAMED = 20
+"""Largest number of hot or dead pixels that are named in text; JSON names all."""
+
+
+def run_pixels(
+    recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
+    calibration: Annotated[Path, typer.Argument(help="Calibration file from 'amiwarp calibrate' (.json).")],
+    out: Annotated[Path, typer.Argument(help="Map of the pixels to write (.npz)."), OUTPUT],
+    *,
+    start: Annotated[
+        float | None, _in_window(min=0.0, help="Start of the used time (s from the first event). Default: one turn.")
+    ] = None,
+    length: Annotated[
+        float | None, _in_window(min=1e-6, help="Length of the used time (s). Default: until the end.")
+    ] = None,
+    refractory_us: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Refractory period of the sensor (us). Default: that of the calibration."),
+    ] = None,
+    common: Common,
+) -> None:
+    """Measure the ON and OFF threshold of every pixel, and find hot and dead pixels, from a calibrated recording.
+
+    Thresholds are relative to their median. Scene and camera must be still, or rotate as calibrated. A threshold needs
+    20 pairs of events, so a longer recording reaches pixels that see less texture.
+    """
+    from amiwarp.brightness.solver import SensorTiming
+    from amiwarp.calib import Calibration
+    from amiwarp.reconstruction.pixels import pixel_thresholds
+
+    check_ending(out, "pixel maps are written", [".npz"])
+    device = choose_device(common.device)
+    source = open_recording(recording)
+    first = source.events.t_first if len(source.events) else 0
+    began = time.perf_counter()
+    with progress("measuring the pixels") as advance:
+        found = pixel_thresholds(
+            source,
+            Calibration.load(calibration),
+            sensor=None if refractory_us is None else SensorTiming(refractory_us=refractory_us),
+            start_us=None if start is None else first + round(start * 1e6),
+            length_us=None if length is None else max(1, round(length * 1e6)),
+            device=device,
+            progress=advance,
+        )
+    found.save(out)
+    data: dict[str, Any] = {"file": str(out), "width": found.size[0], "height": found.size[1]}
+    for name in ("on", "off"):
+        values, std = getattr(found, name), getattr(found, f"{name}_std")
+        known = np.isfinite(values)
+        data[name] = {
+            "known": int(known.sum()),
+            "mismatch": math.sqrt(max(0.0, float(np.var(values[known]) - np.mean(std[known] ** 2))))
+            if known.any()
+            else None,
+            "std": float(np.median(std[known])) if known.any() else None,
+            "pairs": int(getattr(found, f"{name}_pairs").sum()),
+        }
+    for name in ("hot", "dead"):
+        y, x = np.nonzero(getattr(found, name))
+        data[name] = np.stack([x, y], axis=1).tolist()
+    report(common, {**data, "seconds": time.perf_counter() - began, "device": device}, _pixel_lines(data))
+
+
+def _pixel_lines(data: dict[str, Any]) -> list[str]:
+    lines = [data["file"]]
+    for name in ("on", "off"):
+        one = data[name]
+        if one["known"]:
+            lines.append(
+                f"{name.upper()} threshold of {one['known']:,} pixels, each ± {100 * one['std']:.1f} %; they differ by "
+                f"{100 * one['mismatch']:.1f} %"
+            )
+    for name in ("hot", "dead"):
+        pixels = data[name]
+        named = " ".join(f"({x}, {y})" for x, y in pixels[:MOST_NAMED]) + (" ..." if len(pixels) > MOST_NAMED else "")
+        lines.append(f"{len(pixels)} {name} pixel{'' if len(pixels) == 1 else 's'} {named}".rstrip())
+    return lines

@@ -19,6 +19,7 @@ from amiwarp.io import open_recording
 from amiwarp.io.camera_files import load_camera
 from amiwarp.io.files import text_lines
 from amiwarp.io.formats import check_ending
+from amiwarp.io.pixel_map import PixelMap
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
 from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel
@@ -53,7 +54,9 @@ class RigOptions:
     fov_deg: Annotated[
         float | None, _in_camera(help="Horizontal field of view (deg). Default: 60 if --camera is not given.")
     ] = None
-    camera: Annotated[Path | None, _in_camera(help="Camera intrinsics: JSON (including the size) or calib.txt.")] = None
+    camera: Annotated[
+        Path | None, _in_camera(help="Camera intrinsics: JSON or YAML (including the size), or calib.txt.")
+    ] = None
     apex_deg: Annotated[float, _in_prism(help="True apex angle of the prism (deg).")] = 1.0
     nominal_apex_deg: Annotated[
         float | None, _in_prism(help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.")
@@ -355,6 +358,10 @@ def run_simulate(
     scene: SceneOptions,
     rig: RigOptions,
     sensor: SensorOptions,
+    pixels: Annotated[
+        Path | None,
+        _in_sensor(help="Thresholds of every pixel, hot and dead pixels: map from 'amiwarp pixels' (.npz)."),
+    ] = None,
     encoder: EncoderModelOptions,
     common: Common,
 ) -> None:
@@ -376,6 +383,7 @@ def run_simulate(
         motion=rig.build_motion(),
         camera_motion=CameraMotion(scene.rates),
         sensor=sensor.build(),
+        pixels=None if pixels is None else PixelMap.load(pixels),
         encoder_model=encoder.build(),
         nominal_prism=rig.build_nominal(),
         seed=common.seed,

@@ -249,7 +249,7 @@ Array: TypeAlias = tuple[IO[bytes], tuple[int, ...], np.dtype[Any]]
 
 
 @contextlib.contextmanager
-def _array(archive: zipfile.ZipFile, name: str, kinds: str = "iub") -> Iterator[Array]:
+def open_array(archive: zipfile.ZipFile, name: str, kinds: str = "iub") -> Iterator[Array]:
     """Open an array of the archive: its bytes, shape and type. Its header must agree with the archive's directory."""
     about = archive.getinfo(f"{name}.npy")
     if about.compress_type not in PACKED:
@@ -279,7 +279,7 @@ def _header(stream: IO[bytes], name: str, file_bytes: int, kinds: str) -> Array:
 
 def _number(archive: zipfile.ZipFile, name: str) -> int:
     """Return the single number in an array of the archive."""
-    with _array(archive, name) as (stream, shape, dtype):
+    with open_array(archive, name) as (stream, shape, dtype):
         if math.prod(shape) != 1:
             raise AmiwarpError(f"{name} has shape {shape}; expected one number")
         return int(np.frombuffer(stream.read(dtype.itemsize), dtype)[0])
@@ -292,13 +292,13 @@ def _npz_packets(path: Path, notes: dict[str, int]) -> Iterator[Packet]:
         missing = [name for name in "xytp" if name not in names]
         if not missing:
             kinds = {"x": "iubf", "y": "iubf", "t": "iub", "p": "iub"}
-            arrays = {name: opened.enter_context(_array(archive, name, kinds[name])) for name in "xytp"}
+            arrays = {name: opened.enter_context(open_array(archive, name, kinds[name])) for name in "xytp"}
             yield from _npz_columns(path, arrays, notes)
         elif "event_data" in names:
-            array = opened.enter_context(_array(archive, "event_data", "V"))
+            array = opened.enter_context(open_array(archive, "event_data", "V"))
             yield from _records(path, array, notes)
         elif "events" in names:
-            array = opened.enter_context(_array(archive, "events", "iuf"))
+            array = opened.enter_context(open_array(archive, "events", "iuf"))
             yield from _rows(path, array, notes)
         else:
             raise AmiwarpError(f"{path}: is a ZIP archive without x, y, t and p: no array {', '.join(missing)}; {USED}")

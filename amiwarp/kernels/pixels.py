@@ -37,6 +37,7 @@ LAG_ZERO = wp.constant(16)  # ticks added to the lag, because rounding a time st
 NEVER = wp.constant(wp.int64(-(1 << 60)))
 NO_NOISE = wp.constant(wp.int64(1 << 60))
 SMALLEST_THRESHOLD = wp.constant(0.1)  # smallest threshold relative to the nominal one, which mismatch cannot undercut
+UNREACHED = wp.constant(1.0e6)  # threshold of a dead pixel [log intensity], which no light crosses
 PAST_STEP = wp.constant(2.0)  # fraction of a step that means: after the end of the step
 
 
@@ -281,6 +282,41 @@ def start_pixels(view: View, steps: Steps, sensor: SensorParams, seed: int, star
     """Initialise every pixel with the level that it sees at the start."""
     i = start + wp.tid()
     pixels[i] = new_pixel(sensor, seed, i, see_level(view, steps.at[steps.margin], ray_in_prism_frame(view, i)))
+
+
+@wp.kernel
+def set_pixels(
+    on: wp.array(dtype=float),
+    off: wp.array(dtype=float),
+    hot: wp.array(dtype=float),
+    dead: wp.array(dtype=wp.bool),
+    sensor: SensorParams,
+    pixels: wp.array(dtype=Pixel),
+):
+    """Replace drawn thresholds and hot rates by those of a map, which are relative and in events per tick.
+
+    A threshold of NaN stays as drawn. Dead pixels get thresholds that no light crosses.
+    """
+    i = wp.tid()
+    p = pixels[i]
+    reference = p.level
+    if not dead[i]:
+        reference = wp.where(wp.isnan(on[i]), p.reference, p.level - (p.level - p.reference) * sensor.on * on[i] / p.on)
+    p.reference = reference
+    p.on = wp.where(wp.isnan(on[i]), p.on, sensor.on * on[i])
+    p.off = wp.where(wp.isnan(off[i]), p.off, sensor.off * off[i])
+    drawn = p.hot == hot[i] and not dead[i]
+    p.hot = hot[i]
+    if dead[i]:
+        p.on = UNREACHED
+        p.off = UNREACHED
+        p.noise = 0.0
+        p.leak = 0.0
+    if not drawn:
+        rng = p.rng
+        p.next_noise = draw_waiting_time(p.noise + p.hot, wp.randf(rng))
+        p.rng = rng
+    pixels[i] = p
 
 
 @wp.func

@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.brightness.solver import BrightnessMap, EventTable, PairSet, Smoothness, Tiles
+from amiwarp.brightness.solver import BrightnessMap, EventTable, PairSet, SensorTiming, Smoothness, Tiles
 from amiwarp.calib.result import Calibration
 from amiwarp.choices import CONTRAST, Fill, Tone
 from amiwarp.compensation.recordings import check_size
@@ -112,16 +112,16 @@ NOISE_DISTANCE = 2
 
 
 def solve_rounds(
-    solver: BrightnessMap, pair_count: int, last: Picture | None
+    solver: BrightnessMap, pair_count: int, last: NDArray[np.float32] | None
 ) -> tuple[Callable[[], float], Callable[[], NDArray[np.bool_]]]:
     """Solve for the map. Return functions that wait for the median residual and for the known nodes.
 
-    The known nodes have shape (rows, columns). A GPU still works when this returns. ``last`` is the picture of the
-    previous window, from which the solution starts.
+    The known nodes have shape (rows, columns). A GPU still works when this returns. ``last`` is the solution of the
+    previous window, from which this one starts.
     """
     nodes = solver.tiles.nodes
     if last is not None:
-        unknowns = last.to_host().unknowns.copy()
+        unknowns = last.copy()
         unknowns[nodes:] = solver.unknowns[nodes:]
         solver.unknowns = unknowns
     solver.solve(*SCALES[0 if last is None else 1 : -1], steps=STEPS)
@@ -502,7 +502,9 @@ class Reconstruction:
         solver = self._solver(pairs, tiles, off, middle_us)
         smoothness = self.smoothness = choice()
         solver.restart(smoothness)
-        waiting_residual, waiting_covered = solve_rounds(solver, pair_count, last)
+        waiting_residual, waiting_covered = solve_rounds(
+            solver, pair_count, None if last is None else last.to_host().unknowns
+        )
         hot = int((tile_of() < 0).sum())  # while a GPU still solves
         residual, covered = waiting_residual(), waiting_covered()
         cut = np.s_[top : top + height, left : left + width]
@@ -579,14 +581,14 @@ class Reconstruction:
         table = EventTable([events], np.zeros((height, width), np.int32), self.device)
         return table, table.exclude_hot_pixels()
 
-    def _pairs(self, table: EventTable, start_us: int, length_us: int) -> PairSet:
+    def _pairs(self, table: EventTable, start_us: int, length_us: int, sensor: SensorTiming | None = None) -> PairSet:
         """Return all equations of a window: pairs of events, ends of the window, and silence."""
         turn = min(self.turn_us or length_us, length_us)
         spans = max(2, round(SPANS_PER_TURN * length_us / turn))
         edges = np.round(np.linspace(start_us, start_us + length_us, spans + 1)).astype(np.int64)
         return table.pairs(
-            self.encoder, longest_gap_us=length_us, middle_us=start_us + length_us // 2, weak=WEAK_WEIGHT,
-            window=(start_us, start_us + length_us), quiet=(edges, min(spans, SPANS_PER_TURN)),
+            self.encoder, longest_gap_us=length_us, sensor=sensor, middle_us=start_us + length_us // 2,
+            weak=WEAK_WEIGHT, window=(start_us, start_us + length_us), quiet=(edges, min(spans, SPANS_PER_TURN)),
         )  # fmt: skip
 
     def _solver(self, pairs: PairSet, tiles: Tiles, off: float, middle_us: int) -> BrightnessMap:

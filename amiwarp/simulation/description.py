@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder, periodic
 from amiwarp.events.recording import MetadataValue
+from amiwarp.io.pixel_map import PixelMap
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism, check_angles, check_phase
@@ -655,6 +656,8 @@ class SimulationValues:
     """Device that computes, such as ``cpu`` or ``cuda:0``."""
     source: Mapping[str, MetadataValue] = field(default_factory=dict)
     """Description of what the scene was made from; it becomes part of the recording's metadata."""
+    pixels: PixelMap | None = None
+    """Thresholds and hot and dead pixels; None to draw them by the sensor's model. Unknown thresholds are drawn."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.scene, WorldScene):
@@ -669,6 +672,10 @@ class SimulationValues:
         if self.camera.width * self.camera.height > 1 << 22:
             given = f"{self.camera.width}x{self.camera.height}"
             raise AmiwarpError(f"camera of {given} has more than 4194304 pixels; give a smaller camera")
+        size = self.camera.width, self.camera.height
+        if self.pixels is not None and instance(self.pixels, PixelMap, "simulation's pixels").size != size:
+            given, expected = (f"{width}x{height}" for width, height in (self.pixels.size, size))
+            raise AmiwarpError(f"the pixel map has {given} pixels, the camera {expected}; give the map of this camera")
         whole(self.seed, "seed", 0, (1 << 31) - 1)
 
     @property

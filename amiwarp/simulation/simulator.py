@@ -21,6 +21,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, EventSource, MemoryEvents, MetadataValue, Recording
 from amiwarp.events.truth import EventTruth, EventValues, FrameTruth, Poses, Truth
 from amiwarp.io import RecordingWriter
+from amiwarp.io.pixel_map import PixelMap
 from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.optics.camera import Camera, camera_params
 from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
@@ -686,9 +687,21 @@ class Engine:
         inputs = [self._seen(steps, 0, 1), steps, self._sensor, self._simulation.seed, 0, *self._state]
         kernel = pixels.start_pixels if self._maps is not None else pixels.start_world_pixels
         wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
+        if self._simulation.pixels is not None:
+            self._set_pixels(self._simulation.pixels)
         if self._filters:  # at the start, the photoreceptors have settled to the light of the scene
             levels = np.ascontiguousarray(self._state[0].numpy()["level"])
             self._state.append(wp.array(levels, dtype=float, device=self._device))
+
+    def _set_pixels(self, given: PixelMap) -> None:
+        """Give the pixels the thresholds of a map, and its hot and dead pixels."""
+        per_tick = given.hot_hz * np.float32(1e-6 / int(pixels.TICKS))
+        arrays = [
+            wp.array(values.ravel(), device=self._device) for values in (given.on, given.off, per_tick, given.dead)
+        ]
+        wp.launch(
+            pixels.set_pixels, dim=self._pixels, inputs=[*arrays, self._sensor, self._state[0]], device=self._device
+        )
 
     def _generate_keys(self, steps: Any, count: int) -> wp.array:
         """Simulate the pixels over a chunk; return the sorted keys of the events before the end of the chunk.
@@ -1079,6 +1092,7 @@ def simulate(
     motion: PrismMotion | float = 720.0,
     camera_motion: CameraMotion | None = None,
     sensor: SensorModel | None = None,
+    pixels: PixelMap | None = None,
     encoder: EncoderModel | None = None,
     nominal_prism: Prism | None = None,
     seed: int = 0,
@@ -1108,6 +1122,8 @@ def simulate(
         Rotation of the camera; by default none.
     sensor : SensorModel, optional
         Pixels of the sensor.
+    pixels : PixelMap, optional
+        Thresholds of each pixel, and hot and dead pixels, instead of random ones.
     encoder : EncoderModel, optional
         Errors of the encoder.
     nominal_prism : Prism, optional
@@ -1151,6 +1167,7 @@ def simulate(
         motion=motion if isinstance(motion, PrismMotion) else PrismMotion(motion),
         camera_motion=camera_motion or CameraMotion(),
         sensor=sensor or SensorModel(),
+        pixels=pixels,
         encoder_model=encoder or EncoderModel(),
         nominal_prism=nominal_prism,
         seed=seed,

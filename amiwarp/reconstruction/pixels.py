@@ -1,0 +1,349 @@
+"""Thresholds of every pixel from the picture that all pixels see, and the hot and dead pixels among them.
+
+Two successive events of a pixel measure its threshold: L(w(x, θ₂)) − L(w(x, θ₁)) = ±C, with the solved picture L (see
+:mod:`amiwarp.brightness.solver`). Every point of the picture is seen by all pixels on the orbit of the prism, so the
+picture hardly depends on the threshold of one of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.brightness.solver import BrightnessMap, EventTable, PairSet, SensorTiming, Tiles
+from amiwarp.calib.bad_pixels import BINS, LEAST_TURNS, bin_times, outliers, unrepeated_counts
+from amiwarp.calib.result import Calibration
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_events import read_between
+from amiwarp.events.encoder import TWO_PI, Encoder
+from amiwarp.events.recording import Events, Recording
+from amiwarp.io.pixel_map import THRESHOLDS, PixelMap
+from amiwarp.optics.models import Model
+from amiwarp.progress import Progress
+from amiwarp.reconstruction.picture import (
+    SCALES,
+    STEPS,
+    Reconstruction,
+    border_displacements,
+    off_excess_by_counts,
+    solve_rounds,
+)
+from amiwarp.validation import TIME_LIMIT, guarded, whole
+
+DENSITY = 2.0
+"""Nodes of the picture per pixel. At 1, the picture's own error in fine texture is as large as the mismatch."""
+ROUNDS = 3
+"""Number of times that the picture and the thresholds are solved in turn. From the second to the third, thresholds
+change by 2 % of the mismatch."""
+SCALE = 0.3
+"""Deviation from a pixel's threshold at which a pair gets half weight [thresholds]: three times a usual mismatch of
+10 %, beyond which noise events lie."""
+LEAST_CHANGE = 0.5
+"""Change of brightness between the two events of a pair below which one of them is noise [thresholds of the pixel]."""
+LEAST_PAIRS = 20
+"""Smallest number of pairs of a polarity from which a pixel's threshold is known. Each pair is off by about 0.1
+thresholds, so 20 suffice for a mismatch of 10 %."""
+MOST_EVENTS = 3_000_000
+"""Largest number of events of a window, for one picture, which takes about 2 GB of memory."""
+LEAST_RANDOM = 3.0
+"""Smallest number of random events of a hot pixel in each turn. A pixel at the limit of its threshold fires a few times
+in a turn, and not in every turn: with a threshold of two thirds, it had two random events."""
+WORST_RESIDUAL = 0.5
+"""Median residual [thresholds] beyond which the events do not show one picture: a random brightness has more."""
+SILENT_RANGE = 3.0
+"""Change of brightness along the orbit [median thresholds] from which on a silent pixel counts as dead. A working one
+would need a threshold of three times the median."""
+SILENT_ANGLES = 32
+"""Number of prism angles at which the brightness seen by a silent pixel is looked up."""
+
+
+@dataclass
+class _Sums:
+    """Weighted sums over the pairs of each pixel and polarity, each of shape (height, width, 2): OFF, ON."""
+
+    weight: NDArray[np.float64]
+    value: NDArray[np.float64]
+    square: NDArray[np.float64]
+    pairs: NDArray[np.int64]
+    """Number of pairs of two events."""
+    wrong: NDArray[np.int64]
+    """Number of pairs between which the brightness changed by far less than a threshold."""
+    turns: float = 0.0
+
+    def threshold(self) -> NDArray[np.float64]:
+        """Return thresholds, 1 where there are no pairs."""
+        return np.divide(self.value, self.weight, out=np.ones_like(self.value), where=self.weight > 0.0)
+
+
+@guarded
+def pixel_thresholds(
+    recording: Recording,
+    calibration: Calibration | None = None,
+    *,
+    model: Model | None = None,
+    encoder: Encoder | None = None,
+    sensor: SensorTiming | None = None,
+    start_us: int | None = None,
+    length_us: int | None = None,
+    device: Any = None,
+    progress: Progress | None = None,
+) -> PixelMap:
+    """Measure the thresholds of every pixel, and find hot and dead pixels, from a calibrated recording.
+
+    The camera must be still, or rotate as calibrated, and so must the scene. Longer recordings reach pixels that see
+    less texture: a threshold needs 20 pairs of events of its polarity.
+
+    Parameters
+    ----------
+    recording : Recording
+        Recording with events.
+    calibration : Calibration, optional
+        Calibration of the same sensor size. It provides model, encoder and camera rotation.
+    model : Model, optional
+        Optical model of the prism, if there is no calibration.
+    encoder : Encoder, optional
+        Encoder, if neither calibration nor recording provides one.
+    sensor : SensorTiming, optional
+        Latency and refractory period of the sensor; by default the refractory period of the calibration.
+    start_us : int, optional
+        Start of the used time [us]; by default one turn after the first event.
+    length_us : int, optional
+        Length of the used time [us]; by default until the last event.
+    device : str or warp.Device, optional
+        Device to compute on, by default that of :class:`DeviceMemoryEvents`, else the CPU.
+    progress : Progress, optional
+        Called with the finished share.
+
+    Returns
+    -------
+    PixelMap
+        Thresholds relative to the median of their polarity and of the pixels around: what all pixels of a region have
+        in common cannot be told from the contrast of the scene.
+
+    Raises
+    ------
+    AmiwarpError
+        If the events do not show one picture, or no pixel has enough pairs of events, or as for
+        :class:`Reconstruction`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> picture = np.random.default_rng(0).random((64, 64)).astype(np.float32)
+    >>> camera, prism = amiwarp.Camera.from_fov(32, 24, 1.0), amiwarp.Prism(0.03)
+    >>> recording = amiwarp.simulate(picture, camera, prism, duration_s=1.5)
+    >>> pixels = amiwarp.pixel_thresholds(recording, model=amiwarp.ExactModel.from_prism(camera, prism, 0.0))
+    >>> pixels.size
+    (32, 24)
+    """
+    work = Reconstruction(recording, calibration, model=model, encoder=encoder, device=device)
+    if sensor is None:
+        summary = None if calibration is None else calibration.photometric
+        sensor = SensorTiming(refractory_us=0.0 if summary is None else summary.refractory_us)
+    width, height = recording.events.size
+    start, _ = work.span(start_us, length_us)
+    start, end = max(start, recording.events.t_first), recording.events.t_last + 1
+    length = end - start
+    if length_us is not None:
+        length = min(length, whole(length_us, "length_us", 1, TIME_LIMIT, " us"))
+    nothing, none = np.zeros((height, width, 2)), np.zeros((height, width, 2), np.int64)
+    sums, count = _Sums(nothing, nothing, nothing, none, none), np.zeros((height, width), np.int64)
+    silent = np.ones((height, width), np.bool_)
+    excluded, unrepeated = np.zeros((height, width), np.bool_), np.zeros((height, width))
+    last = None
+    windows = list(_windows(work, start, length))
+    for k, (at, span) in enumerate(windows):
+        picture = _PixelPicture(work, at, span, sensor)
+        sums = picture.measure(sums, last)
+        last = None if work.camera_rotation.moves else picture.solver.unknowns
+        count += picture.count
+        excluded |= picture.excluded
+        unrepeated += picture.unrepeated()
+        silent &= (count == 0) & picture.reaches(count == 0)
+        if progress is not None:
+            progress("measuring the pixels", (k + 1) / len(windows))
+    wrong = np.where(excluded, count, sums.wrong.sum(axis=2))
+    random = np.minimum(wrong, unrepeated) if work.turn_us is not None else wrong.astype(np.float64)
+    hot = outliers(random) & (random >= LEAST_RANDOM * length / (work.turn_us or length))
+    return _pixel_map(work, sums, np.where(hot, _excess(count) / (length * 1e-6), 0.0), silent)
+
+
+def _windows(work: Reconstruction, start: int, length: int) -> Iterator[tuple[int, int]]:
+    """Yield start and length [us] of windows of about :data:`MOST_EVENTS`, of two turns or longer."""
+    source = work.recording.events
+    number = -(-(source.find(start + length) - source.find(start)) // MOST_EVENTS)
+    number = max(1, min(number, int(length // (LEAST_TURNS * (work.turn_us or length)))))
+    edges = np.rint(start + np.arange(number + 1) * (length / number)).astype(np.int64)
+    yield from ((int(a), int(b - a)) for a, b in pairwise(edges))
+
+
+class _PixelPicture:
+    """Picture of one window, and the thresholds of the pixels that see it."""
+
+    def __init__(self, work: Reconstruction, start: int, length: int, timing: SensorTiming) -> None:
+        events = read_between(work.recording.events, start, start + length)
+        self._columns = events.x, events.y, events.t, events.p
+        width, height = work.recording.events.size
+        table = EventTable([events], np.zeros((height, width), np.int32), work.device)
+        self.work, self.turns = work, max(1.0, length / (work.turn_us or length))
+        self.count: NDArray[np.int64] = table.exclude_hot_pixels().astype(np.int64)
+        """Number of events of each pixel, shape (height, width)."""
+        self.excluded: NDArray[np.bool_] = table.tile_of.numpy() < 0
+        """Pixels that fire far more often than all around them, shape (height, width)."""
+        self.pairs: PairSet = work._pairs(table, start, length, timing)
+        if not self.pairs.of_two_events:
+            raise AmiwarpError(f"{work.recording.name}: no pixel fires twice; give a recording of more turns")
+        self.off = off_excess_by_counts(work.recording.events, work.turn_us, start, length)
+        left, top, tiles = work._tile(start, length)
+        middle = start + length // 2
+        choice = work._start_choice(self.count.astype(np.int32), self.pairs, middle, (left, top), self.off)
+        work.smoothness = choice()
+        self.radius = _radius(work)
+        self.offset = np.zeros(self.pairs.arrays.stride, np.float32)
+        self.pairs.arrays.offset = wp.array(self.offset, dtype=float, device=self.pairs.device)
+        self.tiles: Tiles = tiles.at_density(DENSITY)
+        self.solver: BrightnessMap = work._solver(self.pairs, self.tiles, self.off, middle)
+        self.solver.restart(work.smoothness)
+
+    def measure(self, sums: _Sums, last: NDArray[np.float32] | None) -> _Sums:
+        """Solve for the picture and the thresholds in turn, and return ``sums`` with these pairs.
+
+        ``last`` is the solution of the previous window, if it shows the same picture.
+        """
+        n = self.pairs.of_two_events or 0
+        width = self.count.shape[1]
+        on = (self.pairs.column("on")[:n] & 1) == 1
+        pixel = self.pairs.column("y")[:n].astype(np.int64) * width + self.pairs.column("x")[:n]
+        key, nominal = 2 * pixel + on, np.where(on, 1.0, -1.0 - self.off)
+        threshold = _normalised(sums, self.radius)
+        for k in range(ROUNDS if not sums.turns else 1):
+            self.offset[:n] = nominal * (1.0 - threshold.ravel()[key])
+            self.pairs.arrays.offset.assign(self.offset)
+            if k:
+                self.solver.solve(SCALES[-1], steps=STEPS)
+            else:
+                residual, self.known = solve_rounds(self.solver, n, last)
+                if residual() > WORST_RESIDUAL:
+                    raise AmiwarpError(
+                        f"{self.work.recording.name}: the events do not show one picture, the brightness equations are "
+                        f"off by {residual():.2f} thresholds; calibrate again, or give a time in which the scene is "
+                        "still (start_us, length_us)"
+                    )
+            r = self.solver.residuals.values.numpy()[:n].astype(np.float64)
+            # ΔL = ±C: what the residual lacks of the assumed threshold, relative to that of the polarity
+            measured = threshold.ravel()[key] - r / nominal
+            total = _add(sums, key, measured, threshold)
+            threshold = _normalised(total, self.radius)
+        return replace(total, turns=sums.turns + self.turns)
+
+    def unrepeated(self) -> NDArray[np.float64]:
+        """Return how many events of each pixel do not repeat from turn to turn, shape (height, width).
+
+        A pixel with a low threshold has events where its neighbours see too little texture for a picture, but in every
+        turn. Infinity if there are less than two turns.
+        """
+        columns: list[Any] = [v if isinstance(v, np.ndarray) else v.numpy() for v in self._columns]
+        x, y, t, p = columns
+        events, encoder = Events(x, y, t, p), self.work.encoder
+        pixel = y.astype(np.int32) * np.int32(self.count.shape[1]) + x
+        found = unrepeated_counts(events, pixel, encoder, self.work.recording.events.size)
+        used = (len(bin_times(events, encoder)) - 1) // BINS // 2 * 2
+        return np.full(self.count.shape, np.inf) if found is None else found * (self.turns / used)
+
+    def reaches(self, pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which of the pixels see a change of brightness that every working pixel reports, shape (h, w)."""
+        from scipy.ndimage import map_coordinates
+
+        y, x = np.nonzero(pixels)
+        theta = np.arange(SILENT_ANGLES) * (TWO_PI / SILENT_ANGLES)
+        xy = np.repeat(np.stack([x, y], axis=1).astype(np.float32), SILENT_ANGLES, axis=0)
+        moved = np.asarray(self.work.model.compensate_points(xy, np.tile(theta, len(x))), np.float64)
+        at = ((moved - self.tiles.origin[0]) * self.tiles.density).T[::-1]
+        image = np.where(self.known(), self.solver.maps()[0], np.nan)
+        seen = map_coordinates(image, np.nan_to_num(at, nan=-1e9), order=0, cval=np.nan).reshape(-1, SILENT_ANGLES)
+        seen = np.where(np.isfinite(seen).any(axis=1)[:, None], seen, 0.0)
+        out = np.zeros_like(pixels)
+        out[y, x] = np.nanmax(seen, axis=1) - np.nanmin(seen, axis=1) >= SILENT_RANGE
+        return out
+
+
+def _add(sums: _Sums, key: NDArray[np.int64], measured: NDArray[np.float64], threshold: NDArray[np.float64]) -> _Sums:
+    """Return the sums with more pairs, whose weights fall with the distance from the pixel's threshold."""
+
+    def added(to: NDArray[Any], which: NDArray[np.bool_], weight: NDArray[np.float64] | None = None) -> NDArray[Any]:
+        return to + np.bincount(key[which], weight, to.size).reshape(to.shape)
+
+    holds = measured >= LEAST_CHANGE * np.maximum(threshold.ravel()[key], LEAST_CHANGE)  # not if NaN, off the picture
+    pairs, wrong = added(sums.pairs, np.ones_like(holds)), added(sums.wrong, ~holds)
+    valid = np.isfinite(measured)
+    for _ in range(3):
+        away = measured[valid] - threshold.ravel()[key[valid]]
+        weight = 1.0 / (1.0 + (away / SCALE) ** 2)
+        total = _Sums(
+            added(sums.weight, valid, weight), added(sums.value, valid, weight * measured[valid]),
+            added(sums.square, valid, (weight * away) ** 2), pairs, wrong, sums.turns,
+        )  # fmt: skip
+        threshold = total.threshold()
+    return total
+
+
+def _known(sums: _Sums) -> NDArray[np.bool_]:
+    """Return which thresholds are known: those with enough pairs, most of which are events of the scene."""
+    return (sums.pairs - sums.wrong >= LEAST_PAIRS) & (2 * sums.wrong < sums.pairs)
+
+
+def _radius(work: Reconstruction) -> int:
+    """Return half the width of the square over whose mean thresholds are compared: two orbits of the prism [px]."""
+    moved = border_displacements(work.model)
+    return 2 + math.ceil(2.0 * float(np.median(np.hypot(*moved.T)))) if len(moved) else 2
+
+
+def _normalised(sums: _Sums, radius: int) -> NDArray[np.float64]:
+    """Return thresholds divided by the mean of those around, shape (height, width, 2); 1 where they are not known.
+
+    Without the division, an error of the picture's contrast would grow from round to round.
+    """
+    from scipy.ndimage import uniform_filter
+
+    known = _known(sums)
+    value = np.where(known, sums.threshold(), 0.0)
+    size = (2 * radius + 1, 2 * radius + 1, 1)
+    near, share = (uniform_filter(np.float64(one), size, mode="nearest") for one in (value, known))
+    out = np.ones_like(value)
+    np.divide(value * share, near, out=out, where=known & (near > 1e-9))
+    return np.clip(out, *THRESHOLDS)
+
+
+def _excess(count: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return how many events a pixel has beyond the median of those around it, at least 1."""
+    from scipy.ndimage import median_filter
+
+    return np.maximum(count - median_filter(count, 5, mode="mirror"), 1.0)
+
+
+def _pixel_map(work: Reconstruction, sums: _Sums, hot_hz: NDArray[np.float64], dead: NDArray[np.bool_]) -> PixelMap:
+    """Return the map of the sums over all windows."""
+    relative, known = _normalised(sums, _radius(work)), _known(sums)
+    if not known.any():
+        raise AmiwarpError(
+            f"{work.recording.name}: no pixel has {LEAST_PAIRS} pairs of events of a polarity; give a longer "
+            "recording, or a scene with more texture"
+        )
+    # in every turn the pairs of a pixel meet the same errors of the picture, so only those of one turn are independent
+    std = np.sqrt(sums.square * max(1.0, sums.turns)) / np.maximum(sums.weight, 1e-9)
+    arrays = {}
+    for k, name in enumerate(("off", "on")):
+        at = known[..., k]
+        value = relative[..., k] / (np.median(relative[at, k]) if at.any() else 1.0)
+        at &= (value > THRESHOLDS[0]) & (value < THRESHOLDS[1])
+        arrays[name] = np.where(at, value, np.nan)
+        arrays[f"{name}_std"] = np.where(at, std[..., k], np.nan)
+        arrays[f"{name}_pairs"] = sums.pairs[..., k].astype(np.int32)
+    return PixelMap(**arrays, hot_hz=hot_hz.astype(np.float32), dead=dead)
