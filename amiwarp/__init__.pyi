@@ -73,6 +73,11 @@ from .io.formats import open_recording as open_recording
 from .io.native_writer import RecordingWriter as RecordingWriter
 from .io.native_writer import save_recording as save_recording
 from .io.pixel_map import PixelMap as PixelMap
+from .lens.board import Board as Board
+from .lens.board import Corners as Corners
+from .lens.calibration import BoardPose as BoardPose
+from .lens.calibration import LensCalibration as LensCalibration
+from .lens.calibration import calibrate_lens as calibrate_lens
 from .optics.camera import Camera as Camera
 from .optics.camera import CameraRotation as CameraRotation
 from .optics.camera import Distortion as Distortion

@@ -74,6 +74,16 @@ COMMANDS = {
         "Find the prism's parameters by contrast maximisation: those that make the image of warped events sharpest.",
         "amiwarp calibrate recording.h5 calibration.json --figure calibration.png",
     ),
+    "lens": Command(
+        "lens",
+        "Calibrate the camera's lens, and the prism with it, from a printed board that stands still.",
+        "amiwarp lens pose*.h5 camera.json --board 9x6 --square-mm 30 --calibration calibration.json",
+    ),
+    "board": Command(
+        "lens",
+        "Write a chessboard or ChArUco board in its true size, to print for a lens calibration.",
+        "amiwarp board board.pdf --board 9x6 --square-mm 30",
+    ),
     "compensate": Command(
         "calibration",
         "Compensate the prism's motion: move every event to its position without the prism.",

@@ -167,11 +167,14 @@ def numbers(text: str, count: int, name: str) -> tuple[float, ...]:
     return values
 
 
-def parse_size(text: str) -> tuple[int, int]:
-    """Convert a size such as ``640x480``. Raises :class:`AmiwarpError` if the text is not a size."""
+def parse_size(text: str, name: str = "--size", example: str = "640x480") -> tuple[int, int]:
+    """Convert a size such as ``640x480``. Raises :class:`AmiwarpError` if the text is not a size.
+
+    ``name`` is the option, and ``example`` a value of it, for the message.
+    """
     width, x, height = text.partition("x")
     if not (x and width.isdigit() and height.isdigit()):
-        raise AmiwarpError(f"--size {text!r} is not a size; write it like 640x480")
+        raise AmiwarpError(f"{name} {text!r} is not a size; write it like {example}")
     return int(width), int(height)
 
 

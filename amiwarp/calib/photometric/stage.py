@@ -48,7 +48,7 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
     Raises :class:`AmiwarpError` for too few pairs.
     """
     given = search.settings.photometric.sensor
-    found = _Equations(recording, search, given)
+    found = Equations(recording, search, given)
     answer = found.answers.search(found.start)
     if found.answers.cost.space.moving:
         answer = found.with_paths(answer)
@@ -71,7 +71,7 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
         if pause and not given.refractory_us:
             turn = find_refractory(found.coarse(), v, pause, direction)
             sensor = replace(given, refractory_us=turn / rad_per_us)
-            found = _Equations(recording, search, sensor)
+            found = Equations(recording, search, sensor)
             answer = found.answers.search(found.start)
             _, lag = timing_steps(found.answers.cost, answer.stage.x, direction)
         if lag:
@@ -103,12 +103,12 @@ LEAST_SILENCE = 0.05
 """Share of the time without events from which on it is reported: the turns are not whole."""
 
 
-class _Equations:
+class Equations:
     """Equations of the stage: pairs of events, a map, and the search on it."""
 
     def __init__(self, recording: Recording, search: Search, sensor: SensorTiming) -> None:
         """Collect the pairs and solve a first map. Raises :class:`AmiwarpError` for too few pairs."""
-        self._search, self._settings = search, replace(search.settings.photometric, sensor=sensor)
+        self.search, self._settings = search, replace(search.settings.photometric, sensor=sensor)
         self.pairs, tiles, self.silent_share = collect_pairs(recording, search, self._settings)
         best, full = search.best, search.full_space
         self._linear = tuple(n for n in search.settings.free or () if n in LINEAR_UNKNOWNS)
@@ -144,7 +144,7 @@ class _Equations:
         self.answers = AnswerSearch(cost, dict(best), left, self._settings, self._report, search.most_cost)
 
     def _report(self, share: float) -> None:
-        self._search.report("photometric", share)
+        self.search.report("photometric", share)
 
     def cost_on(self, tiles: Tiles, space: ParameterSpace) -> Cost:
         """Return a cost with a new map on tiles, which must be solved yet."""
@@ -152,13 +152,13 @@ class _Equations:
             self.pairs, tiles, off_excess=None if "off_ratio" in self._linear else self._off_excess,
             with_leak="leak" in self._linear, middle_us=space.middle_us,
         )  # fmt: skip
-        return Cost(space, brightness, self._settings.steps, self._search.meanwhile)
+        return Cost(space, brightness, self._settings.steps, self.search.meanwhile)
 
     def _solved_on(self, tiles: Tiles) -> Cost:
         """Return a cost with a new map on tiles, solved at the sharpness stage's result."""
         space = self.answers.cost.space
         cost = self.cost_on(tiles, space)
-        cost.warm_up(space.to_vector({**space.start, **self._search.best}))
+        cost.warm_up(space.to_vector({**space.start, **self.search.best}))
         return cost
 
     def coarse(self) -> AnswerSearch:

@@ -1,0 +1,495 @@
+"""Calibration of a lens from recordings of a board that stands still: prism, pictures, corners, lens, and again.
+
+The prism is found first with a rough lens, by sharpness and then photometrically from all poses together. With it, each
+pose gives a picture of the board, and the pictures' corners the lens. As compensation itself uses the lens, pictures
+and corners are made again until the lens no longer changes them. The orbit has f·δ pixels, so focal length and
+deflection cannot be told apart in one recording: the board's known size separates them.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.calib.calibration import prepare
+from amiwarp.calib.parameters import ParameterSpace, like_size, nominal
+from amiwarp.calib.photometric.stage import Equations
+from amiwarp.calib.result import Calibration
+from amiwarp.calib.settings import PhotometricSettings, Settings
+from amiwarp.calib.sharpness import Search
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
+from amiwarp.lens.board import Board, Corners
+from amiwarp.lens.corner_fit import Fit, fit_lens, tilt_of
+from amiwarp.lens.poses import Pose, still_poses
+from amiwarp.optics.camera import Camera, Fisheye
+from amiwarp.optics.models import ExactModel, predicted_error
+from amiwarp.optics.prism import Prism
+from amiwarp.progress import Progress, silent
+from amiwarp.reconstruction.picture import Reconstruction
+from amiwarp.validation import guarded, instance, real
+
+Vector = NDArray[np.float64]
+
+USUAL_FOV = math.radians(60.0)
+"""Horizontal field of view that is assumed if none is known [rad]."""
+LEAST_POSES = 4
+"""Smallest number of poses from which a lens is calibrated."""
+SMOOTHNESS = 0.02
+"""Weight of the pictures' smoothness prior. In 24 pictures of boards 0.004 to 0.1 gave the same corners within 0.01 px.
+"""
+FIRST_POSES = 6
+"""Number of poses whose pictures give the first lens, with which the pictures of all poses are made."""
+MOST_PASSES, ENOUGH_PX = 4, 0.08
+"""Largest number of times that the pictures are made, and the change of the compensation by a new lens from which on
+they are made again [px rms]. A change of 0.36 px moved the principal point by 1.5 px, one of 0.05 px by 0.1 px."""
+SIZES = (0.6, 1.6)
+"""Range of the prism's size that is searched, as a multiple of a nominal one. The rough lens may be wrong by 20 % and
+the nominal prism by 20 %. A wider range lets an orbit as large as a square of the board match another square."""
+SEARCHED = 3
+"""Number of poses in which the prism is searched by sharpness. Each answer is tried on the others."""
+PAIRS = 600_000
+"""Number of pairs of events of all poses together, and at most a sixth of it in one pose."""
+MOST_STEPS, STEPS_OF_ALL, TOLERANCE_PX, LARGEST_GAIN = 10, 4, 0.002, 5.0
+"""Largest number of steps towards size and phase of the prism, and to see whether its other parameters differ from
+their nominal values; length of a step that ends them [px]; and the largest factor by which a step is lengthened,
+because the weights of outliers make Gauss-Newton steps too short."""
+LARGEST_COST = 0.35
+"""Largest photometric cost of a pose, relative to that without a map. Still boards leave 0.05 to 0.2."""
+BAD_POSE, LEAST_BAD_PX = 3.0, 0.3
+"""A pose is left out if its corners miss by this multiple of the median of all poses, and by this much [px rms]."""
+CERTAIN = 5.0
+"""Ratio of a parameter's distance from its nominal value to its standard deviation from which on it is believed."""
+LARGEST_DEVIATION = {"index": 0.02, "tilt": math.radians(0.5)}
+"""Standard deviation above which an index or a tilt [rad] counts as not determined."""
+REGIONS = (("upper", "middle", "lower"), ("left", "centre", "right"))
+"""Names of the nine regions of the image in which corners are counted."""
+STEEP = math.radians(15.0)
+"""Tilt of a board that tells focal length from distance [rad]."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPose:
+    """One pose of the board, and how well the calibrated lens explains it."""
+
+    name: str
+    """Recording, with the time span if it has several."""
+    corners: Corners
+    """Corners in the picture [px]."""
+    residuals: NDArray[np.float64]
+    """Predicted minus seen position of each corner [px], shape ``(n, 2)``."""
+    rotation: NDArray[np.float64]
+    """Rotation vector from the board's frame to the camera's [rad], shape ``(3,)``."""
+    translation: NDArray[np.float64]
+    """Position of the board's first inner corner in the camera's frame [m], shape ``(3,)``."""
+    picture: NDArray[np.uint8]
+    """Picture in which the corners were found, shape ``(height, width)``."""
+
+    @property
+    def rms(self) -> float:
+        """Distance of predicted and seen corners [px rms]."""
+        return float(np.sqrt((self.residuals**2).sum(axis=1).mean()))
+
+
+@dataclass(frozen=True, eq=False)
+class LensCalibration:
+    """Calibrated lens and prism, with the evidence."""
+
+    camera: Camera
+    """The camera."""
+    uncertainty: Mapping[str, float]
+    """Standard deviations of the free parameters of the camera by name: px for fx, fy, cx and cy."""
+    prism: Calibration
+    """Calibration of the prism with this camera, for ``compensate`` and all else."""
+    poses: tuple[BoardPose, ...]
+    """Poses that the lens was fitted to."""
+    left_out: Mapping[str, str]
+    """Reason by name of each pose that was left out."""
+    notes: tuple[str, ...]
+    """What the recordings do not determine, one sentence each."""
+    advice: tuple[str, ...]
+    """What would improve the calibration most, one sentence each; the most helpful first."""
+    seconds: float
+    """Computing time [s]."""
+
+    @property
+    def rms(self) -> float:
+        """Distance of predicted and seen corners over all poses [px rms]."""
+        return float(np.sqrt(np.concatenate([(p.residuals**2).sum(axis=1) for p in self.poses]).mean()))
+
+    @property
+    def coverage(self) -> NDArray[np.int64]:
+        """Number of corners in each of the nine regions of the image, shape ``(3, 3)``."""
+        return coverage_of([pose.corners for pose in self.poses], self.camera.width, self.camera.height)
+
+
+def coverage_of(seen: Sequence[Corners], width: int, height: int) -> NDArray[np.int64]:
+    """Return the number of corners in each third of the image's rows and columns, shape (3, 3)."""
+    xy = np.concatenate([corners.xy for corners in seen])
+    ranges = [[-0.5, height - 0.5], [-0.5, width - 0.5]]
+    return np.histogram2d(xy[:, 1], xy[:, 0], bins=3, range=ranges)[0].astype(np.int64)
+
+
+@guarded
+def calibrate_lens(
+    recordings: Recording | Sequence[Recording],
+    board: Board,
+    *,
+    fov: float | None = None,
+    fisheye: bool = False,
+    device: Any = "cpu",
+    progress: Progress | None = None,
+) -> LensCalibration:
+    """Calibrate a camera's lens, and the prism with it, from recordings of a board that stands still.
+
+    Parameters
+    ----------
+    recordings : Recording or sequence of Recording
+        One recording per pose of the board, or recordings in which the board is moved and held still in turn, all with
+        the same camera, prism and encoder. A prism that a recording names serves as a start and gives the index.
+    board : Board
+        The board.
+    fov : float, optional
+        Rough horizontal field of view [rad], right within 20 %; by default that of the recordings' camera, else 60 deg.
+    fisheye : bool, optional
+        Whether to fit OpenCV's fisheye model instead of the radial-tangential one.
+    device : str or warp.Device, optional
+        Device to compute on.
+    progress : Progress, optional
+        Called with the current step and the finished share.
+
+    Returns
+    -------
+    LensCalibration
+        Camera, prism, poses, and what is missing.
+
+    Raises
+    ------
+    AmiwarpError
+        If fewer than four poses show the board, the board has another size or is mirrored, two boards are seen, or the
+        poses do not determine the focal length.
+
+    Notes
+    -----
+    The corners' fit is Zhang's (2000) with the lens models of OpenCV. ``docs/how-to/lens.md`` describes the steps and
+    gives measured errors.
+
+    Examples
+    --------
+    >>> board = amiwarp.Board(9, 6, 0.03)
+    >>> amiwarp.calibrate_lens([], board)
+    Traceback (most recent call last):
+    ...
+    amiwarp.AmiwarpError: no recordings are given; give at least one
+    """
+    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    instance(board, Board, "board")
+    for recording in given:
+        instance(recording, Recording, "recording")
+    if not given:
+        raise AmiwarpError("no recordings are given; give at least one")
+    sizes = {recording.events.size for recording in given}
+    if len(sizes) > 1:
+        raise AmiwarpError(f"the recordings have sensors of {sorted(sizes)} px; give recordings of one camera")
+    camera = _first_camera(given[0], fov, fisheye=fisheye)
+    return LensWork(board, camera, still_poses(given), device, progress or silent).run()
+
+
+def _first_camera(recording: Recording, fov: float | None, *, fisheye: bool) -> Camera:
+    """Return the camera to start with: without distortion, its principal point in the middle."""
+    width, height = recording.events.size
+    if fov is None:
+        fov = USUAL_FOV if recording.camera is None else 2.0 * math.atan(0.5 * width / recording.camera.fx)
+        if recording.camera is not None and isinstance(recording.camera.distortion, Fisheye):
+            fov = width / recording.camera.fx
+    fov = real(fov, "fov", math.radians(1.0), math.radians(200.0 if fisheye else 150.0), " rad")
+    if not fisheye:
+        return Camera.from_fov(width, height, fov)
+    focal = width / fov  # of an equidistant lens
+    return Camera(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0, Fisheye())
+
+
+@dataclass
+class LensWork:
+    """Steps of a lens calibration, to be read from top to bottom."""
+
+    board: Board
+    camera: Camera
+    """Camera, rough at first."""
+    poses: list[Pose]
+    device: Any
+    progress: Progress
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Reason by name of each pose that was left out."""
+
+    def run(self) -> LensCalibration:
+        """Calibrate; raise :class:`AmiwarpError` as :func:`calibrate_lens` does."""
+        began = time.perf_counter()
+        self._check_count(len(self.poses), "are given")
+        values = self._first_prism()
+        joint = JointPrism(self._equations(values), self.full, values)
+        shown, fit = None, None
+        for k in range(MOST_PASSES):
+            self.progress("prism", (k + 0.1) / (MOST_PASSES + 1))
+            values = joint.refine(self.camera, ("apex", "phase"))
+            model = joint.model(self.camera, values)
+            if k > 1 and shown is not None and predicted_error(model, shown, grid=12).rms < ENOUGH_PX:
+                break
+            shown, names = model, [name for name in joint.equations if k == 1 or name not in self.left_out]
+            first = names[:: max(1, len(names) // FIRST_POSES)]
+            pictures = self._pictures(model, names if k else first, k, turns=1.0 if k else 0.5)
+            fit, seen = self._lens(pictures)
+            self.camera = fit.camera
+        assert fit is not None
+        values, uncertainty, notes = self._whole_prism(joint, fit)
+        self._check_costs(joint)
+        for name, corners in seen.items():
+            if self.board.has_another(pictures[name], corners):
+                raise AmiwarpError(f"{name}: two boards are seen; leave one of them in the picture")
+        used = [
+            BoardPose(n, c, r, v[:3], v[3:], pictures[n])
+            for (n, c), r, v in zip(seen.items(), fit.residuals, fit.poses, strict=True)
+        ]
+        if fit.left_out:
+            notes = (f"the corners do not determine {', '.join(fit.left_out)}, which stay 0", *notes)
+        seconds = time.perf_counter() - began
+        prism = joint.calibration(self.camera, values, uncertainty, seconds)
+        return LensCalibration(
+            fit.camera, fit.deviations, prism, tuple(used), self.left_out, notes, advice_on(used, fit), seconds
+        )
+
+    def _check_count(self, count: int, what: str) -> None:
+        if count < LEAST_POSES:
+            reasons = "".join(f"; {name}: {why}" for name, why in self.left_out.items())
+            raise AmiwarpError(
+                f"{count} poses of the board {what}, but a lens needs {LEAST_POSES} at least, better 12, tilted in "
+                f"different directions{reasons}"
+            )
+
+    def _first_prism(self) -> dict[str, float]:
+        """Return the prism's parameters by sharpness: the answer of one pose that is best for all poses searched."""
+        chosen = self.poses[:: max(1, len(self.poses) // SEARCHED)][:SEARCHED]
+        searches = [self._search(pose, ("apex", "phase"), {}) for pose in chosen]
+        for k, search in enumerate(searches):
+            self.progress("search", 0.1 * k / len(searches) / (MOST_PASSES + 1))
+            search.run()
+        answers = [dict(search.best) for search in searches]
+        totals = [sum(s.fine.measure(a)[0] / s.score for s in searches) for a in answers]
+        return answers[int(np.argmax(totals))]
+
+    def _search(self, pose: Pose, free: tuple[str, ...], start: Mapping[str, float]) -> Search:
+        recording = replace(pose.recording, camera=self.camera)
+        prism = recording.prism
+        bounds = {"apex": (SIZES[0] * prism.apex, SIZES[1] * prism.apex)} if isinstance(prism, Prism) else {}
+        pairs = min(PAIRS // 6, PAIRS // len(self.poses))
+        settings = Settings(
+            model="exact", free=free, start=start, bounds=bounds, photometric=PhotometricSettings(pairs=pairs)
+        )
+        return prepare(recording, settings, device=self.device)[0]
+
+    def _equations(self, values: Mapping[str, float]) -> dict[str, Equations]:
+        """Return the photometric equations of every pose, by name; a pose without enough events is left out."""
+        out = {}
+        for k, pose in enumerate(self.poses):
+            self.progress("events", (0.1 + 0.4 * k / len(self.poses)) / (MOST_PASSES + 1))
+            search = self._search(pose, ALL_FREE, values)
+            self.full, search.best = search.full_space, dict(search.full_space.start) | dict(values)
+            search.full_space = self.full.without(like_size(self.full.names))  # those would ask for a coarse map
+            try:
+                out[pose.name] = Equations(pose.recording, search, search.settings.photometric.sensor)
+            except AmiwarpError as error:
+                self.left_out[pose.name] = str(error).removeprefix(f"{pose.recording.name}: ")
+        self._check_count(len(out), "have enough events")
+        return out
+
+    def _pictures(
+        self, model: ExactModel, names: Sequence[str], done: int, *, turns: float
+    ) -> dict[str, NDArray[np.uint8]]:
+        """Return pictures of some poses, each from some turns of the prism, by name. ``done`` passes are over."""
+        out = {}
+        recordings = {pose.name: pose.recording for pose in self.poses}
+        for k, name in enumerate(names):
+            share = 0.2 + 0.8 * k / len(names)
+            self.progress(f"picture {k + 1} of {len(names)}", (done + share) / (MOST_PASSES + 1))
+            work = Reconstruction(recordings[name], model=model, device=self.device)
+            work.smoothness = SMOOTHNESS
+            log = work.window(*work.span(turns=turns)).to_host().log
+            low, high = np.percentile(log, (1.0, 99.0))
+            out[name] = np.clip((log - low) / max(high - low, 1e-6) * 255.0, 0.0, 255.0).astype(np.uint8)
+        return out
+
+    def _lens(self, pictures: dict[str, NDArray[np.uint8]]) -> tuple[Fit, dict[str, Corners]]:
+        """Return the lens that the corners of the pictures determine, and the corners by name of the pose."""
+        found = {name: self.board.find(picture) for name, picture in pictures.items()}
+        seen = {name: corners for name, corners in found.items() if corners is not None}
+        for name, corners in found.items():
+            if corners is None:
+                self.left_out[name] = self.board.missing(pictures[name])
+        self._check_count(len(seen), "are seen")
+        while True:
+            fit = fit_lens(self.camera, self.board, list(seen.values()))
+            rms = {n: float(np.sqrt((r**2).sum(axis=1).mean())) for n, r in zip(seen, fit.residuals, strict=True)}
+            worst = max(rms, key=lambda name: rms[name])
+            usual = float(np.median([*rms.values()]))
+            if rms[worst] <= max(BAD_POSE * usual, LEAST_BAD_PX):
+                break
+            self.left_out[worst] = f"its corners miss by {rms[worst]:.2f} px rms, those of the others by {usual:.2f} px"
+            del seen[worst]
+            self._check_count(len(seen), "fit together")
+        return fit, seen
+
+    def _check_costs(self, joint: JointPrism) -> None:
+        bad = {name: cost for name, cost in joint.costs.items() if cost > LARGEST_COST}
+        if 2 * len(bad) > len(joint.costs):
+            raise AmiwarpError(
+                f"one prism does not explain the events of the poses ({', '.join(bad)}): the board moves in them, or "
+                "the encoder's zero changed between them; hold the board still, and use an index pulse"
+            )
+
+    def _whole_prism(self, joint: JointPrism, fit: Fit) -> tuple[dict[str, float], dict[str, float], tuple[str, ...]]:
+        """Return all parameters of the prism, their standard deviations, and what the events do not determine.
+
+        Index and tilt are only freed if they differ from their nominal values with certainty.
+        """
+        values, deviations, notes, free = dict(joint.values), joint.deviations(fit), list[str](), ["apex", "phase"]
+        whole = joint.refine(self.camera, ALL_FREE, STEPS_OF_ALL)
+        off = joint.deviations(fit)
+        for group, what in ((("index",), "index"), (("tilt_x", "tilt_y"), "tilt")):
+            if max(off[n] for n in group) > LARGEST_DEVIATION[what]:
+                notes.append(f"the {what} of the prism is not determined, and stays as given")
+            elif any(abs(whole[n] - values[n]) > CERTAIN * off[n] for n in group):
+                free += group
+        joint.values = values
+        if len(free) > 2:
+            values = joint.refine(self.camera, tuple(n for n in ALL_FREE if n in free))
+            deviations = joint.deviations(fit)
+        return values, deviations, tuple(notes)
+
+
+ALL_FREE = ("apex", "phase", "tilt_x", "tilt_y", "index")
+"""Parameters of the prism that poses can determine together."""
+
+
+class JointPrism:
+    """Photometric fit of one prism to the events of all poses."""
+
+    def __init__(self, equations: Mapping[str, Equations], full: ParameterSpace, values: Mapping[str, float]) -> None:
+        """Start at ``values``; ``full`` is the space of all parameters."""
+        self.equations, self.full = equations, full
+        self.values = dict(full.start) | dict(values)
+        """Present values of all parameters."""
+        self.costs: dict[str, float] = {}
+        """Cost of each pose relative to that without a map, by name."""
+        self.space: ParameterSpace
+        """Space of the last fit, and its vector and covariance."""
+        self.v, self.covariance = np.zeros(0), np.zeros((0, 0))
+
+    def model(self, camera: Camera, values: Mapping[str, float]) -> ExactModel:
+        """Return the optical model of some parameter values."""
+        return ExactModel.from_values(camera, self.full.prism, values)
+
+    def refine(self, camera: Camera, names: tuple[str, ...], most: int = MOST_STEPS) -> dict[str, float]:
+        """Fit the parameters ``names`` in at most ``most`` steps from the present values. Return all values."""
+        costs = {name: equations.answers.cost for name, equations in self.equations.items()}
+        for cost in costs.values():
+            cost.space = replace(self.full, camera=camera, names=names).holding(self.values)
+        self.space = space = next(iter(costs.values())).space
+        v, last, gain, parts = space.to_vector(self.values), np.zeros(0), 1.0, list[Vector]()
+        for _ in range(most):
+            hessian, gradient, parts = np.zeros((len(v), len(v))), np.zeros(len(v)), []
+            for cost in costs.values():
+                cost.predict(v)
+                cost.residuals(v)
+                slopes = cost.slopes(v, with_parts=True)
+                hessian, gradient = hessian + slopes.hessian, gradient + slopes.gradient
+                parts.append(slopes.parts)
+            step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(len(v)), gradient)
+            if len(last):  # successive steps in one direction shrink by the same factor: take their sum
+                left = 1.0 - (1.0 - float(step @ last) / max(float(last @ last), 1e-12)) / gain
+                gain = 1.0 / (1.0 - min(max(left, 0.0), 1.0 - 1.0 / LARGEST_GAIN))
+            last = step
+            v = v + np.clip(gain * step, -1.0, 1.0)
+            if float(np.abs(step).max()) < TOLERANCE_PX:
+                break
+        scatter = np.concatenate(parts, axis=1)
+        inverse = np.linalg.pinv(hessian)
+        self.v, self.covariance = v, inverse @ (scatter @ scatter.T) @ inverse
+        self.costs = {name: cost.mean() for name, cost in costs.items()}
+        self.values = {**self.values, **space.to_values(v)}
+        return dict(self.values)
+
+    def deviations(self, fit: Fit) -> dict[str, float]:
+        """Return the standard deviations of the fitted parameters, with those that the lens's own cause."""
+        names = fit.names
+        at = self._displacements(fit.camera, self.v)
+
+        def by_prism(k: int) -> Vector:
+            step = np.zeros(len(self.v))
+            step[k] = 0.05
+            return (self._displacements(fit.camera, self.v + step) - at) / 0.05
+
+        def by_lens(name: str) -> Vector:
+            step = max(fit.deviations[name], 1e-9)
+            if name in ("fx", "fy", "cx", "cy"):
+                camera = replace(fit.camera, **{name: getattr(fit.camera, name) + step})  # type: ignore[arg-type]
+            else:
+                lens: Any = fit.camera.distortion
+                camera = replace(fit.camera, distortion=replace(lens, **{name: getattr(lens, name) + step}))
+            return (self._displacements(camera, self.v) - at) / step
+
+        prism = np.stack([by_prism(k) for k in range(len(self.v))], axis=1)
+        lens = np.stack([by_lens(name) for name in names], axis=1)
+        seen = np.isfinite(prism).all(axis=1) & np.isfinite(lens).all(axis=1)
+        follows = -np.linalg.lstsq(prism[seen], lens[seen], rcond=None)[0]
+        return self.space.deviations(self.v, self.covariance + follows @ fit.covariance @ follows.T)
+
+    def _displacements(self, camera: Camera, v: Vector) -> Vector:
+        """Return the displacements of a grid of pixels over a turn [px], without their means, flattened.
+
+        The mean of a pixel moves its picture, not its events against each other.
+        """
+        space = replace(self.space, camera=camera)
+        x, y = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 7))
+        xy, theta = np.stack([x.ravel(), y.ravel()], axis=1), np.linspace(0.0, math.tau, 12, endpoint=False)
+        points, angles = np.repeat(xy, 12, axis=0).astype(np.float32), np.tile(theta, len(xy)).astype(np.float32)
+        moved = space.build(space.to_values(v)).compensate_points(points, angles)
+        away = (np.asarray(moved, np.float64) - points).reshape(len(xy), 12, 2)
+        return np.asarray((away - away.mean(axis=1, keepdims=True)).ravel())
+
+    def calibration(
+        self, camera: Camera, values: Mapping[str, float], uncertainty: Mapping[str, float], seconds: float
+    ) -> Calibration:
+        """Return the result as a calibration of the prism with ``camera``."""
+        search = next(iter(self.equations.values())).search
+        found = {n: values[n] for n in values if n in ALL_FREE}
+        space = replace(self.full, camera=camera)
+        return Calibration(
+            model_name="exact", camera=camera, prism=nominal(space.prism), parameters=found,
+            uncertainty=dict(uncertainty), free=self.space.names, sharpness_name=search.settings.sharpness.value,
+            sharpness_before=search.fine.measure({**search.best, "apex": 0.0})[0],
+            sharpness_after=search.sharpness_in(space, found), stages=(), events=len(search.calibration_events.events),
+            seconds=seconds,
+        )  # fmt: skip
+
+
+def advice_on(poses: Sequence[BoardPose], fit: Fit) -> tuple[str, ...]:
+    """Return what would improve a calibration most, one sentence each."""
+    said = []
+    tilts = [tilt_of(np.concatenate([p.rotation, p.translation])) for p in poses]
+    if np.median(tilts) < STEEP:
+        said.append(
+            f"tilt the board more: half of the poses are tilted by less than {math.degrees(np.median(tilts)):.0f} deg"
+        )
+    counts = coverage_of([p.corners for p in poses], fit.camera.width, fit.camera.height)
+    empty = [f"{REGIONS[0][a]} {REGIONS[1][b]}" for a, b in np.argwhere(counts == 0)]
+    if empty:
+        said.append(f"no corner lies in the {', '.join(empty)} of the image: hold the board there")
+    if len(poses) < 12:
+        said.append(f"record more poses: {len(poses)} were used, and 12 halve the deviation of four")
+    return tuple(said)

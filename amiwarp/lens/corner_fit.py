@@ -1,0 +1,215 @@
+"""Fit of a lens and of the poses of a board to the corners that were seen: bundle adjustment with robust weights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.lens.board import Board, Corners, opencv
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential, coefficients
+
+Vector = NDArray[np.float64]
+
+INTRINSICS = ("fx", "fy", "cx", "cy")
+"""Names of the intrinsics, in the order of a fit's vector, which the distortion's coefficients follow."""
+GROUPS = {
+    RadialTangential: (("k1",), ("k2",), ("p1", "p2"), ("k3",), ("k4", "k5", "k6")),
+    Fisheye: (("k1",), ("k2",), ("k3",), ("k4",)),
+}
+"""Coefficients of each kind of lens, in the order in which they are tried."""
+LEAST_CHANCE = 0.001
+"""Probability, by the F-test, that noise alone gives as large a gain: coefficients whose gain is likelier are left
+out."""
+LARGEST_FOCAL_DEVIATION = 0.005
+"""Largest relative standard deviation of the focal length of an answer."""
+UNDETERMINED, TILT = "the poses do not determine the focal length", "tilt it by 20 to 40 deg in different directions"
+HUBER = 2.0
+"""Residual from which on a corner gets less weight [standard deviations]."""
+ROUNDS, MOST_STEPS = 3, 60
+"""Number of rounds of robust weights, and the largest number of evaluations in each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Lens and poses that explain the corners best."""
+
+    camera: Camera
+    """Camera of the fit."""
+    poses: Vector
+    """Rotation vector and translation [m] from the board's frame to the camera's, per pose, shape ``(poses, 6)``."""
+    names: tuple[str, ...]
+    """Free parameters of the lens."""
+    covariance: Vector
+    """Covariance of the free parameters of the lens, in px for :data:`INTRINSICS`, shape ``(names, names)``."""
+    residuals: tuple[Vector, ...]
+    """Predicted minus seen position of every corner per pose [px], shape ``(n, 2)`` each."""
+    cost: float
+    """Weighted sum of squares [px²]."""
+    freedom: int
+    """Number of coordinates of corners minus that of parameters."""
+    left_out: tuple[str, ...] = ()
+    """Coefficients that the corners do not determine."""
+
+    @property
+    def deviations(self) -> dict[str, float]:
+        """Standard deviations of the free parameters of the lens, by name."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    @property
+    def rms(self) -> float:
+        """Distance of predicted and seen corners [px rms]."""
+        return float(np.sqrt(np.concatenate([(r**2).sum(axis=1) for r in self.residuals]).mean()))
+
+
+class Projection:
+    """Projection of points of a board by a lens, with its derivatives: OpenCV's formulas."""
+
+    def __init__(self, camera: Camera) -> None:
+        self._matrix = camera.to_opencv()[0]
+        given = np.array([*coefficients(camera.distortion or RadialTangential()).values()])
+        self._fisheye = isinstance(camera.distortion, Fisheye)
+        self._given = given if self._fisheye else np.concatenate([given, np.zeros(8 - len(given))])
+
+    def of(self, pose: Vector, points: Vector) -> tuple[Vector, Vector]:
+        """Return the pixels of points, shape (n, 2), and their derivatives, shape (n, 2, 4 + coefficients + 6).
+
+        ``pose``: rotation vector and translation [m]; ``points``: places in the board's frame [m], shape (n, 3). The
+        derivatives are those by the intrinsics, the coefficients in the lens's order, and the pose.
+        """
+        cv2, turn, shift = opencv(), pose[:3].reshape(3, 1), pose[3:].reshape(3, 1)
+        if self._fisheye:
+            xy, by = cv2.fisheye.projectPoints(points.reshape(-1, 1, 3), turn, shift, self._matrix, self._given)
+            by = by[:, :14]
+        else:
+            xy, by = cv2.projectPoints(points, turn, shift, self._matrix, self._given)
+            by = np.roll(by, -6, axis=1)
+        return xy.reshape(-1, 2), np.asarray(by).reshape(len(points), 2, -1)
+
+
+def first_pose(camera: Camera, board: Board, corners: Corners) -> Vector:
+    """Return the pose of a board from its corners and a known camera: rotation vector and translation [m]."""
+    cv2, points = opencv(), board.points[corners.ids]
+    rays = np.asarray(camera.pixels_to_rays(corners.xy), np.float64)
+    flat = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
+    flags = cv2.SOLVEPNP_IPPE
+    _, turns, shifts, _ = cv2.solvePnPGeneric(points, flat, np.eye(3), None, flags=flags)
+    found = [np.concatenate([a.ravel(), b.ravel()]) for a, b in zip(turns, shifts, strict=True)]
+    lens = Projection(camera)
+    return min(found, key=lambda pose: float(((lens.of(pose, points)[0] - corners.xy) ** 2).sum()))
+
+
+def fit_lens(camera: Camera, board: Board, seen: Sequence[Corners]) -> Fit:
+    """Return the lens with as many coefficients as the corners determine, and the poses of the board.
+
+    ``camera`` is the start. A lens without distortion starts as a radial-tangential one. Raises :class:`AmiwarpError`
+    if the poses do not determine the focal length.
+    """
+    lens = type(camera.distortion or RadialTangential())
+    rough = replace(camera, distortion=lens())
+    # a wrong focal length can turn over a pose that is nearly frontal: with a better one the poses are found again
+    for _ in range(2):
+        best = _fit(rough, np.array([first_pose(rough, board, corners) for corners in seen]), board, seen, INTRINSICS)
+        rough = best.camera
+    names, left_out = INTRINSICS, list[str]()
+    for group in GROUPS[lens]:
+        if group[0] == "k4" and len(group) > 1 and "k3" not in names:
+            left_out += group  # the rational model is for lenses that a third coefficient does not describe
+            continue
+        more = _fit(best.camera, best.poses, board, seen, (*names, *group))
+        if _gain_is_real(best, more, len(group)):
+            best, names = more, (*names, *group)
+        else:
+            left_out += group
+    off = best.deviations["fx"] / best.camera.fx
+    if not off <= LARGEST_FOCAL_DEVIATION:
+        tilts = [math.degrees(tilt_of(pose)) for pose in best.poses]
+        raise AmiwarpError(
+            f"{UNDETERMINED} ({100.0 * off:.1f} % standard deviation): the board is tilted by {min(tilts):.0f} to "
+            f"{max(tilts):.0f} deg; {TILT}"
+        )
+    return replace(best, left_out=tuple(left_out))
+
+
+def _gain_is_real(less: Fit, more: Fit, count: int) -> bool:
+    """Return whether ``count`` more parameters explain more than noise alone would: F-test."""
+    from scipy.stats import f
+
+    if more.freedom <= 0 or more.cost <= 0.0:
+        return False
+    ratio = (less.cost - more.cost) / count / (more.cost / more.freedom)
+    return bool(f.sf(max(ratio, 0.0), count, more.freedom) < LEAST_CHANCE)
+
+
+def _fit(camera: Camera, poses: Vector, board: Board, seen: Sequence[Corners], names: tuple[str, ...]) -> Fit:
+    """Return the fit of the parameters ``names`` of the lens, and of all poses, from a start."""
+    from scipy.optimize import least_squares
+
+    kind = type(camera.distortion)
+    all_names = (*INTRINSICS, *(field.name for field in fields(kind)))  # type: ignore[arg-type]
+    free, count = [all_names.index(n) for n in names], len(names)
+    points, xy = [board.points[c.ids] for c in seen], np.concatenate([c.xy for c in seen])
+    ends = np.cumsum([2 * len(p) for p in points]).tolist()
+
+    def lens_of(v: Vector) -> Camera:
+        values = dict(zip(names, v.tolist(), strict=False))
+        bends = {n: values.pop(n) for n in names if n not in INTRINSICS}
+        return replace(camera, **values, distortion=replace(camera.distortion, **bends))  # type: ignore[type-var]
+
+    @lru_cache(maxsize=1)  # residuals and their derivatives are asked for at the same place in turn
+    def projected(v: bytes) -> list[tuple[Vector, Vector]]:
+        at = np.frombuffer(v)
+        lens = Projection(lens_of(at[:count]))
+        return [lens.of(pose, p) for pose, p in zip(at[count:].reshape(-1, 6), points, strict=True)]
+
+    def residuals(v: Vector) -> Vector:
+        return np.asarray((np.concatenate([found for found, _ in projected(v.tobytes())]) - xy).ravel())
+
+    def jacobian(v: Vector) -> Vector:
+        out = np.zeros((ends[-1], len(v)))
+        for k, (_, by) in enumerate(projected(v.tobytes())):
+            rows, columns = slice(([0, *ends])[k], ends[k]), slice(count + 6 * k, count + 6 * k + 6)
+            flat = by.reshape(-1, by.shape[2])
+            out[rows, :count], out[rows, columns] = flat[:, free], flat[:, len(all_names) :]
+        return out
+
+    def weighted(v: Vector, root: Vector) -> Vector:
+        return root * residuals(v)
+
+    def weighted_jacobian(v: Vector, root: Vector) -> Vector:
+        return root[:, None] * jacobian(v)
+
+    v = np.concatenate([[getattr(camera if n in INTRINSICS else camera.distortion, n) for n in names], poses.ravel()])
+    weight = np.ones(2 * len(xy))
+    for _ in range(ROUNDS):
+        try:
+            v = least_squares(
+                weighted, v, weighted_jacobian, args=(np.sqrt(weight),), method="lm", x_scale="jac", ftol=1e-7,
+                max_nfev=MOST_STEPS,
+            ).x  # fmt: skip
+        except AmiwarpError as error:  # a lens that cannot be
+            raise AmiwarpError(f"{UNDETERMINED}: the fit runs away; {TILT}") from error
+        r = residuals(v)
+        limit = HUBER * max(1.4826 * float(np.median(np.abs(r))), 1e-6)
+        weight = np.minimum(1.0, limit / np.maximum(np.abs(r), 1e-12))
+    j = jacobian(v) * np.sqrt(weight)[:, None]
+    freedom, cost = len(r) - len(v), float((weight * r**2).sum())
+    spread = np.linalg.pinv(j.T @ j) * cost / max(freedom, 1)
+    return Fit(
+        lens_of(v[:count]), v[count:].reshape(-1, 6), names, spread[:count, :count],
+        tuple(np.split(r.reshape(-1, 2), [end // 2 for end in ends[:-1]])), cost, freedom,
+    )  # fmt: skip
+
+
+def tilt_of(pose: Vector) -> float:
+    """Return the angle between a board's normal and the optical axis [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    normal: Any = Rotation.from_rotvec(pose[:3]).apply([0.0, 0.0, 1.0])
+    return float(np.arccos(np.clip(abs(normal[2]), 0.0, 1.0)))

@@ -1,0 +1,102 @@
+"""Time spans in which a board and the camera stand still: the poses of a lens calibration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.calib.first_guess import ANGLE_RANGES, CELL
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.recording import MemoryEvents, Recording
+
+LEAST_TURNS, MOST_TURNS = 1.5, 3.0
+"""Shortest still span, and the longest part of one that is used, from its middle [turns]."""
+LEAST_REPETITION = 0.6
+"""Smallest correlation of the events of two successive turns while nothing moves. A still board's is 0.8 to 0.95, and
+that of a board that moves by 4 px in a turn under 0.5."""
+MOST_POSES = 40
+"""Largest number of poses that are used. More would lengthen the work, and hardly improve the lens."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Span of a recording in which the board stands still."""
+
+    name: str
+    """Name for messages: that of the recording, with the time of the span if the recording has several."""
+    recording: Recording
+    """The events of the span, at most three turns, in memory."""
+
+
+def still_poses(recordings: Sequence[Recording]) -> list[Pose]:
+    """Return the still spans of all recordings. Raises :class:`AmiwarpError` if a recording has none."""
+    spans = [(recording, span) for recording in recordings for span in _spans_of(recording)]
+    if len(spans) > MOST_POSES:
+        spans = [spans[k] for k in np.linspace(0, len(spans) - 1, MOST_POSES).round().astype(int)]
+    return [_pose(recording, *span, single=len(recordings) > 1) for recording, span in spans]
+
+
+def _pose(recording: Recording, start: int, stop: int, *, single: bool) -> Pose:
+    first = recording.events.t_first
+    where = "" if single else f", {(start - first) * 1e-6:.2f} to {(stop - first) * 1e-6:.2f} s"
+    events = MemoryEvents(recording.events.between(start, stop), *recording.events.size)
+    return Pose(f"{recording.name}{where}", replace(recording, events=events))
+
+
+def _spans_of(recording: Recording) -> list[tuple[int, int]]:
+    """Return start and end of every still span [us], each at most :data:`MOST_TURNS` long."""
+    name, encoder, source = recording.name, recording.encoder, recording.events
+    if encoder is None:
+        raise AmiwarpError(f"{name}: has no encoder; record the prism's angle, which all poses must share")
+    if not len(source):
+        raise AmiwarpError(f"{name}: has no events; give a recording with events")
+    first, last = max(source.t_first, encoder.coverage[0]), min(source.t_last, encoder.coverage[1])
+    turns = abs(encoder.rpm) * (last - first) / 60e6
+    if turns < LEAST_TURNS:
+        raise AmiwarpError(
+            f"{name}: the prism makes {max(turns, 0.0):.2g} turns; a pose needs {LEAST_TURNS:g} turns of the prism in "
+            "front of a board that stands still (without a turning prism, a still board gives no events)"
+        )
+    turn = (last - first) / turns
+    if turns <= MOST_TURNS:
+        return [(first, last)]
+    edges = first + (np.arange(int(turns) + 1) * turn).astype(np.int64)
+    still = _repetition(recording, encoder, edges) >= LEAST_REPETITION
+    found = [(int(edges[a]), int(edges[b])) for a, b in _runs(still)]
+    if not found:
+        raise AmiwarpError(f"{name}: the board or the camera moves all the time; hold the board still for two turns")
+    half = int(0.5 * MOST_TURNS * turn)
+    return [(max(a, (a + b) // 2 - half), min(b, (a + b) // 2 + half)) for a, b in found]
+
+
+def _repetition(recording: Recording, encoder: Encoder, edges: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the correlation of the events of each turn with those of the turn before, shape (turns - 1,).
+
+    The events are counted by cell, polarity and range of prism angles.
+    """
+    width, height = recording.events.size
+    columns, rows = -(-width // CELL), -(-height // CELL)
+    before: NDArray[Any] = np.zeros(0)
+    out: list[float] = []
+    for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        e = recording.events.between(start, stop)
+        angle = np.floor(encoder.angle_at(e.t) * (ANGLE_RANGES / math.tau)).astype(np.int64) % ANGLE_RANGES
+        cell = ((e.y // CELL).astype(np.int64) * columns + e.x // CELL) * ANGLE_RANGES + angle
+        counts = np.bincount(cell, weights=2.0 * e.p - 1.0, minlength=rows * columns * ANGLE_RANGES)
+        if len(before):
+            energy = math.sqrt(float(counts @ counts) * float(before @ before))
+            out.append(float(counts @ before) / max(energy, 1e-30))
+        before = counts
+    return np.array(out)
+
+
+def _runs(still: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the first and last edge of each run of still turns: ``still[k]`` compares the turns k and k + 1."""
+    steps = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
+    return [(int(a), int(b) + 1) for a, b in steps.reshape(-1, 2)]

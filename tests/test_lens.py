@@ -1,0 +1,217 @@
+"""Lens calibration from a board: corners, fit, still spans, and the whole way from recordings to a camera."""
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+import amiwarp
+from amiwarp.cli.app import app
+from amiwarp.lens.board import Corners
+from amiwarp.lens.corner_fit import first_pose, fit_lens
+from amiwarp.lens.poses import still_poses
+
+BOARD = amiwarp.Board(6, 5, 0.03)
+CAMERA = amiwarp.Camera(320, 240, 262.0, 261.0, 163.0, 117.0, amiwarp.RadialTangential(k1=-0.1, k2=0.02))
+ROUGH = amiwarp.Camera.from_fov(320, 240, 2.0 * math.atan(160.0 / 240.0))
+FISHEYE = amiwarp.Camera(320, 240, 150.0, 150.5, 161.0, 118.0, amiwarp.Fisheye(-0.02, 0.004))
+PRISM, PHASE = amiwarp.Prism(math.radians(1.0)), 0.7
+
+
+def placed(rng: np.random.Generator, camera: amiwarp.Camera, count: int, tilt: tuple[float, float]) -> list[tuple]:
+    """Return orientations and middles [m] of boards that lie wholly in the image."""
+    out: list[tuple] = []
+    half = BOARD.points.max(axis=0) / 2.0
+    while len(out) < count:
+        ray = np.asarray(camera.pixels_to_rays(rng.uniform([60, 50], [260, 190])[None]), np.float64)[0]
+        middle = ray / ray[2] * rng.uniform(0.25, 0.42)
+        turn, about = math.radians(rng.uniform(*tilt)), rng.uniform(0.0, math.tau)
+        rotation = Rotation.from_rotvec([turn * math.cos(about), turn * math.sin(about), 0.0])
+        xy = corners_of(camera, rotation, middle - rotation.apply(half)).xy
+        if (xy > 8).all() and (xy < [311, 231]).all():
+            out.append((rotation, middle))
+    return out
+
+
+def corners_of(camera: amiwarp.Camera, rotation: Rotation, origin: NDArray[np.float64]) -> Corners:
+    """Return the true corners of a board whose first corner is at ``origin`` [m]."""
+    points = rotation.apply(BOARD.points) + origin
+    rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+    return Corners(np.arange(len(points)), np.asarray(camera.rays_to_pixels(rays), np.float64))
+
+
+def seen(seed: int, camera: amiwarp.Camera, *, noise: float, tilt: tuple[float, float] = (10, 40)) -> list[Corners]:
+    rng = np.random.default_rng(seed)
+    half = BOARD.points.max(axis=0) / 2.0
+    true = [corners_of(camera, r, m - r.apply(half)) for r, m in placed(rng, camera, 8, tilt)]
+    return [replace(c, xy=c.xy + rng.normal(0.0, noise, c.xy.shape)) for c in true]
+
+
+@pytest.mark.parametrize(
+    "camera", [CAMERA, FISHEYE, replace(CAMERA, distortion=None)], ids=["bent", "fisheye", "plain"]
+)
+def test_corners_give_the_lens_within_its_deviations(camera: amiwarp.Camera) -> None:
+    start = replace(ROUGH, fx=0.9 * camera.fx, fy=0.9 * camera.fx)
+    if isinstance(camera.distortion, amiwarp.Fisheye):
+        start = replace(start, distortion=amiwarp.Fisheye())
+    ratios = []
+    for seed in range(5):
+        fit = fit_lens(start, BOARD, seen(seed, camera, noise=0.05))
+        ratios += [(getattr(fit.camera, n) - getattr(camera, n)) / fit.deviations[n] for n in ("fx", "fy", "cx", "cy")]
+        assert ("k1" in fit.left_out) == (camera.distortion is None)
+        assert "k3" in fit.left_out
+        assert math.sqrt(fit.cost / fit.freedom) == pytest.approx(0.05, rel=0.15)
+    assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+
+
+def test_a_corner_far_off_hardly_counts() -> None:
+    corners = seen(3, CAMERA, noise=0.05)
+    corners[4].xy[7] += 5.0
+    fit = fit_lens(ROUGH, BOARD, corners)
+    assert abs(fit.camera.fx - CAMERA.fx) < 4.0 * fit.deviations["fx"]
+    assert np.abs(fit.residuals[4][7]).min() > 4.0
+
+
+def test_the_pose_of_a_board_is_found() -> None:
+    corners = corners_of(CAMERA, Rotation.from_rotvec([0.3, -0.2, 0.1]), np.array([-0.05, -0.06, 0.35]))
+    assert first_pose(CAMERA, BOARD, corners) == pytest.approx([0.3, -0.2, 0.1, -0.05, -0.06, 0.35], abs=1e-4)
+
+
+def photographed(board: amiwarp.Board) -> NDArray[np.uint8]:
+    """Return a picture of a board in front of a grey wall, slightly turned."""
+    flat = board.picture(24)
+    height, width = flat.shape
+    corners = np.float32([[0, 0], [width, 0], [width, height], [0, height]])
+    to = np.float32([[40, 30], [270, 50], [260, 210], [50, 200]])
+    place = cv2.getPerspectiveTransform(corners, to)
+    return np.asarray(cv2.GaussianBlur(cv2.warpPerspective(flat, place, (320, 240), borderValue=128), (0, 0), 0.8))
+
+
+def test_a_board_is_found_and_its_absence_explained() -> None:
+    picture = photographed(BOARD)
+    found = BOARD.find(picture)
+    assert found is not None
+    assert len(found.ids) == 30
+    assert not BOARD.has_another(picture, found)
+    assert "8 x 6 inner corners" not in BOARD.missing(np.full((240, 320), 128, np.uint8))
+    assert BOARD.missing(np.full((240, 320), 128, np.uint8)) == "a board of 6 x 5 inner corners is not seen"
+    squares = amiwarp.Board(7, 6, 0.03).missing(picture)
+    assert squares == "a board of 6 x 5 inner corners is seen, not of 7 x 6; count the inner corners, not the squares"
+
+
+def test_a_charuco_board_is_found_in_parts_and_not_in_a_mirror() -> None:
+    board = amiwarp.Board(6, 5, 0.03, "DICT_4X4_50")
+    picture = cv2.resize(photographed(board), (960, 720))
+    whole = board.find(picture)
+    assert whole is not None
+    picture[:, :300] = 128
+    part = board.find(picture)
+    assert part is not None
+    assert 6 <= len(part.ids) < len(whole.ids) <= 30
+    np.testing.assert_allclose(part.xy, whole.xy[np.isin(whole.ids, part.ids)], atol=0.5)
+    mirror = np.ascontiguousarray(cv2.resize(photographed(board), (960, 720))[:, ::-1])
+    assert board.find(mirror) is None
+    assert board.missing(mirror) == "the board is seen in a mirror image; flip the picture of the sensor"
+
+
+def test_two_boards_are_noticed() -> None:
+    one = cv2.resize(photographed(BOARD), (240, 180))
+    both = np.hstack([one, one])
+    found = BOARD.find(both)
+    assert found is not None
+    assert BOARD.has_another(both, found)
+
+
+def test_boards_that_cannot_be_are_refused() -> None:
+    with pytest.raises(amiwarp.AmiwarpError, match="board columns"):
+        amiwarp.Board(1, 6, 0.03)
+    with pytest.raises(amiwarp.AmiwarpError, match="DICT_4X4_50"):
+        amiwarp.Board(9, 6, 0.03, "DICT_5")
+    with pytest.raises(amiwarp.AmiwarpError, match="has 50 markers; this board needs 60"):
+        amiwarp.Board(11, 9, 0.03, "DICT_4X4_50")
+
+
+@pytest.mark.parametrize("suffix", [".pdf", ".svg"])
+def test_a_printed_board_has_its_true_size(tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"board{suffix}"
+    result = CliRunner().invoke(app, ["board", str(out), "--board", "9x6", "--square-mm", "25", "--json"])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["width_mm"] == pytest.approx(12 * 25.0)
+    if suffix == ".svg":
+        width = re.search(r'<svg [^>]*width="([\d.]+)pt"', out.read_text())
+        assert width is not None
+        assert float(width[1]) == pytest.approx(12 * 25.0 / 25.4 * 72.0)
+
+
+def simulated(pose: tuple, seed: int, motion: float = 720.0) -> amiwarp.Recording:
+    world = BOARD.world(pose[0].as_quat(), pose[1])
+    scene = amiwarp.WorldScene(world, amiwarp.Trajectory.still([0, 0, 0]))
+    recording = amiwarp.simulate(
+        scene, CAMERA, PRISM, duration_s=0.17, motion=amiwarp.PrismMotion(motion, PHASE), seed=seed
+    )
+    return replace(recording, camera=None, name=f"pose{seed}", prism=amiwarp.Prism(1.1 * PRISM.apex))
+
+
+@pytest.fixture(scope="module")
+def recordings() -> list[amiwarp.Recording]:
+    poses = placed(np.random.default_rng(1), CAMERA, 5, (20, 35))
+    return [simulated(pose, seed) for seed, pose in enumerate(poses)]
+
+
+def test_recordings_of_a_still_board_give_lens_and_prism(recordings: list[amiwarp.Recording], tmp_path: Path) -> None:
+    names = [str(tmp_path / f"{k}.h5") for k in range(len(recordings))]
+    for name, recording in zip(names, recordings, strict=True):
+        amiwarp.save_recording(name, recording)
+    camera, prism, figure = (tmp_path / name for name in ("camera.yaml", "prism.json", "lens.png"))
+    outputs = [str(camera), "--calibration", str(prism), "--figure", str(figure)]
+    result = CliRunner().invoke(app, ["lens", *names, *outputs, "--board", "6x5", "--fov-deg", "67", "--json"])
+    assert result.exit_code == 0, result.output
+    found, data = amiwarp.load_camera(camera), json.loads(result.stdout)
+    assert found.fx == pytest.approx(CAMERA.fx, rel=0.008)
+    assert (found.cx, found.cy) == pytest.approx((CAMERA.cx, CAMERA.cy), abs=2.0)
+    calibration = amiwarp.Calibration.load(prism)
+    assert math.degrees(calibration.parameters["apex"]) == pytest.approx(1.0, rel=0.008)
+    assert calibration.camera.fx == data["camera"]["fx"] == found.fx
+    assert data["reprojection_px"] < 0.15
+    assert sum(map(sum, data["coverage"])) == 30 * len(recordings)
+    assert any("record more poses" in text for text in data["advice"])
+    assert cv2.imread(str(figure)).std() > 10.0
+
+
+def test_too_few_poses_and_still_prisms_are_refused(recordings: list[amiwarp.Recording]) -> None:
+    with pytest.raises(amiwarp.AmiwarpError, match="3 poses of the board are given, but a lens needs 4"):
+        amiwarp.calibrate_lens(recordings[:3], BOARD)
+    with pytest.raises(amiwarp.AmiwarpError, match="pose0: has no encoder"):
+        amiwarp.calibrate_lens([replace(recordings[0], encoder=None)], BOARD)
+    still = replace(recordings[0], encoder=amiwarp.Encoder.constant_speed(0.0, -1000, 200_000))
+    with pytest.raises(amiwarp.AmiwarpError, match="the prism makes 0 turns"):
+        amiwarp.calibrate_lens([still], BOARD)
+
+
+def test_parallel_boards_are_refused() -> None:
+    with pytest.raises(amiwarp.AmiwarpError, match=r"do not determine the focal length.*; tilt it by 20 to 40 deg"):
+        fit_lens(ROUGH, BOARD, seen(5, CAMERA, noise=0.05, tilt=(0, 0.5)))
+
+
+def test_still_spans_of_one_recording_are_found() -> None:
+    """The camera rests, moves to another place, and rests."""
+    world = BOARD.world([0, 0, 0, 1], [0.0, 0.0, 0.4])
+    at = [[0, 0, 0], [0, 0, 0], [0.05, 0.02, -0.05], [0.05, 0.02, -0.05]]
+    path = amiwarp.Trajectory([0.0, 0.35, 0.65, 1.0], at, np.tile([0, 0, 0, 1.0], (4, 1)))
+    camera = amiwarp.Camera.from_fov(160, 120, 1.0)
+    recording = amiwarp.simulate(amiwarp.WorldScene(world, path), camera, PRISM, duration_s=1.0, seed=1)
+    poses = still_poses([recording])
+    assert len(poses) == 2
+    spans = [(p.recording.events.t_first * 1e-6, p.recording.events.t_last * 1e-6) for p in poses]
+    assert spans[0][1] < 0.36
+    assert spans[1][0] > 0.64
+    assert all(0.12 < stop - start < 0.26 for start, stop in spans)
+    assert "s" in poses[0].name
