@@ -30,9 +30,11 @@ LENSES = {
     "radial-tangential": amiwarp.Camera(
         640, 480, 520.0, 521.5, 322.0, 236.0, amiwarp.RadialTangential(-0.12, 0.03, 0.0005, -0.0004)
     ),
-    "fisheye": amiwarp.Camera(640, 480, 305.6, 306.2, 322.0, 236.0, amiwarp.Fisheye(-0.02, 0.004)),
+    "fisheye": amiwarp.Camera(640, 480, 320.0, 320.6, 322.0, 236.0, amiwarp.Fisheye(-0.02, 0.004)),
 }
 DISTANCE_M = {"radial-tangential": (0.35, 0.7), "fisheye": (0.2, 0.4)}
+FINE = 4
+"""Number of samples per pixel of a frame along each axis."""
 FRAME_NOISE = 0.02
 """Standard deviation of the noise of frames, as a share of white: a usual camera at ISO 400."""
 
@@ -82,10 +84,9 @@ def one(lens: str, seed: int, count: int, device: str, index: float) -> dict[str
     xy = [corners(true, r, m - r.apply(half)) for r, m in placed]
     motion = amiwarp.PrismMotion(720.0, rng.uniform(-math.pi, math.pi))
     prism, recordings = amiwarp.Prism(math.radians(1.0), index), []
-    seeing = "rays" if lens == "fisheye" else "maps"
     for k, (rotation, middle) in enumerate(placed[:count]):
         world = BOARD.world(rotation.as_quat(), middle, seed=seed)
-        scene = amiwarp.WorldScene(world, amiwarp.Trajectory.still([0, 0, 0]), seeing=seeing)
+        scene = amiwarp.WorldScene(world, amiwarp.Trajectory.still([0, 0, 0]))
         made = amiwarp.simulate(scene, true, prism, duration_s=0.25, motion=motion, seed=100 * seed + k, device=device)
         nominal = amiwarp.Prism(prism.apex * (1.1 if seed % 2 else 0.9))
         recordings.append(replace(made, camera=None, name=f"pose {k}", prism=nominal))
@@ -115,7 +116,8 @@ def on_frame(xy: NDArray[np.float64], camera: amiwarp.Camera, noise: float, rng:
 
     The frame is the board's picture, warped by the lens between the corners, with a blur of 0.5 px.
     """
-    pixels = np.stack(np.meshgrid(np.arange(640.0), np.arange(480.0)), axis=-1).reshape(-1, 2)
+    x, y = ((np.arange(FINE * n) + 0.5) / FINE - 0.5 for n in (640, 480))
+    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     rays = np.asarray(camera.pixels_to_rays(pixels))
     pose = first_pose(camera, BOARD, Corners(np.arange(len(xy)), xy))
     turn = Rotation.from_rotvec(pose[:3])
@@ -123,7 +125,8 @@ def on_frame(xy: NDArray[np.float64], camera: amiwarp.Camera, noise: float, rng:
     at = turn.inv().apply(rays * ((origin @ normal) / (rays @ normal))[:, None] - origin) / BOARD.square_m
     u, v = at[:, 0] + 1.0, at[:, 1] + 1.0
     inside = (u > 0) & (u < BOARD.columns + 1) & (v > 0) & (v < BOARD.rows + 1) & np.isfinite(u)
-    picture = np.where(inside & ((np.floor(u) + np.floor(v)) % 2 == 0), 0.04, 0.9).reshape(480, 640)
+    picture = np.where(inside & ((np.floor(u) + np.floor(v)) % 2 == 0), 0.04, 0.9)
+    picture = picture.reshape(480, FINE, 640, FINE).mean(axis=(1, 3))
     picture = cv2.GaussianBlur(picture, (0, 0), 0.5) + rng.normal(0.0, noise, picture.shape)
     found = BOARD.find(np.clip(255.0 * picture, 0, 255).astype(np.uint8))
     assert found is not None

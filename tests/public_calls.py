@@ -89,6 +89,10 @@ SPACE = aw.ParameterSpace(
     duration_us=1000.0,
     undrifted={},
 )
+BOARD = aw.Board(3, 4, 0.03)
+CORNERS = aw.Corners(np.arange(12), np.mgrid[20:50:10, 20:60:10].reshape(2, -1).T.astype(np.float64))
+BOARD_POSE = aw.BoardPose("a", CORNERS, np.zeros((12, 2)), np.zeros(3), np.ones(3), np.zeros((60, 80), np.uint8))
+LENS = aw.LensCalibration(CAMERA, {}, CALIBRATION, (BOARD_POSE,), {}, (), (), 1.0)
 STACK = aw.PictureStack(np.zeros((2, 3, 4), np.uint8), 100.0, "s")
 FOLDER = aw.PictureFolder((Path("a.png"), Path("b.png")), np.array([0, 10]), (4, 3))
 VIDEO = aw.VideoFile(Path("v.mp4"), (4, 3), 30.0, 1000.0)
@@ -260,6 +264,16 @@ OWN: dict[str, dict[str, Any]] = {
         "left_out": (),
     },
     "convert": {"source_path": "in.h5"},
+    "Board": {"columns": 3, "rows": 4, "square_m": 0.03},
+    "Board.save": {"path": _new(".svg")},
+    "Board.world": {"rotation": (0, 0, 0, 1), "position": (0, 0, 1)},
+    "Board.find": {"picture": np.zeros((60, 80), np.uint8)},
+    "Board.missing": {"picture": np.zeros((60, 80), np.uint8)},
+    "Board.has_another": {"picture": np.zeros((60, 80), np.uint8), "corners": CORNERS},
+    "Corners": {"ids": CORNERS.ids, "xy": CORNERS.xy},
+    "BoardPose": _all(BOARD_POSE),
+    "LensCalibration": _all(LENS),
+    "calibrate_lens": {"recordings": [RECORDING], "board": BOARD},
     "load_camera": {"path": "none.json"},
     "save_camera": {"path": _new(".json"), "camera": CAMERA},
     "PixelMap": _all(PIXELS),
@@ -420,6 +434,7 @@ REFUSED = {
     "reconstruct": "outside the encoder's",
     "PictureFolder.read": "no such file",
     "VideoFile.read": "v.mp4",
+    "calibrate_lens": "the prism makes",
     "load_camera": "no such file",
     "PixelMap.load": "no such file",
     "pixel_thresholds": "no pixel fires twice",

@@ -136,6 +136,8 @@ OVER_INPUTS = (
     ("calibrate a.h5 out.json --figure {}", "a.h5"),
     ("calibrate a.h5 out.json --preset cal.json --figure {}", "cal.json"),
     ("calibrate a.h5 {} --camera cam.json", "cam.json"),
+    ("lens a.h5 {}", "a.h5"),
+    ("lens b.h5 out.json --calibration {}", "b.h5"),
     ("compensate a.h5 {} --calibration cal.json", "a.h5"),
     ("compensate a.h5 {} --calibration cal.json", "cal.json"),
     ("compensate a.h5 out.h5 --calibration cal.json --iwe {}", "cal.json"),
@@ -285,6 +287,10 @@ NAMES: dict[tuple[str, str], tuple[str, tuple[str, ...]]] = {
     # (command, option): (command line, refused extensions)
     ("calibrate", "out"): ("calibrate a.h5 {}", ("h5", "png", *NOT_WRITTEN)),
     ("calibrate", "figure"): ("calibrate a.h5 new.json --figure {}", ("h5", "svg", *NOT_WRITTEN)),
+    ("board", "out"): ("board {}", ("h5", "png", *NOT_WRITTEN)),
+    ("lens", "out"): ("lens a.h5 {}", ("h5", "png", *NOT_WRITTEN)),
+    ("lens", "calibration"): ("lens a.h5 new.json --calibration {}", ("h5", "yaml", *NOT_WRITTEN)),
+    ("lens", "figure"): ("lens a.h5 new.json --figure {}", ("h5", "json", *NOT_WRITTEN)),
     ("compensate", "out"): ("compensate a.h5 {} --calibration cal.json", ("json", "csv", "bag", "jpg", "")),
     ("compensate", "iwe"): ("compensate a.h5 new.h5 --calibration cal.json --iwe {}", ("h5", "tif", *NOT_WRITTEN)),
     ("convert", "out"): ("convert a.h5 {}", ("json", "csv", "bag", "jpg", "")),
@@ -358,6 +364,7 @@ def test_commands_that_write_native_recordings_name_the_conversion(place: Path) 
 
 
 CALLS: dict[str, Callable[[Path, Any], object]] = {
+    "Board.save": lambda path, _: amiwarp.Board(3, 4, 0.03).save(path),
     "Calibration.save": lambda path, given: given.calibration.save(path),
     "PixelMap.save": lambda path, _: amiwarp.PixelMap(*np.ones((8, 3, 4))).save(path),
     "RecordingWriter": lambda path, _: amiwarp.RecordingWriter(path, width=64, height=48).__enter__(),
@@ -515,6 +522,7 @@ ENDLESS = (
     "convert a.h5 out.h5 --camera {}.yaml",
     "calibrate {} out.json",
     "calibrate a.h5 out.json --preset {}",
+    "lens a.h5 {} out.json",
     "compensate {} out.h5 --calibration cal.json",
     "compensate a.h5 out.h5 --calibration {}",
     "compensate a.h5 out.h5 --calibration cal.json --preset {}",

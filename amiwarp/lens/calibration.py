@@ -186,7 +186,7 @@ def calibrate_lens(
     >>> amiwarp.calibrate_lens([], board)
     Traceback (most recent call last):
     ...
-    amiwarp.AmiwarpError: no recordings are given; give at least one
+    amiwarp.errors.AmiwarpError: no recordings are given; give at least one
     """
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
     instance(board, Board, "board")
