@@ -381,6 +381,7 @@ OWN: dict[str, dict[str, Any]] = {
 """Arguments of one callable, before those by name."""
 
 OBJECTS: dict[str, Any] = {
+    "Board": BOARD,
     "ParameterSpace": SPACE,
     "PhotometricSettings": aw.PhotometricSettings(),
     "Calibration": CALIBRATION,

@@ -192,8 +192,20 @@ def test_too_few_poses_and_still_prisms_are_refused(recordings: list[amiwarp.Rec
     with pytest.raises(amiwarp.AmiwarpError, match="pose0: has no encoder"):
         amiwarp.calibrate_lens([replace(recordings[0], encoder=None)], BOARD)
     still = replace(recordings[0], encoder=amiwarp.Encoder.constant_speed(0.0, -1000, 200_000))
-    with pytest.raises(amiwarp.AmiwarpError, match="the prism makes 0 turns"):
+    with pytest.raises(amiwarp.AmiwarpError, match=r"prism makes 0 turns.* without it a still board gives no events"):
         amiwarp.calibrate_lens([still], BOARD)
+    some = [*recordings[:3], replace(recordings[3], encoder=None)]
+    with pytest.raises(amiwarp.AmiwarpError, match=r"3 poses .* are given, but .*; pose3: has no encoder; record"):
+        amiwarp.calibrate_lens(some, BOARD)
+
+
+def test_a_moving_board_is_refused() -> None:
+    world = BOARD.world([0, 0, 0, 1], [0.0, 0.0, 0.4])
+    path = amiwarp.Trajectory([0.0, 0.25], [[0, 0, 0], [0.06, 0.0, 0.0]], np.tile([0, 0, 0, 1.0], (2, 1)))
+    camera = amiwarp.Camera.from_fov(160, 120, 1.0)
+    recording = amiwarp.simulate(amiwarp.WorldScene(world, path), camera, PRISM, duration_s=0.25, seed=1)
+    with pytest.raises(amiwarp.AmiwarpError, match="moves all the time; hold the board still"):
+        amiwarp.calibrate_lens([recording], BOARD)
 
 
 def test_parallel_boards_are_refused() -> None:
@@ -208,8 +220,8 @@ def test_still_spans_of_one_recording_are_found() -> None:
     path = amiwarp.Trajectory([0.0, 0.35, 0.65, 1.0], at, np.tile([0, 0, 0, 1.0], (4, 1)))
     camera = amiwarp.Camera.from_fov(160, 120, 1.0)
     recording = amiwarp.simulate(amiwarp.WorldScene(world, path), camera, PRISM, duration_s=1.0, seed=1)
-    poses = still_poses([recording])
-    assert len(poses) == 2
+    poses, reasons = still_poses([recording])
+    assert (len(poses), reasons) == (2, {})
     spans = [(p.recording.events.t_first * 1e-6, p.recording.events.t_last * 1e-6) for p in poses]
     assert spans[0][1] < 0.36
     assert spans[1][0] > 0.64

@@ -14,7 +14,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import NewFile
 from amiwarp.io.formats import check_ending
 from amiwarp.simulation.worlds.world import Body, Material, Mesh, Trajectory, World
-from amiwarp.validation import guarded, real, shown, whole
+from amiwarp.validation import array, guarded, instance, one_of, real, whole
 
 MOST_SQUARES = 100
 """Largest number of squares of a board along a side."""
@@ -91,9 +91,8 @@ class Board:
         """Return OpenCV's ChArUco board."""
         cv2 = opencv()
         known = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
-        if self.charuco not in known:
-            raise AmiwarpError(f"board charuco {shown(self.charuco)} is unknown; choose among {', '.join(known)}")
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.charuco))
+        name = one_of(instance(self.charuco, str, "board charuco"), known, "board charuco")
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         squares, markers = (self.columns + 1, self.rows + 1), len(dictionary.bytesList)
         if squares[0] * squares[1] // 2 > markers:
             needed = squares[0] * squares[1] // 2
@@ -182,7 +181,8 @@ class Board:
         World
             The world.
         """
-        rng = np.random.default_rng(seed)
+        wall_m = real(wall_m, "wall_m", 0.01, 1e4, " m")
+        rng = np.random.default_rng(whole(seed, "seed", 0, 2**63 - 1))
         coarse = np.kron(rng.uniform(0.2, 0.8, (24, 32)), np.ones((16, 16)))
         spread = np.ones(9) / 9.0
         for axis in (0, 1):  # soft patches
@@ -212,6 +212,7 @@ class Board:
         Corners or None
             The corners.
         """
+        picture = _checked(picture)
         return self._find_charuco(picture) if self.charuco else _find_chessboard(picture, self.columns, self.rows)
 
     def _find_charuco(self, picture: NDArray[np.uint8]) -> Corners | None:
@@ -235,6 +236,7 @@ class Board:
         str
             The reason.
         """
+        picture = _checked(picture)
         if self.charuco and self._find_charuco(np.ascontiguousarray(picture[:, ::-1])) is not None:
             return "the board is seen in a mirror image; flip the picture of the sensor"
         wanted = f"a board of {self.columns} x {self.rows} inner corners"
@@ -261,7 +263,8 @@ class Board:
         bool
             Whether there is another board.
         """
-        cv2 = opencv()
+        cv2, picture = opencv(), _checked(picture)
+        instance(corners, Corners, "corners")
         hull = cv2.convexHull(corners.xy.astype(np.float32)).reshape(-1, 2)
         middle = hull.mean(axis=0)
         reach = 1.0 + 2.2 / min(self.columns, self.rows)  # the outer squares too
@@ -273,6 +276,7 @@ class Board:
         return _find_chessboard(covered, self.columns, self.rows, thorough=False) is not None
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class Corners:
     """Corners of a board in a picture."""
@@ -281,6 +285,21 @@ class Corners:
     """Number of each corner, as in :attr:`Board.points`, shape ``(n,)``."""
     xy: NDArray[np.float64]
     """Position of each corner [px], shape ``(n, 2)``."""
+
+    def __post_init__(self) -> None:
+        ids, xy = array(self.ids, "corners' ids", "iu"), array(self.xy, "corners' xy")
+        if ids.ndim != 1 or xy.shape != (len(ids), 2):
+            raise AmiwarpError(f"corners have ids {ids.shape} and xy {xy.shape}; give shapes (n,) and (n, 2)")
+
+
+def _checked(picture: object) -> NDArray[np.uint8]:
+    """Return a picture; raise :class:`AmiwarpError` for another type or shape."""
+    checked = array(picture, "picture")
+    if checked.ndim != 2 or checked.dtype != np.uint8 or not checked.size:
+        raise AmiwarpError(
+            f"picture has shape {checked.shape}, {checked.dtype}; give grey values, uint8, (height, width)"
+        )
+    return np.ascontiguousarray(checked)
 
 
 def _find_chessboard(picture: NDArray[np.uint8], columns: int, rows: int, *, thorough: bool = True) -> Corners | None:

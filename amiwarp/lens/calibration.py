@@ -33,7 +33,7 @@ from amiwarp.optics.models import ExactModel, predicted_error
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.picture import Reconstruction
-from amiwarp.validation import guarded, instance, real
+from amiwarp.validation import array, guarded, instance, real
 
 Vector = NDArray[np.float64]
 
@@ -74,6 +74,7 @@ STEEP = math.radians(15.0)
 """Tilt of a board that tells focal length from distance [rad]."""
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class BoardPose:
     """One pose of the board, and how well the calibrated lens explains it."""
@@ -91,12 +92,18 @@ class BoardPose:
     picture: NDArray[np.uint8]
     """Picture in which the corners were found, shape ``(height, width)``."""
 
+    def __post_init__(self) -> None:
+        shape = array(self.residuals, "pose's residuals").shape
+        if shape != self.corners.xy.shape:
+            raise AmiwarpError(f"pose's residuals have shape {shape}; give {self.corners.xy.shape}, as its corners")
+
     @property
     def rms(self) -> float:
         """Distance of predicted and seen corners [px rms]."""
         return float(np.sqrt((self.residuals**2).sum(axis=1).mean()))
 
 
+@guarded
 @dataclass(frozen=True, eq=False)
 class LensCalibration:
     """Calibrated lens and prism, with the evidence."""
@@ -117,6 +124,12 @@ class LensCalibration:
     """What would improve the calibration most, one sentence each; the most helpful first."""
     seconds: float
     """Computing time [s]."""
+
+    def __post_init__(self) -> None:
+        if not self.poses:
+            raise AmiwarpError("a lens calibration has no poses; give those of the fit")
+        for pose in self.poses:
+            instance(pose, BoardPose, "lens calibration's pose")
 
     @property
     def rms(self) -> float:
@@ -198,7 +211,8 @@ def calibrate_lens(
     if len(sizes) > 1:
         raise AmiwarpError(f"the recordings have sensors of {sorted(sizes)} px; give recordings of one camera")
     camera = _first_camera(given[0], fov, fisheye=fisheye)
-    return LensWork(board, camera, still_poses(given), device, progress or silent).run()
+    poses, reasons = still_poses(given)
+    return LensWork(board, camera, poses, device, progress or silent, reasons).run()
 
 
 def _first_camera(recording: Recording, fov: float | None, *, fisheye: bool) -> Camera:
@@ -437,7 +451,7 @@ class JointPrism:
         def by_lens(name: str) -> Vector:
             step = max(fit.deviations[name], 1e-9)
             if name in ("fx", "fy", "cx", "cy"):
-                camera = replace(fit.camera, **{name: getattr(fit.camera, name) + step})  # type: ignore[arg-type]
+                camera = replace(fit.camera, **{name: getattr(fit.camera, name) + step})
             else:
                 lens: Any = fit.camera.distortion
                 camera = replace(fit.camera, distortion=replace(lens, **{name: getattr(lens, name) + step}))

@@ -20,6 +20,7 @@ LEAST_TURNS, MOST_TURNS = 1.5, 3.0
 LEAST_REPETITION = 0.6
 """Smallest correlation of the events of two successive turns while nothing moves. A still board's is 0.8 to 0.95, and
 that of a board that moves by 4 px in a turn under 0.5."""
+WITHOUT_PRISM = "because without it a still board gives no events"
 MOST_POSES = 40
 """Largest number of poses that are used. More would lengthen the work, and hardly improve the lens."""
 
@@ -34,43 +35,57 @@ class Pose:
     """The events of the span, at most three turns, in memory."""
 
 
-def still_poses(recordings: Sequence[Recording]) -> list[Pose]:
-    """Return the still spans of all recordings. Raises :class:`AmiwarpError` if a recording has none."""
-    spans = [(recording, span) for recording in recordings for span in _spans_of(recording)]
+def still_poses(recordings: Sequence[Recording]) -> tuple[list[Pose], dict[str, str]]:
+    """Return the still spans of all recordings, and the reason by name of each recording that has none.
+
+    Raises :class:`AmiwarpError`, with the reason of the first recording, if none has any.
+    """
+    spans, reasons = list[tuple[Recording, tuple[int, int]]](), dict[str, str]()
+    for recording in recordings:
+        try:
+            spans += [(recording, span) for span in _spans_of(recording)]
+        except AmiwarpError as error:
+            if len(reasons) == len(recordings) - 1:
+                raise AmiwarpError(f"{recordings[0].name}: {reasons.get(recordings[0].name, error)}") from error
+            reasons[recording.name] = str(error)
     if len(spans) > MOST_POSES:
         spans = [spans[k] for k in np.linspace(0, len(spans) - 1, MOST_POSES).round().astype(int)]
-    return [_pose(recording, *span, single=len(recordings) > 1) for recording, span in spans]
+    several = {recording.name for recording in recordings if sum(one is recording for one, _ in spans) > 1}
+    return [_pose(recording, *span, several=recording.name in several) for recording, span in spans], reasons
 
 
-def _pose(recording: Recording, start: int, stop: int, *, single: bool) -> Pose:
+def _pose(recording: Recording, start: int, stop: int, *, several: bool) -> Pose:
     first = recording.events.t_first
-    where = "" if single else f", {(start - first) * 1e-6:.2f} to {(stop - first) * 1e-6:.2f} s"
+    where = f", {(start - first) * 1e-6:.2f} to {(stop - first) * 1e-6:.2f} s" if several else ""
     events = MemoryEvents(recording.events.between(start, stop), *recording.events.size)
     return Pose(f"{recording.name}{where}", replace(recording, events=events))
 
 
 def _spans_of(recording: Recording) -> list[tuple[int, int]]:
     """Return start and end of every still span [us], each at most :data:`MOST_TURNS` long."""
-    name, encoder, source = recording.name, recording.encoder, recording.events
+    encoder, source = recording.encoder, recording.events
     if encoder is None:
-        raise AmiwarpError(f"{name}: has no encoder; record the prism's angle, which all poses must share")
+        raise AmiwarpError(f"has no encoder; record the angle of a turning prism, {WITHOUT_PRISM}")
     if not len(source):
-        raise AmiwarpError(f"{name}: has no events; give a recording with events")
+        raise AmiwarpError("has no events; give a recording with events")
     first, last = max(source.t_first, encoder.coverage[0]), min(source.t_last, encoder.coverage[1])
     turns = abs(encoder.rpm) * (last - first) / 60e6
     if turns < LEAST_TURNS:
         raise AmiwarpError(
-            f"{name}: the prism makes {max(turns, 0.0):.2g} turns; a pose needs {LEAST_TURNS:g} turns of the prism in "
-            "front of a board that stands still (without a turning prism, a still board gives no events)"
+            f"the prism makes {max(turns, 0.0):.2g} turns; a pose needs {LEAST_TURNS:g} turns of the prism in front of "
+            f"a board that stands still, {WITHOUT_PRISM}"
         )
     turn = (last - first) / turns
-    if turns <= MOST_TURNS:
+    if turns < 2.0:
         return [(first, last)]
     edges = first + (np.arange(int(turns) + 1) * turn).astype(np.int64)
+    edges[-1] = last
     still = _repetition(recording, encoder, edges) >= LEAST_REPETITION
     found = [(int(edges[a]), int(edges[b])) for a, b in _runs(still)]
     if not found:
-        raise AmiwarpError(f"{name}: the board or the camera moves all the time; hold the board still for two turns")
+        raise AmiwarpError(
+            "the board or the camera moves all the time; hold the board still for two turns of the prism"
+        )
     half = int(0.5 * MOST_TURNS * turn)
     return [(max(a, (a + b) // 2 - half), min(b, (a + b) // 2 + half)) for a, b in found]
 

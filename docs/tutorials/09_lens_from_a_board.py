@@ -24,9 +24,9 @@ prism = amiwarp.Prism(math.radians(1.0))
 board = amiwarp.Board(6, 5, square_m=0.03)
 
 # %%
-# Twelve poses: in all parts of the image, tilted by 29 degrees in five directions.
-# A real recording knows neither the lens nor the true prism, only a data sheet, which
-# may be 10 % off.
+# Twelve poses: in all parts of the image, tilted by 29 degrees in five ways. A
+# real recording knows neither the lens nor the true prism, only a data sheet, here
+# 10 % off.
 nominal = amiwarp.Prism(1.1 * prism.apex)
 motion = amiwarp.PrismMotion(720.0, 0.7)
 still = amiwarp.Trajectory.still([0.0, 0.0, 0.0])
@@ -39,7 +39,8 @@ for k in range(12):
     made = amiwarp.simulate(
         scene, camera, prism, duration_s=0.17, motion=motion, seed=k
     )
-    recordings.append(replace(made, camera=None, name=f"pose {k}", prism=nominal))
+    made = replace(made, camera=None, name=f"pose {k}", prism=nominal)
+    recordings.append(made)
 
 # %%
 # A rough field of view is all that must be known of the lens.
