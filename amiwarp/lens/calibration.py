@@ -56,7 +56,9 @@ SEARCHED = 3
 """Number of poses in which the prism is searched by sharpness. Each answer is tried on the others."""
 PAIRS = 600_000
 """Number of pairs of events of all poses together, and at most a sixth of it in one pose."""
-MOST_STEPS, STEPS_OF_ALL, TOLERANCE_PX, LARGEST_GAIN = 10, 4, 0.002, 5.0
+FIRST_TOLERANCE_PX = 0.01
+"""Length of a step that ends the search for the prism with a lens that is not the last one [px]."""
+MOST_STEPS, STEPS_OF_ALL, TOLERANCE_PX, LARGEST_GAIN = 10, 2, 0.003, 5.0
 """Largest number of steps towards size and phase of the prism, and to see whether its other parameters differ from
 their nominal values; length of a step that ends them [px]; and the largest factor by which a step is lengthened,
 because the weights of outliers make Gauss-Newton steps too short."""
@@ -251,14 +253,22 @@ class LensWork:
         shown, fit = None, None
         for k in range(MOST_PASSES):
             self.progress("prism", (k + 0.1) / (MOST_PASSES + 1))
-            values = joint.refine(self.camera, ("apex", "phase"))
+            values = joint.refine(
+                self.camera, ("apex", "phase"), tolerance=TOLERANCE_PX if k > 1 else FIRST_TOLERANCE_PX
+            )
             model = joint.model(self.camera, values)
             if k > 1 and shown is not None and predicted_error(model, shown, grid=12).rms < ENOUGH_PX:
                 break
             shown, names = model, [name for name in joint.equations if k == 1 or name not in self.left_out]
-            first = names[:: max(1, len(names) // FIRST_POSES)]
-            pictures = self._pictures(model, names if k else first, k, turns=1.0 if k else 0.5)
-            fit, seen = self._lens(pictures)
+            first = names if k else names[:: max(1, len(names) // FIRST_POSES)]
+            pictures = self._pictures(model, first, k, turns=1.0 if k else 0.5)
+            try:
+                fit, seen = self._lens(pictures)
+            except AmiwarpError:  # the first poses alone do not suffice
+                rest = [name for name in names if name not in first]
+                if not rest:
+                    raise
+                fit, seen = self._lens(pictures | self._pictures(model, rest, k, turns=0.5))
             self.camera = fit.camera
         assert fit is not None
         values, uncertainty, notes = self._whole_prism(joint, fit)
@@ -332,7 +342,7 @@ class LensWork:
             share = 0.2 + 0.8 * k / len(names)
             self.progress(f"picture {k + 1} of {len(names)}", (done + share) / (MOST_PASSES + 1))
             work = Reconstruction(recordings[name], model=model, device=self.device)
-            work.smoothness = SMOOTHNESS
+            work.smoothness, work.with_silence = SMOOTHNESS, False
             log = work.window(*work.span(turns=turns)).to_host().log
             low, high = np.percentile(log, (1.0, 99.0))
             out[name] = np.clip((log - low) / max(high - low, 1e-6) * 255.0, 0.0, 255.0).astype(np.uint8)
@@ -341,6 +351,7 @@ class LensWork:
     def _lens(self, pictures: dict[str, NDArray[np.uint8]]) -> tuple[Fit, dict[str, Corners]]:
         """Return the lens that the corners of the pictures determine, and the corners by name of the pose."""
         found = {name: self.board.find(picture) for name, picture in pictures.items()}
+        self.left_out = {name: why for name, why in self.left_out.items() if name not in found}
         seen = {name: corners for name, corners in found.items() if corners is not None}
         for name, corners in found.items():
             if corners is None:
@@ -408,8 +419,13 @@ class JointPrism:
         """Return the optical model of some parameter values."""
         return ExactModel.from_values(camera, self.full.prism, values)
 
-    def refine(self, camera: Camera, names: tuple[str, ...], most: int = MOST_STEPS) -> dict[str, float]:
-        """Fit the parameters ``names`` in at most ``most`` steps from the present values. Return all values."""
+    def refine(
+        self, camera: Camera, names: tuple[str, ...], most: int = MOST_STEPS, tolerance: float = TOLERANCE_PX
+    ) -> dict[str, float]:
+        """Fit the parameters ``names`` in at most ``most`` steps from the present values. Return all values.
+
+        A step shorter than ``tolerance`` [px] ends the fit.
+        """
         costs = {name: equations.answers.cost for name, equations in self.equations.items()}
         for cost in costs.values():
             cost.space = replace(self.full, camera=camera, names=names).holding(self.values)
@@ -429,7 +445,7 @@ class JointPrism:
                 gain = 1.0 / (1.0 - min(max(left, 0.0), 1.0 - 1.0 / LARGEST_GAIN))
             last = step
             v = v + np.clip(gain * step, -1.0, 1.0)
-            if float(np.abs(step).max()) < TOLERANCE_PX:
+            if float(np.abs(step).max()) < tolerance:
                 break
         scatter = np.concatenate(parts, axis=1)
         inverse = np.linalg.pinv(hessian)

@@ -33,7 +33,8 @@ UNDETERMINED, TILT = "the poses do not determine the focal length", "tilt it by 
 HUBER = 2.0
 """Residual from which on a corner gets less weight [standard deviations]."""
 ROUNDS, MOST_STEPS = 3, 60
-"""Number of rounds of robust weights, and the largest number of evaluations in each."""
+"""Number of rounds of robust weights of the answer, and the largest number of evaluations in each. Fits that only give
+a start have one round."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +116,10 @@ def fit_lens(camera: Camera, board: Board, seen: Sequence[Corners]) -> Fit:
     rough = replace(camera, distortion=lens())
     # a wrong focal length can turn over a pose that is nearly frontal: with a better one the poses are found again
     for _ in range(2):
-        best = _fit(rough, np.array([first_pose(rough, board, corners) for corners in seen]), board, seen, INTRINSICS)
+        poses = np.array([first_pose(rough, board, corners) for corners in seen])
+        best = _fit(rough, poses, board, seen, INTRINSICS, rounds=1)
         rough = best.camera
+    best = _fit(best.camera, best.poses, board, seen, INTRINSICS)
     names, left_out = INTRINSICS, list[str]()
     for group in GROUPS[lens]:
         if group[0] == "k4" and len(group) > 1 and "k3" not in names:
@@ -147,7 +150,14 @@ def _gain_is_real(less: Fit, more: Fit, count: int) -> bool:
     return bool(f.sf(max(ratio, 0.0), count, more.freedom) < LEAST_CHANCE)
 
 
-def _fit(camera: Camera, poses: Vector, board: Board, seen: Sequence[Corners], names: tuple[str, ...]) -> Fit:
+def _fit(
+    camera: Camera,
+    poses: Vector,
+    board: Board,
+    seen: Sequence[Corners],
+    names: tuple[str, ...],
+    rounds: int = ROUNDS,
+) -> Fit:
     """Return the fit of the parameters ``names`` of the lens, and of all poses, from a start."""
     from scipy.optimize import least_squares
 
@@ -187,7 +197,7 @@ def _fit(camera: Camera, poses: Vector, board: Board, seen: Sequence[Corners], n
 
     v = np.concatenate([[getattr(camera if n in INTRINSICS else camera.distortion, n) for n in names], poses.ravel()])
     weight = np.ones(2 * len(xy))
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         try:
             v = least_squares(
                 weighted, v, weighted_jacobian, args=(np.sqrt(weight),), method="lm", x_scale="jac", ftol=1e-7,

@@ -423,6 +423,7 @@ class Reconstruction:
         self.fill = choice(Fill, fill, "fill")
         self.turn_us = turn_between(encoder, first, last)
         self.smoothness: float | None = None  # weight of the prior; None: the next window chooses it
+        self.with_silence = True  # whether pixels without events give equations, which make half of the work
 
     def span(
         self, start_us: int | None = None, length_us: int | None = None, turns: float | None = None
@@ -588,7 +589,8 @@ class Reconstruction:
         edges = np.round(np.linspace(start_us, start_us + length_us, spans + 1)).astype(np.int64)
         return table.pairs(
             self.encoder, longest_gap_us=length_us, sensor=sensor, middle_us=start_us + length_us // 2,
-            weak=WEAK_WEIGHT, window=(start_us, start_us + length_us), quiet=(edges, min(spans, SPANS_PER_TURN)),
+            weak=WEAK_WEIGHT, window=(start_us, start_us + length_us),
+            quiet=(edges, min(spans, SPANS_PER_TURN)) if self.with_silence else None,
         )  # fmt: skip
 
     def _solver(self, pairs: PairSet, tiles: Tiles, off: float, middle_us: int) -> BrightnessMap:
