@@ -213,7 +213,6 @@ OPENED_OTHERWISE = {
     "amiwarp.io.plain_files: (folder / name).open('rb')": "own file",
     "amiwarp.plotting.clouds: np.load(picture)": "own file",
     "amiwarp.plotting.clouds: np.load(points)": "own file",
-    "amiwarp.viewer.jobs: path.read_bytes()": "own file",
     # What is no file.
     "amiwarp.io.plain_files: np.loadtxt(kept, ndmin=2, comments=None, encoding='ascii')": "lines",
     "amiwarp.plotting.figures: Image.open(buffer)": "bytes",

@@ -35,11 +35,10 @@ from amiwarp import (
     save_recording,
     simulate,
 )
-from amiwarp.choices import Colour
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
 from amiwarp.live.stream.session import RecentEvents, followed
 from amiwarp.live.stream.sources import open_source, reopen_source
-from amiwarp.viewer import drawing, jobs, layout
+from amiwarp.viewer import drawing, jobs
 from amiwarp.viewer import inspector as inspector_module
 from amiwarp.viewer.drawing import FOOT_PX, ImageKind, make_images, strip_share
 from amiwarp.viewer.inspector import Inspector, Library, Source
@@ -668,8 +667,8 @@ def test_pictures_have_legend_colour_bar_and_caption_and_images_the_difference(
     ready(page)
     height = page.locator(".clouds canvas").bounding_box()["height"]
     below = picture("picture")[int(height) :]
-    assert colours_in(below, drawing.colour_table(Colour.RESIDUAL, dark=False)[10:-10:10]) > 0.95
-    words = layout.caption(inspector, inspector.show())
+    assert colours_in(below, drawing.table_of("cividis")[10:-10:10]) > 0.95
+    words = drawing.caption(inspector, inspector.show())
     left, top, right, bottom = region(page)
     assert f"x {left} to {right - 1}, y {top} to {bottom - 1} px" in words
     assert " ms; " in words

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import io
 import json
 import math
 from dataclasses import replace
@@ -38,10 +37,9 @@ from amiwarp.imaging.metrics import random_variance, relative_variance
 from amiwarp.viewer import drawing, jobs
 from amiwarp.viewer import inspector as timeline
 from amiwarp.viewer import inspector as viewer
-from amiwarp.viewer.drawing import ImageKind, Scale, make_images
+from amiwarp.viewer.drawing import ImageKind, Scale, events_text, make_images
 from amiwarp.viewer.inspector import EventRates, Inspector, Knobs, Selection, Source, suggest_region
 from amiwarp.viewer.jobs import (
-    as_bytes,
     cost_surface,
     estimate_phase,
     find_calibration,
@@ -56,7 +54,6 @@ from amiwarp.viewer.layout import (
     current_state,
     decode_state,
     encode_state,
-    events_text,
 )
 from amiwarp.viewer.panel import Panel
 
@@ -652,6 +649,28 @@ def test_a_state_sets_the_inspector(inspector: Inspector, recording: Recording) 
     assert current_state(other) == state
 
 
+def test_camera_and_index_set_by_hand_are_undone_and_in_the_address(recording: Recording) -> None:
+    made = Inspector(replace(recording, camera=None, prism=None))
+    history = History(first := current_state(made))
+    made.set_camera(72.5)
+    made.set_index(1.7)
+    history.add(by_hand := current_state(made))
+    shown = made.show().after
+    apply_state(made, history.undo())
+    assert (made.fov_deg, made.prism.index, current_state(made)) == (60.0, first.prism_index, first)
+    assert "field of view assumed" in made.notes[-1]
+    assert np.abs(made.show().after - shown).max() > 0.01
+    found, wrong = decode(encode_state(by_hand, first), first, made)
+    assert (found, wrong) == (by_hand, ())
+    apply_state(made, found)
+    np.testing.assert_array_equal(made.show().after, shown)
+    assert not made.notes
+    assert decode("fov_deg=171", first, made)[1] != ()
+    known = current_state(Inspector(recording))
+    assert decode("fov_deg=50", known, made) == (known, decode("fov_deg=50", known, made)[1])
+    assert "fov_deg" in decode("fov_deg=50", known, made)[1][0]
+
+
 # calibration
 
 
@@ -786,11 +805,10 @@ def test_images_are_downloaded(inspector: Inspector, tmp_path: Path) -> None:
     inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
     for kind in (ImageKind.COUNT, ImageKind.POLARITY, ImageKind.TIME_SURFACE):
         images = make_images(inspector, kind)
-        values = np.load(
-            io.BytesIO(as_bytes(".npy", lambda path, images=images: write_image(images, path, before=True)))
-        )
-        np.testing.assert_array_equal(values, images.before)
-        with Image.open(io.BytesIO(as_bytes(".tif", lambda path, images=images: write_image(images, path)))) as picture:
+        write_image(images, tmp_path / f"{kind}.npy", before=True)
+        np.testing.assert_array_equal(np.load(tmp_path / f"{kind}.npy"), images.before)
+        write_image(images, tmp_path / f"{kind}.tif")
+        with Image.open(tmp_path / f"{kind}.tif") as picture:
             assert picture.n_frames == (2 if kind is ImageKind.POLARITY else 1)
             first = images.after[0] if kind is ImageKind.POLARITY else images.after
             np.testing.assert_array_equal(np.asarray(picture), first)
@@ -826,8 +844,9 @@ def test_the_events_shown_are_downloaded_as_tables(
         jobs.write_table(inspector, tmp_path / "events.txt")
 
 
-def test_a_calibration_is_downloaded(inspector: Inspector) -> None:
-    data = json.loads(as_bytes(".json", inspector.as_calibration().save))
+def test_a_calibration_is_downloaded(inspector: Inspector, tmp_path: Path) -> None:
+    inspector.as_calibration().save(tmp_path / "calibration.json")
+    data = json.loads((tmp_path / "calibration.json").read_text())
     assert data["parameters"]["apex"]["value"] == TRUE.apex
 
 

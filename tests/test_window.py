@@ -7,14 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 
 from amiwarp import AmiwarpError, Camera, Events, MemoryEvents, Prism, Recording, simulate
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
-from amiwarp.viewer import layout
-from amiwarp.viewer.drawing import orbit_lines
+from amiwarp.viewer import jobs, layout
+from amiwarp.viewer.drawing import RECORDED, Look, orbit_lines
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector
 from amiwarp.viewer.window import MORE_KEYS, Window
 
@@ -276,6 +277,77 @@ def test_steps_nudges_and_undo(window: Window) -> None:
     assert window.closed
 
 
+def test_statistics_of_the_region_are_those_of_the_page(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("amiwarp.viewer.window.REST_S", 0.0)
+    window.key("i")
+    for key in ("", "n"):
+        window.key(key)
+        while window.turn():
+            pass
+        found = window.inspector.statistics()
+        assert f"{found.rate:,.0f} events/s" in window._texts[3].input
+        assert f"{100.0 * found.on_share:.1f} %" in window._texts[3].input
+        _, (line, median) = window._plots["intervals"]
+        np.testing.assert_allclose(line.y, 100.0 * found.intervals / found.intervals.sum())
+        assert median.x[0] == pytest.approx(math.log10(found.median_us))
+    assert found.on_share == 1.0
+    assert window._statistics.GetDraw()
+    assert not any(slider.GetKeyPressActivation() for slider in window.sliders.values())  # VTK's i hides a widget
+    window.key("i")
+    window.turn()
+    assert not window._statistics.GetDraw()
+
+
+def film_of(path: Path) -> np.ndarray:
+    with av.open(str(path)) as container:
+        return np.array([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], np.int16)
+
+
+def test_a_film_goes_to_the_end_of_the_recording(recording: Recording, tmp_path: Path) -> None:
+    inspector, last = Inspector(recording), recording.events.t_last + 1
+    inspector.open(last - 60_000, 20_000)
+    shares: list[float] = []
+    film = {"look": Look(), "view": View.FREE, "what": "film", "speed": 0.25}
+    made = jobs.write_film(tmp_path / "film.mp4", inspector, progress=lambda _, share: shares.append(share), **film)
+    pictures = film_of(tmp_path / "film.mp4")
+    assert made == len(pictures) == len(shares) == 5  # 10 ms of the recording each
+    assert shares == [0.0, 0.2, 0.4, 0.6, 0.8]
+    assert np.abs(pictures[0] - pictures[-1]).mean() > 0.5
+    assert inspector.window == (last - 60_000, 20_000)
+    ended = jobs.write_film(tmp_path / "part.mp4", inspector, progress=lambda *_: None, ended=lambda: True, **film)
+    assert ended == len(film_of(tmp_path / "part.mp4")) == 1
+
+    def stopped(_: str, share: float) -> None:
+        if share > 0.3:
+            raise jobs.JobCancelled
+
+    with pytest.raises(jobs.JobCancelled):
+        jobs.write_film(tmp_path / "none.mp4", inspector, progress=stopped, **film)
+    assert {path.name for path in tmp_path.iterdir()} == {"film.mp4", "part.mp4"}
+
+
+@pytest.mark.parametrize(("key", "films"), [("f", 1), ("c", 0)])
+def test_a_film_of_the_window_is_ended_or_cancelled(
+    window: Window, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str, films: int
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    show, shares = window._show_progress, list[float]()
+
+    def progress(what: str, share: float) -> None:
+        shares.append(share)
+        if len(shares) == 3:
+            window.key(key)
+        show(what, share)
+
+    monkeypatch.setattr(window, "_show_progress", progress)
+    window.key("f")
+    window.turn()
+    assert [len(film_of(path)) for path in tmp_path.iterdir()] == [3] * films
+    assert ("saved" if films else "film cancelled") in window._texts[0].input
+    assert len(shares) == 3
+    assert not window._progress
+
+
 def test_b_is_compared_with(window: Window) -> None:
     window.key("b")
     drag(window, "apex", 0.4)
@@ -313,7 +385,7 @@ def test_playing_moves_the_window_to_the_end(window: Window, recording: Recordin
 def test_a_file_without_a_prism_has_one_large_cloud(recording: Recording) -> None:
     plain = replace(recording, encoder=None, truth=None)
     window = Window(Inspector(plain), size=SIZE, off_screen=True)
-    assert window._look.titles == (layout.RECORDED,)
+    assert window._look.titles == (RECORDED,)
     assert window.look.axis is Axis.TIME
     assert not window._charts.GetDraw()
     assert "no encoder" in window._texts[0].input

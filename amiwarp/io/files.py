@@ -588,8 +588,8 @@ def _reason(error: BaseException) -> str:
 
 
 @contextlib.contextmanager
-def interrupts_later() -> Iterator[None]:
-    """Postpone Ctrl-C and signals that act like it to the end of the ``with`` block.
+def interrupts_later() -> Iterator[list[int]]:
+    """Postpone Ctrl-C and signals that act like it to the end of the ``with`` block; yield those that have arrived.
 
     Native code that calls Python, or is left half-done by an exception, cannot close its files and windows.
     """
@@ -602,7 +602,7 @@ def interrupts_later() -> Iterator[None]:
                 before[number] = handler
                 signal.signal(number, lambda number, _frame: arrived.append(number))
     try:
-        yield
+        yield arrived
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -22,11 +22,13 @@ from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.export import GAMMA, PERCENTILE, save_png
+from amiwarp.imaging.metrics import random_variance
 from amiwarp.imaging.palette import BLUE, OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK, ORANGE, PINK, VERMILION
 from amiwarp.plotting.figures import instance_colours
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.validation import choice
 from amiwarp.viewer.inspector import (
+    SMOOTHING_PX,
     STORES,
     DisplayedWindow,
     DrawnTruth,
@@ -209,7 +211,7 @@ class Scale:
     high: float
     """Value at the end of the colour bar. Higher values have the same colour."""
     colours: str
-    """Name of Matplotlib's colour map, "polarity" for OFF and ON in two colours on black, or "difference"."""
+    """Colours, as :func:`table_of` knows them, or "polarity" for OFF and ON in two colours on black."""
     gamma: float = 1.0
     """Exponent of the tone curve: a colour's place on the bar is the share of the range to this power."""
 
@@ -224,7 +226,7 @@ class Scale:
     def rgb(self, values: NDArray[np.floating]) -> NDArray[np.uint8]:
         """Return the colours of an image, shape ``(height, width, 3)``; pixels without a value are black.
 
-        ``values``: shape ``(height, width)``, or ``(2, height, width)`` for OFF and ON.
+        ``values``: shape ``(height, width)`` or ``(n,)``, or ``(2, height, width)`` for OFF and ON.
         """
         places = self.places(values)
         if self.colours == "polarity":
@@ -238,6 +240,11 @@ class Scale:
         """Whether the values are numbers of events, or their differences."""
         return self.unit == "per pixel"
 
+    @property
+    def label(self) -> str:
+        """Name and unit of the quantity."""
+        return f"{self.title} {self.unit}" if self.counts else f"{self.title} [{self.unit}]"
+
     def ticks(self) -> tuple[tuple[float, str], ...]:
         """Return the marks of the colour bar: their places, 0 to 1, and their texts."""
         from matplotlib.ticker import MaxNLocator
@@ -250,16 +257,21 @@ class Scale:
 
 @cache
 def table_of(colours: str) -> NDArray[np.uint8]:
-    """Return the 256 colours of a bar, shape ``(256, 3)``: of :data:`DIFFERENCES`, or a colour map of Matplotlib."""
+    """Return the 256 colours of a bar, shape ``(256, 3)``: of :data:`DIFFERENCES`, or a colour map of Matplotlib.
+
+    The suffix " on light" or " on dark" keeps white or black apart from the background.
+    """
     from matplotlib import colormaps
 
-    shares = np.linspace(0.0, 1.0, 256)
-    if colours == "difference":
+    shares, (name, _, paper) = np.linspace(0.0, 1.0, 256), colours.partition(" on ")
+    if name == "difference":
         ends = np.linspace(0.0, 1.0, len(DIFFERENCES))
-        table = np.stack([np.interp(shares, ends, channel) for channel in DIFFERENCES.T], axis=1)
+        table = np.stack([np.interp(shares, ends, channel) for channel in DIFFERENCES.T], axis=1) / 255.0
     else:
-        table = 255.0 * colormaps[colours](shares)[:, :3]
-    return np.asarray(np.rint(table), np.uint8)
+        table = colormaps[name](shares)[:, :3]
+    if paper:
+        table = 1.0 - 0.8 * (1.0 - table) if paper == "dark" else 0.8 * table
+    return np.asarray(np.rint(255.0 * table), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,8 +465,6 @@ def _scale(depth: NDArray[Any]) -> tuple[float, float]:
 
 # Colours of the points in the event clouds, and the quantities that the colours show.
 
-COLOUR_MAPS = {Colour.ANGLE: "twilight", Colour.TIME: "viridis", Colour.DENSITY: "cividis", Colour.RESIDUAL: "cividis"}
-"""Matplotlib colour map of each quantity that a scale shows."""
 NEAR_PX = 2.0
 """Standard deviation of the Gaussian weights of the events near an event [px]."""
 WIDEST_PX = 3.0 * NEAR_PX
@@ -492,67 +502,26 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
         return np.full((len(shown.events), 3), 128, np.uint8)
     if look.colour in STORES:
         return truth_colours(shown.truth, look.colour)
-    bar = colour_bar(shown, look.colour, dark=look.dark)
-    assert bar is not None
-    share = np.clip((_measure(shown, look.colour, after=after) - bar.low) / (bar.high - bar.low), 0.0, 1.0)
-    return np.asarray(bar.colours[(255.0 * np.nan_to_num(share) ** bar.gamma).astype(np.uint8)])
+    scale = scale_of(shown, look.colour, dark=look.dark)
+    assert scale is not None
+    return scale.rgb(_measure(shown, look.colour, after=after))
 
 
-def colour_table(colour: Colour, *, dark: bool) -> NDArray[np.uint8]:
-    """Return the 256 colours of a scale, shape ``(256, 3)``.
+def scale_of(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> Scale | None:
+    """Return the scale of a colour choice; None for polarity and ground truth, whose legends have rows.
 
-    The colour maps are perceptually uniform; the colour map of the angle is cyclic.
+    The colour maps are perceptually uniform; that of the angle is cyclic, with white ends and a black middle. The scale
+    of the density is that of both clouds.
     """
-    from matplotlib import colormaps
-
-    name = COLOUR_MAPS[colour]
-    table = colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3]
-    if colour is Colour.ANGLE:  # its ends are white and its middle is black: keep both apart from the background
-        table = 1.0 - 0.8 * (1.0 - table) if dark else 0.8 * table
-    return np.asarray(255.0 * table, np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class ColourBar:
-    """Scale of a quantity that colours show."""
-
-    low: float
-    """Value of the first colour."""
-    high: float
-    """Value of the last colour."""
-    title: str
-    """Name of the quantity."""
-    unit: str
-    """Unit of the values; empty for numbers."""
-    colours: NDArray[np.uint8]
-    """Red, green and blue from ``low`` to ``high``, shape ``(256, 3)``."""
-    gamma: float = 1.0
-    """Exponent of a value's share of the range that gives the place of its colour."""
-
-    @property
-    def label(self) -> str:
-        """Name and unit of the quantity."""
-        return f"{self.title} [{self.unit}]" if self.unit else self.title
-
-
-def colour_bar(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> ColourBar | None:
-    """Return the scale of a colour choice; None for polarity and ground truth, whose legends have rows."""
-    if colour not in COLOUR_MAPS:
-        return None
-    table = colour_table(colour, dark=dark)
     if colour is Colour.ANGLE:
-        return ColourBar(0.0, 360.0, "prism angle θ", "°", table)
+        return Scale("prism angle θ", "°", 0.0, 360.0, f"twilight on {'dark' if dark else 'light'}")
     if colour is Colour.TIME:
-        return ColourBar(*axis_range(shown, Axis.TIME), "time", "ms", table)
+        return Scale("time", "ms", *axis_range(shown, Axis.TIME), "viridis")
     if colour is Colour.DENSITY:
-        return ColourBar(0.0, density_top(shown), "events per pixel", "", table, 0.5)
-    return ColourBar(0.0, WIDEST_PX, "residual σ", "px", table)
-
-
-def density_top(shown: DisplayedWindow) -> float:
-    """Return the number of events per pixel at which the colour scale of the density ends, for both clouds."""
-    image = shown.image_after
-    return float(math.ceil(np.percentile(image[image > 0], 99.0))) if (image > 0).any() else 1.0
+        image = shown.image_after
+        top = math.ceil(np.percentile(image[image > 0], 99.0)) if (image > 0).any() else 1.0
+        return Scale("events", "per pixel", 0.0, float(top), "cividis", GAMMA)
+    return Scale("residual σ", "px", 0.0, WIDEST_PX, "cividis") if colour is Colour.RESIDUAL else None
 
 
 def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> NDArray[np.float64]:
@@ -638,7 +607,7 @@ FONT_SIZE, MARK = 12, "■"
 """Font size of the legend [px], and character that shows the colour of a row."""
 LETTER_PX, MARGIN_PX, LARGEST_STRIP = 7.2, 48, 0.35
 """Width of a letter, width of mark and margins [px], and largest width of the strip as a fraction of the picture."""
-TITLE_PX = 22
+TITLE_PX = 32
 """Height of the title of a scale [px]."""
 FOOT_PX, OWN_RENDERERS = 22, 4
 """Height of the caption [px], and number of renderers of a scene: two clouds, their legend and the caption."""
@@ -667,7 +636,7 @@ def legend_actors(legend: Legend, ink: str, place: tuple[float, float]) -> list[
     return actors
 
 
-def bar_actors(bar: ColourBar, ink: str, height: int) -> list[Any]:
+def bar_actors(bar: Scale, ink: str, height: int) -> list[Any]:
     """Return the actors of a vertical scale in the strip of a picture of a given height [px].
 
     ``ink`` is the colour of the text.
@@ -675,12 +644,15 @@ def bar_actors(bar: ColourBar, ink: str, height: int) -> list[Any]:
     import pyvista
     from vtkmodules.vtkRenderingAnnotation import vtkScalarBarActor
 
-    rgb = bar.colours[np.rint(255.0 * np.linspace(0.0, 1.0, 256) ** bar.gamma).astype(int)]
+    rgb = table_of(bar.colours)[np.rint(255.0 * np.linspace(0.0, 1.0, 256) ** bar.gamma).astype(int)]
     table = pyvista.LookupTable(values=np.column_stack([rgb, np.full(256, 255, np.uint8)]))
     table.scalar_range = bar.low, bar.high
     actor = vtkScalarBarActor()
     actor.SetLookupTable(table)
-    actor.SetNumberOfLabels(5)
+    actor.SetMaximumNumberOfColors(256)
+    values = ticks(bar.low, bar.high)
+    actor.SetUseCustomLabels(True)
+    actor.SetCustomLabels(pyvista.convert_array(values[values % 1.0 == 0.0] if bar.counts else values))
     actor.SetLabelFormat("%.4g")
     actor.UnconstrainedFontSizeOn()
     actor.SetPosition(CORNER[0], BAR_BOTTOM)
@@ -702,6 +674,77 @@ def text_actor(text: str, colour: str, place: tuple[float, float]) -> Any:
     actor.GetPositionCoordinate().SetCoordinateSystemToNormalizedViewport()
     actor.position = place
     return actor
+
+
+# What the clouds show, in words: their titles, and the caption of a picture.
+
+RECORDED = "events as recorded"
+"""Title of the only cloud, if there is no motion to compensate."""
+AGAINST = {
+    "recorded": "as recorded", "B": "compensated with B", "found": "compensated with the result",
+    "truth": "compensated with the known truth",
+}  # fmt: skip
+"""What the left cloud and image can show: name, and title."""
+PLACE_VARIANCE = 0.0025
+"""Relative variance of what one event adds to the variance of an image smoothed by 1 px, over its place in a pixel."""
+LEAST_CERTAIN = 0.05
+"""Standard deviation of the sharpness of random events below which any sharpness is shown."""
+
+
+def against_title(inspector: Inspector, against: str) -> str:
+    """Return the title of what the left cloud shows, by its name in :data:`AGAINST`."""
+    beside = inspector.beside if against == "recorded" else None
+    return AGAINST[against] if beside is None else f"{beside.recording.name} (other recording)"
+
+
+def cloud_titles(inspector: Inspector, against: str) -> tuple[str, ...]:
+    """Return the titles of the clouds. ``against``: name of what the left one shows, see :data:`AGAINST`."""
+    if math.isfinite(inspector.turn_us):
+        return against_title(inspector, against), "compensated" if against == "recorded" else "compensated with A"
+    if inspector.beside is not None:
+        return against_title(inspector, "recorded"), f"{inspector.recording.name}, as recorded"
+    return (RECORDED,)
+
+
+def caption(inspector: Inspector, shown: DisplayedWindow) -> str:
+    """Return what a picture of the clouds shows: recording, time, region, numbers of events and sharpness."""
+    left, top, right, bottom = shown.region
+    end_ms = shown.span.start_ms + shown.span.length_us * 1e-3
+    sharpness = sharpness_text(shown, compensated=math.isfinite(inspector.turn_us))
+    beside = "" if shown.beside is None or inspector.beside is None else f"; left: {inspector.beside.recording.name}"
+    return (
+        f"{inspector.recording.name}: {shown.span.start_ms:.3f} to {end_ms:.3f} ms; x {left} to {right - 1}, "
+        f"y {top} to {bottom - 1} px; {events_text(shown)}; sharpness {sharpness}{beside}"
+    )
+
+
+def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:
+    """Return the sharpness of the images as text, with the gain if there are two images.
+
+    So few events that their sharpness may be that of random ones have none.
+    """
+    before, after = shown.sharpness_before, shown.sharpness_after
+    left, top, right, bottom = shown.region
+    area = (right - left) * (bottom - top)
+    # for random events, the variance over mean varies by sqrt(2 / area) of itself, and with the places in the pixels
+    relative = math.sqrt(2.0 / area + PLACE_VARIANCE / shown.selected)
+    deviation = random_variance(SMOOTHING_PX) * area / shown.selected * relative
+    if deviation > LEAST_CERTAIN and max(abs(before), abs(after)) < 3.0 * deviation:
+        return "unknown: too few events"
+    if not compensated:
+        return f"{before:.3f}"
+    gain = f" (×{after / before:.2f})" if before > 1e-3 and after > 0.0 else ""
+    return f"{before:.3f} → {after:.3f}{gain}"
+
+
+def events_text(shown: DisplayedWindow) -> str:
+    """Return the numbers of events of the window, of those that were read, of these selected, and of these drawn."""
+    total, read, drawn = shown.span.count, len(shown.span.events), len(shown.events)
+    parts = [f"{total:,} events"]
+    parts += [] if read == total else [f"{read:,} of them read"]
+    parts += [] if shown.selected == read else [f"{shown.selected:,} of these selected"]
+    whole = "all" if len(parts) == 1 else "all of these"
+    return ", ".join([*parts, f"{whole if drawn == shown.selected else f'{drawn:,} of these'} drawn"])
 
 
 # VTK scene with the event clouds before and after compensation, drawn off screen without a user interface.
@@ -1060,7 +1103,7 @@ class Scene:
         ink, camera = BACKGROUND_AND_INK[look.dark][1], self._views[0].camera
         home = self.plotter.renderers[2]
         width, height = self.plotter.window_size
-        bar = colour_bar(shown, look.colour, dark=look.dark)
+        bar = scale_of(shown, look.colour, dark=look.dark)
         rows = legend_of(shown.truth, look.colour, rows_in(height))
         if look.overlaid and len(look.titles) > 1:
             rows = (*rows, (GREY, look.titles[0]))
@@ -1074,7 +1117,7 @@ class Scene:
             camera.parallel_scale *= grows
             self._views[0].reset_camera_clipping_range()
         self._caption.input, self._caption.prop.color = caption, ink
-        explained = (rows, ink) if bar is None else (rows, ink, bar.low, bar.high, bar.title)
+        explained = rows, ink, bar
         if self._explained == explained:
             return
         self._explained = explained
@@ -1174,21 +1217,20 @@ def cloud_state(shown: DisplayedWindow, colour: Colour, axis: Axis, *, dark: boo
 
 def legend(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> dict[str, Any]:
     """Return the legend of a colour choice: title, rows of colour and text, or a scale with its ends."""
-    bar = colour_bar(shown, colour, dark=dark)
+    bar = scale_of(shown, colour, dark=dark)
     if bar is None:
         (_, title), *rows = legend_of(shown.truth, colour, LEGEND_ROWS)
         return {"title": title, "rows": [list(row) for row in rows], "bar": "", "low": "", "high": ""}
-    title = f"{bar.title} (square root)" if bar.gamma != 1.0 else bar.title
-    low, high = f"{bar.low:.6g}", f"{bar.high:.3g}" if colour is Colour.DENSITY else f"{bar.high:.6g}"
-    unit = f" {bar.unit}" if bar.unit and bar.unit != "°" else bar.unit
-    return {"title": title, "rows": [], "bar": gradient(bar.colours), "low": low, "high": high + unit}
+    title = f"{bar.label} (square root)" if bar.counts else bar.title
+    unit = "" if bar.counts else bar.unit if bar.unit == "°" else f" {bar.unit}"
+    return {"title": title, "rows": [], "bar": gradient(bar.colours), "low": f"{bar.low:.6g}",
+            "high": f"{bar.high:.6g}{unit}"}  # fmt: skip
 
 
-def gradient(table: NDArray[Any]) -> str:
-    """Return a colour map, shape ``(n, 3)``, as a gradient of CSS."""
-    chosen = table[np.linspace(0, len(table) - 1, min(STOPS, len(table))).round().astype(int)]
-    colours = ", ".join(f"rgb({r} {g} {b})" for r, g, b in chosen.round().astype(int).tolist())
-    return f"linear-gradient(90deg, {colours})"
+def gradient(colours: str) -> str:
+    """Return the colours of a scale as a gradient of CSS."""
+    chosen = table_of(colours)[np.linspace(0, 255, STOPS).round().astype(int)].tolist()
+    return f"linear-gradient(90deg, {', '.join(f'rgb({r} {g} {b})' for r, g, b in chosen)})"
 
 
 def scale_state(scale: Scale) -> dict[str, Any]:
@@ -1196,10 +1238,9 @@ def scale_state(scale: Scale) -> dict[str, Any]:
 
     OFF and ON have a square instead of a bar: OFF to the right, ON upwards.
     """
-    title = f"{scale.title} {scale.unit}" if scale.counts else f"{scale.title} [{scale.unit or '1'}]"
-    ticks = [list(tick) for tick in scale.ticks()]
+    title, ticks = scale.label, [list(tick) for tick in scale.ticks()]
     if scale.colours != "polarity":
-        return {"bar": gradient(table_of(scale.colours)), "ticks": ticks, "title": title, "square": None}
+        return {"bar": gradient(scale.colours), "ticks": ticks, "title": title, "square": None}
     values = scale.low + np.linspace(0.0, 1.0, SQUARE) ** (1.0 / scale.gamma) * (scale.high - scale.low)
     square = picture_state(np.stack(np.broadcast_arrays(values, values[::-1, None])), replace(scale, unit=""))
     return {"bar": "", "ticks": ticks, "title": title, "square": square}
@@ -1239,6 +1280,16 @@ def orbit_lines(inspector: Inspector, shown: DisplayedWindow, picked: int = -1) 
     theta, orbit = inspector.orbit(float(point[0]), float(point[1]))
     lines = [np.column_stack([xy, np.degrees(theta)]) for xy in (orbit, np.broadcast_to(point, orbit.shape))]
     return lines[0], lines[1]
+
+
+def shown_lines(
+    inspector: Inspector, shown: DisplayedWindow, axis: Axis, against: Knobs | None, picked: int = -1
+) -> tuple[NDArray[Any], ...]:
+    """Return the line of each cloud: of a scene point that moves, or that stays; none without a motion or over time."""
+    if axis is not Axis.ANGLE or not math.isfinite(inspector.turn_us):
+        return ()
+    orbit, column = orbit_lines(inspector, shown, picked)
+    return (orbit if against is None and shown.beside is None else column, column)
 
 
 NO_ORBIT = {"orbit": b"", "column": b"", "has_orbit": False}

@@ -6,6 +6,7 @@ import enum
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -822,9 +823,7 @@ class Inspector:
         path = None if calibration is None or recording.encoder is not None else calibration.path
         if path is not None and path.covers(source.t_first, source.t_last):
             recording = replace(recording, encoder=path)
-        no_speed = recording.encoder is None and calibration is None
-        self.notes = (NO_ENCODER,) * no_speed + (NO_CAMERA,) * (recording.camera is None)
-        """What is missing to compensate the prism's motion, one sentence each."""
+        self._no_speed = recording.encoder is None and calibration is None
         self.sources = {
             "camera": Source.ASSUMED if recording.camera is None else Source.FILE,
             "prism": Source.ASSUMED if recording.prism is None else Source.FILE,
@@ -863,17 +862,35 @@ class Inspector:
         if calibration is not None:
             self.accept(calibration)
 
+    def copy(self) -> Inspector:
+        """Return an inspector that shows the same, with buffers of its own, for another thread."""
+        made, size = copy(self), self.recording.events.size
+        made.lock, made._votes, made.sources = Lock(), {}, dict(self.sources)
+        made._imager, made._curve_imager = (WindowImager(size, self.device) for _ in range(2))
+        made._window = made._span = None
+        made.beside = None if self.beside is None else self.beside.copy()
+        return made
+
     @property
     def camera(self) -> Camera:
         """Camera of the calibration or of the recording; an assumed camera if both lack it."""
         assert self.recording.camera is not None
         return self.recording.camera
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is missing to compensate the prism's motion, one sentence each."""
+        return (NO_ENCODER,) * self._no_speed + (NO_CAMERA,) * (self.sources["camera"] is Source.ASSUMED)
+
+    @property
+    def fov_deg(self) -> float:
+        """Horizontal field of view of the camera [deg]."""
+        return round(2.0 * math.degrees(math.atan(0.5 * self.camera.width / self.camera.fx)), 4)
+
     def set_camera(self, fov_deg: float) -> None:
         """Set a camera with a horizontal field of view [deg], without distortion. The window is read again."""
         camera = Camera.from_fov(*self.recording.events.size, math.radians(fov_deg))
         self.recording, self.sources["camera"] = replace(self.recording, camera=camera), Source.HAND
-        self.notes = tuple(note for note in self.notes if note != NO_CAMERA)
         self._window = None
 
     def set_index(self, index: float) -> None:
@@ -1085,12 +1102,20 @@ class Inspector:
         self.beside = Inspector(recording, device=self.device, most_points=self.most_points)
         self.beside._is_beside = True
 
-    def _show_beside(self, inspector: Inspector, span: Span) -> DisplayedWindow:
-        """Return what a recording beside shows in the time of ``span``."""
-        window = span.start_us - span.first_us + inspector.recording.events.t_first, span.length_us
-        if (window, self.selection) != (inspector.window, inspector.selection):
-            inspector.open(*window, self.selection)
-        return inspector.show()
+    def _beside(self, span: Span, selection: Selection, image_after: NDArray[np.float32]) -> DisplayedWindow:
+        """Return what this recording, as recorded, shows beside another one in the time of that one's ``span``.
+
+        ``image_after``: compensated image of the other recording, which sets the scale of colours.
+        """
+        window = span.start_us - span.first_us + self.recording.events.t_first, span.length_us
+        if (window, selection) != (self.window, self.selection):
+            self.open(*window, selection)
+        w = self.loaded
+        first = self._unmoved(w)
+        return DisplayedWindow(
+            w.span, w.region, w.selected, w.drawn, w.truth, w.xy, w.xy, self._wrapped(w, self.knobs), first.image,
+            image_after, first.sharpness, first.sharpness, is_beside=True,
+        )  # fmt: skip
 
     def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:
         """Return the time window's images and points.
@@ -1102,9 +1127,9 @@ class Inspector:
         w, knobs = self.loaded, knobs or self.knobs
         xy = w.xy if against is None else self._moved(w, against)
         second, theta = self._measured(w, knobs), self._wrapped(w, knobs)
-        other = None if self.beside is None or against is not None else self._show_beside(self.beside, w.span)
-        if other is not None:  # the second image sets the scale of colours
-            other = replace(other, image_after=second.image, is_beside=True)
+        other = None
+        if self.beside is not None and against is None:
+            other = self.beside._beside(w.span, self.selection, second.image)
             image, sharpness = other.image_before, other.sharpness_before
         else:
             first = self._unmoved(w) if against is None else self._measured(w, against)

@@ -2,11 +2,9 @@
 
 import asyncio
 import contextlib
-import itertools
 import logging
 import math
 import re
-import tempfile
 import weakref
 from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -32,11 +30,10 @@ from amiwarp.io.formats import check_ending
 from amiwarp.live.stream.session import RecentEvents
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.picture import save_film
-from amiwarp.viewer.drawing import Look, Scene, SelectedPart, ShownImages, orbit_lines, select_part
+from amiwarp.viewer.drawing import Look, Scene, SelectedPart, ShownImages, caption, select_part, shown_lines
 from amiwarp.viewer.inspector import (
     CURVE_HALF_WIDTH,
     MOST_SEARCHED,
-    DisplayedWindow,
     Inspector,
     Knobs,
     Source,
@@ -75,6 +72,8 @@ class JobProgress:
     def __init__(self, show: Callable[[str, float], None]) -> None:
         """``show``: method of the page that shows the name of a step and the finished share, 0 to 1."""
         self.cancelled = False
+        self.ended = False
+        """Whether a film ends with the pictures made so far."""
         self._show, self._loop, self._last_s = weakref.WeakMethod(show), asyncio.get_running_loop(), -math.inf
 
     def __call__(self, what: str, share: float) -> None:
@@ -462,14 +461,6 @@ COLUMNS = ("t", "x", "y", "p", "theta", "x_compensated", "y_compensated")
 """Columns of a table of events: time [us], pixel, polarity, prism angle [rad] and compensated place [px]."""
 
 
-def as_bytes(suffix: str, write: Callable[[Path], object]) -> bytes:
-    """Return the content of a file that ``write`` writes to the path that it is given, which ends in ``suffix``."""
-    with tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True) as folder:
-        path = Path(folder) / f"download{suffix}"
-        write(path)
-        return path.read_bytes()
-
-
 def write_events(inspector: Inspector, path: Path, *, compensated: bool) -> int:
     """Write all selected events of the window to a new native file, and return their number.
 
@@ -592,18 +583,16 @@ def _cut(encoder: Encoder, first_us: int, last_us: int) -> Encoder:
 # Films of the clouds, and the downloads that a page offers. No file is written on the server.
 
 FRAMES, FPS = 90, 25.0
-"""Number of pictures of a film, and pictures per second."""
+"""Number of pictures of a turning film, and pictures per second."""
 FILM_SIZE = (1280, 560)
 """Width and height of a film [px]."""
 EXPORTS = {
-    "picture": ("picture", ".png", "image/png"), "image": ("images", ".png", "image/png"),
-    "values": ("image values", ".tif", "image/tiff"), "events": ("events", ".h5", "application/x-hdf5"),
-    "compensated": ("compensated events", ".h5", "application/x-hdf5"),
-    "csv": ("events, CSV", ".csv", "text/csv"), "npz": ("events, NPZ", ".npz", "application/x-npz"),
-    "calibration": ("calibration", ".json", "application/json"), "turntable": ("film, turning", ".mp4", "video/mp4"),
-    "film": ("film from here", ".mp4", "video/mp4"),
+    "picture": ("picture", ".png"), "image": ("images", ".png"), "values": ("image values", ".tif"),
+    "events": ("events", ".h5"), "compensated": ("compensated events", ".h5"), "csv": ("events, CSV", ".csv"),
+    "npz": ("events, NPZ", ".npz"), "calibration": ("calibration", ".json"), "turntable": ("film, turning", ".mp4"),
+    "film": ("film from here", ".mp4"),
 }  # fmt: skip
-"""Downloads by name: text of the button, suffix and media type."""
+"""Downloads by name: text of the button, and suffix."""
 FILMS = ("turntable", "film")
 """Downloads that take long."""
 
@@ -616,39 +605,44 @@ def download_name(recording: str, what: str) -> str:
 
 def write_film(
     path: Path, inspector: Inspector, look: Look, view: View, progress: Progress, *, what: str,
-    against: Knobs | None, with_orbit: bool, speed: float, caption: Callable[[Inspector, DisplayedWindow], str],
-) -> None:  # fmt: skip
-    """Write a film of the clouds to a new file.
+    against: Knobs | None = None, with_orbit: bool = True, speed: float, ended: Callable[[], bool] = lambda: False,
+) -> int:  # fmt: skip
+    """Write a film of the clouds to a new file, picture by picture, and return their number.
 
     ``what``: "turntable" for a camera that moves once around the clouds of the inspector's window, or "film" for a time
-    window that moves on from there with ``speed`` times real time. ``against``: parameters of the left cloud; None for
-    the recorded events. ``progress`` may raise an error to stop the film. ``caption`` gives the text below the clouds.
+    window that moves on from there with ``speed`` times real time, to the end of the recording or until ``ended``
+    returns True. A time without events keeps the picture before it. ``against``: parameters of the left cloud; None for
+    the recorded events. ``progress`` may raise an error to stop the film; no file is left then.
     """
+    inspector, turns = inspector.copy(), what == "turntable"
+    span, step_us = inspector.loaded.span, 1e6 / FPS * speed
+    last_us = inspector.recording.events.t_last + 1 - span.length_us
+    frames = FRAMES if turns else 1 + max(0, math.floor((last_us - span.start_us) / step_us))
 
     def draw(scene: Scene) -> None:
         shown = inspector.show(against=against)
-        orbit, column = orbit_lines(inspector, shown)
-        lines = (orbit if against is None else column, column)
-        scene.show(shown, look, lines if with_orbit else (), caption(inspector, shown))
+        lines = shown_lines(inspector, shown, look.axis, against) if with_orbit else ()
+        scene.show(shown, look, lines, caption(inspector, shown))
 
     def pictures() -> Iterator[NDArray[np.uint8]]:
         with contextlib.closing(Scene(FILM_SIZE)) as scene:
             draw(scene)
             scene.look_from(view, look)
-            if what == "turntable":
-                yield from scene.turntable(FRAMES)
+            if turns:
+                yield from scene.turntable(frames)
                 return
-            span = inspector.loaded.span
-            start_us, last_us = float(span.start_us), inspector.recording.events.t_last + 1 - span.length_us
-            while (start_us := start_us + 1e6 / FPS * speed) <= last_us:
-                yield scene.picture()
-                inspector.open(round(start_us), span.length_us)
-                draw(scene)
             yield scene.picture()
+            for k in range(1, frames):
+                with contextlib.suppress(AmiwarpError):  # there are no events at this time
+                    inspector.open(span.start_us + round(k * step_us), span.length_us)
+                    draw(scene)
+                yield scene.picture()
 
     def counted() -> Iterator[NDArray[np.uint8]]:
-        for k, picture in enumerate(itertools.islice(pictures(), FRAMES)):
-            progress(f"making the {EXPORTS[what][0]}", k / FRAMES)
+        for k, picture in enumerate(pictures()):
+            if k and ended():
+                return
+            progress(f"making the {EXPORTS[what][0]}, {k / FPS:.0f} of {frames / FPS:.0f} s", k / frames)
             yield picture
 
-    save_film(counted(), path, fps=FPS)
+    return save_film(counted(), path, fps=FPS)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
@@ -10,16 +11,13 @@ import numpy as np
 
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
-from amiwarp.imaging.metrics import random_variance
 from amiwarp.optics.models import MODELS
-from amiwarp.viewer.drawing import NO_ORBIT, ImageKind
+from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look
 from amiwarp.viewer.inspector import (
     INTERVALS_US,
     NO_ENCODER,
     OTHERS,
     SLIDING,
-    SMOOTHING_PX,
-    DisplayedWindow,
     Inspector,
     Knobs,
     Selection,
@@ -69,15 +67,22 @@ class ViewState:
     """Direction from which the clouds are seen."""
     overlaid: bool = False
     """Whether both clouds are in one frame."""
+    fov_deg: float | None = None
+    """Horizontal field of view [deg]; None if the recording holds its camera."""
+    prism_index: float | None = None
+    """Refractive index; None if the recording holds its prism."""
 
 
-def current_state(inspector: Inspector) -> ViewState:
-    """Return the state of an inspector, with the default look."""
+def current_state(inspector: Inspector, **look: Any) -> ViewState:
+    """Return the state of an inspector, with the default look but for the given fields."""
     start_us, length_us = inspector.window or inspector.first_window()
     first = inspector.recording.events.t_first
     axis = Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME
     sources = tuple(inspector.sources.items())
-    return ViewState(start_us - first, length_us, inspector.selection, inspector.knobs, sources, axis=axis)
+    given = given_state(inspector)
+    of = {"axis": axis, "fov_deg": given["fov_deg"] if given["gives_camera"] else None,
+          "prism_index": given["index"] if given["gives_prism"] else None, **look}  # fmt: skip
+    return ViewState(start_us - first, length_us, inspector.selection, inspector.knobs, sources, **of)
 
 
 def apply_state(inspector: Inspector, state: ViewState) -> None:
@@ -88,9 +93,15 @@ def apply_state(inspector: Inspector, state: ViewState) -> None:
     window = state.start_us + inspector.recording.events.t_first, state.length_us
     if (window, state.selection) != (inspector.window, inspector.selection):
         inspector.open(*window, state.selection)
+    given = given_state(inspector)
+    if state.fov_deg is not None and state.fov_deg != given["fov_deg"]:
+        inspector.set_camera(state.fov_deg)
+    if state.prism_index is not None and state.prism_index != given["index"]:
+        inspector.set_index(state.prism_index)
     inspector.set(state.knobs)
-    given = {name: inspector.sources[name] for name in ("camera", "prism")}  # are no part of a state
-    inspector.sources = dict(state.sources) | given
+    known = {name: source for name, source in inspector.sources.items() if name in ("camera", "prism")}
+    held = {name: source for name, source in known.items() if source is Source.FILE}
+    inspector.sources = dict(state.sources) | held
 
 
 class History:
@@ -154,6 +165,8 @@ LIMITS = {
 }  # fmt: skip
 """Smallest and largest value of each parameter in an address and a field: angles in degrees, others in their own units.
 """
+HAND_LIMITS = {"fov_deg": (1.0, 170.0), "prism_index": (1.01, 3.5)}
+"""Smallest and largest value of the properties of camera and prism that can be set by hand."""
 CHOICES: dict[str, Any] = {"image": ImageKind, "colour": Colour, "axis": Axis, "view": View}
 POLARITIES = {"both": None, "on": 1, "off": 0}
 FLAGS = {"0": False, "1": True}
@@ -192,6 +205,7 @@ def _texts(state: ViewState) -> dict[str, str]:
         "polarity": polarities[s.polarity], "region": "all" if s.region is None else ",".join(map(str, s.region)),
         "hide_hot": str(int(s.hide_hot)), "noise_us": "0" if s.noise_us is None else str(s.noise_us),
         "overlaid": str(int(state.overlaid)), **{name: getattr(state, name).value for name in CHOICES},
+        **{name: f"{value:.10g}" for name in HAND_LIMITS if (value := getattr(state, name)) is not None},
         **_knob_texts(state.knobs, ""),
     }  # fmt: skip
     if state.against is not None:
@@ -223,8 +237,13 @@ def _with_value(state: ViewState, key: str, text: str, size: tuple[int, int], du
     }
     if key in plain:
         return plain[key]()
+    change: dict[str, Any] = {}
     if key in CHOICES:
-        return replace(state, **{key: CHOICES[key](text)})
+        change[key] = CHOICES[key](text)
+    elif key in HAND_LIMITS and getattr(state, key) is not None:
+        change[key] = _within(float(text), *HAND_LIMITS[key])
+    if change:
+        return replace(state, **change)
     if key.startswith("b_"):
         return replace(state, against=_with_knob(state.against or state.knobs, key.removeprefix("b_"), text))
     return replace(state, knobs=_with_knob(state.knobs, key, text))
@@ -283,7 +302,8 @@ NAMES = tuple(UNITS)
 """Names of the prism parameters that have a slider."""
 GIVEN = {"fov_deg": ("field of view", "°", "gives_camera"), "index": ("refractive index", "", "gives_prism")}
 """Properties of camera and prism that a recording may lack: label, unit, and the condition for showing the field."""
-FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, "fov_deg": (1.0, 170.0), "index": (1.01, 3.5)}
+FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, "fov_deg": HAND_LIMITS["fov_deg"],
+                "index": HAND_LIMITS["prism_index"]}  # fmt: skip
 """Smallest and largest value of the fields of the prism and the camera, in the page's units."""
 EDITABLE = ("start_ms", "length_ms", "turns", "noise_ms", *GIVEN)
 """State variables with a number field, next to the prism's parameters."""
@@ -303,17 +323,10 @@ SPEEDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10)
 """Choices of the playback speed, relative to real time."""
 VIEWS = ((View.FREE.value, "corner"), (View.XY.value, "x-y"), (View.X_AXIS.value, "x-θ"), (View.Y_AXIS.value, "y-θ"))
 """Viewpoints of the clouds, with the texts of their buttons."""
-RECORDED = "events as recorded"
-"""Title of the only cloud, if there is no motion to compensate."""
 SCOPES = ("selection", "whole recording")
 """Choices of the events that a calibration uses."""
 TOOLS = (("region", "draw region"), ("move", "move"), ("measure", "measure"))
 """What a drag of the mouse does on the images: name and text."""
-AGAINST = {
-    "recorded": "as recorded", "B": "compensated with B", "found": "compensated with the result",
-    "truth": "compensated with the known truth",
-}  # fmt: skip
-"""What the left cloud and image can show: name, and title."""
 KEYS = (
     ("ArrowRight", ("step", 1), "forward by one turn, or by the window's length"),
     ("ArrowLeft", ("step", -1), "back by one turn, or by the window's length"),
@@ -343,7 +356,7 @@ CALLS = (
     "key", "released", "choose", "typed", "edge", "draw", "whole", "suggest", "look_from", "step", "move_window",
     "resize_window", "take_from_curve", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline",
     "undo", "redo", "reset", "restore", "answer", "keep_b", "swap_b", "compare_found", "export", "open_file",
-    "use_card",
+    "use_card", "end_film",
 )  # fmt: skip
 """Methods of the panel that the page may call."""
 SETTABLE: dict[str, Check] = {
@@ -360,27 +373,157 @@ SETTABLE: dict[str, Check] = {
 :data:`CALLS`."""
 CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice")
 """State variables that the browser keeps to itself."""
-PLACE_VARIANCE = 0.0025
-"""Relative variance of what one event adds to the variance of an image smoothed by 1 px, over its place in a pixel."""
-LEAST_CERTAIN = 0.05
-"""Standard deviation of the sharpness of random events below which any sharpness is shown."""
 NO_SCALE: dict[str, Any] = {"bar": "", "ticks": [], "title": "", "square": None}
 """Scale of an image before the first update."""
 
 
-def against_title(inspector: Inspector, against: str) -> str:
-    """Return the title of what the left cloud shows, by its name in :data:`AGAINST`."""
-    beside = inspector.beside if against == "recorded" else None
-    return AGAINST[against] if beside is None else f"{beside.recording.name} (other recording)"
+class Actions:
+    """What page and window do alike: actions of keys and buttons, playback, and the history of what is shown."""
 
+    keys: tuple[tuple[str, tuple[Any, ...], str], ...] = KEYS
+    inspector: Inspector
+    look: Look
+    view: View
+    time_window: tuple[int, int]
+    """Start and length of the wanted time window on the events' clock [us]."""
+    b: Knobs | None = None
+    """Parameters that were kept as B."""
+    found: Calibration | None = None
+    """Result of a calibration that is not accepted yet."""
+    history: History | None = None
+    wanted: ViewState | str | None = None
+    """State that is to be shown, or the address that describes it; None to stay."""
 
-def cloud_titles(inspector: Inspector, against: str) -> tuple[str, ...]:
-    """Return the titles of the clouds. ``against``: name of what the left one shows, see :data:`AGAINST`."""
-    if math.isfinite(inspector.turn_us):
-        return against_title(inspector, against), "compensated" if against == "recorded" else "compensated with A"
-    if inspector.beside is not None:
-        return against_title(inspector, "recorded"), f"{inspector.recording.name}, as recorded"
-    return (RECORDED,)
+    def request(self, *what: str, change: str = "") -> None:
+        """Request updates. Successive changes of one name are undone in one step."""
+        raise NotImplementedError
+
+    def released(self) -> None:
+        """End a change that lasts, such as a drag."""
+
+    def errors_shown(self, what: str) -> AbstractContextManager[None]:
+        """Show errors of the enclosed code as a message. ``what``: kind of the action."""
+        raise NotImplementedError
+
+    def say(self, text: str) -> None:
+        """Show a message."""
+        raise NotImplementedError
+
+    def knobs_taken(self) -> None:
+        """Show parameters that the inspector has taken from elsewhere."""
+        self.request("knobs")
+        self.released()
+
+    @property
+    def against(self) -> Knobs | None:
+        """Parameters that the first cloud shows; None for the recorded events."""
+        return self.b
+
+    @property
+    def image(self) -> ImageKind:
+        """What the images show."""
+        return ImageKind.COUNT
+
+    @property
+    def compensates(self) -> bool:
+        """Whether the prism rotates, so that there is a motion to compensate."""
+        return math.isfinite(self.inspector.turn_us)
+
+    @property
+    def whole_us(self) -> int:
+        """Duration of the recording [us]."""
+        source = self.inspector.recording.events
+        return int(source.t_last - source.t_first + 1)
+
+    def key(self, key: str) -> None:
+        """Run the action of a key."""
+        for known, (name, *given), _ in self.keys:
+            if key == known:
+                getattr(self, name)(*given)
+
+    def suggest(self) -> None:
+        """Show the region in which compensation gains most sharpness."""
+        self.request("suggestion", "window")
+        self.released()
+
+    def toggle_axis(self) -> None:
+        """Switch the third axis between angle and time."""
+        self.restyle(axis=Axis.TIME if self.look.axis is Axis.ANGLE else Axis.ANGLE)
+
+    def restyle(self, **changes: Any) -> None:
+        """Change fields of the look."""
+        self.look = replace(self.look, **changes)
+        self.request("look")
+
+    def take_truth(self) -> None:
+        """Set the parameters to the known truth of a simulated recording."""
+        with self.errors_shown("knobs"):
+            self.inspector.take_truth()
+        self.knobs_taken()
+
+    # Time
+
+    def step(self, count: int) -> None:
+        """Move the time window by turns; without a prism, by its length."""
+        start_us, length_us = self.time_window
+        self.move(start_us + count * (round(self.inspector.turn_us) if self.compensates else length_us))
+        self.released()
+
+    def move(self, start_us: int, change: str = "") -> bool:
+        """Move the time window to a start, within the recording. Return whether it is at the end."""
+        first, (_, length_us) = self.inspector.recording.events.t_first, self.time_window
+        last = first + max(0, self.whole_us - length_us)
+        self.time_window = min(max(start_us, first), last), length_us
+        self.request("window", change=change)
+        return start_us >= last
+
+    def can_play(self) -> bool:
+        """Go back to the start from the end. Return whether there is something to play, or a live stream to follow."""
+        start_us, length_us = self.time_window
+        if self.inspector.latest is None:
+            if length_us >= self.whole_us:
+                self.say("the window holds the whole recording; make it shorter to play")
+                return False
+            if self.move(start_us):
+                self.move(self.inspector.recording.events.t_first)
+        return True
+
+    def advance(self, shown_us: float, *, loop: bool) -> bool:
+        """Move the time window on while the recording is played, once or in a loop. Return whether it goes on."""
+        start_us = self.time_window[0] + round(shown_us)
+        if not self.move(start_us):
+            return True
+        self.move(self.inspector.recording.events.t_first if loop else start_us)
+        return loop
+
+    # History
+
+    def undo(self) -> None:
+        """Go back by one step."""
+        self._travel(History.undo)
+
+    def redo(self) -> None:
+        """Go forward by one step that was undone."""
+        self._travel(History.redo)
+
+    def reset(self) -> None:
+        """Show the first state again."""
+        self._travel(History.reset)
+
+    def _travel(self, step: Callable[[History], ViewState]) -> None:
+        if self.history is not None:
+            self.wanted = step(self.history)
+            self.request("state")
+            self.released()
+
+    def remember(self, change: str) -> History:
+        """Add what is shown now to the history, and return it. Equal ``change`` of successive states make one step."""
+        look = self.look
+        now = current_state(self.inspector, against=self.against, image=self.image, axis=look.axis, colour=look.colour,
+                            view=self.view, overlaid=look.overlaid)  # fmt: skip
+        self.history = self.history or History(now)
+        self.history.add(now, change)
+        return self.history
 
 
 def template() -> str:
@@ -425,7 +568,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "has_encoder": inspector.has_encoder, "models": list(MODELS),
         "apex_most": apex_most(inspector), "truths": truths(inspector),
         "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth),
-        "exports": [[name, text, name in FILMS] for name, (text, *_) in EXPORTS.items()],
+        "exports": [[name, text, name in FILMS] for name, (text, _) in EXPORTS.items()],
         "open_shown": False, "playing": False, "speed": 0.1, "speeds": list(SPEEDS), "loop": False, "polarity": "both",
         "hide_hot": False, "noise_filter": False, "noise_ms": 2.0, "region_kind": "whole",
         "region_wanted": [0, 0, *size], "region": [0, 0, *size], "knob": "apex",
@@ -483,9 +626,8 @@ def prism_state(inspector: Inspector) -> dict[str, Any]:
 
 def given_state(inspector: Inspector) -> dict[str, Any]:
     """Return the state variables of the camera and the prism that can be set if the recording lacks them."""
-    fov = 2.0 * math.degrees(math.atan(0.5 * inspector.camera.width / inspector.camera.fx))
     return {
-        "fov_deg": round(fov, 4), "index": round(inspector.prism.index, 4),
+        "fov_deg": inspector.fov_deg, "index": round(inspector.prism.index, 4),
         "gives_camera": inspector.sources["camera"] in (Source.ASSUMED, Source.HAND),
         "gives_prism": inspector.sources["prism"] in (Source.ASSUMED, Source.HAND),
     }  # fmt: skip
@@ -509,47 +651,6 @@ def notes(inspector: Inspector) -> list[str]:
 
 
 # Texts and figures about the shown window, a live stream and a calibration.
-
-
-def caption(inspector: Inspector, shown: DisplayedWindow) -> str:
-    """Return what a picture of the clouds shows: recording, time, region, numbers of events and sharpness."""
-    left, top, right, bottom = shown.region
-    end_ms = shown.span.start_ms + shown.span.length_us * 1e-3
-    sharpness = sharpness_text(shown, compensated=math.isfinite(inspector.turn_us))
-    beside = "" if shown.beside is None or inspector.beside is None else f"; left: {inspector.beside.recording.name}"
-    return (
-        f"{inspector.recording.name}: {shown.span.start_ms:.3f} to {end_ms:.3f} ms; x {left} to {right - 1}, "
-        f"y {top} to {bottom - 1} px; {events_text(shown)}; sharpness {sharpness}{beside}"
-    )
-
-
-def sharpness_text(shown: DisplayedWindow, *, compensated: bool) -> str:
-    """Return the sharpness of the images as text, with the gain if there are two images.
-
-    So few events that their sharpness may be that of random ones have none.
-    """
-    before, after = shown.sharpness_before, shown.sharpness_after
-    left, top, right, bottom = shown.region
-    area = (right - left) * (bottom - top)
-    # for random events, the variance over mean varies by sqrt(2 / area) of itself, and with the places in the pixels
-    relative = math.sqrt(2.0 / area + PLACE_VARIANCE / shown.selected)
-    deviation = random_variance(SMOOTHING_PX) * area / shown.selected * relative
-    if deviation > LEAST_CERTAIN and max(abs(before), abs(after)) < 3.0 * deviation:
-        return "unknown: too few events"
-    if not compensated:
-        return f"{before:.3f}"
-    gain = f" (×{after / before:.2f})" if before > 1e-3 and after > 0.0 else ""
-    return f"{before:.3f} → {after:.3f}{gain}"
-
-
-def events_text(shown: DisplayedWindow) -> str:
-    """Return the numbers of events of the window, of those that were read, of these selected, and of these drawn."""
-    total, read, drawn = shown.span.count, len(shown.span.events), len(shown.events)
-    parts = [f"{total:,} events"]
-    parts += [] if read == total else [f"{read:,} of them read"]
-    parts += [] if shown.selected == read else [f"{shown.selected:,} of these selected"]
-    whole = "all" if len(parts) == 1 else "all of these"
-    return ", ".join([*parts, f"{whole if drawn == shown.selected else f'{drawn:,} of these'} drawn"])
 
 
 def statistics_state(found: Statistics) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import math
 import secrets
+import tempfile
 import traceback
 import weakref
 from collections.abc import Callable
@@ -47,7 +48,7 @@ PLAY_S, FOLLOW_S, RATES_S = 0.05, 0.1, 1.0
 two counts of a live stream's events for the timeline [s]."""
 
 
-class Panel:
+class Panel(layout.Actions):
     """Panel that connects the page of one browser tab with its inspector. Call :meth:`close` when the tab is closed.
 
     The page may call the methods in :data:`amiwarp.viewer.layout.CALLS`. The server checks their arguments by their
@@ -60,19 +61,15 @@ class Panel:
         self.work = PageWork(server, inspector.device, self.make, self.make_slow)
         self.shown: DisplayedWindow | None = None
         """Window as the page shows it; None before the first update."""
-        self.found: Calibration | None = None
-        """Result of the calibration that the user has not accepted yet; None if there is none."""
-        self.b: Knobs | None = None
-        """Parameters that were kept as B."""
         self.plays = False
         """Whether the playback runs; after a stop it runs until it notices the stop."""
         self._picked, self._card = -1, False
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
-        self._history: layout.History | None = None
-        self._wanted: layout.ViewState | str | None = None
         self._rates: EventRates
         self._progress: JobProgress | None = None
-        use_page(server, layout.template())
+        self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
+        self._downloads = 0
+        use_page(server, layout.template(), self._folder.name)
         self.state.client_only(*layout.CLIENT_ONLY)
         self._listen()
         self.start(inspector)
@@ -80,14 +77,13 @@ class Panel:
     def start(self, inspector: Inspector) -> None:
         """Show an inspector from its first state."""
         self.inspector, self.shown, self.b, self.found, self._picked = inspector, None, None, None, -1
-        self._history = self._wanted = None
+        self.history = self.wanted = None
         self._give_points()
         inspector.renew()  # a live stream may have gone on since the inspector was made
         files = [] if self._library is None else self._library.files()
         folder = "" if self._library is None else str(self._library.folder)
-        start, length = inspector.window or inspector.first_window()
-        self.state.update({**layout.initial_state(inspector), "files": files, "folder": folder,
-                           "start_ms": self._page_ms(start), "length_ms": round(length * 1e-3, 3)})  # fmt: skip
+        self.state.update({**layout.initial_state(inspector), "files": files, "folder": folder})
+        self.time_window = inspector.window or inspector.first_window()
         self._count_events()
         self.request("window", *(["suggestion"] if self.compensates else []))
         self.released()
@@ -98,7 +94,8 @@ class Panel:
             self.work.start_job(self._watch(inspector.latest))
 
     def close(self) -> None:
-        """Stop all work of the browser tab."""
+        """Stop all work of the browser tab, and remove its downloads."""
+        self._folder.cleanup()
         self.cancel()
         self.inspector.closed = True
         self.work.close()
@@ -108,15 +105,59 @@ class Panel:
         if self._progress is not None:
             self._progress.cancelled = True
 
+    def end_film(self) -> None:
+        """End the film that is being made with the pictures made so far."""
+        if self._progress is not None:
+            self._progress.ended = True
+
     @property
     def offered(self) -> dict[str, Callable[..., None]]:
         """Methods that the page may call, by name."""
         return {name: getattr(self, name) for name in layout.CALLS}
 
     @property
-    def compensates(self) -> bool:
-        """Whether the prism rotates, so that there is a motion to compensate."""
-        return math.isfinite(self.inspector.turn_us)
+    def look(self) -> Look:
+        """Style of the clouds."""
+        s = self.state
+        return Look(
+            Colour(s.colour), Axis(s.axis), float(s.point_size), float(s.opacity), bool(s.dark), bool(s.overlaid)
+        )
+
+    @look.setter
+    def look(self, look: Look) -> None:
+        self.state.update({"colour": look.colour.value, "axis": look.axis.value, "overlaid": look.overlaid})
+
+    @property
+    def view(self) -> View:
+        """Direction from which the clouds are seen. Setting it resets a camera that the mouse has moved."""
+        return View(self.state.view[0])
+
+    @view.setter
+    def view(self, view: View) -> None:
+        self.state.view = [view.value, self.state.view[1] + 1]
+
+    @property
+    def image(self) -> ImageKind:
+        """What the images show."""
+        return ImageKind(self.state.kind)
+
+    @property
+    def time_window(self) -> tuple[int, int]:
+        """Start and length of the time window that the page shows, on the events' clock [us]."""
+        return self._clock_us(float(self.state.start_ms)), max(1, round(float(self.state.length_ms) * 1e3))
+
+    @time_window.setter
+    def time_window(self, window: tuple[int, int]) -> None:
+        start_us, length_us = window[0] - self.inspector.recording.events.t_first, window[1]
+        self.state.update({"start_ms": round(start_us * 1e-3, 3), "length_ms": round(length_us * 1e-3, 3)})
+
+    def say(self, text: str) -> None:
+        """Show a message."""
+        self.work.show_message(text, "info")
+
+    def errors_shown(self, what: str) -> contextlib.AbstractContextManager[None]:
+        """Show errors of the enclosed code as a message, until the same kind of action succeeds."""
+        return self.work.errors_shown(what)
 
     def request(self, *what: str, change: str = "") -> None:
         """Request quick updates of the page.
@@ -142,12 +183,6 @@ class Panel:
             self._server.trigger(name)(call)
 
     # Buttons, keys, fields and the mouse
-
-    def key(self, key: str) -> None:
-        """Run the action of a key that was pressed outside of a text field."""
-        for known, (name, *given), _ in layout.KEYS:
-            if key == known:
-                getattr(self, name)(*given)
 
     def released(self) -> None:
         """Update the slow parts of the page after a change, and end what is undone in one step."""
@@ -217,15 +252,10 @@ class Panel:
         """Invert a state variable that is true or false."""
         self.state[name] = not self.state[name]
 
-    def toggle_axis(self) -> None:
-        """Switch the third axis between angle and time."""
-        angle, time = Axis.ANGLE.value, Axis.TIME.value
-        self.state.axis = time if self.state.axis == angle else angle
-
     def look_from(self, view: str) -> None:
         """Set the view, and reset a camera that the mouse has moved."""
         if view in list(View):
-            self.state.view = [view, self.state.view[1] + 1]
+            self.view = View(view)
 
     def pick(self, k: int) -> None:
         """Describe a drawn event, and show its orbit; -1 for none."""
@@ -268,11 +298,6 @@ class Panel:
         """Show the whole image."""
         self._show_region([0, 0, *self.state.size], "whole")
 
-    def suggest(self) -> None:
-        """Show the region in which compensation gains most sharpness."""
-        self.request("suggestion", "window")
-        self.released()
-
     def _show_region(self, region: list[int], kind: str) -> None:
         width, height = self.state.size
         left, right = (min(max(x, 0), width) for x in region[::2])
@@ -283,24 +308,17 @@ class Panel:
 
     # Time: window, timeline and playback. The page counts all times from the recording's first event.
 
-    def step(self, count: int) -> None:
-        """Move the time window by one turn, forward (1) or back (-1); without a prism, by the window's length."""
-        if count in (-1, 1):
-            turn = self.inspector.turn_us * 1e-3 if self.compensates else float(self.state.length_ms)
-            self._move(float(self.state.start_ms) + count * turn)
-            self.released()
-
     def move_window(self, start_ms: float) -> None:
         """Move the time window to a start [ms]; playing stops, except a live stream's."""
         if not self.state.live:
             self.state.playing = False
-        self._move(float(start_ms), change="start_ms")
+        self.move(self._clock_us(float(start_ms)), change="start_ms")
 
     def resize_window(self, start_ms: float, end_ms: float) -> None:
         """Set the ends of the time window [ms]."""
         start, end = max(0.0, float(start_ms)), min(float(end_ms), float(self.state.whole_ms))
         if end > start:
-            self.state.update({"start_ms": round(start, 3), "length_ms": round(end - start, 3)})
+            self.time_window = self._clock_us(start), max(1, round(1e3 * (end - start)))
             self.request("window", change="length_ms")
 
     def zoom_timeline(self, start_ms: float, end_ms: float) -> None:
@@ -316,12 +334,9 @@ class Panel:
         state.playing = not state.playing
         if not state.playing or self.plays:
             return
-        if self.inspector.latest is None and float(state.length_ms) >= float(state.whole_ms):
+        if not self.can_play():
             state.playing = False
-            self.work.show_message("the window holds the whole recording; make it shorter to play", "info")
             return
-        if self.inspector.latest is None and self._move(float(state.start_ms)):
-            self._move(0.0)  # restart after the end
         self.plays = True
         self.work.start_job(self._play())
 
@@ -336,9 +351,7 @@ class Panel:
         while state.playing:
             start_s = loop.time()
             with state:
-                if self._move(float(state.start_ms) + 1e3 * elapsed_s * float(state.speed)):
-                    state.playing = bool(state.loop)
-                    self._move(0.0 if state.loop else float(state.start_ms))
+                state.playing = self.advance(1e6 * elapsed_s * float(state.speed), loop=bool(state.loop))
             await self.work.until_drawn()
             await asyncio.sleep(max(0.0, PLAY_S - (loop.time() - start_s)))
             elapsed_s = loop.time() - start_s
@@ -357,7 +370,7 @@ class Panel:
                 if start_s >= counted_s + RATES_S:
                     counted_s = start_s
                     self._count_events()
-                self._move(float(self.state.whole_ms))
+                self.move(self.inspector.recording.events.t_last)
             await self.work.until_drawn()
             await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
@@ -368,16 +381,6 @@ class Panel:
             with self.state as state:
                 state.update(layout.live_state(source.figures()))
             await asyncio.sleep(FOLLOW_S)
-
-    def _move(self, start_ms: float, change: str = "") -> bool:
-        """Move the time window to a start [ms], limited to the recording. Return whether the window is at the end."""
-        last = max(0.0, float(self.state.whole_ms) - float(self.state.length_ms))
-        self.state.start_ms = round(min(max(start_ms, 0.0), last), 3)
-        self.request("window", change=change)
-        return start_ms >= last
-
-    def _page_ms(self, time_us: int) -> float:
-        return round((time_us - self.inspector.recording.events.t_first) * 1e-3, 3)
 
     def _clock_us(self, time_ms: float) -> int:
         return int(self.inspector.recording.events.t_first) + round(time_ms * 1e3)
@@ -409,12 +412,6 @@ class Panel:
         self.request("knobs")
         self.released()
 
-    def take_truth(self) -> None:
-        """Set the parameters to the known truth of a simulated recording."""
-        with self.work.errors_shown("knobs"):
-            self.inspector.take_truth()
-        self._knobs_taken()
-
     def keep_b(self) -> None:
         """Keep the current parameters as B, and show them on the left."""
         self.show_b(self.inspector.knobs)
@@ -426,7 +423,7 @@ class Panel:
             with self.work.errors_shown("knobs"):
                 self.inspector.set(self.b)
                 self.show_b(now)
-            self._knobs_taken()
+            self.knobs_taken()
 
     def show_b(self, knobs: Knobs | None) -> None:
         """Show parameters on the left as B; None for the recorded events."""
@@ -454,11 +451,10 @@ class Panel:
         """Show the inspector's parameters on the page."""
         self.state.update(layout.knob_state(self.inspector))
 
-    def _knobs_taken(self) -> None:
+    def knobs_taken(self) -> None:
         """Show parameters that the inspector has taken from elsewhere."""
         self.show_knobs()
-        self.request("knobs")
-        self.released()
+        super().knobs_taken()
 
     def _dragged(self, name: str) -> None:
         """Follow a slider. Values that the server itself has set are ignored."""
@@ -467,7 +463,7 @@ class Panel:
             self.request("knobs", change=name)
 
     @property
-    def _against(self) -> Knobs | None:
+    def against(self) -> Knobs | None:
         """Parameters that the left cloud and image show; None for the recorded events."""
         return self._compared(self.state.against)
 
@@ -479,8 +475,8 @@ class Panel:
 
     def _against_choices(self) -> list[list[str]]:
         """Return names and titles of what the left cloud can show now."""
-        known = [name for name in layout.AGAINST if name == "recorded" or self._compared(name) is not None]
-        return [[name, layout.against_title(self.inspector, name)] for name in known]
+        known = [name for name in drawing.AGAINST if name == "recorded" or self._compared(name) is not None]
+        return [[name, drawing.against_title(self.inspector, name)] for name in known]
 
     # Calibration
 
@@ -532,7 +528,7 @@ class Panel:
             with self.work.errors_shown("knobs"):
                 self.inspector.accept(self.found)
             self.discard()
-            self._knobs_taken()
+            self.knobs_taken()
 
     def discard(self) -> None:
         """Forget the result of the calibration."""
@@ -547,13 +543,13 @@ class Panel:
         """Give the browser a file; ``what`` is a name in :data:`amiwarp.viewer.jobs.EXPORTS`."""
         s = self.state
         if what in ("picture", "image") and self.shown is not None:
-            words = layout.caption(self.inspector, self.shown).split("; ")
+            words = drawing.caption(self.inspector, self.shown).split("; ")
             self._server.js_call("page", what, jobs.download_name(self.inspector.recording.name, what), words)
         elif what in jobs.EXPORTS and what not in ("picture", "image") and not (what in jobs.FILMS and s.busy):
             self.work.start_job(self._film(what) if what in jobs.FILMS else self._write(what))
 
     async def _write(self, what: str) -> None:
-        inspector, kind, against = self.inspector, ImageKind(self.state.kind), self._against
+        inspector, kind, against = self.inspector, self.image, self.against
         difference = bool(self.state.difference)
 
         def write_image(path: Path) -> None:
@@ -570,17 +566,13 @@ class Panel:
             await self._download(what, write[what])
 
     async def _film(self, what: str) -> None:
-        s, inspector = self.state, Inspector(self.inspector.recording, device=self.inspector.device)
-        inspector.set(self.inspector.knobs)
-        if self.inspector.beside is not None:
-            inspector.put_beside(self.inspector.beside.recording)
-        inspector.window, inspector.selection = self.inspector.window, self.inspector.selection
-        look = drawing.Look(Colour(s.colour), Axis(s.axis), float(s.point_size), float(s.opacity), dark=bool(s.dark),
-                           overlaid=bool(s.overlaid)).for_clouds([title for _, title in s.titles])  # fmt: skip
+        s = self.state
+        look = self.look.for_clouds([title for _, title in s.titles])
         self._progress = progress = JobProgress(self._show_progress)
         film = partial(
-            jobs.write_film, inspector=inspector, look=look, view=View(s.view[0]), progress=progress, what=what,
-            against=self._against, with_orbit=self._orbit_drawn, speed=float(s.speed), caption=layout.caption,
+            jobs.write_film, inspector=self.inspector, look=look, view=self.view, progress=progress, what=what,
+            against=self.against, with_orbit=bool(s.orbit_shown), speed=float(s.speed),
+            ended=lambda: progress.ended,
         )  # fmt: skip
         with s:
             s.update({"busy": f"making the {jobs.EXPORTS[what][0]}", "progress": 0})
@@ -594,77 +586,58 @@ class Panel:
 
     async def _download(self, what: str, write: Callable[[Path], object]) -> None:
         """Write a file in a thread, and give it to the browser."""
-        name, (_, suffix, kind) = jobs.download_name(self.inspector.recording.name, what), jobs.EXPORTS[what]
+        name = jobs.download_name(self.inspector.recording.name, what)
         with self.work.errors_shown("export"):
-            content = await self.work.in_thread(jobs.as_bytes, suffix, write)
-            self._server.js_call("page", "download", name, content, kind)
-            size = f"{len(content) / 1e3:,.0f} kB"
+            path = Path(self._folder.name) / name
+            path.unlink(missing_ok=True)
+            await self.work.in_thread(write, path)
+            self._downloads += 1  # a browser keeps what it has loaded from an address
+            self._server.js_call("page", "download", name, f"{self._server.name}/{name}?{self._downloads}")
+            size = f"{path.stat().st_size / 1e3:,.0f} kB"
             self.work.show_message(f"{name}: {size}, in the browser's downloads", "success")
         self.state.flush()
 
     # Undo, redo, reset, and the state in the page's address
 
-    def undo(self) -> None:
-        """Go back by one step."""
-        self._travel(layout.History.undo)
-
-    def redo(self) -> None:
-        """Go forward by one step that was undone."""
-        self._travel(layout.History.redo)
-
-    def reset(self) -> None:
-        """Show the first state again."""
-        self._travel(layout.History.reset)
-
     def restore(self, address: str) -> None:
         """Show the state that an address describes."""
-        self._wanted = address
+        self.wanted = address
         self.request("state")
         self.released()
 
-    def _travel(self, step: Callable[[layout.History], layout.ViewState]) -> None:
-        if self._history is not None:
-            self._wanted = step(self._history)
-            self.request("state")
-            self.released()
-
-    def remember(self, change: str) -> None:
-        """Add what the page shows now to the history. Equal ``change`` of successive states make one step."""
-        s = self.state
-        now = replace(
-            layout.current_state(self.inspector), against=self._against, image=ImageKind(s.kind), axis=Axis(s.axis),
-            colour=Colour(s.colour), view=View(s.view[0]), overlaid=bool(s.overlaid),
-        )  # fmt: skip
-        self._history = history = self._history or layout.History(now)
-        history.add(now, change)
-        address = layout.encode_state(history.state, history.first)
-        s.update({"can_undo": history.can_undo, "can_redo": history.can_redo, "address": address})
+    def remember(self, change: str) -> layout.History:
+        """Add what the page shows now to the history, and to its address."""
+        h = super().remember(change)
+        address = layout.encode_state(h.state, h.first)
+        self.state.update({"can_undo": h.can_undo, "can_redo": h.can_redo, "address": address})
+        return h
 
     async def _apply_wanted(self) -> None:
         """Show the requested state. Raises :class:`AmiwarpError` if it selects no events."""
-        wanted, self._wanted = self._wanted, None
-        if wanted is None or self._history is None:
+        wanted, self.wanted = self.wanted, None
+        if wanted is None or self.history is None:
             return
         if isinstance(wanted, str):
-            source = self.inspector.recording.events
-            duration_us = source.t_last - source.t_first + 1
-            wanted, wrong = layout.decode_state(wanted, self._history.first, size=source.size, duration_us=duration_us)
+            first, size = self.history.first, self.inspector.recording.events.size
+            wanted, wrong = layout.decode_state(wanted, first, size=size, duration_us=self.whole_us)
             if wrong:
                 self.work.show_message("; ".join(wrong), "error")
         await self.work.in_thread(layout.apply_state, self.inspector, wanted)
         s, selection = self.state, wanted.selection
         region = list(selection.region or (0, 0, *s.size))
         kind = s.region_kind if region == s.region_wanted else "whole" if selection.region is None else "drawn"
+        self.time_window = self.inspector.window or self.time_window
         s.update({
-            "start_ms": round(wanted.start_us * 1e-3, 3), "length_ms": round(wanted.length_us * 1e-3, 3),
-            "polarity": {None: "both", 1: "ON", 0: "OFF"}[selection.polarity], "hide_hot": selection.hide_hot,
-            "noise_filter": selection.noise_us is not None, "region_wanted": region, "region_kind": kind,
-            "kind": wanted.image.value, "colour": wanted.colour.value, "axis": wanted.axis.value,
-            "view": [wanted.view.value, s.view[1] + int(wanted.view.value != s.view[0])], "overlaid": wanted.overlaid,
+            **layout.given_state(self.inspector), "polarity": {None: "both", 1: "ON", 0: "OFF"}[selection.polarity],
+            "hide_hot": selection.hide_hot, "noise_filter": selection.noise_us is not None, "region_wanted": region,
+            "region_kind": kind, "kind": wanted.image.value,
         })  # fmt: skip
+        self.look = replace(self.look, colour=wanted.colour, axis=wanted.axis, overlaid=wanted.overlaid)
+        if wanted.view is not self.view:
+            self.view = wanted.view
         if selection.noise_us is not None:
             s.noise_ms = selection.noise_us * 1e-3
-        if wanted.against != self._against:
+        if wanted.against != self.against:
             self.show_b(wanted.against)
         self.show_knobs()
 
@@ -714,10 +687,10 @@ class Panel:
     async def _open(self, *, suggest: bool) -> None:
         """Read the window and the selection that the page shows."""
         s, inspector, in_thread = self.state, self.inspector, self.work.in_thread
-        start, length = float(s.start_ms), min(float(s.length_ms), float(s.whole_ms))
-        if not length > 0.0:
-            raise AmiwarpError(f"a window of {length:g} ms; give a length above 0")
-        start_us, length_us = self._clock_us(start), max(1, round(length * 1e3))
+        if not float(s.length_ms) > 0.0:
+            raise AmiwarpError(f"a window of {s.length_ms:g} ms; give a length above 0")
+        start_us, length_us = self.time_window
+        length_us = min(length_us, self.whole_us)
         await in_thread(inspector.open, start_us, length_us, self._selection())
         if suggest:
             if await in_thread(jobs.estimate_phase, inspector):
@@ -739,29 +712,29 @@ class Panel:
         """Show time and region of the window that is still shown. Playback goes on through a time without events."""
         s, window = self.state, self.inspector.window
         if window is not None and not s.playing:
-            s.start_ms, s.length_ms = self._page_ms(window[0]), round(window[1] * 1e-3, 3)
+            self.time_window = window
             s.region_wanted = list(self.inspector.loaded.region)
 
     def _compute(self) -> tuple[DisplayedWindow, dict[str, Any]]:
         """Return what is to be shown, and the state variables that show it."""
-        s, before, against = self.state, self.shown, self._against
+        s, before, against = self.state, self.shown, self.against
         shown = self.inspector.show(against=against)
         values = drawing.cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
         values |= self._images(shown) | self._orbit(shown)
         if before is None or shown.span is not before.span:
             values["overview"] = drawing.whole_image(shown.span.events, self.inspector.recording.events.size)
         left = "recorded" if against is None else s.against
-        titles = layout.cloud_titles(self.inspector, left)
+        titles = drawing.cloud_titles(self.inspector, left)
         return shown, {
-            **values, "titles": [list(each) for each in enumerate(titles)], "events": layout.events_text(shown),
-            "sharpness": layout.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
+            **values, "titles": [list(each) for each in enumerate(titles)], "events": drawing.events_text(shown),
+            "sharpness": drawing.sharpness_text(shown, compensated=self.compensates), "picked": self._picked,
             "picked_text": "" if self._picked < 0 else drawing.event_text(shown, self._picked),
-            "against_title": layout.against_title(self.inspector, left), "against_choices": self._against_choices(),
+            "against_title": drawing.against_title(self.inspector, left), "against_choices": self._against_choices(),
         }  # fmt: skip
 
     def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
         """Return the state variables of the images of the region; of slow kinds, only that they are."""
-        kind = ImageKind(self.state.kind)
+        kind = self.image
         if kind is ImageKind.LOG_INTENSITY:
             return {"image_slow": True}
         if kind is not ImageKind.COUNT:
@@ -770,19 +743,15 @@ class Panel:
         return {"image_slow": False, **_image_state(drawing.with_difference(pair) if self.state.difference else pair)}
 
     def _other_images(self) -> dict[str, Any]:
-        return _image_state(drawing.make_images(self.inspector, ImageKind(self.state.kind), against=self._against))
-
-    @property
-    def _orbit_drawn(self) -> bool:
-        return bool(self.state.orbit_shown) and self.state.axis == Axis.ANGLE.value and self.compensates
+        return _image_state(drawing.make_images(self.inspector, self.image, against=self.against))
 
     def _orbit(self, shown: DisplayedWindow) -> dict[str, Any]:
         """Return the orbit of the scene point of the picked event, or of the middle of the region."""
-        if not self._orbit_drawn:
+        lines = drawing.shown_lines(self.inspector, shown, self.look.axis, self.against, self._picked)
+        if not (lines and self.state.orbit_shown):
             return drawing.NO_ORBIT
-        orbit, column = map(drawing.float_bytes, drawing.orbit_lines(self.inspector, shown, self._picked))
-        recorded = self._against is None and self.inspector.beside is None  # otherwise, it moves in neither cloud
-        return {"orbit": orbit if recorded else column, "column": column, "has_orbit": True}
+        orbit, column = map(drawing.float_bytes, lines)
+        return {"orbit": orbit, "column": column, "has_orbit": True}
 
     async def _curve(self) -> None:
         s, name = self.state, self.state.knob
@@ -968,12 +937,12 @@ def save_screenshot(
     """Write a picture of both event clouds as PNG; ``size`` is its width and height [px]."""
 
     check_output(path)
-    look = (look or Look()).for_clouds(layout.cloud_titles(inspector, "recorded"))
+    look = (look or Look()).for_clouds(drawing.cloud_titles(inspector, "recorded"))
     clouds = inspector.show()
     with (
         interrupts_later(),
         contextlib.closing(Scene(size)) as scene,
     ):  # VTK crashes if an exception leaves it half-drawn
-        scene.show(clouds, look, caption=layout.caption(inspector, clouds))
+        scene.show(clouds, look, caption=drawing.caption(inspector, clouds))
         scene.look_from(view, look)
         scene.save(path)

@@ -194,7 +194,7 @@ def _integer(value: Any) -> bool:
 
 
 flag = one_of(True, False)
-ARGUMENTS: Mapping[str, Check] = {"str": text(MOST_CHARACTERS), "float": number(), "int": _integer, "bool": flag}
+ARGUMENTS: Mapping[type, Check] = {str: text(MOST_CHARACTERS), float: number(), int: _integer, bool: flag}
 """Checks of the arguments of functions that the page calls, by their annotation."""
 
 
@@ -241,7 +241,7 @@ class MessageFilter:
         called = self._server.controller.trigger_fn(name)
         if called is None:
             return False
-        signature = inspect.signature(called)
+        signature = inspect.signature(called, eval_str=True)
         arguments = signature.bind(*given).arguments  # raises TypeError for another number of arguments
         return all(ARGUMENTS[signature.parameters[k].annotation](value) for k, value in arguments.items())
 
@@ -294,11 +294,11 @@ def read_template() -> str:
     return (FOLDER / "page.html").read_text(encoding="utf-8")
 
 
-def use_page(server: Any, template: str) -> None:
-    """Give a trame server the page's style and scripts, and its template."""
+def use_page(server: Any, template: str, downloads: str) -> None:
+    """Give a trame server the page's style and scripts, its template, and the folder ``downloads`` below its name."""
     server.enable_module({
-        "serve": {ROUTE: str(FOLDER)}, "styles": [f"{ROUTE}/page.css"], "module_scripts": [f"{ROUTE}/page.js"],
-        "vue_use": ["amiwarp_page"],
+        "serve": {ROUTE: str(FOLDER), server.name: downloads}, "styles": [f"{ROUTE}/page.css"],
+        "module_scripts": [f"{ROUTE}/page.js"], "vue_use": ["amiwarp_page"],
     })  # fmt: skip
     # when the connection ends, trame shows the second template: the same page, which then says so
     server.state.update({f"trame__template_{name}": template for name in ("main", "error")})
@@ -542,6 +542,7 @@ async def _connection(
         stack.push_async_callback(server.stop)
         for route, source in server.serve.items():
             folders[f"/{route.strip('/')}/"] = Path(source if isinstance(source, str) else source[0]).resolve()
+        stack.callback(folders.pop, f"/{server.name}/", None)
         await server.ready
         server.controller.on_error.add(_log_report)
 

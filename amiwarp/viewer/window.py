@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
@@ -28,12 +27,15 @@ from amiwarp.viewer.drawing import (
     OWN_RENDERERS,
     Look,
     Scene,
+    caption,
+    cloud_titles,
     event_text,
     font,
     orbit_lines,
+    shown_lines,
     text_actor,
 )
-from amiwarp.viewer.inspector import SLIDING, DisplayedWindow, Inspector, Knobs, colours_on_offer
+from amiwarp.viewer.inspector import SLIDING, DisplayedWindow, Inspector, colours_on_offer
 
 SIZE = (1500, 950)
 """Width and height of the window at the start [px]."""
@@ -57,10 +59,14 @@ HELP_PLACE = (0.35, 0.48, 0.72, 0.97)
 """Left, bottom, right and top of the help, in shares of the window's size."""
 VTK_FONT_FILE = 4
 """Number by which VTK knows that a text has a font of a file."""
+STATISTICS_PLACE = (0.735, 0.0, 1.0, 0.25)
+"""Left, bottom, right and top of the statistics, in shares of the window's size."""
 HELP_PAPER = {False: "#f0f0ea", True: "#24282e"}
-"""Background of the help, for light (False) and dark (True) mode."""
+"""Background of help and statistics, for light (False) and dark (True) mode."""
 LEGEND_SHARE = 0.5
 """Height of the space for the legend above the curves of a chart, as a share of their height."""
+INTERVAL_CURVES = ((OFF_COLOUR, 2.0, "intervals"), (ON_COLOUR, 2.0, "median"))
+"""Colour, width and name of the histogram of intervals, and of the line at their median."""
 MARKS = ((ORBIT_COLOUR, 5.0, "truth"), (ON_COLOUR, 2.0, "now"))
 """Colour, width and name of the lines that mark values on a sharpness curve."""
 ORBIT_CURVES = ((ON_COLOUR, 2.0, "in x"), (OFF_COLOUR, 2.0, "in y"))
@@ -83,20 +89,24 @@ MORE_KEYS = (
     ("m", ("next_model",), "next optical model"),
     ("k", ("next_colour",), "next quantity shown by colour"),
     ("n", ("next_polarity",), "ON, OFF or both"),
+    ("i", ("toggle", "statistics_shown"), "statistics of the selected events of the region: show or hide"),
     ("v", ("take_truth",), "take the known true parameters of a simulation"),
     ("+", ("resize_points", 1.0), "larger points"),
     ("-", ("resize_points", -1.0), "smaller points"),
+    ("f", ("film",), "film from here on, at a tenth of real time; f ends it, c cancels it"),
     ("q", ("close",), "close the window"),
 )
 """Keys that only the window has, as :data:`amiwarp.viewer.layout.KEYS`."""
 
 
-class Window:
+class Window(layout.Actions):
     """Window that shows an inspector. :meth:`run` follows the user until the window is closed.
 
     Input only notes what must be done (:meth:`request`); :meth:`update` does it, so that many moves of a slider during
     one picture cost one.
     """
+
+    keys = layout.KEYS + MORE_KEYS
 
     def __init__(
         self, inspector: Inspector, *, look: Look | None = None, view: View = View.FREE, size: tuple[int, int] = SIZE,
@@ -106,37 +116,34 @@ class Window:
 
         Raises :class:`AmiwarpError` if there is no display, or no events in the inspector's window.
         """
-        self.scene = Scene(size, corner=CORNER, more=3, off_screen=off_screen)
+        self.scene = Scene(size, corner=CORNER, more=4, off_screen=off_screen)
         self.inspector, self.view = inspector, view
         compensates = math.isfinite(inspector.turn_us)
         self.look = look or Look(axis=Axis.ANGLE if compensates else Axis.TIME)
         self.shown: DisplayedWindow
         """What the window shows."""
-        self.b: Knobs | None = None
-        """Parameters that were kept as B, which the left cloud shows; None for the recorded events."""
-        self.found: Calibration | None = None
-        """Result of a calibration that is not accepted yet."""
-        self.help_shown = self.plays = self.loop = self.closed = False
+        self.help_shown = self.statistics_shown = self.plays = self.loop = self.closed = False
         self.knob, self.message = "apex", ""
         self.sliders: dict[str, Any] = {}
         """Slider widgets by the name of their value."""
         self.plotter = self.scene.plotter
-        self._controls, self._charts, self._help = list(self.plotter.renderers)[OWN_RENDERERS:]
+        self._controls, self._charts, self._help, self._statistics = list(self.plotter.renderers)[OWN_RENDERERS:]
         self._wanted: set[str] = set()
-        self._window = inspector.window or inspector.first_window()  # start and length [us]
-        self._change, self._progress = "", False
+        self.time_window = inspector.window or inspector.first_window()
+        self._change, self._progress, self._film_ends = "", False, False
+        self._interrupts: list[int] = []
         self._progress_due_s = 0.0
         self._picked, self._pressed = -1, (0, 0)
         self._built: tuple[Any, ...] = ()
         self._dirty, self._changed_s, self._played_s = True, 0.0, 0.0
         self._coarse = 1
         self._curves: Iterator[None] = iter(())
-        self._history: layout.History | None = None
         self._plots: dict[str, tuple[Any, list[Any]]] = {}
+        self._chart_homes: tuple[Any, ...] = ()
         self.curves: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         """Values and sharpness of the curves by parameter, in the units of the sliders."""
         self._stream: list[str] = []
-        self._texts = [text_actor("", "black", (0.05, top)) for top in (0.985, 0.97, 0.26)]
+        self._texts = [text_actor("", "black", (0.05, top)) for top in (0.985, 0.97, 0.26, 0.97)]
         self._listen()
         self._start()
 
@@ -148,7 +155,9 @@ class Window:
         """Follow the user until the window is closed or the command is interrupted."""
         with contextlib.suppress(KeyboardInterrupt), contextlib.closing(self.scene):
             while not (self.closed or self.plotter.iren.interactor.GetDone()):
-                with interrupts_later():  # VTK ends the process if an exception leaves one of its callbacks
+                with (
+                    interrupts_later() as self._interrupts
+                ):  # VTK ends the process if an exception leaves one of its callbacks
                     if not self.turn():
                         time.sleep(IDLE_S)
 
@@ -180,12 +189,15 @@ class Window:
         wanted, self._wanted = self._wanted, set()
         inspector = self.inspector
         try:
-            if wanted & {"window", "suggestion"}:
-                inspector.open(*self._window)
+            if isinstance(self.wanted, layout.ViewState):
+                state, self.wanted = self.wanted, None
+                self._apply(state)
+            elif wanted & {"window", "suggestion"}:
+                inspector.open(*self.time_window)
             if "suggestion" in wanted:
                 jobs.estimate_phase(inspector)
                 region = inspector.suggest_region().region
-                inspector.open(*self._window, replace(inspector.selection, region=region))
+                inspector.open(*self.time_window, replace(inspector.selection, region=region))
             before = getattr(self, "shown", None)
             self.shown, self._shown_knobs = inspector.show(against=self.b), inspector.knobs
             self._picked = self._picked if before is not None and before.events is self.shown.events else -1
@@ -195,39 +207,33 @@ class Window:
                 raise
             self.message = str(error)
             inspector.knobs = self._shown_knobs
-        self._window = inspector.window or inspector.first_window()
+        self.time_window = inspector.window or inspector.first_window()
         self._build()
         self._show()
         if not self.plays:
-            self._remember()
+            self.remember(self._change)
 
     def request(self, *what: str, change: str = "") -> None:
-        """Request an update: "window", "suggestion", "knobs" or "look". Successive changes of one name are one step."""
+        """Request an update: "window", "suggestion", "knobs", "state" or "look"."""
         self._wanted.update(what)
         self._change = change
-        if set(what) & {"window", "knobs", "suggestion"}:
+        if set(what) - {"look"}:
             self._curves = self._curve_steps()
 
     # Input: sliders and keys
 
-    def key(self, name: str) -> None:
+    def key(self, key: str) -> None:
         """Run the action of a key, by its name in VTK."""
-        name = X_KEYS.get(name, name)
-        for known, (method, *given), _ in (*layout.KEYS, *MORE_KEYS):
-            if name == known and hasattr(self, method):
-                getattr(self, method)(*given)
-                return
+        super().key(X_KEYS.get(key, key))
 
     def slide(self, name: str, value: float) -> None:
         """Set a value, in the unit of its slider."""
         if name in FINE:
-            start_us, length_us = self._window
-            whole_us = self._whole_us
             if name == "start_ms":
-                start_us = self.inspector.recording.events.t_first + round(value * 1e3)
+                self.move(self.inspector.recording.events.t_first + round(value * 1e3), change=name)
             else:
-                length_us = max(1, round(value * 1e3))
-            self._move(start_us, min(length_us, whole_us), change=name)
+                self.time_window = self.time_window[0], min(max(1, round(value * 1e3)), self.whole_us)
+                self.move(self.time_window[0], change=name)
             return
         self.knob = name
         knobs = self.inspector.knobs.with_values({name: value * layout.UNITS[name]})
@@ -260,7 +266,7 @@ class Window:
     def next_colour(self) -> None:
         """Show the next quantity by colour."""
         offered = colours_on_offer(self.inspector.recording.truth)
-        self._restyle(colour=offered[(offered.index(self.look.colour) + 1) % len(offered)])
+        self.restyle(colour=offered[(offered.index(self.look.colour) + 1) % len(offered)])
 
     def next_polarity(self) -> None:
         """Show only ON events, only OFF events, or both."""
@@ -269,21 +275,16 @@ class Window:
 
     def resize_points(self, px: float) -> None:
         """Make the points larger."""
-        self._restyle(point_size=min(max(self.look.point_size + px, 1.0), 20.0))
+        self.restyle(point_size=min(max(self.look.point_size + px, 1.0), 20.0))
 
     def toggle(self, name: str) -> None:
-        """Invert "overlaid", "dark", "loop" or "help_shown"."""
-        if name == "help_shown":
-            self.help_shown = not self.help_shown
-            self.request("look")
-        elif name == "loop":
-            self.loop = not self.loop
-        elif name in ("overlaid", "dark"):
-            self._restyle(**{name: not getattr(self.look, name)})
-
-    def toggle_axis(self) -> None:
-        """Switch the third axis between angle and time."""
-        self._restyle(axis=Axis.TIME if self.look.axis is Axis.ANGLE else Axis.ANGLE)
+        """Invert "overlaid", "dark", "loop", "help_shown" or "statistics_shown"."""
+        if name in ("overlaid", "dark"):
+            self.restyle(**{name: not getattr(self.look, name)})
+            return
+        setattr(self, name, not getattr(self, name))
+        self._curves = self._curve_steps()
+        self.request("look")
 
     def look_from(self, view: str) -> None:
         """Set the direction from which the clouds are seen, and fit them into the window."""
@@ -304,76 +305,63 @@ class Window:
         self.message = "" if self._picked < 0 else event_text(self.shown, self._picked)
         self.request("look")
 
-    def suggest(self) -> None:
-        """Show the region in which compensation gains most sharpness."""
-        self.request("suggestion")
-
     def whole(self) -> None:
         """Show the whole image."""
         self._select(region=None)
-
-    def take_truth(self) -> None:
-        """Set the parameters to the known truth of a simulation."""
-        with self._errors_shown():
-            self.inspector.take_truth()
-            self.request("knobs")
 
     def keep_b(self) -> None:
         """Keep the parameters as B, and show them on the left; a second time, show the recorded events again."""
         self.b = None if self.b == self.inspector.knobs else self.inspector.knobs
         self.request("knobs")
 
-    def step(self, count: int) -> None:
-        """Move the time window by turns; without a prism, by its length."""
-        start_us, length_us = self._window
-        turn = round(self.inspector.turn_us) if self.compensates else length_us
-        self._move(start_us + count * turn, length_us)
-
     def play(self) -> None:
         """Play the recording from the current window, or follow a live stream; stop if already playing."""
-        self.plays, self._played_s = not self.plays, time.perf_counter()
-
-    def undo(self) -> None:
-        """Go back by one step."""
-        self._travel(layout.History.undo)
-
-    def redo(self) -> None:
-        """Go forward by one step that was undone."""
-        self._travel(layout.History.redo)
-
-    def reset(self) -> None:
-        """Show the first state again."""
-        self._travel(layout.History.reset)
+        self.plays, self._played_s = not self.plays and self.can_play(), time.perf_counter()
 
     def calibrate(self) -> None:
         """Calibrate on the shown events, or cancel the running calibration. The window goes on meanwhile."""
         if self._progress:
             self._progress = False
             return
+        with self._job("calibration"):
+            found = jobs.find_calibration(self.inspector, progress=self._show_progress)
+            self.found, self.message = found.calibration, f"{layout.found_text(found)}. Press a to accept"
+
+    def film(self) -> None:
+        """Save a film from here on under a new name in the current folder, or end it. The window goes on meanwhile."""
+        self._film_ends = self._progress
+        if self._progress:
+            return
+        with self._job("film"):
+            path = self._new_name("film")
+            jobs.write_film(path, self.inspector, self._look, self.view, self._show_progress, what="film",
+                            against=self.b, speed=SPEED, ended=lambda: self._film_ends)  # fmt: skip
+            self.message = f"saved {path}"
+
+    @contextlib.contextmanager
+    def _job(self, what: str) -> Iterator[None]:
+        """Run a long job, which :meth:`calibrate` cancels."""
         self._progress = True
-        with self._errors_shown():
+        with self.errors_shown("window"):
             try:
-                found = jobs.find_calibration(self.inspector, progress=self._show_progress)
-                self.found, self.message = found.calibration, f"{layout.found_text(found)}. Press a to accept"
+                yield
             except jobs.JobCancelled:
-                self.message = "calibration cancelled"
+                self.message = f"{what} cancelled"
         self._progress = False
         self.request("look")
 
     def accept(self) -> None:
         """Set the parameters to the result of the calibration."""
         if self.found is not None:
-            with self._errors_shown():
+            with self.errors_shown("window"):
                 self.inspector.accept(self.found)
             self.found = None
             self.request("knobs")
 
     def export(self, what: str) -> None:
         """Save the calibration, or a picture of the window, under a new name in the current folder."""
-        name = Path(jobs.download_name(self.inspector.recording.name, what))
-        names = (name.with_stem(f"{name.stem}-{k}") if k else name for k in itertools.count())
-        path = next(each for each in names if not each.exists())
-        with self._errors_shown():
+        path = self._new_name(what)
+        with self.errors_shown("window"):
             if what == "picture":
                 self.scene.save(path)
             else:
@@ -381,81 +369,51 @@ class Window:
             self.message = f"saved {path}"
         self.request("look")
 
-    # State
+    def _new_name(self, what: str) -> Path:
+        name = Path(jobs.download_name(self.inspector.recording.name, what))
+        names = (name.with_stem(f"{name.stem}-{k}") if k else name for k in itertools.count())
+        return next(each for each in names if not each.exists())
 
-    @property
-    def compensates(self) -> bool:
-        """Whether the prism rotates, so that there is a motion to compensate."""
-        return math.isfinite(self.inspector.turn_us)
+    # State
 
     @property
     def _look(self) -> Look:
         against = "recorded" if self.b is None else "B"
-        return self.look.for_clouds(layout.cloud_titles(self.inspector, against))
+        return self.look.for_clouds(cloud_titles(self.inspector, against))
 
-    @property
-    def _whole_us(self) -> int:
-        source = self.inspector.recording.events
-        return int(source.t_last - source.t_first + 1)
+    def say(self, text: str) -> None:
+        """Show a message."""
+        self.message = text
+        self.request("look")
 
     @contextlib.contextmanager
-    def _errors_shown(self) -> Iterator[None]:
+    def errors_shown(self, what: str) -> Iterator[None]:
+        """Show errors of the enclosed code as a message."""
         try:
             yield
         except (AmiwarpError, OSError) as error:
-            self.message = str(error)
-            self.request("look")
-
-    def _restyle(self, **changes: Any) -> None:
-        self.look = replace(self.look, **changes)
-        self.request("look")
+            self.say(str(error))
 
     def _select(self, **changes: Any) -> None:
         inspector = self.inspector
-        with self._errors_shown():
-            inspector.open(*self._window, replace(inspector.selection, **changes))
+        with self.errors_shown("window"):
+            inspector.open(*self.time_window, replace(inspector.selection, **changes))
             self.request("knobs")
 
-    def _move(self, start_us: int, length_us: int, change: str = "") -> bool:
-        """Move the time window, within the recording. Return whether it is at the end."""
-        first, whole = self.inspector.recording.events.t_first, self._whole_us
-        last = first + whole - length_us
-        self._window = min(max(start_us, first), last), length_us
-        self.request("window", change=change)
-        return start_us >= last
-
-    def _remember(self) -> None:
-        now = replace(
-            layout.current_state(self.inspector), against=self.b, axis=self.look.axis, colour=self.look.colour,
-            view=self.view, overlaid=self.look.overlaid,
-        )  # fmt: skip
-        self._history = self._history or layout.History(now)
-        self._history.add(now, self._change)
-
-    def _travel(self, step: Any) -> None:
-        if self._history is None:
-            return
-        state = step(self._history)
-        with self._errors_shown():
-            layout.apply_state(self.inspector, state)
-        self.b, self.look = state.against, replace(
-            self.look, axis=state.axis, colour=state.colour, overlaid=state.overlaid
-        )  # fmt: skip
-        self.request("knobs")
-        if state.view is not self.view:
-            self.look_from(state.view)
+    def _apply(self, state: layout.ViewState) -> None:
+        """Show a state of the history."""
+        layout.apply_state(self.inspector, state)
+        self.b, self.view = state.against, state.view
+        self.look = replace(self.look, axis=state.axis, colour=state.colour, overlaid=state.overlaid)
+        self.scene.look_from(self.view, self._look)
 
     def _play(self, now: float) -> None:
         """Move the window by the time since the last call, if the recording is played; or follow a live stream."""
         if self.inspector.latest is not None:
             self._follow(self.inspector.latest, now)
         elif self.plays:
-            start_us, length_us = self._window
-            start_us += round(1e6 * SPEED * (now - self._played_s))
+            self.plays = self.advance(1e6 * SPEED * (now - self._played_s), loop=self.loop)
             self._played_s = now
-            if self._move(start_us, length_us):
-                self.plays = self.loop
-                self._move(self.inspector.recording.events.t_first if self.loop else start_us, length_us)
 
     def _follow(self, latest: Callable[[], Recording], now: float) -> None:
         """Show the figures of a live stream, and its last events if it is followed."""
@@ -466,16 +424,16 @@ class Window:
             state = layout.live_state(latest.figures())
             self._stream = [*(f"{name}: {text}" for name, text, _ in state["live_rows"]), state["stream_note"]]
         if self.plays:
-            with self._errors_shown():
+            with self.errors_shown("window"):
                 self.inspector.renew()
-            self._move(self.inspector.recording.events.t_last, self._window[1])
+            self.move(self.inspector.recording.events.t_last)
         else:
             self._show_texts()
             self.plotter.render_window.Render()
 
     def _show_progress(self, what: str, share: float) -> None:
         """Show how far a calibration is, and handle the input meanwhile."""
-        if not self._progress or self.closed or self.plotter.iren.interactor.GetDone():
+        if not self._progress or self._interrupts or self.closed or self.plotter.iren.interactor.GetDone():
             raise jobs.JobCancelled
         if (now := time.perf_counter()) >= self._progress_due_s:
             self.message = f"{what}: {100.0 * min(share, 1.0):.0f} % (c cancels)"
@@ -500,7 +458,9 @@ class Window:
         self._controls.SetViewport(0.0, 0.0, CORNER[0], 1.0)
         self._charts.SetViewport(CORNER[0], 0.0, 1.0, CORNER[1])
         self._help.SetViewport(*HELP_PLACE)
-        for renderer, actor in zip((self._controls, self._help, self._controls), self._texts, strict=True):
+        self._statistics.SetViewport(*STATISTICS_PLACE)
+        homes = self._controls, self._help, self._controls, self._statistics
+        for renderer, actor in zip(homes, self._texts, strict=True):
             renderer.add_actor(actor, render=False, pickable=False, reset_camera=False)
         self.inspector.renew()
         self.plays = self.inspector.latest is not None
@@ -530,14 +490,10 @@ class Window:
     def _show(self) -> None:
         """Give what is to be shown to VTK."""
         shown, look = self.shown, self._look
-        lines: tuple[NDArray[Any], ...] = ()
+        lines = shown_lines(self.inspector, shown, look.axis, self.b, self._picked)
         if self.compensates:
-            orbit, column = orbit_lines(self.inspector, shown, self._picked)
-            self._plot_orbit(orbit, column)
-            moves = self.b is None and shown.beside is None
-            lines = (orbit if moves else column, column) if look.axis is Axis.ANGLE else ()
-        caption = layout.caption(self.inspector, shown)
-        self.scene.show(shown, look, lines, caption)
+            self._plot_orbit(*orbit_lines(self.inspector, shown, self._picked))
+        self.scene.show(shown, look, lines, caption(self.inspector, shown))
         for name in self.curves:
             self._plot_curve(name)
 
@@ -559,8 +515,8 @@ class Window:
             self.scene.place((CORNER[0], CORNER[1] if self.compensates else 0.0), self._look)
             self._curves = self._curve_steps()
         values = layout.knob_values(inspector)
-        values |= {"start_ms": (self._window[0] - inspector.recording.events.t_first) * 1e-3,
-                   "length_ms": self._window[1] * 1e-3}  # fmt: skip
+        values |= {"start_ms": (self.time_window[0] - inspector.recording.events.t_first) * 1e-3,
+                   "length_ms": self.time_window[1] * 1e-3}  # fmt: skip
         for name, slider in self.sliders.items():
             shape, (low, high) = slider.GetRepresentation(), self._range(name)
             shape.SetMinimumValue(low)
@@ -587,7 +543,7 @@ class Window:
         return f"{label} {value:.6g}{unit if unit in ('°', '') else f' {unit}'} ({self.inspector.sources[name].value})"
 
     def _range(self, name: str) -> tuple[float, float]:
-        whole_ms = self._whole_us * 1e-3
+        whole_ms = self.whole_us * 1e-3
         if name in FINE:
             return {"start_ms": (0.0, whole_ms), "length_ms": (min(0.1, 0.5 * whole_ms), whole_ms)}[name]
         low, high, _ = layout.SLIDERS[name][2]
@@ -606,6 +562,7 @@ class Window:
                 pointa=(0.05, y), pointb=(0.95, y), interaction_event="always", title_height=0.014, tube_width=0.003,
                 slider_width=0.02,
             )  # fmt: skip
+            slider.KeyPressActivationOff()  # VTK's key i would hide it
             slider.GetRepresentation().ShowSliderLabelOff()
             slider.GetRepresentation().SetEndCapWidth(0.01)
             title = slider.GetRepresentation().GetTitleProperty()
@@ -616,40 +573,51 @@ class Window:
             self.sliders[name] = slider
 
     def _make_charts(self) -> None:
-        """Make the charts: sharpness over two parameters, and the displacement of a scene point over one turn."""
+        """Make the charts: sharpness over two parameters, displacement of a scene point in a turn, and intervals."""
+        ink = BACKGROUND_AND_INK[self.look.dark][1]
+        for renderer, (chart, _) in zip(self._chart_homes, self._plots.values(), strict=False):
+            renderer.remove_chart(chart)
+        self._charts.SetDraw(self.compensates)
+        self._plots, self._chart_homes = {}, (*(self._charts,) * 3, self._statistics)
+        for k, name in enumerate((*self._curve_names(), "orbit")):
+            label, unit, *_ = layout.SLIDERS.get(name, ("prism angle", "°"))
+            titles = f"{label} [{unit}]" if unit else label, "displacement [px]" if name == "orbit" else "sharpness"
+            curves = ORBIT_CURVES if name == "orbit" else ((ink, 2.0, "sharpness"), *MARKS)
+            self._plots[name] = self._chart(k, titles, (0.01 + 0.33 * k, 0.02, 0.32, 0.96), curves)
+        titles = "log10 of the interval of a pixel [µs]", "share [%]"
+        self._plots["intervals"] = self._chart(3, titles, (0.02, 0.02, 0.96, 0.62), INTERVAL_CURVES)
+
+    def _chart(
+        self, k: int, titles: tuple[str, str], place: tuple[float, ...], curves: tuple[tuple[str, float, str], ...]
+    ) -> tuple[Any, list[Any]]:
+        """Make the ``k``-th chart at a place (left, bottom, width, height); return it with its empty curves."""
         import pyvista
 
         paper, ink = BACKGROUND_AND_INK[self.look.dark]
-        for chart, _ in self._plots.values():
-            self._charts.remove_chart(chart)
-        self._charts.SetDraw(self.compensates)
-        self._plots = {}
-        for k, name in enumerate((*self._curve_names(), "orbit")):
-            label, unit, *_ = layout.SLIDERS.get(name, ("prism angle", "°"))
-            chart = pyvista.Chart2D(
-                size=(0.32, 0.96), loc=(0.01 + 0.33 * k, 0.02), x_label=f"{label} [{unit}]" if unit else label,
-                y_label="displacement [px]" if name == "orbit" else "sharpness", grid=False,
-            )  # fmt: skip
-            chart.background_color, chart.border_color = paper, paper
-            for axis in (chart.x_axis, chart.y_axis):
-                axis.pen.color, axis.label_size, axis.tick_label_size = ink, 13, 11
-                axis.GetTitleProperties().SetColor(pyvista.Color(ink).float_rgb)
-                axis.GetLabelProperties().SetColor(pyvista.Color(ink).float_rgb)
-            curves = ORBIT_CURVES if name == "orbit" else ((ink, 2.0, "sharpness"), *MARKS)
-            lines = [chart.line([], [], color=colour, width=width, label=text) for colour, width, text in curves]
-            chart.legend_visible, legend = True, chart.GetLegend()
-            legend.GetBrush().SetColorF(pyvista.Color(paper).float_rgb)
-            legend.GetPen().SetColorF(pyvista.Color(paper).float_rgb)
-            legend.GetLabelProperties().SetColor(pyvista.Color(ink).float_rgb)
-            self._charts.add_chart(chart)
-            self._plots[name] = chart, lines
+        paper = paper if k < 3 else HELP_PAPER[self.look.dark]
+        chart = pyvista.Chart2D(size=place[2:], loc=place[:2], x_label=titles[0], y_label=titles[1], grid=False)
+        chart.background_color, chart.border_color = paper, paper
+        for axis in (chart.x_axis, chart.y_axis):
+            axis.pen.color, axis.label_size, axis.tick_label_size = ink, 13, 11
+            axis.GetTitleProperties().SetColor(pyvista.Color(ink).float_rgb)
+            axis.GetLabelProperties().SetColor(pyvista.Color(ink).float_rgb)
+        lines = [chart.line([], [], color=colour, width=width, label=text) for colour, width, text in curves]
+        chart.legend_visible, legend = True, chart.GetLegend()
+        legend.GetBrush().SetColorF(pyvista.Color(paper).float_rgb)
+        legend.GetPen().SetColorF(pyvista.Color(paper).float_rgb)
+        legend.GetLabelProperties().SetColor(pyvista.Color(ink).float_rgb)
+        self._chart_homes[k].add_chart(chart)
+        return chart, lines
 
     def _curve_names(self) -> tuple[str, str]:
         """Return the parameters of the two sharpness curves: the chosen one, and phase or apex."""
         return self.knob, "apex" if self.knob == "phase" else "phase"
 
     def _curve_steps(self) -> Iterator[None]:
-        """Compute the sharpness curves, one value at a time, so that the window can follow the user meanwhile."""
+        """Compute statistics and sharpness curves, one value at a time, so that the window follows its user."""
+        if self.statistics_shown:
+            self._show_statistics()
+            yield
         for name in self._curve_names() if self.compensates else ():
             found = []
             for point in self.inspector.curve_points(name):
@@ -682,18 +650,31 @@ class Window:
         low, high = moved.min(), max(moved.max(), moved.min() + 1e-3)
         chart.x_range, chart.y_range = (0.0, 360.0), (1.1 * low, high + LEGEND_SHARE * (high - low))
 
+    def _show_statistics(self) -> None:
+        """Show the statistics of the selected events, as the page does."""
+        found, (chart, (line, mark)) = layout.statistics_state(self.inspector.statistics()), self._plots["intervals"]
+        rows = [f"{name}:  {text}" for name, text in found["rows"]]
+        self._texts[3].input = "\n".join(["Statistics of the selected events", *rows])
+        x, y = found["x"] or [0.0, 6.0], found["y"] if found["x"] else [0.0, 0.0]
+        median, top = found["median"], 1.3 * max(*y, 1.0)
+        line.update(x, y)
+        mark.update([] if median is None else [median, median], [] if median is None else [0.0, top])
+        chart.x_range, chart.y_range = (x[0], x[-1]), (0.0, top)
+        self._dirty = True
+
     def _show_texts(self) -> None:
         """Show what is missing, messages, and the help."""
         paper, ink = BACKGROUND_AND_INK[self.look.dark]
         notes = [f"model {self.inspector.knobs.model}      h: help", "", self.message, *layout.notes(self.inspector)]
         notes, stream = ([line for text in texts for line in textwrap.wrap(text, COLUMN_LETTERS)]
                          for texts in (notes, self._stream))  # fmt: skip
-        keys = (*((key, words) for key, (method, *_), words in layout.KEYS if hasattr(self, method)),
-                *((key, words) for key, _, words in MORE_KEYS))  # fmt: skip
-        rows = [f"{KEY_NAMES.get(key, key):>6}   {words}" for key, words in keys]
-        for actor, lines in zip(self._texts, (notes, rows, stream), strict=True):
-            actor.input, actor.prop.color = "\n".join(lines), ink
-        self._help.SetDraw(self.help_shown)
+        rows = [f"{KEY_NAMES.get(key, key):>6}   {words}" for key, _, words in self.keys]
+        for actor, lines in zip(self._texts, (notes, rows, stream), strict=False):
+            actor.input = "\n".join(lines)
+        for actor in self._texts:
+            actor.prop.color = ink
+        for renderer, drawn in ((self._help, self.help_shown), (self._statistics, self.statistics_shown)):
+            renderer.SetDraw(drawn)
+            renderer.set_background(HELP_PAPER[self.look.dark])
         for renderer in (self._controls, self._charts):
             renderer.set_background(paper)
-        self._help.set_background(HELP_PAPER[self.look.dark])

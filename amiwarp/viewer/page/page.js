@@ -15,13 +15,13 @@ const ASK_MS = 250; // interval between questions that the server answers at onc
 const LATE_MS = 750; // age of an unanswered question from which the page is marked
 const ADDRESS_MS = 300; // a change of the address costs the browser more than a drawn cloud: once, after a drag
 
-// Saves a file that the server sends, or that the page makes.
-function download(name, content, type) {
+// Save a file of the server by its address, or a Blob of the page.
+function download(name, content) {
   const link = document.createElement('a');
-  link.href = URL.createObjectURL(content instanceof Blob ? content : new Blob([content], { type }));
+  link.href = content instanceof Blob ? URL.createObjectURL(content) : content;
   link.download = name;
   link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 60e3);
+  if (content instanceof Blob) setTimeout(() => URL.revokeObjectURL(link.href), 60e3);
 }
 
 // Element around the page: keys, the state in the address, downloads, and the loss of the connection.

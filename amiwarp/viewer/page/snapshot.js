@@ -53,7 +53,7 @@ function wrapped(context, texts, width) {
 }
 
 function save(context, name, download) {
-  context.canvas.toBlob((blob) => download(name, blob, 'image/png'), 'image/png');
+  context.canvas.toBlob((blob) => download(name, blob), 'image/png');
 }
 
 // Save the clouds as they are seen; `words` are the lines of the caption, the legend comes from the page.
