@@ -646,6 +646,12 @@ def test_downloads_leave_no_file_on_the_server(
     page.locator("#do-keep").click()  # both clouds show the same parameters
     page.locator("#against-title").filter(has_text="compensated with B").wait_for()
     assert film()[1] < 0.3 * apart
+    page.locator("#speed").select_option("0.001")
+    with page.expect_download() as waiting:  # thousands of pictures to the end of the recording
+        page.locator("#do-film").click()
+        page.locator("#do-end-film").click()
+    with av.open(str(waiting.value.path())) as container:
+        assert 1 <= len(list(container.decode(video=0))) < 100
     assert {path: path.stat().st_mtime_ns for path in folder.iterdir()} == before
 
 
@@ -1072,6 +1078,11 @@ def test_a_recording_without_a_prism_is_played_fills_its_pane_and_gets_camera_an
     assert saved.encoder is not None
     assert saved.encoder.rpm == pytest.approx(RPM, rel=1e-4)
     assert len(saved.events) == len(short)
+    for step, values in (("undo", (60.0, 1.5168)), ("redo", (50.0, 1.6))):
+        for _ in range(4):  # apex, speed, index and field of view
+            page.locator(f"#do-{step}").click()
+            ready(page)
+        assert (field(page, "fov_deg"), field(page, "index")) == values
     again = opened(of=saved)
     assert again.locator("#field-fov_deg").count() == 0
     assert again.locator("#image-before").count() == 1

@@ -17,7 +17,7 @@ from amiwarp.optics.models import MODELS
 from amiwarp.viewer import jobs, layout
 from amiwarp.viewer.drawing import RECORDED, Look, orbit_lines
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector
-from amiwarp.viewer.window import MORE_KEYS, Window
+from amiwarp.viewer.window import HELP_PAPER, MORE_KEYS, Window
 
 SIZE = (900, 600)
 TRUE = Prism(math.radians(1.0))
@@ -280,10 +280,11 @@ def test_steps_nudges_and_undo(window: Window) -> None:
 def test_statistics_of_the_region_are_those_of_the_page(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("amiwarp.viewer.window.REST_S", 0.0)
     window.key("i")
-    for key in ("", "n"):
+    for key in ("d", "n"):
         window.key(key)
         while window.turn():
             pass
+        assert window._statistics.background_color.hex_rgb == HELP_PAPER[True]
         found = window.inspector.statistics()
         assert f"{found.rate:,.0f} events/s" in window._texts[3].input
         assert f"{100.0 * found.on_share:.1f} %" in window._texts[3].input

@@ -247,11 +247,7 @@ class Scale:
 
     def ticks(self) -> tuple[tuple[float, str], ...]:
         """Return the marks of the colour bar: their places, 0 to 1, and their texts."""
-        from matplotlib.ticker import MaxNLocator
-
-        locator = MaxNLocator(4, steps=[1, 2, 2.5, 5, 10], integer=self.counts)
-        values = np.asarray(locator.tick_values(self.low, self.high), np.float64)
-        values = values[(values >= self.low) & (values <= self.high)]
+        values = ticks(self.low, self.high, 4, whole=self.counts)
         return tuple((float(place), f"{v:g}") for place, v in zip(self.places(values), values, strict=True))
 
 
@@ -314,16 +310,14 @@ def make_images(
     per_polarity = kind is ImageKind.POLARITY
     images = [each.counts(w, k, per_polarity=per_polarity)[cut] for each, w, k in pair]
     colours = "polarity" if per_polarity else "gray"
-    scale = Scale("events", "per pixel", 0.0, _top(*images), colours, GAMMA)
-    return ShownImages(kind, images[0], images[1], scale)
+    return ShownImages(kind, images[0], images[1], _count_scale(images, colours))
 
 
 def count_images(shown: DisplayedWindow) -> ShownImages:
     """Return the images of kind :attr:`ImageKind.COUNT` of a window that is already shown."""
     left, top, right, bottom = shown.region
     images = [each[top:bottom, left:right] for each in (shown.image_before, shown.image_after)]
-    scale = Scale("events", "per pixel", 0.0, _top(*images), "gray", GAMMA)
-    return ShownImages(ImageKind.COUNT, images[0], images[1], scale)
+    return ShownImages(ImageKind.COUNT, images[0], images[1], _count_scale(images))
 
 
 def with_difference(images: ShownImages) -> ShownImages:
@@ -336,10 +330,11 @@ def with_difference(images: ShownImages) -> ShownImages:
     return replace(images, after=difference, after_scale=scale)
 
 
-def _top(*images: NDArray[np.float32]) -> float:
-    """Return the count at the end of the scale of both images."""
+def _count_scale(images: Sequence[NDArray[np.float32]], colours: str = "gray") -> Scale:
+    """Return one scale of counts for images."""
     positive = [image[image > 0.0] for image in images]
-    return math.ceil(max([1.0, *(float(np.percentile(each, PERCENTILE)) for each in positive if each.size)]))
+    top = max([1.0, *(float(np.percentile(each, PERCENTILE)) for each in positive if each.size)])
+    return Scale("events", "per pixel", 0.0, math.ceil(top), colours, GAMMA)
 
 
 def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:
@@ -650,9 +645,8 @@ def bar_actors(bar: Scale, ink: str, height: int) -> list[Any]:
     actor = vtkScalarBarActor()
     actor.SetLookupTable(table)
     actor.SetMaximumNumberOfColors(256)
-    values = ticks(bar.low, bar.high)
     actor.SetUseCustomLabels(True)
-    actor.SetCustomLabels(pyvista.convert_array(values[values % 1.0 == 0.0] if bar.counts else values))
+    actor.SetCustomLabels(pyvista.convert_array(ticks(bar.low, bar.high, whole=bar.counts)))
     actor.SetLabelFormat("%.4g")
     actor.UnconstrainedFontSizeOn()
     actor.SetPosition(CORNER[0], BAR_BOTTOM)
@@ -1073,7 +1067,7 @@ class Scene:
             home, cloud = (left, right)[not look.overlaid], self._clouds[1]
             (right if look.overlaid else left).RemoveActor(cloud)
             home.AddActor(cloud)
-        for renderer in self.plotter.renderers:
+        for renderer in list(self.plotter.renderers)[:OWN_RENDERERS]:
             renderer.set_background(background)
         for k, actor in self._frame:
             self.plotter.renderers[k].remove_actor(actor, render=False)
@@ -1174,12 +1168,15 @@ class Scene:
         return actors
 
 
-def ticks(low: float, high: float) -> NDArray[np.float64]:
-    """Return round numbers from ``low`` to ``high``; for angles, divisors of a full turn are preferred."""
+def ticks(low: float, high: float, most: int = 5, *, whole: bool = False) -> NDArray[np.float64]:
+    """Return at most about ``most`` round numbers from ``low`` to ``high``; for angles, divisors of a full turn.
+
+    ``whole``: only whole numbers.
+    """
     from matplotlib.ticker import MaxNLocator
 
     steps = [1, 2, 3, 4.5, 6, 9, 10] if high == 360.0 else [1, 2, 2.5, 5, 10]
-    values = np.asarray(MaxNLocator(5, steps=steps).tick_values(low, high), np.float64)
+    values = np.asarray(MaxNLocator(most, steps=steps, integer=whole).tick_values(low, high), np.float64)
     return values[(values >= low) & (values <= high)]
 
 
@@ -1299,7 +1296,7 @@ NO_ORBIT = {"orbit": b"", "column": b"", "has_orbit": False}
 def whole_image(events: Events, size: tuple[int, int]) -> dict[str, Any]:
     """Return the image of events as recorded, for the browser."""
     counts = recorded_counts(events, size)
-    return picture_state(counts, Scale("events", "per pixel", 0.0, _top(counts), "gray", GAMMA))
+    return picture_state(counts, _count_scale([counts]))
 
 
 def event_text(shown: DisplayedWindow, k: int) -> str:

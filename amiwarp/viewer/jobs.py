@@ -600,7 +600,8 @@ FILMS = ("turntable", "film")
 def download_name(recording: str, what: str) -> str:
     """Return the file name of a download. ``recording``: name of the recording, which may be that of a stream."""
     name = re.sub(r"[^\w.+=@-]+", "_", recording)[:60].strip("._-~ ") or "recording"
-    return f"{name}.{what}{EXPORTS[what][1]}"
+    suffix = EXPORTS[what][1]
+    return f"{name}{suffix}" if suffix == f".{what}" else f"{name}.{what}{suffix}"
 
 
 def write_film(

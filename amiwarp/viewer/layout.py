@@ -12,7 +12,7 @@ import numpy as np
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
-from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look
+from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look, Scale, picture_state
 from amiwarp.viewer.inspector import (
     INTERVALS_US,
     NO_ENCODER,
@@ -709,6 +709,8 @@ def found_text(found: FoundCalibration) -> str:
 
 def surface_state(surface: CostSurface, inspector: Inspector, found: Calibration | None) -> dict[str, Any]:
     """Return the map of sharpness for the page, with marks of the current, the found and the true parameters."""
+    low, high = float(surface.sharpness.min()), float(surface.sharpness.max())
+    picture = picture_state(surface.sharpness[::-1], Scale("sharpness", "1", low, max(high, low + 1e-9), "cividis"))
     names, scales = surface.names, [UNITS[name] for name in surface.names]
     x, y = ((values / scale).tolist() for values, scale in zip(surface.values, scales, strict=True))
     known = {"now": ("○", inspector.knobs), "truth": ("◇", inspector.truth),
@@ -721,5 +723,5 @@ def surface_state(surface: CostSurface, inspector: Inspector, found: Calibration
                 place[1] += 360.0 * round((inspector.knobs.phase / scales[1] - place[1]) / 360.0)
             marks.append({"x": place[0], "y": place[1], "sign": sign, "title": title})
     titles = [f"{SLIDERS[name][0]} ({SLIDERS[name][1]})" for name in names]
-    return {"x": x, "y": y, "values": surface.sharpness.tolist(), "marks": marks, "x_title": titles[0],
+    return {"x": x, "y": y, "picture": picture, "marks": marks, "x_title": titles[0],
             "y_title": titles[1]}  # fmt: skip

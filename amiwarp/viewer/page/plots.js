@@ -6,7 +6,7 @@ import { text, ticks } from './ticks.js';
 const LEAST_SHARE = 0.18; // of a colour bar between two numbers
 const WIDE_SHARE = 0.45; // of an axis between two wide numbers
 
-const { computed, onMounted, ref, watch } = window.Vue;
+const { computed } = window.Vue;
 
 // Return the ticks of an axis with their places as shares of its length.
 function placed(low, high, most) {
@@ -45,7 +45,7 @@ export const CurvePlot = {
       return props.x.map((x, k) => `${share(x)},${100 - (100 * (props.y[k] - low)) / (high - low)}`).join(' ');
     });
     const across = computed(() => { // wide numbers would touch each other
-      const all = placed(...range.value, 5);
+      const all = placed(...range.value, window.innerHeight > 520 ? 5 : 3);
       if (!all.some((tick) => tick.text.length > 4)) return all;
       const far = (tick, last) => !last || tick.at - last.at >= WIDE_SHARE;
       return placed(...range.value, 2).reduce((kept, tick) => (far(tick, kept.at(-1)) ? [...kept, tick] : kept), []);
@@ -61,10 +61,10 @@ export const CurvePlot = {
 };
 
 export const CostSurface = {
-  props: { x: Array, y: Array, values: Array, marks: Array, xTitle: String, yTitle: String, label: String },
+  props: { x: Array, y: Array, picture: Object, marks: Array, xTitle: String, yTitle: String, label: String },
   template: `<div class="plot surface" role="img" :aria-label="label">
     <div class="plot-y">{{ yTitle }}</div>
-    <div class="plot-box"><canvas ref="canvas"></canvas>
+    <div class="plot-box"><img :src="image" alt=""/>
       <span v-for="m in within" class="cross" :class="m.kind" :style="{ left: share(m.x, x), bottom: share(m.y, y) }"
         :title="m.title">{{ m.sign }}</span>
       <span v-for="t in placed(y[0], y[y.length - 1], 4)" class="tick-y" :style="{ bottom: 100 * t.at + '%' }">{{ t.text }}</span>
@@ -73,26 +73,11 @@ export const CostSurface = {
     <div class="plot-x">{{ xTitle }}</div>
   </div>`,
   setup(props) {
-    const canvas = ref(null);
+    const image = computed(() => painted(props.picture).toDataURL());
     const share = (value, axis) => `${(100 * (value - axis[0])) / (axis[axis.length - 1] - axis[0])}%`;
     const inside = (value, axis) => value >= axis[0] && value <= axis[axis.length - 1];
     const within = computed(() => props.marks.filter((mark) => inside(mark.x, props.x) && inside(mark.y, props.y)));
-    function draw() {
-      const [width, height, flat] = [props.x.length, props.y.length, props.values.flat()];
-      const [low, high] = [Math.min(...flat), Math.max(...flat)];
-      Object.assign(canvas.value, { width, height });
-      const context = canvas.value.getContext('2d');
-      const image = context.createImageData(width, height);
-      flat.forEach((value, k) => {
-        const [row, column] = [height - 1 - Math.floor(k / width), k % width];
-        const tone = (value - low) / Math.max(high - low, 1e-12);
-        image.data.set([Math.round(20 + 235 * tone), Math.round(30 + 190 * tone), Math.round(90 + 30 * tone), 255], 4 * (row * width + column));
-      });
-      context.putImageData(image, 0, 0);
-    }
-    onMounted(draw);
-    watch(() => props.values, draw);
-    return { canvas, share, within, placed };
+    return { image, share, within, placed };
   },
 };
 
