@@ -570,7 +570,7 @@ class Panel(layout.Actions):
         look = self.look.for_clouds([title for _, title in s.titles])
         self._progress = progress = JobProgress(self._show_progress)
         film = partial(
-            jobs.write_film, inspector=self.inspector, look=look, view=self.view, progress=progress, what=what,
+            jobs.write_film, inspector=self.inspector.copy(), look=look, view=self.view, progress=progress, what=what,
             against=self.against, with_orbit=bool(s.orbit_shown), speed=float(s.speed),
             ended=lambda: progress.ended,
         )  # fmt: skip
