@@ -253,16 +253,16 @@ class Scale:
 
 @cache
 def table_of(colours: str) -> NDArray[np.uint8]:
-    """Return the 256 colours of a bar, shape ``(256, 3)``: of :data:`DIFFERENCES`, or a colour map of Matplotlib.
+    """Return the 256 colours of a bar, shape ``(256, 3)``: of a colour map of Matplotlib, or "difference".
 
     The suffix " on light" or " on dark" keeps white or black apart from the background.
     """
     from matplotlib import colormaps
+    from matplotlib.colors import LinearSegmentedColormap
 
     shares, (name, _, paper) = np.linspace(0.0, 1.0, 256), colours.partition(" on ")
     if name == "difference":
-        ends = np.linspace(0.0, 1.0, len(DIFFERENCES))
-        table = np.stack([np.interp(shares, ends, channel) for channel in DIFFERENCES.T], axis=1) / 255.0
+        table = LinearSegmentedColormap.from_list(name, (OFF_COLOUR, "white", ON_COLOUR))(shares)[:, :3]
     else:
         table = colormaps[name](shares)[:, :3]
     if paper:
@@ -1184,8 +1184,6 @@ def ticks(low: float, high: float, most: int = 5, *, whole: bool = False) -> NDA
 
 LEGEND_ROWS = 8
 """Largest number of causes, instances or depths in a legend."""
-DIFFERENCES = np.array([[0, 114, 178], [255, 255, 255], [213, 94, 0]], np.float64)
-"""Colours of fewer, equally many and more events in an image of differences."""
 STOPS = 16
 """Number of colours from which the browser draws a colour scale."""
 MOST_SENT = 4_000_000

@@ -111,11 +111,6 @@ class Panel(layout.Actions):
             self._progress.ended = True
 
     @property
-    def offered(self) -> dict[str, Callable[..., None]]:
-        """Methods that the page may call, by name."""
-        return {name: getattr(self, name) for name in layout.CALLS}
-
-    @property
     def look(self) -> Look:
         """Style of the clouds."""
         s = self.state
@@ -179,8 +174,8 @@ class Panel(layout.Actions):
         follow(("colour", "axis", "dark", "orbit_shown"), self.request, "look")
         follow(("model", "against", "kind", "difference"), self.request, "knobs")
         follow(("model", "kind", "polarity", "hide_hot", "noise_filter"), self.released)
-        for name, call in self.offered.items():
-            self._server.trigger(name)(call)
+        for name in layout.CALLS:
+            self._server.trigger(name)(getattr(self, name))
 
     # Buttons, keys, fields and the mouse
 

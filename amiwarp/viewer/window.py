@@ -253,25 +253,22 @@ class Window(layout.Actions):
     def choose_next(self) -> None:
         """Choose the next parameter for the keys and the sharpness curve."""
         names = [name for name in self.sliders if name not in FINE]
-        self.knob = names[(names.index(self.knob) + 1) % len(names)] if self.knob in names else names[0]
+        self.knob = _following(names, self.knob)
         self.request("look")
 
     def next_model(self) -> None:
         """Show the next optical model."""
-        names = list(MODELS)
         knobs = self.inspector.knobs
-        self.inspector.set(replace(knobs, model=names[(names.index(knobs.model) + 1) % len(names)]))
+        self.inspector.set(replace(knobs, model=_following(list(MODELS), knobs.model)))
         self.request("knobs")
 
     def next_colour(self) -> None:
         """Show the next quantity by colour."""
-        offered = colours_on_offer(self.inspector.recording.truth)
-        self.restyle(colour=offered[(offered.index(self.look.colour) + 1) % len(offered)])
+        self.restyle(colour=_following(colours_on_offer(self.inspector.recording.truth), self.look.colour))
 
     def next_polarity(self) -> None:
         """Show only ON events, only OFF events, or both."""
-        following = {None: 1, 1: 0, 0: None}
-        self._select(polarity=following[self.inspector.selection.polarity])
+        self._select(polarity=_following([None, 1, 0], self.inspector.selection.polarity))
 
     def resize_points(self, px: float) -> None:
         """Make the points larger."""
@@ -678,3 +675,8 @@ class Window(layout.Actions):
             renderer.set_background(HELP_PAPER[self.look.dark])
         for renderer in (self._controls, self._charts):
             renderer.set_background(paper)
+
+
+def _following(choices: list[Any], now: Any) -> Any:
+    """Return the choice after the current one."""
+    return choices[(choices.index(now) + 1) % len(choices) if now in choices else 0]
