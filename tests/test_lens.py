@@ -167,8 +167,11 @@ def recordings() -> list[amiwarp.Recording]:
 
 
 def test_recordings_of_a_still_board_give_lens_and_prism(recordings: list[amiwarp.Recording], tmp_path: Path) -> None:
-    names = [str(tmp_path / f"{k}.h5") for k in range(len(recordings))]
-    for name, recording in zip(names, recordings, strict=True):
+    encoder = recordings[0].encoder
+    assert encoder is not None
+    shifted = replace(recordings[0], encoder=encoder.with_clock_offset(83333 / 36))  # its zero is off by 10 deg
+    names = [str(tmp_path / f"{k}.h5") for k in range(len(recordings) + 1)]
+    for name, recording in zip(names, [*recordings, shifted], strict=True):
         amiwarp.save_recording(name, recording)
     camera, prism, figure = (tmp_path / name for name in ("camera.yaml", "prism.json", "lens.png"))
     outputs = [str(camera), "--calibration", str(prism), "--figure", str(figure)]
@@ -181,6 +184,8 @@ def test_recordings_of_a_still_board_give_lens_and_prism(recordings: list[amiwar
     assert math.degrees(calibration.parameters["apex"]) == pytest.approx(1.0, rel=0.008)
     assert calibration.camera.fx == data["camera"]["fx"] == found.fx
     assert data["reprojection_px"] < 0.15
+    assert list(data["left_out"]) == ["5"]
+    assert "the encoder's zero changed" in data["left_out"]["5"]
     assert sum(map(sum, data["coverage"])) == 30 * len(recordings)
     assert any("record more poses" in text for text in data["advice"])
     assert cv2.imread(str(figure)).std() > 10.0

@@ -17,9 +17,9 @@ from amiwarp.events.recording import MemoryEvents, Recording
 
 LEAST_TURNS, MOST_TURNS = 1.5, 3.0
 """Shortest still span, and the longest part of one that is used, from its middle [turns]."""
-LEAST_REPETITION = 0.6
-"""Smallest correlation of the events of two successive turns while nothing moves. A still board's is 0.8 to 0.95, and
-that of a board that moves by 4 px in a turn under 0.5."""
+LEAST_REPETITION = 0.75
+"""Smallest correlation of the events of two successive turns while nothing moves. A still board's was 0.96 to 0.98,
+that of a board that moved by 1.8 px in a turn 0.82, and by 3.7 px 0.52."""
 WITHOUT_PRISM = "because without it a still board gives no events"
 MOST_POSES = 40
 """Largest number of poses that are used. More would lengthen the work, and hardly improve the lens."""
