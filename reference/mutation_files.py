@@ -49,12 +49,12 @@ from amiwarp import (
     load_world,
     open_recording,
 )
-from amiwarp.cli.options import read_camera
 from amiwarp.cli.recordings import describe
 from amiwarp.cli.simulation import _read_speed
 from amiwarp.events.recording import check_events
 from amiwarp.events.truth import MAPS
 from amiwarp.io import read_encoder_csv
+from amiwarp.io.camera_files import load_camera
 from amiwarp.io.json_files import append_line, sealed
 from amiwarp.io.plain_files import read_calib
 from amiwarp.simulation.pictures import _read_times, open_pictures, read_picture
@@ -547,7 +547,7 @@ KINDS: dict[str, Kind] = {
     "sensors_plain": (".h5", partial(write_plain, write_sensors), read_recording),
     "encoder_csv": (".csv", write_csv, read_log),
     "calib_txt": (".txt", lambda path: path.write_text(CALIB), lambda path: read_calib(path, *SIZE)),
-    "camera_json": (".json", write_camera, lambda path: read_camera(path, *SIZE)),
+    "camera_json": (".json", write_camera, lambda path: load_camera(path, SIZE)),
     "calibration_json": (".json", write_calibration, lambda path: Calibration.load(path).model),
     **{
         f"{name}_{part}": (

@@ -27,7 +27,7 @@ from amiwarp import AmiwarpError, Camera, Prism, Recording, simulate
 from amiwarp.viewer import serve as server_module
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.jobs import MOST_IN_FLIGHT
-from amiwarp.viewer.layout import SETTABLE
+from amiwarp.viewer.layout import CALLS, SETTABLE
 from amiwarp.viewer.serve import MOST_BYTES, HostNames, MessageFilter, address, is_local, reachable, serve, warning
 from tests.test_serve import COUNT, TOKEN, WAIT_S, Counters, get, origin_of, served, until
 
@@ -167,7 +167,7 @@ def test_junk_changes_nothing_and_the_page_goes_on(
                 for junk in JUNK:
                     if name not in SETTABLE or not SETTABLE[name](junk):
                         await page.send("trame.state.update", [{"key": name, "value": junk}])
-            for name in (*build.panels[0].offered, "close", "trigger__1"):
+            for name in (*CALLS, "close", "trigger__1"):
                 for junk in JUNK:
                     if not isinstance(junk, str | int | float):
                         await page.send("trame.trigger", name, [junk], {})
@@ -218,7 +218,7 @@ def test_all_that_the_page_may_set_leaves_it_alive(recording: Recording, caplog:
             for name in ("apex", "start_ms", "length_ms", "turns", "rpm", "message", "trame__title", "__class__"):
                 for text in ("", "nan", "inf", "-inf", "1e308", "-1e308", "1e-308", "x", "0x10", "1_0", "٣"):
                     await page.call("trame.trigger", "typed", [name, text], {})
-            for name in build.panels[0].offered:
+            for name in CALLS:
                 for plain in ("", "c", "?", "__class__", "apex", 0, -1, 1e12, True):
                     for args in ([], [plain], [plain] * 2, [plain] * 4):
                         await page.send("trame.trigger", name, args, {})
