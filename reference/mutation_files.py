@@ -40,8 +40,10 @@ from amiwarp import (
     Fisheye,
     FrameTruth,
     ImuSamples,
+    PixelMap,
     Poses,
     Prism,
+    RadialTangential,
     Recording,
     RecordingWriter,
     Trajectory,
@@ -54,7 +56,7 @@ from amiwarp.cli.simulation import _read_speed
 from amiwarp.events.recording import check_events
 from amiwarp.events.truth import MAPS
 from amiwarp.io import read_encoder_csv
-from amiwarp.io.camera_files import load_camera
+from amiwarp.io.camera_files import load_camera, save_camera
 from amiwarp.io.json_files import append_line, sealed
 from amiwarp.io.plain_files import read_calib
 from amiwarp.simulation.pictures import _read_times, open_pictures, read_picture
@@ -156,6 +158,9 @@ def write_calibration(path: Path) -> None:
     camera = Camera(*SIZE, 200.0, 200.0, 150.0, 110.0, Fisheye(0.1, 0.0, 0.0, 0.0))
     values = {"apex": 0.035, "phase": 0.5, "tilt_x": 0.0, "tilt_y": 0.0, "clock_offset": 0.0}
     exact_calibration(camera, Prism(0.035), values).save(path)
+
+
+LENS = Camera(320, 240, 200.0, 201.0, 160.0, 120.0, RadialTangential(-0.1, 0.02))
 
 
 def write_camera(path: Path) -> None:
@@ -547,6 +552,11 @@ KINDS: dict[str, Kind] = {
     "sensors_plain": (".h5", partial(write_plain, write_sensors), read_recording),
     "encoder_csv": (".csv", write_csv, read_log),
     "calib_txt": (".txt", lambda path: path.write_text(CALIB), lambda path: read_calib(path, *SIZE)),
+    **{
+        f"camera_{layout}": (".yaml", lambda path, layout=layout: save_camera(path, LENS, layout=layout), load_camera)
+        for layout in ("ros", "kalibr")
+    },
+    "pixel_map": (".npz", PixelMap(*np.ones((8, 12, 16))).save, PixelMap.load),
     "camera_json": (".json", write_camera, lambda path: load_camera(path, SIZE)),
     "calibration_json": (".json", write_calibration, lambda path: Calibration.load(path).model),
     **{

@@ -40,7 +40,7 @@ def load_camera(path: str | os.PathLike[str], size: tuple[int, int] | None = Non
 
     Parameters
     ----------
-    path : path
+    path : str or Path
         A file ``.json`` (a camera or a calibration), ``.yaml`` or ``.yml`` (ROS's camera info, or Kalibr's camchain
         with one camera), or with any other extension a ``calib.txt`` (fx fy cx cy k1 k2 p1 p2 k3).
     size : tuple of int, optional
@@ -82,7 +82,7 @@ def save_camera(path: str | os.PathLike[str], camera: Camera, *, layout: str = "
 
     Parameters
     ----------
-    path : path
+    path : str or Path
         The file, which ends in ``.json``, ``.yaml`` or ``.yml``.
     camera : Camera
         The camera.

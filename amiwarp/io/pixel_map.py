@@ -113,7 +113,7 @@ class PixelMap:
 
         Parameters
         ----------
-        path : path
+        path : str or Path
             The file, which ends in ``.npz``.
         overwrite : bool, default False
             Whether to replace an existing file.
@@ -134,7 +134,7 @@ class PixelMap:
 
         Parameters
         ----------
-        path : path
+        path : str or Path
             The file.
 
         Returns
