@@ -30,7 +30,7 @@ LENSES = {
     "radial-tangential": amiwarp.Camera(
         640, 480, 520.0, 521.5, 322.0, 236.0, amiwarp.RadialTangential(-0.12, 0.03, 0.0005, -0.0004)
     ),
-    "fisheye": amiwarp.Camera(640, 480, 320.0, 320.6, 322.0, 236.0, amiwarp.Fisheye(-0.02, 0.004)),
+    "fisheye": amiwarp.Camera(640, 480, 340.0, 340.6, 322.0, 236.0, amiwarp.Fisheye(-0.02, 0.004)),
 }
 DISTANCE_M = {"radial-tangential": (0.35, 0.7), "fisheye": (0.2, 0.4)}
 FINE = 4
