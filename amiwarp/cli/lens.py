@@ -117,10 +117,10 @@ def run_lens(
 
 def _data(found: LensCalibration, out: Path) -> dict[str, Any]:
     """Return the result for ``--json``."""
-    lens = found.camera.distortion
-    values = {n: getattr(found.camera if n in ("fx", "fy", "cx", "cy") else lens, n) for n in found.uncertainty}
+    from amiwarp.lens.corner_fit import lens_values
+
     return {
-        "file": str(out), "camera": values, "camera_std": dict(found.uncertainty),
+        "file": str(out), "camera": lens_values(found.camera, found.uncertainty), "camera_std": dict(found.uncertainty),
         "prism": dict(found.prism.parameters), "prism_std": dict(found.prism.uncertainty), "reprojection_px": found.rms,
         "poses": [{"name": p.name, "corners": len(p.corners.ids), "reprojection_px": p.rms} for p in found.poses],
         "left_out": dict(found.left_out), "coverage": found.coverage.tolist(), "notes": found.notes,

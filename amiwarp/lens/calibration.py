@@ -26,10 +26,10 @@ from amiwarp.calib.sharpness import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.lens.board import Board, Corners
-from amiwarp.lens.corner_fit import Fit, fit_lens, tilt_of
+from amiwarp.lens.corner_fit import Fit, fit_lens, lens_values, tilt_of, with_lens_values
 from amiwarp.lens.poses import Pose, still_poses
 from amiwarp.optics.camera import Camera, Fisheye
-from amiwarp.optics.models import ExactModel, predicted_error
+from amiwarp.optics.models import ExactModel, predicted_error, rms
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.picture import Reconstruction
@@ -104,7 +104,7 @@ class BoardPose:
     @property
     def rms(self) -> float:
         """Distance of predicted and seen corners [px rms]."""
-        return float(np.sqrt((self.residuals**2).sum(axis=1).mean()))
+        return rms(self.residuals)
 
 
 @guarded
@@ -138,7 +138,7 @@ class LensCalibration:
     @property
     def rms(self) -> float:
         """Distance of predicted and seen corners over all poses [px rms]."""
-        return float(np.sqrt(np.concatenate([(p.residuals**2).sum(axis=1) for p in self.poses]).mean()))
+        return rms(np.concatenate([pose.residuals for pose in self.poses]))
 
     @property
     def coverage(self) -> NDArray[np.int64]:
@@ -362,12 +362,14 @@ class LensWork:
         self._check_count(len(seen), "are seen")
         while True:
             fit = fit_lens(self.camera, self.board, list(seen.values()))
-            rms = {n: float(np.sqrt((r**2).sum(axis=1).mean())) for n, r in zip(seen, fit.residuals, strict=True)}
-            worst = max(rms, key=lambda name: rms[name])
-            usual = float(np.median([*rms.values()]))
-            if rms[worst] <= max(BAD_POSE * usual, LEAST_BAD_PX):
+            misses = {name: rms(r) for name, r in zip(seen, fit.residuals, strict=True)}
+            worst = max(misses, key=lambda name: misses[name])
+            usual = float(np.median([*misses.values()]))
+            if misses[worst] <= max(BAD_POSE * usual, LEAST_BAD_PX):
                 break
-            self.left_out[worst] = f"its corners miss by {rms[worst]:.2f} px rms, those of the others by {usual:.2f} px"
+            self.left_out[worst] = (
+                f"its corners miss by {misses[worst]:.2f} px rms, those of the others by {usual:.2f} px"
+            )
             del seen[worst]
             self._check_count(len(seen), "fit together")
         return fit, seen
@@ -478,12 +480,8 @@ class JointPrism:
 
         def by_lens(name: str) -> Vector:
             step = max(fit.deviations[name], 1e-9)
-            if name in ("fx", "fy", "cx", "cy"):
-                camera = replace(fit.camera, **{name: getattr(fit.camera, name) + step})
-            else:
-                lens: Any = fit.camera.distortion
-                camera = replace(fit.camera, distortion=replace(lens, **{name: getattr(lens, name) + step}))
-            return (self._displacements(camera, self.v) - at) / step
+            moved = {name: lens_values(fit.camera, [name])[name] + step}
+            return (self._displacements(with_lens_values(fit.camera, moved), self.v) - at) / step
 
         prism = np.stack([by_prism(k) for k in range(len(self.v))], axis=1)
         lens = np.stack([by_lens(name) for name in names], axis=1)
@@ -524,10 +522,8 @@ def advice_on(poses: Sequence[BoardPose], fit: Fit) -> tuple[str, ...]:
     """Return what would improve a calibration most, one sentence each."""
     said = []
     tilts = [tilt_of(np.concatenate([p.rotation, p.translation])) for p in poses]
-    if np.median(tilts) < STEEP:
-        said.append(
-            f"tilt the board more: half of the poses are tilted by less than {math.degrees(np.median(tilts)):.0f} deg"
-        )
+    if (usual := float(np.median(tilts))) < STEEP:
+        said.append(f"tilt the board more: half of the poses are tilted by less than {math.degrees(usual):.0f} deg")
     counts = coverage_of([p.corners for p in poses], fit.camera.width, fit.camera.height)
     empty = [f"{REGIONS[0][a]} {REGIONS[1][b]}" for a, b in np.argwhere(counts == 0)]
     if empty:

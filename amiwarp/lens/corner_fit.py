@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.lens.board import Board, Corners, opencv
 from amiwarp.optics.camera import Camera, Fisheye, RadialTangential, coefficients
+from amiwarp.optics.models import rms
 
 Vector = NDArray[np.float64]
 
@@ -66,7 +67,19 @@ class Fit:
     @property
     def rms(self) -> float:
         """Distance of predicted and seen corners [px rms]."""
-        return float(np.sqrt(np.concatenate([(r**2).sum(axis=1) for r in self.residuals]).mean()))
+        return rms(np.concatenate(self.residuals))
+
+
+def lens_values(camera: Camera, names: Iterable[str]) -> dict[str, float]:
+    """Return intrinsics and coefficients of a camera by name, in the order of ``names``."""
+    return {n: getattr(camera if n in INTRINSICS else camera.distortion, n) for n in names}
+
+
+def with_lens_values(camera: Camera, values: Mapping[str, float]) -> Camera:
+    """Return the camera, which has a distortion, with other intrinsics and coefficients."""
+    bends = {n: x for n, x in values.items() if n not in INTRINSICS}
+    lengths = {n: x for n, x in values.items() if n in INTRINSICS}
+    return replace(camera, **lengths, distortion=replace(camera.distortion, **bends))  # type: ignore[type-var, arg-type]
 
 
 class Projection:
@@ -168,14 +181,12 @@ def _fit(
     ends = np.cumsum([2 * len(p) for p in points]).tolist()
 
     def lens_of(v: Vector) -> Camera:
-        values = dict(zip(names, v.tolist(), strict=False))
-        bends = {n: values.pop(n) for n in names if n not in INTRINSICS}
-        return replace(camera, **values, distortion=replace(camera.distortion, **bends))  # type: ignore[type-var]
+        return with_lens_values(camera, dict(zip(names, v[:count].tolist(), strict=True)))
 
     @lru_cache(maxsize=1)  # residuals and their derivatives are asked for at the same place in turn
     def projected(v: bytes) -> list[tuple[Vector, Vector]]:
         at = np.frombuffer(v)
-        lens = Projection(lens_of(at[:count]))
+        lens = Projection(lens_of(at))
         return [lens.of(pose, p) for pose, p in zip(at[count:].reshape(-1, 6), points, strict=True)]
 
     def residuals(v: Vector) -> Vector:
@@ -195,7 +206,7 @@ def _fit(
     def weighted_jacobian(v: Vector, root: Vector) -> Vector:
         return root[:, None] * jacobian(v)
 
-    v = np.concatenate([[getattr(camera if n in INTRINSICS else camera.distortion, n) for n in names], poses.ravel()])
+    v = np.concatenate([[*lens_values(camera, names).values()], poses.ravel()])
     weight = np.ones(2 * len(xy))
     for _ in range(rounds):
         try:
@@ -212,7 +223,7 @@ def _fit(
     freedom, cost = len(r) - len(v), float((weight * r**2).sum())
     spread = np.linalg.pinv(j.T @ j) * cost / max(freedom, 1)
     return Fit(
-        lens_of(v[:count]), v[count:].reshape(-1, 6), names, spread[:count, :count],
+        lens_of(v), v[count:].reshape(-1, 6), names, spread[:count, :count],
         tuple(np.split(r.reshape(-1, 2), [end // 2 for end in ends[:-1]])), cost, freedom,
     )  # fmt: skip
 
