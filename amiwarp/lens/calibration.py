@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.calibration import prepare
 from amiwarp.calib.parameters import ParameterSpace, like_size, nominal
+from amiwarp.calib.photometric.cost import Slopes
 from amiwarp.calib.photometric.stage import LARGEST_COST, Equations
 from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import PhotometricSettings, Settings
@@ -444,16 +445,18 @@ class JointPrism:
         for cost in costs.values():
             cost.space = replace(self.full, camera=camera, names=names).holding(self.values)
         self.space = space = next(iter(costs.values())).space
-        v, last, gain, parts = space.to_vector(self.values), np.zeros(0), 1.0, list[Vector]()
+        v, last, gain = space.to_vector(self.values), np.zeros(0), 1.0
         for _ in range(most):
-            hessian, gradient, parts = np.zeros((len(v), len(v))), np.zeros(len(v)), []
+            each = []
             for cost in costs.values():
                 cost.predict(v)
                 cost.residuals(v)
-                slopes = cost.slopes(v, with_parts=True)
-                hessian, gradient = hessian + slopes.hessian, gradient + slopes.gradient
-                parts.append(slopes.parts)
-            step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(len(v)), gradient)
+                each.append(cost.slopes(v, with_parts=True))
+            slopes = Slopes(
+                np.sum([s.hessian for s in each], axis=0), np.sum([s.gradient for s in each], axis=0),
+                np.concatenate([s.parts for s in each], axis=1),
+            )  # fmt: skip
+            step = slopes.step()
             if len(last):  # successive steps in one direction shrink by the same factor: take their sum
                 left = 1.0 - (1.0 - float(step @ last) / max(float(last @ last), 1e-12)) / gain
                 gain = 1.0 / (1.0 - min(max(left, 0.0), 1.0 - 1.0 / LARGEST_GAIN))
@@ -461,9 +464,7 @@ class JointPrism:
             v = v + np.clip(gain * step, -1.0, 1.0)
             if float(np.abs(step).max()) < tolerance:
                 break
-        scatter = np.concatenate(parts, axis=1)
-        inverse = np.linalg.pinv(hessian)
-        self.v, self.covariance = v, inverse @ (scatter @ scatter.T) @ inverse
+        self.v, self.covariance = v, slopes.covariance()
         self.costs = {name: cost.mean() for name, cost in costs.items()}
         self.values = {**self.values, **space.to_values(v)}
         return dict(self.values)
