@@ -1002,6 +1002,23 @@ def test_control_z_undoes_and_the_look_is_kept_on_reload(opened: Open) -> None:
         page.evaluate("localStorage.clear()")
 
 
+def test_undo_before_a_change_is_computed_undoes_it_and_redo_brings_it_back(
+    page: Any, tabs: Tabs, kept: tuple[Any, Any, dict[str, Any]]
+) -> None:
+    panel = kept[1]
+
+    def at_once() -> None:
+        panel.typed("apex", "0.9")
+        panel.undo()
+
+    tabs.loop.call_soon_threadsafe(at_once)
+    until(lambda: bool(panel.state.can_redo))
+    ready(page)
+    assert field(page, "apex") == NOMINAL_DEG
+    page.keyboard.press("y")
+    until(lambda: field(page, "apex") == 0.9)
+
+
 def test_one_event_has_no_sharpness(opened: Open, recording: Recording) -> None:
     one = MemoryEvents(recording.events.slice(20_000, 20_001), *recording.events.size)
     page = opened(of=replace(recording, events=one, truth=None))

@@ -273,6 +273,14 @@ def test_steps_nudges_and_undo(window: Window) -> None:
         window.turn()
     assert layout.knob_values(window.inspector)["phase"] == pytest.approx(phase)
     assert window.inspector.window == start
+    drag(window, "length_ms", 15.0)
+    for key in ("Right", "z"):  # an undo right after a change undoes that change, and can be redone
+        window.key(key)
+    window.turn()
+    assert window.inspector.window[0] == start[0]
+    window.key("y")
+    window.turn()
+    assert window.inspector.window[0] == pytest.approx(start[0] + window.inspector.turn_us, abs=50.0)
     window.key("q")
     assert window.closed
 

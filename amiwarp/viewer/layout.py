@@ -391,8 +391,8 @@ class Actions:
     found: Calibration | None = None
     """Result of a calibration that is not accepted yet."""
     history: History | None = None
-    wanted: ViewState | str | None = None
-    """State that is to be shown, or the address that describes it; None to stay."""
+    steps: tuple[Callable[[History], ViewState], ...] = ()
+    """Steps through the history that are to be made after the changes which were requested before them."""
 
     def request(self, *what: str, change: str = "") -> None:
         """Request updates. Successive changes of one name are undone in one step."""
@@ -500,21 +500,29 @@ class Actions:
 
     def undo(self) -> None:
         """Go back by one step."""
-        self._travel(History.undo)
+        self.travel(History.undo)
 
     def redo(self) -> None:
         """Go forward by one step that was undone."""
-        self._travel(History.redo)
+        self.travel(History.redo)
 
     def reset(self) -> None:
         """Show the first state again."""
-        self._travel(History.reset)
+        self.travel(History.reset)
 
-    def _travel(self, step: Callable[[History], ViewState]) -> None:
+    def travel(self, step: Callable[[History], ViewState]) -> None:
+        """Request the state that a step through the history gives."""
+        self.steps = (*self.steps, step)
+        self.request("state")
+        self.released()
+
+    def travelled(self) -> ViewState | None:
+        """Make the requested steps, and return the state to show; None to stay."""
+        steps, self.steps, state = self.steps, (), None
         if self.history is not None:
-            self.wanted = step(self.history)
-            self.request("state")
-            self.released()
+            for step in steps:
+                state = step(self.history)
+        return state
 
     def remember(self, change: str) -> History:
         """Add what is shown now to the history, and return it. Equal ``change`` of successive states make one step."""

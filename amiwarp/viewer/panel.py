@@ -77,7 +77,7 @@ class Panel(layout.Actions):
     def start(self, inspector: Inspector) -> None:
         """Show an inspector from its first state."""
         self.inspector, self.shown, self.b, self.found, self._picked = inspector, None, None, None, -1
-        self.history = self.wanted = None
+        self.history, self.steps = None, ()
         self._give_points()
         inspector.renew()  # a live stream may have gone on since the inspector was made
         files = [] if self._library is None else self._library.files()
@@ -596,9 +596,14 @@ class Panel(layout.Actions):
 
     def restore(self, address: str) -> None:
         """Show the state that an address describes."""
-        self.wanted = address
-        self.request("state")
-        self.released()
+        self.travel(partial(self._described, address))
+
+    def _described(self, address: str, history: layout.History) -> layout.ViewState:
+        size = self.inspector.recording.events.size
+        state, wrong = layout.decode_state(address, history.first, size=size, duration_us=self.whole_us)
+        if wrong:
+            self.work.show_message("; ".join(wrong), "error")
+        return state
 
     def remember(self, change: str) -> layout.History:
         """Add what the page shows now to the history, and to its address."""
@@ -607,16 +612,11 @@ class Panel(layout.Actions):
         self.state.update({"can_undo": h.can_undo, "can_redo": h.can_redo, "address": address})
         return h
 
-    async def _apply_wanted(self) -> None:
+    async def _apply_steps(self) -> None:
         """Show the requested state. Raises :class:`AmiwarpError` if it selects no events."""
-        wanted, self.wanted = self.wanted, None
-        if wanted is None or self.history is None:
+        wanted = self.travelled()
+        if wanted is None:
             return
-        if isinstance(wanted, str):
-            first, size = self.history.first, self.inspector.recording.events.size
-            wanted, wrong = layout.decode_state(wanted, first, size=size, duration_us=self.whole_us)
-            if wrong:
-                self.work.show_message("; ".join(wrong), "error")
         await self.work.in_thread(layout.apply_state, self.inspector, wanted)
         s, selection = self.state, wanted.selection
         region = list(selection.region or (0, 0, *s.size))
@@ -641,6 +641,9 @@ class Panel(layout.Actions):
     async def make(self, todo: set[str]) -> None:
         """Make quick updates: "suggestion", "window", "knobs", "look" and "state"."""
         state = self.state
+        if self.shown is not None and "state" in todo and len(todo) > 1:  # what came before an undo can be redone
+            await self.make(todo - {"state"})
+            todo = {"state"}
         if todo & {"window", "suggestion"}:
             with self.work.errors_shown("window"):
                 try:
@@ -656,7 +659,7 @@ class Panel(layout.Actions):
                 if self.shown is None:
                     self.remember("")
                 if "state" in todo:
-                    await self._apply_wanted()
+                    await self._apply_steps()
                 self.show_knobs()  # not after the computation: a value that is typed meanwhile would be lost
                 self.shown, values = await self.work.in_thread(self._compute)
             except AmiwarpError:

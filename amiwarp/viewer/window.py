@@ -189,11 +189,13 @@ class Window(layout.Actions):
         wanted, self._wanted = self._wanted, set()
         inspector = self.inspector
         try:
-            if isinstance(self.wanted, layout.ViewState):
-                state, self.wanted = self.wanted, None
-                self._apply(state)
-            elif wanted & {"window", "suggestion"}:
+            if wanted & {"window", "suggestion"}:
                 inspector.open(*self.time_window)
+            if "state" in wanted:
+                if not self.plays:
+                    self.remember("")  # what came before an undo can be redone
+                if (state := self.travelled()) is not None:
+                    self._apply(state)
             if "suggestion" in wanted:
                 jobs.estimate_phase(inspector)
                 region = inspector.suggest_region().region
