@@ -128,8 +128,12 @@ def on_frame(xy: NDArray[np.float64], camera: amiwarp.Camera, noise: float, rng:
     picture = np.where(inside & ((np.floor(u) + np.floor(v)) % 2 == 0), 0.04, 0.9)
     picture = picture.reshape(480, FINE, 640, FINE).mean(axis=(1, 3))
     picture = cv2.GaussianBlur(picture, (0, 0), 0.5) + rng.normal(0.0, noise, picture.shape)
-    found = BOARD.find(np.clip(255.0 * picture, 0, 255).astype(np.uint8))
+    frame = np.clip(255.0 * picture, 0, 255).astype(np.uint8)
+    found = BOARD.find(frame)
     assert found is not None
+    until = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
+    fine = cv2.cornerSubPix(frame, found.xy.astype(np.float32).reshape(-1, 1, 2), (5, 5), (-1, -1), until)
+    found = replace(found, xy=fine.reshape(-1, 2).astype(np.float64))
     flipped = np.linalg.norm(found.xy[0] - xy[0]) > np.linalg.norm(found.xy[-1] - xy[0])
     return replace(found, xy=found.xy[::-1]) if flipped else found
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import amiwarp
 from amiwarp.cli.app import app
 from amiwarp.lens.board import Corners
-from amiwarp.lens.corner_fit import first_pose, fit_lens
+from amiwarp.lens.corner_fit import first_pose, fit_lens, match_corners
 from amiwarp.lens.poses import still_poses
 
 BOARD = amiwarp.Board(6, 5, 0.03)
@@ -120,6 +120,38 @@ def test_a_charuco_board_is_found_in_parts_and_not_in_a_mirror() -> None:
     mirror = np.ascontiguousarray(cv2.resize(photographed(board), (960, 720))[:, ::-1])
     assert board.find(mirror) is None
     assert board.missing(mirror) == "the board is seen in a mirror image; flip the picture of the sensor"
+
+
+@pytest.mark.parametrize("charuco", [None, "DICT_4X4_50"])
+def test_matched_corners_are_better_by_far_than_detected_ones(charuco: str | None) -> None:
+    """A rendered frame: bent lens, blur, pixel noise, and one corner that is covered."""
+    board = replace(BOARD, charuco=charuco)
+    pose = np.array([0.3, -0.25, 0.1, -0.07, -0.06, 0.27])
+    true = corners_of(CAMERA, Rotation.from_rotvec(pose[:3]), pose[3:])
+    flat, fine = board.picture(40), 4
+    x, y = ((np.arange(fine * n) + 0.5) / fine - 0.5 for n in (320, 240))
+    rays = np.asarray(CAMERA.pixels_to_rays(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)), np.float64)
+    turn = Rotation.from_rotvec(pose[:3])
+    normal = turn.apply([0.0, 0.0, 1.0])
+    at = turn.inv().apply(rays * ((pose[3:] @ normal) / (rays @ normal))[:, None] - pose[3:]) / board.square_m
+    u, v = (((at[:, k] + 2.0) * 40 - 0.5).reshape(240 * fine, -1).astype(np.float32) for k in (0, 1))
+    sampled = cv2.remap(flat, u, v, cv2.INTER_LINEAR, borderValue=255).astype(float)
+    picture = cv2.GaussianBlur(sampled.reshape(240, fine, 320, fine).mean(axis=(1, 3)), (0, 0), 0.7)
+    rng = np.random.default_rng(1)
+    picture = np.clip(40.0 + 0.6 * picture + rng.normal(0.0, 6.0, picture.shape), 0.0, 255.0).astype(np.uint8)
+    hidden = np.rint(true.xy[8]).astype(int)
+    found = board.find(picture)
+    assert found is not None
+    picture[hidden[1] - 12 : hidden[1] + 13, hidden[0] - 12 : hidden[0] + 13] = 90
+    flipped = np.linalg.norm(found.xy[0] - true.xy[found.ids[0]]) > 20.0
+    found = replace(found, xy=found.xy[::-1]) if flipped else found
+    rough = replace(CAMERA, fx=CAMERA.fx * 1.01, fy=CAMERA.fx * 1.01, distortion=amiwarp.RadialTangential(k1=-0.08))
+    matched = match_corners(picture, board, found, rough, first_pose(rough, board, found))
+    seen = found.ids != 8
+    before, after = (np.sqrt(np.mean((c.xy - true.xy[c.ids])[seen] ** 2)) for c in (found, matched))
+    assert after < 0.02
+    assert after < 0.4 * before
+    assert np.abs(matched.xy - found.xy).max() < 1.5  # a covered corner stays near its place
 
 
 def test_two_boards_are_noticed() -> None:

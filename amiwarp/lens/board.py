@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,9 +23,6 @@ MARGIN = 1.0
 """White margin around the squares of a printed board [squares]."""
 BLACK, WHITE = 0.04, 0.9
 """Reflectance of printed ink and of paper."""
-LEAST_WINDOW_PX, LARGEST_WINDOW_PX, WINDOW_SHARE = 2, 8, 0.35
-"""Half side of the square in which a corner is refined [px]: between the first two, at most the third number times the
-distance to the next corner. In pictures of 30 px per square, 8 px give a smaller error than 4 px by a tenth."""
 PAGE_MM = 25.4
 """Millimetres per inch, the unit of Matplotlib's pages."""
 
@@ -220,8 +216,7 @@ class Board:
         found, ids, _, _ = cv2.aruco.CharucoDetector(self._charuco()).detectBoard(picture)
         if found is None or len(found) < 6:
             return None
-        numbers = np.asarray(ids, np.int64).ravel()
-        return Corners(numbers, _refined(picture, np.asarray(found, np.float32).reshape(-1, 2), numbers, self.columns))
+        return Corners(np.asarray(ids, np.int64).ravel(), np.asarray(found, np.float64).reshape(-1, 2))
 
     def missing(self, picture: NDArray[np.uint8]) -> str:
         """Return in words why the board is not found in a picture, as far as that can be told.
@@ -309,31 +304,7 @@ def _find_chessboard(picture: NDArray[np.uint8], columns: int, rows: int, *, tho
     found, corners = cv2.findChessboardCornersSB(picture, (columns, rows), flags=flags)
     if not found:
         return None
-    numbers = np.arange(columns * rows)
-    return Corners(numbers, _refined(picture, np.asarray(corners, np.float32).reshape(-1, 2), numbers, columns))
-
-
-def _refined(
-    picture: NDArray[np.uint8], xy: NDArray[np.float32], numbers: NDArray[np.int64], columns: int
-) -> NDArray[np.float64]:
-    """Return corners refined by the gradients around them: OpenCV's ``cornerSubPix``.
-
-    In reconstructed pictures its error is half of that of ``findChessboardCornersSB`` alone.
-    """
-    cv2 = opencv()
-    apart = [np.linalg.norm(xy[a] - xy[b]) for a, b in _neighbours(numbers, columns)]
-    reach = WINDOW_SHARE * float(min(apart)) if apart else LEAST_WINDOW_PX
-    half = max(LEAST_WINDOW_PX, min(LARGEST_WINDOW_PX, math.floor(reach)))
-    until = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
-    fine = cv2.cornerSubPix(picture, xy.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), until).reshape(-1, 2)
-    return np.asarray(fine, np.float64)
-
-
-def _neighbours(numbers: NDArray[np.int64], columns: int) -> list[tuple[int, int]]:
-    """Return pairs of places in ``numbers`` whose corners are neighbours in a row or in a column."""
-    place = {int(n): k for k, n in enumerate(numbers)}
-    right = [(k, place[n + 1]) for n, k in place.items() if n + 1 in place and (n + 1) % columns]
-    return right + [(k, place[n + columns]) for n, k in place.items() if n + columns in place]
+    return Corners(np.arange(columns * rows), np.asarray(corners, np.float64).reshape(-1, 2))
 
 
 def _other_sizes(columns: int, rows: int) -> list[tuple[int, int]]:

@@ -27,7 +27,7 @@ from amiwarp.calib.sharpness import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.lens.board import Board, Corners
-from amiwarp.lens.corner_fit import Fit, fit_lens, lens_values, tilt_of, with_lens_values
+from amiwarp.lens.corner_fit import Fit, fit_lens, lens_values, match_corners, tilt_of, with_lens_values
 from amiwarp.lens.poses import Pose, still_poses
 from amiwarp.optics.camera import Camera, Fisheye
 from amiwarp.optics.models import ExactModel, predicted_error, rms
@@ -361,6 +361,11 @@ class LensWork:
             if corners is None:
                 self.left_out[name] = self.board.missing(pictures[name])
         self._check_count(len(seen), "are seen")
+        fit = fit_lens(self.camera, self.board, list(seen.values()))
+        seen = {
+            name: match_corners(pictures[name], self.board, corners, fit.camera, pose)
+            for (name, corners), pose in zip(seen.items(), fit.poses, strict=True)
+        }
         while True:
             fit = fit_lens(self.camera, self.board, list(seen.values()))
             misses = {name: rms(r) for name, r in zip(seen, fit.residuals, strict=True)}
