@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.calibration import prepare
 from amiwarp.calib.parameters import ParameterSpace, like_size, nominal
-from amiwarp.calib.photometric.cost import Slopes
+from amiwarp.calib.photometric.cost import Cost, Slopes
 from amiwarp.calib.photometric.stage import LARGEST_COST, Equations
 from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import PhotometricSettings, Settings
@@ -59,10 +59,12 @@ PAIRS = 600_000
 """Number of pairs of events of all poses together, and at most a sixth of it in one pose."""
 FIRST_TOLERANCE_PX = 0.01
 """Length of a step that ends the search for the prism with a lens that is not the last one [px]."""
-MOST_STEPS, STEPS_OF_ALL, TOLERANCE_PX, LARGEST_GAIN = 10, 2, 0.003, 5.0
+MOST_STEPS, STEPS_OF_ALL, TOLERANCE_PX, LARGEST_GAIN = 10, 2, 0.001, 5.0
 """Largest number of steps towards size and phase of the prism, and to see whether its other parameters differ from
 their nominal values; length of a step that ends them [px]; and the largest factor by which a step is lengthened,
 because the weights of outliers make Gauss-Newton steps too short."""
+PROBED, PROBE_PX = 3, 0.05
+"""Every which pose tells how the gradient changes, and the step of the parameters that shows it [px]."""
 BAD_COST = 1.6
 """A pose is left out if its photometric cost exceeds this multiple of the median of all poses. Still poses reached 1.3
 times the median; one with the prism's zero off by 10 deg had 2.4, and boards that moved by 0.9 and 2.6 px in a turn had
@@ -432,8 +434,8 @@ class JointPrism:
         self.costs: dict[str, float] = {}
         """Cost of each pose relative to that without a map, by name."""
         self.space: ParameterSpace
-        """Space of the last fit, and its vector and covariance."""
-        self.v, self.covariance = np.zeros(0), np.zeros((0, 0))
+        """Space of the last fit, its vector, and the derivatives of each pose's cost there."""
+        self._v, self._each = np.zeros(0), list[Slopes]()
 
     def model(self, camera: Camera, values: Mapping[str, float]) -> ExactModel:
         """Return the optical model of some parameter values."""
@@ -452,48 +454,65 @@ class JointPrism:
         self.space = space = next(iter(costs.values())).space
         v, last, gain = space.to_vector(self.values), np.zeros(0), 1.0
         for _ in range(most):
-            each = []
-            for cost in costs.values():
-                cost.predict(v)
-                cost.residuals(v)
-                each.append(cost.slopes(v, with_parts=True))
-            slopes = Slopes(
-                np.sum([s.hessian for s in each], axis=0), np.sum([s.gradient for s in each], axis=0),
-                np.concatenate([s.parts for s in each], axis=1),
-            )  # fmt: skip
-            step = slopes.step()
-            if len(last):  # successive steps in one direction shrink by the same factor: take their sum
+            self._each = self._slopes(costs.values(), v)
+            step = _total(self._each).step()
+            if len(last):  # the weights of outliers make steps too short, by the same factor: take their sum
                 left = 1.0 - (1.0 - float(step @ last) / max(float(last @ last), 1e-12)) / gain
                 gain = 1.0 / (1.0 - min(max(left, 0.0), 1.0 - 1.0 / LARGEST_GAIN))
-            last = step
             v = v + np.clip(gain * step, -1.0, 1.0)
-            if float(np.abs(step).max()) < tolerance:
+            if len(last) and gain * float(np.abs(step).max()) < tolerance:
                 break
-        self.v, self.covariance = v, slopes.covariance()
+            last = step
+        self._v = v
         self.costs = {name: cost.mean() for name, cost in costs.items()}
         self.values = {**self.values, **space.to_values(v)}
         return dict(self.values)
 
+    def _slopes(self, costs: Iterable[Cost], v: Vector) -> list[Slopes]:
+        """Return the derivatives of the cost of each pose at a vector of parameters."""
+        out = []
+        for cost in costs:
+            cost.predict(v)
+            cost.residuals(v, rounds=2)
+            out.append(cost.slopes(v, with_parts=True))
+        return out
+
+    def covariance(self) -> Vector:
+        """Return the covariance of the fitted parameters [px²], from the scatter of the poses and within them.
+
+        The weights of outliers change with the parameters. So the gradient at a board changes only a third as fast as
+        the Gauss-Newton Hessian says. Some of the poses tell the factor, for size and phase.
+        """
+        total, some = _total(self._each), [*self.equations.values()][::PROBED]
+        of_poses = replace(total, parts=np.stack([s.gradient for s in self._each], axis=1))
+        at, changes = _total(self._slopes([e.answers.cost for e in some], self._v)), []
+        for unit in np.eye(len(self._v))[:2]:
+            moved = _total(self._slopes([e.answers.cost for e in some], self._v + PROBE_PX * unit))
+            changes.append((moved.gradient - at.gradient)[:2] / PROBE_PX)
+        shares = np.linalg.eigvals(np.linalg.solve(at.hessian[:2, :2], np.stack(changes, axis=1))).real
+        longer = 1.0 / np.clip(shares.mean(), 1.0 / LARGEST_GAIN, 1.0)
+        return np.asarray(longer**2 * (total.covariance() + of_poses.covariance()))
+
     def deviations(self, fit: Fit) -> dict[str, float]:
         """Return the standard deviations of the fitted parameters, with those that the lens's own cause."""
         names = fit.names
-        at = self._displacements(fit.camera, self.v)
+        at = self._displacements(fit.camera, self._v)
 
         def by_prism(k: int) -> Vector:
-            step = np.zeros(len(self.v))
+            step = np.zeros(len(self._v))
             step[k] = 0.05
-            return (self._displacements(fit.camera, self.v + step) - at) / 0.05
+            return (self._displacements(fit.camera, self._v + step) - at) / 0.05
 
         def by_lens(name: str) -> Vector:
             step = max(fit.deviations[name], 1e-9)
             moved = {name: lens_values(fit.camera, [name])[name] + step}
-            return (self._displacements(with_lens_values(fit.camera, moved), self.v) - at) / step
+            return (self._displacements(with_lens_values(fit.camera, moved), self._v) - at) / step
 
-        prism = np.stack([by_prism(k) for k in range(len(self.v))], axis=1)
+        prism = np.stack([by_prism(k) for k in range(len(self._v))], axis=1)
         lens = np.stack([by_lens(name) for name in names], axis=1)
         seen = np.isfinite(prism).all(axis=1) & np.isfinite(lens).all(axis=1)
         follows = -np.linalg.lstsq(prism[seen], lens[seen], rcond=None)[0]
-        return self.space.deviations(self.v, self.covariance + follows @ fit.covariance @ follows.T)
+        return self.space.deviations(self._v, self.covariance() + follows @ fit.covariance @ follows.T)
 
     def _displacements(self, camera: Camera, v: Vector) -> Vector:
         """Return the displacements of a grid of pixels over a turn [px], without their means, flattened.
@@ -522,6 +541,14 @@ class JointPrism:
             sharpness_after=search.sharpness_in(space, found), stages=(), events=len(search.calibration_events.events),
             seconds=seconds,
         )  # fmt: skip
+
+
+def _total(each: Sequence[Slopes]) -> Slopes:
+    """Return the derivatives of the cost of several poses together."""
+    return Slopes(
+        np.sum([s.hessian for s in each], axis=0), np.sum([s.gradient for s in each], axis=0),
+        np.concatenate([s.parts for s in each], axis=1),
+    )  # fmt: skip
 
 
 def advice_on(poses: Sequence[BoardPose], fit: Fit) -> tuple[str, ...]:
