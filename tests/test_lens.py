@@ -2,7 +2,10 @@
 
 import json
 import math
+import os
 import re
+import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +18,13 @@ from typer.testing import CliRunner
 
 import amiwarp
 from amiwarp.cli.app import app
+from amiwarp.lens import calibration, corner_fit
+from amiwarp.lens import live as lens_live
 from amiwarp.lens.board import Corners
 from amiwarp.lens.corner_fit import first_pose, fit_lens, match_corners
-from amiwarp.lens.poses import still_poses
+from amiwarp.lens.live import StillSpans
+from amiwarp.lens.poses import Pose, still_poses
+from amiwarp.live.stream import session
 
 BOARD = amiwarp.Board(6, 5, 0.03)
 CAMERA = amiwarp.Camera(320, 240, 262.0, 261.0, 163.0, 117.0, amiwarp.RadialTangential(k1=-0.1, k2=0.02))
@@ -183,6 +190,16 @@ def test_a_printed_board_has_its_true_size(tmp_path: Path, suffix: str) -> None:
         assert float(width[1]) == pytest.approx(12 * 25.0 / 25.4 * 72.0)
 
 
+LIVE = ("--live", "--board", "6x5", "--fov-deg", "67", "--json")
+
+
+def run_live(*args: object) -> str:
+    """Run ``amiwarp lens`` that must end with an error; return what it says."""
+    result = CliRunner().invoke(app, ["lens", *map(str, args)])
+    assert result.exit_code == 1, result.output
+    return result.stderr
+
+
 def simulated(pose: tuple, seed: int, motion: float = 720.0) -> amiwarp.Recording:
     world = BOARD.world(pose[0].as_quat(), pose[1])
     scene = amiwarp.WorldScene(world, amiwarp.Trajectory.still([0, 0, 0]))
@@ -236,13 +253,16 @@ def test_too_few_poses_and_still_prisms_are_refused(recordings: list[amiwarp.Rec
         amiwarp.calibrate_lens(some, BOARD)
 
 
-def test_a_moving_board_is_refused() -> None:
+def test_a_moving_board_is_refused(tmp_path: Path) -> None:
     world = BOARD.world([0, 0, 0, 1], [0.0, 0.0, 0.4])
     path = amiwarp.Trajectory([0.0, 0.25], [[0, 0, 0], [0.06, 0.0, 0.0]], np.tile([0, 0, 0, 1.0], (2, 1)))
     camera = amiwarp.Camera.from_fov(160, 120, 1.0)
     recording = amiwarp.simulate(amiwarp.WorldScene(world, path), camera, PRISM, duration_s=0.25, seed=1)
     with pytest.raises(amiwarp.AmiwarpError, match="moves all the time; hold the board still"):
         amiwarp.calibrate_lens([recording], BOARD)
+    amiwarp.save_recording(tmp_path / "moving.h5", recording)
+    said = run_live(tmp_path / "moving.h5", tmp_path / "camera.json", "--fast", *LIVE)
+    assert "moves all the time; hold the board still" in said
 
 
 def test_parallel_boards_are_refused() -> None:
@@ -250,17 +270,174 @@ def test_parallel_boards_are_refused() -> None:
         fit_lens(ROUGH, BOARD, seen(5, CAMERA, noise=0.05, tilt=(0, 0.5)))
 
 
-def test_still_spans_of_one_recording_are_found() -> None:
+@pytest.fixture(scope="module")
+def moved() -> amiwarp.Recording:
     """The camera rests, moves to another place, and rests."""
     world = BOARD.world([0, 0, 0, 1], [0.0, 0.0, 0.4])
     at = [[0, 0, 0], [0, 0, 0], [0.05, 0.02, -0.05], [0.05, 0.02, -0.05]]
     path = amiwarp.Trajectory([0.0, 0.35, 0.65, 1.0], at, np.tile([0, 0, 0, 1.0], (4, 1)))
     camera = amiwarp.Camera.from_fov(160, 120, 1.0)
-    recording = amiwarp.simulate(amiwarp.WorldScene(world, path), camera, PRISM, duration_s=1.0, seed=1)
-    poses, reasons = still_poses([recording])
+    return amiwarp.simulate(amiwarp.WorldScene(world, path), camera, PRISM, duration_s=1.0, seed=1)
+
+
+def test_still_spans_of_one_recording_are_found(moved: amiwarp.Recording) -> None:
+    poses, reasons = still_poses([moved])
     assert (len(poses), reasons) == (2, {})
     spans = [(p.recording.events.t_first * 1e-6, p.recording.events.t_last * 1e-6) for p in poses]
     assert spans[0][1] < 0.36
     assert spans[1][0] > 0.64
     assert all(0.12 < stop - start < 0.26 for start, stop in spans)
     assert "s" in poses[0].name
+
+
+def streamed(recording: amiwarp.Recording, late_us: int = 0) -> list[amiwarp.Recording]:
+    """Return the still spans found in a stream of 5 ms packets whose events come later than its encoder samples."""
+    assert recording.encoder is not None
+    found: list[amiwarp.Recording] = []
+    spans, e = StillSpans("stream", recording.events.size, None, found.append), recording.encoder
+    for start in range(recording.events.t_first, recording.events.t_last + late_us, 5000):
+        new = (e.t >= start) & (e.t < start + 5000)
+        spans.append_encoder(e.t[new], e.angle[new])
+        events = recording.events.between(start - late_us, start - late_us + 5000)
+        if len(events):
+            spans.append(events)
+    spans.finish()
+    return found
+
+
+@pytest.mark.parametrize("late_us", [0, 300_000])
+def test_a_stream_has_the_same_still_spans(moved: amiwarp.Recording, late_us: int) -> None:
+    found = streamed(moved, late_us)
+    times = [(r.events.t_first * 1e-6, r.events.t_last * 1e-6) for r in found]
+    assert len(found) == 2
+    assert times[0][1] < 0.36
+    assert times[1][0] > 0.64
+    for recording in found:
+        e = recording.events
+        assert 0.12 < (e.t_last - e.t_first) * 1e-6 < 0.26
+        np.testing.assert_array_equal(e.slice(0, len(e)).x, moved.events.between(e.t_first, e.t_last + 1).x)
+        assert recording.encoder is not None
+        np.testing.assert_allclose(recording.encoder.angle_at(e.t_first), moved.encoder.angle_at(e.t_first))
+
+
+def test_turns_with_lost_events_are_no_pose(recordings: list[amiwarp.Recording]) -> None:
+    """In the second of six still turns, events are missing for 15 ms."""
+    e = recordings[0].events.between(0, 166_667)
+    six = [amiwarp.Events(e.x, e.y, e.t + k * 166_667, e.p) for k in range(3)]
+    joined = amiwarp.Events.concatenate(six)
+    encoder = amiwarp.Encoder.constant_speed(720.0, -1000, 510_000)
+    for until in (110_000, 125_000):
+        kept = joined[(joined.t < 110_000) | (joined.t >= until)]
+        found = streamed(amiwarp.Recording(amiwarp.MemoryEvents(kept, 320, 240), None, encoder))
+        assert [r.events.t_first > 125_000 for r in found] == [until > 110_000]
+
+
+def test_a_stream_is_not_kept_in_memory(moved: amiwarp.Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lens_live, "MOST_BYTES", 100_000)
+    monkeypatch.setattr(lens_live, "MOST_SAMPLES", 100)
+    spans = StillSpans("stream", moved.events.size, None, lambda _: None)
+    for k in range(300):
+        spans.append_encoder(np.arange(10 * k, 10 * k + 10) * 1000, np.zeros(10))
+        spans.append(moved.events.slice(1000 * k, 1000 * k + 1000))
+    assert len(spans._t) <= 210
+    assert sum(len(events) for events in spans._waiting) < 10_000
+    with pytest.raises(amiwarp.AmiwarpError, match="stream: the prism makes 0 turns"):
+        spans.finish()
+    with pytest.raises(amiwarp.AmiwarpError, match=r"stream: .*no encoder samples.*--port"):
+        StillSpans("stream", moved.events.size, None, lambda _: None).finish()
+
+
+@pytest.fixture(scope="module")
+def stream(recordings: list[amiwarp.Recording], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two turns of each pose three times, and a mirrored turn as a move; the second again."""
+    turn, scrambled = 60e6 / 720.0, np.random.default_rng(0).permutation(320 * 240).astype(np.int64)
+    parts = []
+    for k, pose in enumerate((0, 1, 1, None, 2, 3, 4)):
+        e = recordings[pose or 0].events.between(0, round(2 * turn))
+        place = np.asarray(e.y, np.int64) * 320 + e.x
+        if pose is None:
+            place = scrambled[place]
+        parts += [(place % 320, place // 320, e.t + round((7 * k + 2 * n) * turn), e.p) for n in range(3)]
+        one = e.t < turn
+        parts.append((319 - place[one] % 320, place[one] // 320, e.t[one] + round((7 * k + 6) * turn), e.p[one]))
+    x, y, t, p = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.argsort(t, kind="stable")
+    events = amiwarp.Events.from_arrays(x[order], y[order], t[order], p[order])
+    assert recordings[0].encoder is not None
+    first = float(recordings[0].encoder.angle_at(np.array([0]))[0])
+    at = np.arange(-1000, round(49 * turn) + 1000, 1000)
+    encoder = amiwarp.Encoder(at, first + at * (math.tau / turn))
+    path = tmp_path_factory.mktemp("stream") / "stream.h5"
+    recording = amiwarp.Recording(amiwarp.MemoryEvents(events, 320, 240), None, encoder, recordings[0].prism)
+    amiwarp.save_recording(path, recording)
+    return path
+
+
+def test_a_stream_gives_a_lens_once_its_poses_are_enough(
+    stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lens_live, "GOOD_POSES", 4)
+    monkeypatch.setattr(corner_fit, "LARGEST_FOCAL_DEVIATION", 0.02)
+    monkeypatch.setattr(calibration, "MOST_PASSES", 1)
+    result = CliRunner().invoke(app, ["lens", str(stream), str(tmp_path / "camera.json"), "--fast", *LIVE])
+    assert result.exit_code == 0, result.output
+    data = json.loads(result.stdout)
+    assert [pose["name"] for pose in data["poses"]] == ["pose 1", "pose 2", "pose 5", "pose 6"]
+    assert amiwarp.load_camera(tmp_path / "camera.json").fx == pytest.approx(CAMERA.fx, rel=0.02)
+    said = [text for text in data["messages"] if not text.startswith(" ")]
+    grids = [text for text in data["messages"] if text.startswith(" ")]
+    assert len(grids) == 4 * 3
+    assert sum(int(count) for row in grids[-3:] for count in row.split()) == 4 * 30
+    assert re.match(r"pose 1: board seen, tilt \d+ deg; 1 of 4 poses", said[1])
+    assert "no corner lies in the upper left, upper centre" in said[2]
+    assert "pose 3: as pose 2, so it does not count; move the board" in said
+    assert "pose 4: a board of 6 x 5 inner corners is not seen" in said
+    assert said[-1] == "enough: 4 poses; calibrating"
+    assert data["left_out"] == {"pose 4": "a board of 6 x 5 inner corners is not seen"}
+
+
+@pytest.mark.parametrize("tilt", [(0, 0.5), (15, 40)])
+def test_poses_are_enough_only_if_they_determine_the_focal_length(
+    tilt: tuple[float, float], recordings: list[amiwarp.Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    corners, said = seen(5, CAMERA, noise=0.05, tilt=tilt), list[str]()
+    monkeypatch.setattr(lens_live, "GOOD_POSES", len(corners))
+    monkeypatch.setattr(lens_live, "lacking", lambda *_: [])
+    monkeypatch.setattr(lens_live.LiveLens, "_find", lambda *_: corners[len(poses.poses)])
+    poses = lens_live.LiveLens(BOARD, ROUGH, "cpu", said.append)
+    for _ in corners:
+        poses.add(recordings[0])
+    assert poses.enough == (tilt[0] > 0)
+    assert any(text.startswith("still missing: the poses do not determine") for text in said) == (tilt[0] == 0)
+
+
+def test_ctrl_c_ends_a_stream_with_the_poses_so_far(
+    stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(self: lens_live.LiveLens, recording: amiwarp.Recording) -> None:
+        self._spans += 1
+        self.poses.append(Pose(f"pose {self._spans}", recording))
+        if self._spans == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(lens_live.LiveLens, "add", interrupted)
+    said = run_live(stream, tmp_path / "camera.json", *LIVE)
+    assert re.search(r"amiwarp: [12] poses of the board are given, but a lens needs 4", said)
+
+
+def test_streams_that_cannot_show_a_board_are_refused(recordings: list[amiwarp.Recording], tmp_path: Path) -> None:
+    path, out = tmp_path / "stream.h5", tmp_path / "camera.json"
+    amiwarp.save_recording(path, replace(recordings[0], encoder=None))
+    assert "contains no encoder samples; give the controller's --port" in run_live(path, out, *LIVE)
+    assert "--live takes one source, and 2 are given" in run_live(path, path, out, *LIVE)
+    assert "--seconds and --wait-for-source belong to --live" in run_live(path, out, "--seconds", "1")
+
+
+def test_a_prism_at_rest_ends_a_stream(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "FIRST_S", 0.2)
+    ends = amiwarp.Events.from_arrays([1, 1], [1, 1], [0, 100_000_000], [0, 1])
+    still = amiwarp.Encoder.constant_speed(0.0, 0, 100_000_000, interval_us=20_000)
+    path, began = tmp_path / "stream.h5", time.monotonic()
+    amiwarp.save_recording(path, amiwarp.Recording(amiwarp.MemoryEvents(ends, 8, 8), None, still))
+    assert "the prism makes 0 turns; a pose needs 1.5 turns" in run_live(path, tmp_path / "camera.json", *LIVE)
+    assert time.monotonic() - began < 90.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,13 +12,18 @@ import typer
 
 from amiwarp.cli.console import choose_device, progress, report, table
 from amiwarp.cli.options import OUTPUT, Common, NominalPrismOptions, parse_size
+from amiwarp.cli.rig import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt
+from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.io.camera_files import save_camera
 from amiwarp.io.formats import check_ending
+from amiwarp.live.queues import Policy
 
 if TYPE_CHECKING:
     from amiwarp.lens.board import Board
     from amiwarp.lens.calibration import LensCalibration
+    from amiwarp.lens.live import LiveLens
+    from amiwarp.live.stream.session import SessionStatus
 
 _BOARD = "Board"
 
@@ -70,7 +76,11 @@ def run_board(
 
 def run_lens(
     recordings: Annotated[
-        list[Path], typer.Argument(help="Recordings of the board: one per pose, or with several still poses each.")
+        list[Path],
+        typer.Argument(
+            help="Recordings of the board: one per pose, or with several still poses each. With --live: a source as "
+            "for 'amiwarp live'."
+        ),
     ],
     out: Annotated[Path, typer.Argument(help="Camera file to write (.json, or .yaml for ROS)."), OUTPUT],
     *,
@@ -80,6 +90,10 @@ def run_lens(
         typer.Option(help="Rough horizontal field of view (deg), right within 20 %. Default: the recording's, or 60."),
     ] = None,
     fisheye: Annotated[bool, typer.Option("--fisheye", help="Fit OpenCV's fisheye lens model.")] = False,
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="Take the poses from a live stream, say what is missing, end when it is enough."),
+    ] = False,
     calibration: Annotated[
         Path | None, typer.Option(help="Calibration of the prism to write (.json), for 'amiwarp compensate'."), OUTPUT
     ] = None,
@@ -88,10 +102,14 @@ def run_lens(
         typer.Option(help="Picture of corners, residuals and coverage to write (.png, .svg or .pdf)."),
         OUTPUT,
     ] = None,
+    stream: SourceOptions,
     prism: NominalPrismOptions,
     common: Common,
 ) -> None:
-    """Calibrate the camera's lens, and the prism with it, from a printed board that stands still."""
+    """Calibrate the camera's lens, and the prism with it, from a printed board that stands still.
+
+    With --live, hold the board still for half a second, move it, and so on. Ctrl-C ends earlier, with the poses so far.
+    """
     from amiwarp.lens.calibration import calibrate_lens
 
     check_ending(out, "cameras are written", [".json", ".yaml", ".yml"])
@@ -100,11 +118,21 @@ def run_lens(
     if figure is not None:
         check_ending(figure, "figures are written", [".png", ".svg", ".pdf"])
     device, made = choose_device(common.device), board.build()
-    opened = [open_recording(path) for path in recordings]
-    given = [replace(recording, prism=prism.build(recording.prism)) for recording in opened]
-    with progress("lens") as show:
-        fov = None if fov_deg is None else math.radians(fov_deg)
-        found = calibrate_lens(given, made, fov=fov, fisheye=fisheye, device=device, progress=show)
+    fov, messages = None if fov_deg is None else math.radians(fov_deg), dict[str, Any]()
+    if live:
+        if len(recordings) != 1:
+            raise AmiwarpError(f"--live takes one source, and {len(recordings)} are given; see 'amiwarp live --help'")
+        poses, said = _watch(str(recordings[0]), made, stream, prism, fov=fov, fisheye=fisheye, device=device)
+        messages["messages"] = said
+        with progress("lens") as show:
+            found = poses.calibrate(show)
+    else:
+        if stream != SourceOptions():
+            raise AmiwarpError("--port, --counts-per-turn, --fast, --seconds and --wait-for-source belong to --live")
+        opened = [open_recording(path) for path in recordings]
+        given = [replace(recording, prism=prism.build(recording.prism)) for recording in opened]
+        with progress("lens") as show:
+            found = calibrate_lens(given, made, fov=fov, fisheye=fisheye, device=device, progress=show)
     save_camera(out, found.camera)
     if calibration is not None:
         found.prism.save(calibration)
@@ -112,7 +140,42 @@ def run_lens(
         from amiwarp.lens.figure import save_figure
 
         save_figure(found, figure)
-    report(common, _data(found, out), _lines(found, out))
+    report(common, {**_data(found, out), **messages}, _lines(found, out))
+
+
+def _watch(
+    source: str, board: Board, stream: SourceOptions, prism: NominalPrismOptions, *, fov: float | None, fisheye: bool,
+    device: str,
+) -> tuple[LiveLens, list[str]]:  # fmt: skip
+    """Collect poses from a stream until they are enough, it ends, or Ctrl-C. Return them, and what was said."""
+    from amiwarp.lens.calibration import LEAST_POSES, first_camera
+    from amiwarp.lens.live import LiveLens, StillSpans
+    from amiwarp.live.stream.session import FIRST_S, Session
+
+    stop = threading.Event()
+    policy = Policy.BLOCK if stream.fast else Policy.DROP_OLDEST  # what is said must not be late
+    with StatusLine(stop, stream.seconds) as line, stream.link() as link:
+        opened = stream.open(source, line.say)
+        check_angles(opened, link)
+        poses = LiveLens(board, first_camera(opened.size, opened.camera, fov, fisheye=fisheye), device, line.say)
+        spans = StillSpans(opened.name, opened.size, prism.build(opened.prism), poses.add)
+
+        def update(status: SessionStatus) -> None:
+            line.update(status)
+            if poses.enough or (not spans.turns and status.seconds > FIRST_S):
+                stop.set()
+
+        line.say("hold the board still for half a second, move it, and so on; Ctrl-C ends with the poses so far")
+        with stopped_by_interrupt(stop):
+            try:
+                session = Session(opened, link=link, raw=[spans], policy=policy, say=line.say)
+                check_whole(opened, session.run(stop, update))
+            except AmiwarpError as error:
+                if len(poses.poses) < LEAST_POSES:
+                    raise
+                line.say(str(error))
+            spans.finish()
+    return poses, list(line.messages)
 
 
 def _data(found: LensCalibration, out: Path) -> dict[str, Any]:

@@ -40,8 +40,8 @@ Vector = NDArray[np.float64]
 
 USUAL_FOV = math.radians(60.0)
 """Horizontal field of view that is assumed if none is known [rad]."""
-LEAST_POSES = 4
-"""Smallest number of poses from which a lens is calibrated."""
+LEAST_POSES, GOOD_POSES = 4, 12
+"""Smallest number of poses from which a lens is calibrated, and the number from which on more are not asked for."""
 SMOOTHNESS = 0.02
 """Weight of the pictures' smoothness prior. Choosing it for each picture takes as long as the picture; the corners'
 errors change by a tenth between 0.02 and 0.1."""
@@ -79,6 +79,7 @@ REGIONS = (("upper", "middle", "lower"), ("left", "centre", "right"))
 """Names of the nine regions of the image in which corners are counted."""
 STEEP = math.radians(15.0)
 """Tilt of a board that tells focal length from distance [rad]."""
+TWO_BOARDS = "two boards are seen; leave one of them in the picture"
 
 
 @guarded
@@ -217,18 +218,21 @@ def calibrate_lens(
     sizes = {recording.events.size for recording in given}
     if len(sizes) > 1:
         raise AmiwarpError(f"the recordings have sensors of {sorted(sizes)} px; give recordings of one camera")
-    camera = _first_camera(given[0], fov, fisheye=fisheye)
+    camera = first_camera(given[0].events.size, given[0].camera, fov, fisheye=fisheye)
     poses, reasons = still_poses(given)
     return LensWork(board, camera, poses, device, progress or silent, reasons).run()
 
 
-def _first_camera(recording: Recording, fov: float | None, *, fisheye: bool) -> Camera:
-    """Return the camera to start with: without distortion, its principal point in the middle."""
-    width, height = recording.events.size
+def first_camera(size: tuple[int, int], known: Camera | None, fov: float | None, *, fisheye: bool) -> Camera:
+    """Return the camera to start with: without distortion, its principal point in the middle.
+
+    Without ``fov``, its field of view is that of the camera ``known``, else :data:`USUAL_FOV`.
+    """
+    width, height = size
     if fov is None:
-        fov = USUAL_FOV if recording.camera is None else 2.0 * math.atan(0.5 * width / recording.camera.fx)
-        if recording.camera is not None and isinstance(recording.camera.distortion, Fisheye):
-            fov = width / recording.camera.fx
+        fov = USUAL_FOV if known is None else 2.0 * math.atan(0.5 * width / known.fx)
+        if known is not None and isinstance(known.distortion, Fisheye):
+            fov = width / known.fx
     fov = real(fov, "fov", math.radians(1.0), math.radians(200.0 if fisheye else 150.0), " rad")
     if not fisheye:
         return Camera.from_fov(width, height, fov)
@@ -268,20 +272,20 @@ class LensWork:
                 break
             shown, names = model, [name for name in joint.equations if k == 1 or name not in self.left_out]
             first = names if k else names[:: max(1, len(names) // FIRST_POSES)]
-            pictures = self._pictures(model, first, k, turns=1.0 if k else 0.5)
+            pictures = self.pictures(model, first, k, turns=1.0 if k else 0.5)
             try:
                 fit, seen = self._lens(pictures)
             except AmiwarpError:  # the first poses alone do not suffice
                 rest = [name for name in names if name not in first]
                 if not rest:
                     raise
-                fit, seen = self._lens(pictures | self._pictures(model, rest, k, turns=0.5))
+                fit, seen = self._lens(pictures | self.pictures(model, rest, k, turns=0.5))
             self.camera = fit.camera
         assert fit is not None
         values, uncertainty, notes = self._whole_prism(joint, fit)
         for name, corners in seen.items():
             if self.board.has_another(pictures[name], corners):
-                raise AmiwarpError(f"{name}: two boards are seen; leave one of them in the picture")
+                raise AmiwarpError(f"{name}: {TWO_BOARDS}")
         used = [
             BoardPose(n, c, r, v[:3], v[3:], pictures[n])
             for (n, c), r, v in zip(seen.items(), fit.residuals, fit.poses, strict=True)
@@ -298,14 +302,14 @@ class LensWork:
         if count < LEAST_POSES:
             reasons = "".join(f"; {name}: {why}" for name, why in self.left_out.items())
             raise AmiwarpError(
-                f"{count} poses of the board {what}, but a lens needs {LEAST_POSES} at least, better 12, tilted in "
-                f"different directions{reasons}"
+                f"{count} poses of the board {what}, but a lens needs {LEAST_POSES} at least, better {GOOD_POSES}, "
+                f"tilted in different directions{reasons}"
             )
 
     def _first_prism(self) -> dict[str, float]:
         """Return the prism's parameters by sharpness: the answer of one pose that is best for all poses searched."""
         chosen = self.poses[:: max(1, len(self.poses) // SEARCHED)][:SEARCHED]
-        searches = [self._search(pose, ("apex", "phase"), {}) for pose in chosen]
+        searches = [self.search(pose, ("apex", "phase"), {}) for pose in chosen]
         for k, search in enumerate(searches):
             self.progress("search", 0.1 * k / len(searches) / (MOST_PASSES + 1))
             search.run()
@@ -313,7 +317,8 @@ class LensWork:
         totals = [sum(s.fine.measure(a)[0] / s.score for s in searches) for a in answers]
         return answers[int(np.argmax(totals))]
 
-    def _search(self, pose: Pose, free: tuple[str, ...], start: Mapping[str, float]) -> Search:
+    def search(self, pose: Pose, free: tuple[str, ...], start: Mapping[str, float]) -> Search:
+        """Return the search for some parameters of the prism by sharpness, in one pose."""
         recording = replace(pose.recording, camera=self.camera)
         prism = recording.prism
         bounds = {"apex": (SIZES[0] * prism.apex, SIZES[1] * prism.apex)} if isinstance(prism, Prism) else {}
@@ -328,7 +333,7 @@ class LensWork:
         out = {}
         for k, pose in enumerate(self.poses):
             self.progress("events", (0.1 + 0.4 * k / len(self.poses)) / (MOST_PASSES + 1))
-            search = self._search(pose, ALL_FREE, values)
+            search = self.search(pose, ALL_FREE, values)
             self.full, search.best = search.full_space, dict(search.full_space.start) | dict(values)
             search.full_space = self.full.without(like_size(self.full.names))  # those would ask for a coarse map
             try:
@@ -338,7 +343,7 @@ class LensWork:
         self._check_count(len(out), "have enough events")
         return out
 
-    def _pictures(
+    def pictures(
         self, model: ExactModel, names: Sequence[str], done: int, *, turns: float
     ) -> dict[str, NDArray[np.uint8]]:
         """Return pictures of some poses, each from some turns of the prism, by name. ``done`` passes are over."""
@@ -553,14 +558,19 @@ def _total(each: Sequence[Slopes]) -> Slopes:
 
 def advice_on(poses: Sequence[BoardPose], fit: Fit) -> tuple[str, ...]:
     """Return what would improve a calibration most, one sentence each."""
-    said = []
     tilts = [tilt_of(np.concatenate([p.rotation, p.translation])) for p in poses]
+    said = lacking(tilts, coverage_of([p.corners for p in poses], fit.camera.width, fit.camera.height))
+    if len(poses) < GOOD_POSES:
+        said.append(f"record more poses: {len(poses)} were used, and {GOOD_POSES} halve the deviation of four")
+    return tuple(said)
+
+
+def lacking(tilts: Sequence[float], coverage: NDArray[np.int64]) -> list[str]:
+    """Return what the poses lack in tilt [rad] and in coverage of the image, one sentence each."""
+    said = []
     if (usual := float(np.median(tilts))) < STEEP:
         said.append(f"tilt the board more: half of the poses are tilted by less than {math.degrees(usual):.0f} deg")
-    counts = coverage_of([p.corners for p in poses], fit.camera.width, fit.camera.height)
-    empty = [f"{REGIONS[0][a]} {REGIONS[1][b]}" for a, b in np.argwhere(counts == 0)]
+    empty = [f"{REGIONS[0][a]} {REGIONS[1][b]}" for a, b in np.argwhere(coverage == 0)]
     if empty:
         said.append(f"no corner lies in the {', '.join(empty)} of the image: hold the board there")
-    if len(poses) < 12:
-        said.append(f"record more poses: {len(poses)} were used, and 12 halve the deviation of four")
-    return tuple(said)
+    return said

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from amiwarp.calib.first_guess import ANGLE_RANGES, CELL
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import MemoryEvents, Recording
+from amiwarp.events.recording import Events, MemoryEvents, Recording
 
 LEAST_TURNS, MOST_TURNS = 1.5, 3.0
 """Shortest still span, and the longest part of one that is used, from its middle [turns]."""
@@ -21,6 +21,7 @@ LEAST_REPETITION = 0.75
 """Smallest correlation of the events of two successive turns while nothing moves. A still board's was 0.96 to 0.98,
 that of a board that moved by 1.8 px in a turn 0.82, and by 3.7 px 0.52."""
 WITHOUT_PRISM = "because without it a still board gives no events"
+MOVES = "the board or the camera moves all the time; hold the board still for two turns of the prism"
 MOST_POSES = 40
 """Largest number of poses that are used. More would lengthen the work, and hardly improve the lens."""
 
@@ -71,10 +72,7 @@ def _spans_of(recording: Recording) -> list[tuple[int, int]]:
     first, last = max(source.t_first, encoder.coverage[0]), min(source.t_last, encoder.coverage[1])
     turns = abs(encoder.rpm) * (last - first) / 60e6
     if turns < LEAST_TURNS:
-        raise AmiwarpError(
-            f"the prism makes {max(turns, 0.0):.2g} turns; a pose needs {LEAST_TURNS:g} turns of the prism in front of "
-            f"a board that stands still, {WITHOUT_PRISM}"
-        )
+        raise AmiwarpError(too_few_turns(turns))
     turn = (last - first) / turns
     if turns < 2.0:
         return [(first, last)]
@@ -83,32 +81,50 @@ def _spans_of(recording: Recording) -> list[tuple[int, int]]:
     still = _repetition(recording, encoder, edges) >= LEAST_REPETITION
     found = [(int(edges[a]), int(edges[b])) for a, b in _runs(still)]
     if not found:
-        raise AmiwarpError(
-            "the board or the camera moves all the time; hold the board still for two turns of the prism"
-        )
+        raise AmiwarpError(MOVES)
+    return [used_part(a, b, turn) for a, b in found]
+
+
+def too_few_turns(turns: float) -> str:
+    """Return the reason for an error: the prism makes too few turns for a pose."""
+    return (
+        f"the prism makes {max(turns, 0.0):.2g} turns; a pose needs {LEAST_TURNS:g} turns of the prism in front of a "
+        f"board that stands still, {WITHOUT_PRISM}"
+    )
+
+
+def used_part(start: int, stop: int, turn: float) -> tuple[int, int]:
+    """Return the part of a still span that is used: at most :data:`MOST_TURNS` turns, in its middle [us]."""
     half = int(0.5 * MOST_TURNS * turn)
-    return [(max(a, (a + b) // 2 - half), min(b, (a + b) // 2 + half)) for a, b in found]
+    return max(start, (start + stop) // 2 - half), min(stop, (start + stop) // 2 + half)
 
 
 def _repetition(recording: Recording, encoder: Encoder, edges: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the correlation of the events of each turn with those of the turn before, shape (turns - 1,).
-
-    The events are counted by cell, polarity and range of prism angles.
-    """
-    width, height = recording.events.size
-    columns, rows = -(-width // CELL), -(-height // CELL)
-    before: NDArray[Any] = np.zeros(0)
+    """Return the repetition of each turn after the first, shape (turns - 1,)."""
+    before: NDArray[Any] | None = None
     out: list[float] = []
     for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        e = recording.events.between(start, stop)
-        angle = np.floor(encoder.angle_at(e.t) * (ANGLE_RANGES / math.tau)).astype(np.int64) % ANGLE_RANGES
-        cell = ((e.y // CELL).astype(np.int64) * columns + e.x // CELL) * ANGLE_RANGES + angle
-        counts = np.bincount(cell, weights=2.0 * e.p - 1.0, minlength=rows * columns * ANGLE_RANGES)
-        if len(before):
-            energy = math.sqrt(float(counts @ counts) * float(before @ before))
-            out.append(float(counts @ before) / max(energy, 1e-30))
+        counts = counts_of(recording.events.between(start, stop), encoder, recording.events.size)
+        if before is not None:
+            out.append(repetition(before, counts))
         before = counts
     return np.array(out)
+
+
+def counts_of(turn: Events, encoder: Encoder, size: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the events of a turn, ON minus OFF, by cell of the image and range of prism angles, flattened."""
+    columns, rows = (-(-side // CELL) for side in size)
+    angle = np.floor(encoder.angle_at(turn.t) * (ANGLE_RANGES / math.tau)).astype(np.int64) % ANGLE_RANGES
+    cell = ((turn.y // CELL).astype(np.int64) * columns + turn.x // CELL) * ANGLE_RANGES + angle
+    return np.asarray(
+        np.bincount(cell, weights=2.0 * turn.p - 1.0, minlength=rows * columns * ANGLE_RANGES), np.float64
+    )
+
+
+def repetition(before: NDArray[np.float64], counts: NDArray[np.float64]) -> float:
+    """Return the correlation of the events of a turn with those of the turn before, see :data:`LEAST_REPETITION`."""
+    energy = math.sqrt(float(counts @ counts) * float(before @ before))
+    return float(counts @ before) / max(energy, 1e-30)
 
 
 def _runs(still: NDArray[np.bool_]) -> list[tuple[int, int]]:
