@@ -8,6 +8,7 @@ import signal
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from amiwarp.cli.app import app
 from amiwarp.lens import calibration, corner_fit
 from amiwarp.lens import live as lens_live
 from amiwarp.lens.board import Corners
+from amiwarp.lens.calibration import JointPrism
 from amiwarp.lens.corner_fit import first_pose, fit_lens, match_corners
 from amiwarp.lens.live import StillSpans
 from amiwarp.lens.poses import Pose, still_poses
@@ -159,6 +161,33 @@ def test_matched_corners_are_better_by_far_than_detected_ones(charuco: str | Non
     assert after < 0.02
     assert after < 0.4 * before
     assert np.abs(matched.xy - found.xy).max() < 1.5  # a covered corner stays near its place
+
+
+@pytest.mark.parametrize(("scatter", "bend"), [(0.0, 1.0), (0.01, 1.0), (0.0, 0.0)])
+def test_the_index_is_where_the_cost_of_the_poses_is_least(
+    monkeypatch: pytest.MonkeyPatch, scatter: float, bend: float
+) -> None:
+    """Costs with a minimum at an index of 1.57, which differs between poses by ``scatter``; or flat ones."""
+    least = 1.57 + scatter * np.random.default_rng(2).standard_normal(12)
+    maps = SimpleNamespace(copy_unknowns=lambda: None)
+    cost = SimpleNamespace(brightness=maps, replace_map=lambda unknowns: None)
+    equations = {str(k): SimpleNamespace(answers=SimpleNamespace(cost=cost)) for k in range(12)}
+    joint = JointPrism(equations, SimpleNamespace(start={}), {"apex": 0.0175, "index": 1.5168})
+    sizes = []
+
+    def refine(*_: object) -> None:
+        joint.costs = {k: 0.15 + bend * (joint.values["index"] - least[int(k)]) ** 2 for k in joint.equations}
+        sizes.append(joint.values["apex"] * (joint.values["index"] - 1.0))
+
+    monkeypatch.setattr(joint, "refine", refine)
+    index, off = joint.index(CAMERA, [*equations])
+    assert joint.values == {"apex": 0.0175, "index": 1.5168}
+    assert sizes == pytest.approx([0.0175 * 0.5168] * 3)  # the orbit stays as large
+    if not bend:
+        assert off == math.inf
+        return
+    assert index == pytest.approx(1.57, abs=1e-9 + 3.0 * off)
+    assert off == pytest.approx(scatter / math.sqrt(12), rel=0.5, abs=1e-9)
 
 
 def test_two_boards_are_noticed() -> None:

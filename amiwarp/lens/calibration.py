@@ -71,8 +71,9 @@ times the median; one with the prism's zero off by 10 deg had 2.4, and boards th
 1.9 and 2.5 times the median."""
 BAD_POSE, LEAST_BAD_PX = 3.0, 0.3
 """A pose is left out if its corners miss by this multiple of the median of all poses, and by this much [px rms]."""
-CERTAIN = 5.0
-"""Ratio of a parameter's distance from its nominal value to its standard deviation from which on it is believed."""
+CERTAIN, DOUBTFUL = 5.0, 2.5
+"""Ratio of a parameter's distance from its nominal value to its standard deviation from which on it is believed; and of
+the index from which on a third of the poses let all of them be asked."""
 LARGEST_DEVIATION = {"index": 0.02, "tilt": math.radians(0.5)}
 """Standard deviation above which an index or a tilt [rad] counts as not determined."""
 REGIONS = (("upper", "middle", "lower"), ("left", "centre", "right"))
@@ -409,23 +410,52 @@ class LensWork:
 
         Index and tilt are only freed if they differ from their nominal values with certainty.
         """
-        values, deviations, notes, free = dict(joint.values), joint.deviations(fit), list[str](), ["apex", "phase"]
-        whole = joint.refine(self.camera, ALL_FREE, STEPS_OF_ALL)
+        notes = list[str]()
+        index_off = self._free_index(joint, notes)
+        values, deviations = dict(joint.values), joint.deviations(fit)
+        whole = joint.refine(self.camera, TILTED, STEPS_OF_ALL)
         off = joint.deviations(fit)
-        for group, what in ((("index",), "index"), (("tilt_x", "tilt_y"), "tilt")):
-            if max(off[n] for n in group) > LARGEST_DEVIATION[what]:
-                notes.append(f"the {what} of the prism is not determined, and stays as given")
-            elif any(abs(whole[n] - values[n]) > CERTAIN * off[n] for n in group):
-                free += group
         joint.values = values
-        if len(free) > 2:
-            values = joint.refine(self.camera, tuple(n for n in ALL_FREE if n in free))
+        if max(off[n] for n in TILTED[2:]) > LARGEST_DEVIATION["tilt"]:
+            notes.append("the tilt of the prism is not determined, and stays as given")
+        elif any(abs(whole[n] - values[n]) > CERTAIN * off[n] for n in TILTED[2:]):
+            values = joint.refine(self.camera, TILTED)
             deviations = joint.deviations(fit)
+        if index_off:
+            by_index = values["apex"] / (values["index"] - 1.0) * index_off
+            deviations = {**deviations, "apex": math.hypot(deviations["apex"], by_index), "index": index_off}
         return values, deviations, tuple(notes)
+
+    def _free_index(self, joint: JointPrism, notes: list[str]) -> float:
+        """Set the prism's index if it differs from the given one with certainty; return its deviation, or 0 if held."""
+        given, names, largest = dict(joint.values), [*joint.equations], LARGEST_DEVIATION["index"]
+        index, off = given["index"], math.inf
+        if len(names) >= GOOD_POSES:
+            index, off = joint.index(self.camera, names[::PROBED])  # a few tell whether it is worth while
+
+        def differs(enough: float) -> bool:
+            return off < largest and abs(index - given["index"]) > enough * off
+
+        for k in range(INDEX_ROUNDS):
+            if differs(CERTAIN if k else DOUBTFUL):
+                joint.set_index(index)
+                joint.refine(self.camera, ("apex", "phase"))
+                index, off = joint.index(self.camera, names)
+        if joint.values != given:
+            joint.values = given
+            joint.set_index(index if differs(CERTAIN) else given["index"])
+            joint.refine(self.camera, ("apex", "phase"))
+        if off >= largest:
+            notes.append(f"the index of the prism is not determined, and stays as given, {given['index']:g}")
+        return off if differs(CERTAIN) else 0.0
 
 
 ALL_FREE = ("apex", "phase", "tilt_x", "tilt_y", "index")
 """Parameters of the prism that poses can determine together."""
+TILTED = ALL_FREE[:4]
+INDEX_STEP, INDEX_STEPS, INDEX_ROUNDS = 0.1, 4, 2
+"""Distance of the indices at which the cost is compared, number of Gauss-Newton steps at each, and number of times that
+the comparison is repeated about its answer: the maps are biased to the index of their fit."""
 
 
 class JointPrism:
@@ -472,6 +502,41 @@ class JointPrism:
         self.costs = {name: cost.mean() for name, cost in costs.items()}
         self.values = {**self.values, **space.to_values(v)}
         return dict(self.values)
+
+    def set_index(self, index: float) -> None:
+        """Change the prism's index, and its apex with it, so that the orbit stays as large."""
+        thinner = (self.values["index"] - 1.0) / (index - 1.0)
+        self.values = {**self.values, "index": index, "apex": thinner * self.values["apex"]}
+
+    def index(self, camera: Camera, names: Sequence[str]) -> tuple[float, float]:
+        """Return the prism's index by some poses, and its standard deviation; infinity where they do not tell it.
+
+        Apex and index trade against each other, but for a part of the orbit that grows with the angle of incidence. So
+        the cost is compared at three indices, with apex and phase fitted at each from the same maps. The minimum of the
+        parabola is the index, and its jackknife over the poses the deviation.
+        """
+        every, values, rows = self.equations, self.values, []
+        self.equations = {name: every[name] for name in names}
+        costs = [equations.answers.cost for equations in self.equations.values()]
+        maps, middle = [cost.brightness.copy_unknowns() for cost in costs], values["index"]
+        for index in (middle - INDEX_STEP, middle, middle + INDEX_STEP):
+            for cost, unknowns in zip(costs, maps, strict=True):
+                cost.replace_map(unknowns)
+                cost.replace_map(cost.brightness.copy_unknowns())
+            self.values = values
+            self.set_index(index)
+            self.refine(camera, ("apex", "phase"), INDEX_STEPS, 0.0)
+            rows.append([*self.costs.values()])
+        for cost, unknowns in zip(costs, maps, strict=True):
+            cost.replace_map(unknowns)
+        self.equations, self.values = every, values
+        low, at, high = np.array(rows)
+        bend, slope = low - 2.0 * at + high, high - low
+        if not bend.sum() > 0.0:
+            return middle, math.inf
+        without = (slope.sum() - slope) / (bend.sum() - bend)
+        off = 0.5 * INDEX_STEP * math.sqrt((len(without) - 1) * float(np.var(without)))
+        return middle - 0.5 * INDEX_STEP * float(slope.sum() / bend.sum()), off
 
     def _slopes(self, costs: Iterable[Cost], v: Vector) -> list[Slopes]:
         """Return the derivatives of the cost of each pose at a vector of parameters."""
