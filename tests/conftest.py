@@ -1,5 +1,6 @@
 """Shared fixtures: devices, a headless browser, the folder of real recordings, a picture and a simulated recording."""
 
+import gc
 import math
 import os
 import shutil
@@ -12,8 +13,11 @@ import pytest
 import warp as wp
 
 from amiwarp import Calibration, Camera, PhotometricSettings, Prism, PrismMotion, Recording, calibrate, simulate
+from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 
 wp.init()
+# The many processes that tests start would otherwise compile the package each time.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 LONGEST_FIRST = (
     "test_moving", "test_stability", "test_photometric", "test_sparse", "test_session", "test_demo", "test_stream_cli",
@@ -33,6 +37,26 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest files. The order within a file stays."""
     rank = {name: k for k, name in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
+def pytest_collection_finish() -> None:
+    """Leave all modules and tests out of later garbage collections, which would take half a second each."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_cores() -> Iterator[None]:
+    """Give each of xdist's processes its share of the cores: threads of several processes hinder each other."""
+    with limited_cpu_threads(max(1, cpu_threads() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))):
+        yield
+
+
+@pytest.fixture
+def every_core() -> Iterator[None]:
+    """Use all cores nevertheless: for tests of what several threads make."""
+    with limited_cpu_threads(None):
+        yield
 
 
 @pytest.fixture(params=["cpu", "cuda:0"])
