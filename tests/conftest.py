@@ -20,11 +20,14 @@ wp.init()
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 LONGEST_FIRST = (
-    "test_moving", "test_stability", "test_photometric", "test_sparse", "test_session", "test_demo", "test_stream_cli",
-    "test_examples", "test_refusals", "test_named_worlds", "test_view_browser", "test_reconstruct", "test_cli",
-    "test_evaluate_motion", "test_design", "test_chart", "test_calibrate", "test_consistency", "test_stream_returning",
+    "test_view_browser", "test_photometric", "test_consistency", "test_stability", "test_moving", "test_public_values",
+    "test_cli", "test_sparse", "test_lens", "test_refusals", "test_dataset", "test_session", "test_chart",
+    "test_named_worlds", "test_design", "test_calibrate", "test_stream_cli", "test_evaluate_motion", "test_live_writer",
+    "test_world_truth", "test_link", "test_examples", "test_output", "test_window", "test_demo", "test_io_mutation",
+    "test_benchmarks", "test_benchmarks_gpu", "test_sensor_timing", "test_prism_path", "test_translate",
+    "test_structure", "test_stream_returning", "test_compensate", "test_view_cli",
 )  # fmt: skip
-"""Files whose tests take longest. They are run first, so that no process works alone on one of them at the end."""
+"""Files whose tests take longest, in this order. They are run first, so that no process works alone at the end."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
