@@ -55,7 +55,7 @@ from amiwarp.cli.recordings import describe
 from amiwarp.cli.simulation import _read_speed
 from amiwarp.events.recording import check_events
 from amiwarp.events.truth import MAPS
-from amiwarp.io import read_encoder_csv
+from amiwarp.io import read_encoder_csv, reading_process
 from amiwarp.io.camera_files import load_camera, save_camera
 from amiwarp.io.json_files import append_line, sealed
 from amiwarp.io.plain_files import read_calib
@@ -730,13 +730,17 @@ def memory_kib(field: str) -> int:
 
 
 class Checker:
-    """Runs :func:`check` in a supervised process, so that a crash or a hang is a finding too."""
+    """Runs :func:`check` in a supervised process, so that a crash or a hang is a finding too.
 
-    def __init__(self) -> None:
+    ``cpu_seconds`` is the processor time after which the package's own reading process refuses a file.
+    """
+
+    def __init__(self, cpu_seconds: int = reading_process.CPU_SECONDS) -> None:
+        self._cpu_seconds = cpu_seconds
         self._start()
 
     def _start(self) -> None:
-        command = [sys.executable, "-P", "-m", "reference.mutation_files", "--serve"]
+        command = [sys.executable, "-P", "-m", "reference.mutation_files", "--serve", str(self._cpu_seconds)]
         modules = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}  # the amiwarp of this process
         self._process = subprocess.Popen(command, env=modules, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
@@ -767,8 +771,9 @@ class Checker:
         self._process.stdout.close()
 
 
-def serve() -> None:
+def serve(cpu_seconds: int) -> None:
     """Check the files whose names arrive on standard input."""
+    reading_process.CPU_SECONDS = cpu_seconds
     replies = sys.stdout
     sys.stdout = io.StringIO()
     for line in sys.stdin:
@@ -801,7 +806,7 @@ def main(count: int, names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--serve"]:
-        serve()
+    if sys.argv[1:2] == ["--serve"]:
+        serve(int(sys.argv[2]))
     else:
         main(int(sys.argv[1]), sys.argv[2:])

@@ -1,5 +1,6 @@
 """Shared fixtures: devices, a headless browser, the folder of real recordings, a picture and a simulated recording."""
 
+import gc
 import math
 import os
 import shutil
@@ -12,15 +13,21 @@ import pytest
 import warp as wp
 
 from amiwarp import Calibration, Camera, PhotometricSettings, Prism, PrismMotion, Recording, calibrate, simulate
+from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 
 wp.init()
+# The many processes that tests start would otherwise compile the package each time.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 LONGEST_FIRST = (
-    "test_moving", "test_stability", "test_photometric", "test_sparse", "test_session", "test_demo", "test_stream_cli",
-    "test_examples", "test_refusals", "test_named_worlds", "test_view_browser", "test_reconstruct", "test_cli",
-    "test_evaluate_motion", "test_design", "test_chart", "test_calibrate", "test_consistency", "test_stream_returning",
+    "test_view_browser", "test_photometric", "test_consistency", "test_stability", "test_moving", "test_public_values",
+    "test_cli", "test_sparse", "test_lens", "test_refusals", "test_dataset", "test_session", "test_chart",
+    "test_named_worlds", "test_design", "test_calibrate", "test_stream_cli", "test_evaluate_motion", "test_live_writer",
+    "test_world_truth", "test_link", "test_examples", "test_output", "test_window", "test_demo", "test_io_mutation",
+    "test_benchmarks", "test_benchmarks_gpu", "test_sensor_timing", "test_prism_path", "test_translate",
+    "test_structure", "test_stream_returning", "test_compensate", "test_view_cli",
 )  # fmt: skip
-"""Files whose tests take longest. They are run first, so that no process works alone on one of them at the end."""
+"""Files whose tests take longest, in this order. They are run first, so that no process works alone at the end."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -33,6 +40,26 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest files. The order within a file stays."""
     rank = {name: k for k, name in enumerate(LONGEST_FIRST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
+def pytest_collection_finish() -> None:
+    """Leave all modules and tests out of later garbage collections, which would take half a second each."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_cores() -> Iterator[None]:
+    """Give each of xdist's processes its share of the cores: threads of several processes hinder each other."""
+    with limited_cpu_threads(max(1, cpu_threads() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))):
+        yield
+
+
+@pytest.fixture
+def every_core() -> Iterator[None]:
+    """Use all cores nevertheless: for tests of what several threads make."""
+    with limited_cpu_threads(None):
+        yield
 
 
 @pytest.fixture(params=["cpu", "cuda:0"])

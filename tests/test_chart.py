@@ -338,6 +338,7 @@ def test_charts_are_drawn_later(
     assert "No module named 'matplotlib'" in note
     assert "benchmarks.chart --from chart.json" in note
     assert not list(tmp_path.iterdir())
+    monkeypatch.setattr(figures, "save_svg", lambda figure, path: None)
     drawn = loaded.draw(tmp_path)
     assert set(data["notes"]) == set(drawn.notes)
     for chart in ("compensation", "calibration"):
@@ -529,6 +530,7 @@ def test_letters_do_not_overlap(
 
     drawn: list[Any] = []
     monkeypatch.setattr(figures, "save", lambda figure, path: drawn.append(figure))
+    monkeypatch.setattr(figures, "save_svg", lambda figure, path: None)
     rows = DRAWN[name](known)
     draw(tmp_path / "chart", rows, "Chart on 2 cores of Intel(R) Xeon(R) Platinum 8488C CPU @ 2.40GHz: 8 M events", "n")
     (figure,) = drawn

@@ -236,7 +236,7 @@ def test_a_failure_is_reported_and_does_not_stop_the_rest(place: Path) -> None:
 
 
 def test_a_killed_run_is_continued(place: Path) -> None:
-    (place / "spec.toml").write_text("seeds = 10\n" + BASE + PICTURES)
+    (place / "spec.toml").write_text("seeds = 4\n" + BASE + PICTURES)
     journal = place / "out" / JOURNAL
     command = ["dataset", str(place / "spec.toml"), str(place / "out"), "--workers", "1", "--device", "cpu"]
     with subprocess.Popen([sys.executable, "-m", "amiwarp", *command], stderr=subprocess.DEVNULL) as process:
@@ -247,15 +247,15 @@ def test_a_killed_run_is_continued(place: Path) -> None:
         process.kill()
     assert process.returncode == -signal.SIGKILL
     kept = len(list(read_journal(journal, dict, [])))
-    assert 3 <= kept < 120
+    assert 3 <= kept < 48
     append_line(journal, {"key": "cut off"})
     journal.write_bytes(journal.read_bytes()[:-4])
     assert any(p.name.startswith(".scratch") for p in (place / "out").iterdir())
     done = make(place)
-    assert (done.kept, done.made) == (kept, 120 - kept)
+    assert (done.kept, done.made) == (kept, 48 - kept)
     assert {item["file"]: item["sha256"] for item in manifest(place)["items"]} == checksums(place)
     assert not any(p.name.startswith(".") for p in (place / "out").iterdir())
-    assert make(place).kept == 120
+    assert make(place).kept == 48
 
 
 def test_a_dry_run_makes_nothing(place: Path) -> None:

@@ -369,6 +369,7 @@ def test_a_script_without_a_guard_is_not_run_again(dsec, tmp_path):
     assert out.stderr == ""
 
 
+@pytest.mark.usefixtures("every_core")
 def test_threads_share_the_process(dsec):
     source = open_recording(dsec).events
     found: list[int] = []

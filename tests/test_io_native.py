@@ -468,6 +468,7 @@ def test_a_flipped_bit_in_a_chunk_is_noticed(tmp_path, name, place):
         next(iter(open_recording(path).events.blocks()))
 
 
+@pytest.mark.usefixtures("every_core")
 def test_threads_may_slice_at_once(tmp_path):
     events = make(5 * CHUNK + 7)
     source = open_recording(write(tmp_path / "a.h5", events)).events

@@ -319,7 +319,7 @@ def test_garbage_is_said_in_a_sentence_and_raises_nothing() -> None:
     assert sum(len(n.t_us) for n in taken(follower)) <= 2000
 
 
-@pytest.mark.parametrize("drift_ppm", [-80.0, 0.0, 250.0])
+@pytest.mark.parametrize("drift_ppm", [-80.0, 250.0])
 def test_the_clock_is_found_with_honest_deviations(drift_ppm: float) -> None:
     controller, follower = Controller(Motor(), drift_ppm=drift_ppm, clock_start=WRAP - 20 * S), Follower("port")
     rng = np.random.default_rng(2)

@@ -529,7 +529,7 @@ def test_radial_circle_never_returns_an_unsolved_point(device: str, side: FlatSi
 @pytest.mark.parametrize("lens", [None, BARREL], ids=str)
 def test_predicted_error_is_that_of_a_dense_independent_evaluation(side: FlatSide, lens: Any) -> None:
     cam, wedge = camera(60.0, lens, (320, 240)), prism(1.0, side)
-    xy, theta = lattice(cam, 46, 35)
+    xy, theta = lattice(cam, 28, 21)
     rays = oracle.pixels_to_rays(cam, xy)
     sign = 1.0 if side is FlatSide.SCENE else -1.0
     circle = oracle.rays_to_pixels(cam, oracle.turn(rays, theta, sign * math.radians(1.0)))

@@ -538,8 +538,8 @@ def test_closed_tabs_give_back_threads_and_memory(recording: Recording) -> None:
         until(lambda: all(part() is None for part in build.parts) and not ours())
         before = native_threads()
         for _ in range(2):
-            run(lambda: visit(url, 4))
+            run(lambda: visit(url, 2))
             until(lambda: all(part() is None for part in build.parts) and not ours())
             until(lambda: native_threads() <= before)
-    assert len(build.parts) == 9 * 4
+    assert len(build.parts) == 5 * 4
     assert ours() == []

@@ -182,6 +182,7 @@ def test_chunks_do_not_matter(device: str, chunk_us: int) -> None:
     np.testing.assert_array_equal(np.concatenate([p for _, p in parts]), whole[1])
 
 
+@pytest.mark.usefixtures("every_core")
 def test_threads_and_room_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     many = base().run()
     monkeypatch.setattr("amiwarp.simulation.simulator.CPU_RUN", 100)

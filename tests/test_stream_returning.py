@@ -267,8 +267,7 @@ def test_a_view_of_less_than_a_turn_says_how_it_ended(tmp_path: Path) -> None:
             view.__enter__()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("kind", ["encoder", "triggers"])
+@pytest.mark.parametrize(("kind", "number"), [("encoder", signal.SIGINT), ("triggers", signal.SIGTERM)])
 def test_a_flood_without_events_can_be_ended(tmp_path: Path, number: int, kind: str) -> None:
     """One signal ends it, with a whole file; the sender would go on for long."""
     server, address = listen(f"unix:{tmp_path / 's'}")

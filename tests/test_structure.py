@@ -43,9 +43,21 @@ def name_of(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@pytest.fixture(scope="module", autouse=True)
+def trees() -> Iterator[None]:
+    """Free the syntax trees after this file's tests."""
+    yield
+    tree_of.cache_clear()
+
+
 def imports_of(path: Path) -> Iterator[str]:
     """Yield the modules that a file imports: in functions, and for types only, too."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -58,7 +70,7 @@ def device_code() -> list[tuple[str, str, ast.FunctionDef]]:
     """Return the place, the decorator and the syntax tree of every Warp kernel and device function."""
     found = []
     for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.FunctionDef):
                 for decorator in node.decorator_list:
                     text = ast.unparse(decorator)
@@ -119,17 +131,16 @@ def test_types_in_public_signatures_are_public() -> None:
         f"{name} uses {used}"
         for name in amiwarp.__all__
         for used in _types_of(name)
-        if used not in amiwarp.__all__ and used in CLASSES
+        if used not in amiwarp.__all__ and used in classes()
     }
     assert sorted(missing) == []
 
 
-CLASSES = {
-    node.name
-    for path in MODULES
-    for node in ast.parse(path.read_text()).body
-    if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
-}
+@functools.cache
+def classes() -> set[str]:
+    """Return the names of the package's classes."""
+    nodes = (node for path in MODULES for node in tree_of(path).body)
+    return {node.name for node in nodes if isinstance(node, ast.ClassDef) and not node.name.startswith("_")}
 
 
 def _types_of(name: str) -> Iterator[str]:
@@ -225,13 +236,20 @@ OPENED_OTHERWISE = {
 """Calls that open a file for reading in another way, and what they open."""
 
 
+def last_name(node: ast.AST) -> str:
+    """Return the last part of the name of a called function; empty for other nodes and for calls of other values."""
+    function = node.func if isinstance(node, ast.Call) else None
+    return function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+
+
 def opened_otherwise(source: str) -> Iterator[str]:
     """Yield the calls that open a file for reading, other than ``open_input(path)`` and ``f(input_path(path))``."""
     for node in ast.walk(ast.parse(source)):
-        if not isinstance(node, ast.Call):
+        last = last_name(node)
+        if last not in OPENING_NAMES | {name.rpartition(".")[2] for name in OPENERS}:
             continue
+        assert isinstance(node, ast.Call)
         name = ast.unparse(node.func)
-        last = name.rpartition(".")[2]
         if name in OPEN_NO_FILE or (name not in OPENERS and last not in OPENING_NAMES):
             continue
         modes = [*node.args[:2], *(word.value for word in node.keywords if word.arg == "mode")]
@@ -257,8 +275,8 @@ def test_paths_reach_the_reading_process_as_paths() -> None:
         name_of(path)
         for path in MODULES
         if path.name != "reading_process.py"
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "os.path.abspath"
+        for node in ast.walk(tree_of(path))
+        if last_name(node) == "abspath" and ast.unparse(node.func) == "os.path.abspath"
     ]
     assert texts == []
 

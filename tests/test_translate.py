@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from amiwarp import AmiwarpError, Camera, Events, ExactModel, Prism, Recording, SensorModel, translate
+from amiwarp.simulation import pictures
 from amiwarp.simulation.pictures import DARK, open_pictures
 from amiwarp.translation.translator import translation
 
@@ -149,9 +150,10 @@ def test_bad_sequences_are_told(tmp_path: Path) -> None:
         translate(tmp_path / "loud.npy", WEDGE, fps=10.0)
 
 
-def test_tables_of_pictures_have_a_limit(tmp_path: Path) -> None:
-    (tmp_path / "times.csv").write_text("file,t_us\n" + "".join(f"a,{k}\n" for k in range(1_000_001)))
-    with pytest.raises(AmiwarpError, match=r"times\.csv: .*it lists over 1000000 pictures; split the folder"):
+def test_tables_of_pictures_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "MOST_PICTURES", 1000)
+    (tmp_path / "times.csv").write_text("file,t_us\n" + "".join(f"a,{k}\n" for k in range(1001)))
+    with pytest.raises(AmiwarpError, match=r"times\.csv: .*it lists over 1000 pictures; split the folder"):
         open_pictures(tmp_path)
 
 

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from amiwarp import AmiwarpError, Sun, Trajectory, load_world
 from amiwarp.io.files import inputs_in_use, inputs_noted
 from amiwarp.simulation.pictures import LUMINANCE, linear_luminance
+from amiwarp.simulation.worlds import world
 from amiwarp.simulation.worlds.world_files import load_mesh
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "world-files.md"
@@ -383,14 +384,16 @@ def test_files_of_a_mesh_are_inputs_of_the_command(tmp_path: Path) -> None:
     assert noted >= {"quad.obj", "quad.mtl", "paint.png"}
 
 
-def test_trajectories_have_a_limit(tmp_path: Path) -> None:
+def test_trajectories_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Their splines take 1.7 kB for each pose."""
+    assert world.MOST_POSES * 1700 < 1 << 30  # bytes
+    monkeypatch.setattr(world, "MOST_POSES", 500)
     row = " 0 0 0 0 0 0 1\n"
-    (tmp_path / "a.txt").write_text("".join(f"{k}{row}" for k in range(500_001)))
-    with pytest.raises(AmiwarpError, match=r"a\.txt: has over 500000 poses; give fewer, at a lower rate"):
+    (tmp_path / "a.txt").write_text("".join(f"{k}{row}" for k in range(501)))
+    with pytest.raises(AmiwarpError, match=r"a\.txt: has over 500 poses; give fewer, at a lower rate"):
         Trajectory.from_file(tmp_path / "a.txt")
-    with pytest.raises(AmiwarpError, match=r"trajectory has 500001 poses; give at most 500000"):
-        Trajectory(np.arange(500_001.0), np.zeros((500_001, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (500_001, 1)))
+    with pytest.raises(AmiwarpError, match=r"trajectory has 501 poses; give at most 500,"):
+        Trajectory(np.arange(501.0), np.zeros((501, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (501, 1)))
     with pytest.raises(AmiwarpError, match=r"trajectory has 1000000001 poses; .*by a smaller rate_hz"):
         Trajectory.from_function(lambda t: (Rotation.identity(), np.zeros(3)), 1000.0, rate_hz=1e6)
     (tmp_path / "b.txt").write_text("0" + row + "#" * 1001 + "\n")
