@@ -275,12 +275,12 @@ class LensWork:
             first = names if k else names[:: max(1, len(names) // FIRST_POSES)]
             pictures = self.pictures(model, first, k, turns=1.0 if k else 0.5)
             try:
-                fit, seen = self._lens(pictures)
+                fit, seen = self._lens(pictures, matched=k > 0)
             except AmiwarpError:  # the first poses alone do not suffice
                 rest = [name for name in names if name not in first]
                 if not rest:
                     raise
-                fit, seen = self._lens(pictures | self.pictures(model, rest, k, turns=0.5))
+                fit, seen = self._lens(pictures | self.pictures(model, rest, k, turns=0.5), matched=k > 0)
             self.camera = fit.camera
         assert fit is not None
         values, uncertainty, notes = self._whole_prism(joint, fit)
@@ -360,8 +360,12 @@ class LensWork:
             out[name] = np.clip((log - low) / max(high - low, 1e-6) * 255.0, 0.0, 255.0).astype(np.uint8)
         return out
 
-    def _lens(self, pictures: dict[str, NDArray[np.uint8]]) -> tuple[Fit, dict[str, Corners]]:
-        """Return the lens that the corners of the pictures determine, and the corners by name of the pose."""
+    def _lens(self, pictures: dict[str, NDArray[np.uint8]], *, matched: bool) -> tuple[Fit, dict[str, Corners]]:
+        """Return the lens that the corners of the pictures determine, and the corners by name of the pose.
+
+        The rough lens smears the first pictures, each in its way: corners that were ``matched`` in them would agree too
+        well, and free coefficients that mean nothing.
+        """
         found = {name: self.board.find(picture) for name, picture in pictures.items()}
         self.left_out = {name: why for name, why in self.left_out.items() if name not in found}
         seen = {name: corners for name, corners in found.items() if corners is not None}
@@ -369,11 +373,12 @@ class LensWork:
             if corners is None:
                 self.left_out[name] = self.board.missing(pictures[name])
         self._check_count(len(seen), "are seen")
-        fit = fit_lens(self.camera, self.board, list(seen.values()))
-        seen = {
-            name: match_corners(pictures[name], self.board, corners, fit.camera, pose)
-            for (name, corners), pose in zip(seen.items(), fit.poses, strict=True)
-        }
+        if matched:
+            fit = fit_lens(self.camera, self.board, list(seen.values()))
+            seen = {
+                name: match_corners(pictures[name], self.board, corners, fit.camera, pose)
+                for (name, corners), pose in zip(seen.items(), fit.poses, strict=True)
+            }
         while True:
             fit = fit_lens(self.camera, self.board, list(seen.values()))
             misses = {name: rms(r) for name, r in zip(seen, fit.residuals, strict=True)}

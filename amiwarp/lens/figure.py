@@ -28,10 +28,12 @@ def save_figure(found: LensCalibration, path: Path, *, overwrite: bool = False) 
     grid = figure.add_gridspec(rows + 2, COLUMNS, height_ratios=[3.0, 0.01, *[1.2] * rows])
     left, right = figure.add_subplot(grid[0, :2]), figure.add_subplot(grid[0, 2:])
     longest = max(float(np.hypot(*p.residuals.T).max()) for p in poses)
-    factor = 10.0 ** math.floor(math.log10(0.06 * width / max(longest, 1e-6)))
+    most = 0.06 * width / max(longest, 1e-6)
+    decade = 10.0 ** math.floor(math.log10(most))
+    factor = max(step * decade for step in (1.0, 2.0, 5.0) if step * decade <= most)
     for k, pose in enumerate(poses):
         colour = f"C{k % 10}"
-        left.plot(*pose.corners.xy.T, ".", color=colour, markersize=4)
+        left.plot(*pose.corners.xy.T, ".", color=colour, markersize=3)
         left.quiver(
             *pose.corners.xy.T, *(factor * pose.residuals).T, color=colour, angles="xy", scale_units="xy", scale=1.0,
             width=0.0018,
@@ -51,7 +53,7 @@ def save_figure(found: LensCalibration, path: Path, *, overwrite: bool = False) 
         axes = figure.add_subplot(grid[2 + k // COLUMNS, k % COLUMNS])
         axes.imshow(pose.picture, cmap="gray")
         axes.plot(*pose.corners.xy.T, ".", color="C1", markersize=2)
-        axes.set_title(f"{pose.name}: {pose.rms:.2f} px", fontsize=8)
+        axes.set_title(f"{pose.name}: {pose.rms:.2g} px", fontsize=8)
         axes.set(xticks=[], yticks=[])
     with NewFile(path, overwrite=overwrite) as new:
         figure.savefig(new.part, format=path.suffix[1:].lower(), dpi=110)
