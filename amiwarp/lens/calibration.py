@@ -518,12 +518,13 @@ class JointPrism:
 
         Apex and index trade against each other, but for a part of the orbit that grows with the angle of incidence. So
         the cost is compared at three indices, with apex and phase fitted at each from the same maps. The minimum of the
-        parabola is the index, and its jackknife over the poses the deviation.
+        parabola is the index, and its jackknife over the poses the deviation. The fit stays as it was.
         """
-        every, values, rows = self.equations, self.values, []
-        self.equations = {name: every[name] for name in names}
+        fit, values, rows = dict(vars(self)), self.values, []
+        self.equations = {name: self.equations[name] for name in names}
         costs = [equations.answers.cost for equations in self.equations.values()]
-        maps, middle = [cost.brightness.copy_unknowns() for cost in costs], values["index"]
+        maps, spaces = [cost.brightness.copy_unknowns() for cost in costs], [cost.space for cost in costs]
+        middle = values["index"]
         for index in (middle - INDEX_STEP, middle, middle + INDEX_STEP):
             for cost, unknowns in zip(costs, maps, strict=True):
                 cost.replace_map(unknowns)
@@ -532,9 +533,10 @@ class JointPrism:
             self.set_index(index)
             self.refine(camera, ("apex", "phase"), INDEX_STEPS, 0.0)
             rows.append([*self.costs.values()])
-        for cost, unknowns in zip(costs, maps, strict=True):
+        for cost, unknowns, space in zip(costs, maps, spaces, strict=True):
             cost.replace_map(unknowns)
-        self.equations, self.values = every, values
+            cost.space = space
+        vars(self).update(fit)
         low, at, high = np.array(rows)
         bend, slope = low - 2.0 * at + high, high - low
         if not bend.sum() > 0.0:
