@@ -153,7 +153,7 @@ def _watch(
     from amiwarp.live.stream.session import FIRST_S, Session
 
     stop = threading.Event()
-    policy = Policy.BLOCK if stream.fast else Policy.DROP_OLDEST  # what is said must not be late
+    policy = Policy.BLOCK if stream.fast else Policy.DROP_OLDEST  # a late message would tell of a pose long gone
     with StatusLine(stop, stream.seconds) as line, stream.link() as link:
         opened = stream.open(source, line.say)
         check_angles(opened, link)

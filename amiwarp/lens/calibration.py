@@ -41,7 +41,7 @@ Vector = NDArray[np.float64]
 USUAL_FOV = math.radians(60.0)
 """Horizontal field of view that is assumed if none is known [rad]."""
 LEAST_POSES, GOOD_POSES = 4, 12
-"""Smallest number of poses from which a lens is calibrated, and the number from which on more are not asked for."""
+"""Smallest number of poses for a calibration, and the number that suffices for a good one."""
 SMOOTHNESS = 0.02
 """Weight of the pictures' smoothness prior. Choosing it for each picture takes as long as the picture; the corners'
 errors change by a tenth between 0.02 and 0.1."""

@@ -1,4 +1,4 @@
-"""Poses of a lens calibration from a running stream: still spans are found turn by turn, and their coverage is told."""
+"""Poses of the board from a live stream: finds when it stands still, and says which parts of the image lack corners."""
 
 from __future__ import annotations
 
