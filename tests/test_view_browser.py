@@ -1019,6 +1019,28 @@ def test_undo_before_a_change_is_computed_undoes_it_and_redo_brings_it_back(
     until(lambda: field(page, "apex") == 0.9)
 
 
+def test_a_value_typed_while_the_window_is_read_is_kept(
+    page: Any, kept: tuple[Any, Any, dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inspector, reads, goes_on = kept[1].inspector, threading.Event(), threading.Event()
+    read = inspector.open
+
+    def slow(*args: Any) -> None:
+        reads.set()
+        assert goes_on.wait(WAIT_S)
+        read(*args)
+
+    monkeypatch.setattr(inspector, "open", slow)
+    enter(page, "start_ms", 20)
+    assert reads.wait(WAIT_S)
+    enter(page, "apex", 0.9)
+    until(lambda: bool(kept[1].state.apex == 0.9))
+    goes_on.set()
+    until(lambda: math.isclose(inspector.knobs.apex, math.radians(0.9)))
+    ready(page)
+    assert field(page, "apex") == 0.9
+
+
 def test_one_event_has_no_sharpness(opened: Open, recording: Recording) -> None:
     one = MemoryEvents(recording.events.slice(20_000, 20_001), *recording.events.size)
     page = opened(of=replace(recording, events=one, truth=None))

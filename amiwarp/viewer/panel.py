@@ -67,6 +67,7 @@ class Panel(layout.Actions):
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
         self._rates: EventRates
         self._progress: JobProgress | None = None
+        self._knobs_shown: dict[str, Any] = {}  # parameters and model as the page was last told
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
         self._downloads = 0
         use_page(server, layout.template(), self._folder.name)
@@ -83,6 +84,8 @@ class Panel(layout.Actions):
         files = [] if self._library is None else self._library.files()
         folder = "" if self._library is None else str(self._library.folder)
         self.state.update({**layout.initial_state(inspector), "files": files, "folder": folder})
+        self._knobs_shown = {}
+        self.show_knobs()
         self.time_window = inspector.window or inspector.first_window()
         self._count_events()
         self.request("window", *(["suggestion"] if self.compensates else []))
@@ -440,11 +443,14 @@ class Panel(layout.Actions):
         """Give the inspector the parameters that the page shows, where they differ from the inspector's."""
         known, shown = layout.knob_values(self.inspector), self.state
         values = {name: float(shown[name]) * layout.UNITS[name] for name in layout.NAMES if shown[name] != known[name]}
+        self._knobs_shown = {name: shown[name] for name in self._knobs_shown}
         self.inspector.set(replace(self.inspector.knobs.with_values(values), model=shown.model))
 
     def show_knobs(self) -> None:
-        """Show the inspector's parameters on the page."""
-        self.state.update(layout.knob_state(self.inspector))
+        """Show the inspector's parameters on the page, but leave those that a user has changed since the last time."""
+        state = layout.knob_state(self.inspector)
+        was, self._knobs_shown = self._knobs_shown, {name: state[name] for name in ("model", *layout.UNITS)}
+        self.state.update({name: value for name, value in state.items() if value != was.get(name)})
 
     def knobs_taken(self) -> None:
         """Show parameters that the inspector has taken from elsewhere."""
@@ -660,7 +666,7 @@ class Panel(layout.Actions):
                     self.remember("")
                 if "state" in todo:
                     await self._apply_steps()
-                self.show_knobs()  # not after the computation: a value that is typed meanwhile would be lost
+                self.show_knobs()
                 self.shown, values = await self.work.in_thread(self._compute)
             except AmiwarpError:
                 self.inspector.knobs, self.inspector.sources = good
