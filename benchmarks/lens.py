@@ -30,8 +30,10 @@ LENSES = {
     "radial-tangential": amiwarp.Camera(
         640, 480, 520.0, 521.5, 322.0, 236.0, amiwarp.RadialTangential(-0.12, 0.03, 0.0005, -0.0004)
     ),
-    "fisheye": amiwarp.Camera(640, 480, 340.0, 340.6, 322.0, 236.0, amiwarp.Fisheye(-0.02, 0.004)),
+    "fisheye": amiwarp.Camera(640, 480, 305.0, 305.6, 322.0, 236.0, amiwarp.Fisheye(-0.02, 0.004)),
 }
+SEEING: dict[str, dict[str, Any]] = {"radial-tangential": {}, "fisheye": {"seeing": "rays", "samples": 16}}
+"""A map of what is seen covers 151 deg. The diagonal of a fisheye of 120 deg has more."""
 DISTANCE_M = {"radial-tangential": (0.35, 0.7), "fisheye": (0.2, 0.4)}
 FINE = 4
 """Number of samples per pixel of a frame along each axis."""
@@ -86,7 +88,7 @@ def one(lens: str, seed: int, count: int, device: str, index: float) -> dict[str
     prism, recordings = amiwarp.Prism(math.radians(1.0), index), []
     for k, (rotation, middle) in enumerate(placed[:count]):
         world = BOARD.world(rotation.as_quat(), middle, seed=seed)
-        scene = amiwarp.WorldScene(world, amiwarp.Trajectory.still([0, 0, 0]))
+        scene = amiwarp.WorldScene(world, amiwarp.Trajectory.still([0, 0, 0]), **SEEING[lens])
         made = amiwarp.simulate(scene, true, prism, duration_s=0.25, motion=motion, seed=100 * seed + k, device=device)
         nominal = amiwarp.Prism(prism.apex * (1.1 if seed % 2 else 0.9))
         recordings.append(replace(made, camera=None, name=f"pose {k}", prism=nominal))

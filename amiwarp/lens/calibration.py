@@ -71,11 +71,16 @@ times the median; one with the prism's zero off by 10 deg had 2.4, and boards th
 1.9 and 2.5 times the median."""
 BAD_POSE, LEAST_BAD_PX = 3.0, 0.3
 """A pose is left out if its corners miss by this multiple of the median of all poses, and by this much [px rms]."""
-CERTAIN, DOUBTFUL = 5.0, 2.5
+CERTAIN, DOUBTFUL = 4.0, 1.5
 """Ratio of a parameter's distance from its nominal value to its standard deviation from which on it is believed; and of
 the index from which on a third of the poses let all of them be asked."""
 LARGEST_DEVIATION = {"index": 0.02, "tilt": math.radians(0.5)}
 """Standard deviation above which an index or a tilt [rad] counts as not determined."""
+ORBIT_ERROR = 0.35
+"""Standard deviation of errors of the orbits' shape that all poses share [px], times the cube of the orbits' radius at
+the centre of the image [px]. Maps are looked up bilinearly, which follows the picture less within a small orbit:
+indices came out too large, by 0.003 px of shape in orbits of 4.7 px, 0.012 to 0.018 px in 3 px, and less than 0.001 px
+in 6 px."""
 REGIONS = (("upper", "middle", "lower"), ("left", "centre", "right"))
 """Names of the nine regions of the image in which corners are counted."""
 STEEP = math.radians(15.0)
@@ -416,7 +421,7 @@ class LensWork:
         Index and tilt are only freed if they differ from their nominal values with certainty.
         """
         notes = list[str]()
-        index_off = self._free_index(joint, notes)
+        index_off = self._free_index(joint, fit, notes)
         values, deviations = dict(joint.values), joint.deviations(fit)
         whole = joint.refine(self.camera, TILTED, STEPS_OF_ALL)
         off = joint.deviations(fit)
@@ -431,28 +436,35 @@ class LensWork:
             deviations = {**deviations, "apex": math.hypot(deviations["apex"], by_index), "index": index_off}
         return values, deviations, tuple(notes)
 
-    def _free_index(self, joint: JointPrism, notes: list[str]) -> float:
+    def _free_index(self, joint: JointPrism, fit: Fit, notes: list[str]) -> float:
         """Set the prism's index if it differs from the given one with certainty; return its deviation, or 0 if held."""
-        given, names, largest = dict(joint.values), [*joint.equations], LARGEST_DEVIATION["index"]
+        given, names = dict(joint.values), [*joint.equations]
         index, off = given["index"], math.inf
-        if len(names) >= GOOD_POSES:
-            index, off = joint.index(self.camera, names[::PROBED])  # a few tell whether it is worth while
+        systematic = joint.systematic_of_index(fit)
+
+        def ask(names: Sequence[str]) -> tuple[float, float]:
+            index, off = joint.index(self.camera, names)
+            return index, math.hypot(off, systematic)
 
         def differs(enough: float) -> bool:
-            return off < largest and abs(index - given["index"]) > enough * off
+            return abs(index - given["index"]) > enough * off
 
-        for k in range(INDEX_ROUNDS):
-            if differs(CERTAIN if k else DOUBTFUL):
+        if len(names) >= GOOD_POSES and systematic < LARGEST_DEVIATION["index"]:
+            index, off = ask(names[::PROBED])  # a few tell whether it is worth while
+            for _ in range(INDEX_ROUNDS):
+                if not differs(DOUBTFUL):
+                    break
                 joint.set_index(index)
                 joint.refine(self.camera, ("apex", "phase"))
-                index, off = joint.index(self.camera, names)
+                index, off = ask(names)
+        sure = off < LARGEST_DEVIATION["index"]
         if joint.values != given:
             joint.values = given
-            joint.set_index(index if differs(CERTAIN) else given["index"])
+            joint.set_index(index if sure and differs(CERTAIN) else given["index"])
             joint.refine(self.camera, ("apex", "phase"))
-        if off >= largest:
+        if not sure:
             notes.append(f"the index of the prism is not determined, and stays as given, {given['index']:g}")
-        return off if differs(CERTAIN) else 0.0
+        return off if sure and differs(CERTAIN) else 0.0
 
 
 ALL_FREE = ("apex", "phase", "tilt_x", "tilt_y", "index")
@@ -461,6 +473,10 @@ TILTED = ALL_FREE[:4]
 INDEX_STEP, INDEX_STEPS, INDEX_ROUNDS = 0.1, 4, 2
 """Distance of the indices at which the cost is compared, number of Gauss-Newton steps at each, and number of times that
 the comparison is repeated about its answer: the maps are biased to the index of their fit."""
+
+
+ROWS, COLUMNS, TURN = 7, 9, 12
+"""Numbers of rows and columns of pixels, and of angles of a turn, on which displacements are compared."""
 
 
 class JointPrism:
@@ -482,13 +498,14 @@ class JointPrism:
         return ExactModel.from_values(camera, self.full.prism, values)
 
     def refine(
-        self, camera: Camera, names: tuple[str, ...], most: int = MOST_STEPS, tolerance: float = TOLERANCE_PX
-    ) -> dict[str, float]:
+        self, camera: Camera, names: tuple[str, ...], most: int = MOST_STEPS, tolerance: float = TOLERANCE_PX,
+        poses: Iterable[str] = (),
+    ) -> dict[str, float]:  # fmt: skip
         """Fit the parameters ``names`` in at most ``most`` steps from the present values. Return all values.
 
-        A step shorter than ``tolerance`` [px] ends the fit.
+        A step shorter than ``tolerance`` [px] ends the fit. Without names of ``poses`` all are used.
         """
-        costs = {name: equations.answers.cost for name, equations in self.equations.items()}
+        costs = {name: self.equations[name].answers.cost for name in poses or self.equations}
         for cost in costs.values():
             cost.space = replace(self.full, camera=camera, names=names).holding(self.values)
         self.space = space = next(iter(costs.values())).space
@@ -521,8 +538,7 @@ class JointPrism:
         parabola is the index, and its jackknife over the poses the deviation. The fit stays as it was.
         """
         fit, values, rows = dict(vars(self)), self.values, []
-        self.equations = {name: self.equations[name] for name in names}
-        costs = [equations.answers.cost for equations in self.equations.values()]
+        costs = [self.equations[name].answers.cost for name in names]
         maps, spaces = [cost.brightness.copy_unknowns() for cost in costs], [cost.space for cost in costs]
         middle = values["index"]
         for index in (middle - INDEX_STEP, middle, middle + INDEX_STEP):
@@ -531,7 +547,7 @@ class JointPrism:
                 cost.replace_map(cost.brightness.copy_unknowns())
             self.values = values
             self.set_index(index)
-            self.refine(camera, ("apex", "phase"), INDEX_STEPS, 0.0)
+            self.refine(camera, ("apex", "phase"), INDEX_STEPS, 0.0, names)
             rows.append([*self.costs.values()])
         for cost, unknowns, space in zip(costs, maps, spaces, strict=True):
             cost.replace_map(unknowns)
@@ -571,38 +587,14 @@ class JointPrism:
         return np.asarray(longer**2 * (total.covariance() + of_poses.covariance()))
 
     def deviations(self, fit: Fit) -> dict[str, float]:
-        """Return the standard deviations of the fitted parameters, with those that the lens's own cause."""
-        names = fit.names
-        at = self._displacements(fit.camera, self._v)
+        """Return the standard deviations of the fitted parameters, with those that lens and orbits' shape cause."""
+        return self.space.deviations(self._v, self.covariance() + _systematic(self.space, self._v, fit))
 
-        def by_prism(k: int) -> Vector:
-            step = np.zeros(len(self._v))
-            step[k] = 0.05
-            return (self._displacements(fit.camera, self._v + step) - at) / 0.05
-
-        def by_lens(name: str) -> Vector:
-            step = max(fit.deviations[name], 1e-9)
-            moved = {name: lens_values(fit.camera, [name])[name] + step}
-            return (self._displacements(with_lens_values(fit.camera, moved), self._v) - at) / step
-
-        prism = np.stack([by_prism(k) for k in range(len(self._v))], axis=1)
-        lens = np.stack([by_lens(name) for name in names], axis=1)
-        seen = np.isfinite(prism).all(axis=1) & np.isfinite(lens).all(axis=1)
-        follows = -np.linalg.lstsq(prism[seen], lens[seen], rcond=None)[0]
-        return self.space.deviations(self._v, self.covariance() + follows @ fit.covariance @ follows.T)
-
-    def _displacements(self, camera: Camera, v: Vector) -> Vector:
-        """Return the displacements of a grid of pixels over a turn [px], without their means, flattened.
-
-        The mean of a pixel moves its picture, not its events against each other.
-        """
-        space = replace(self.space, camera=camera)
-        x, y = np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 7))
-        xy, theta = np.stack([x.ravel(), y.ravel()], axis=1), np.linspace(0.0, math.tau, 12, endpoint=False)
-        points, angles = np.repeat(xy, 12, axis=0).astype(np.float32), np.tile(theta, len(xy)).astype(np.float32)
-        moved = space.build(space.to_values(v)).compensate_points(points, angles)
-        away = (np.asarray(moved, np.float64) - points).reshape(len(xy), 12, 2)
-        return np.asarray((away - away.mean(axis=1, keepdims=True)).ravel())
+    def systematic_of_index(self, fit: Fit) -> float:
+        """Return the standard deviation of the index that errors of the lens and of the orbits' shape cause."""
+        space = replace(self.full, camera=fit.camera, names=("apex", "phase", "index")).holding(self.values)
+        v = space.to_vector(self.values)
+        return space.deviations(v, _systematic(space, v, fit))["index"]
 
     def calibration(
         self, camera: Camera, values: Mapping[str, float], uncertainty: Mapping[str, float], seconds: float
@@ -618,6 +610,52 @@ class JointPrism:
             sharpness_after=search.sharpness_in(space, found), stages=(), events=len(search.calibration_events.events),
             seconds=seconds,
         )  # fmt: skip
+
+
+def _systematic(space: ParameterSpace, v: Vector, fit: Fit) -> Vector:
+    """Return the covariance of the prism's parameters that errors of the lens and of the orbits' shape cause [px²].
+
+    All but the first two parameters, the orbits' size and phase, change the shape of the orbits only, and how it varies
+    over the image.
+    """
+    at = _displacements(space, fit.camera, v)
+
+    def by_prism(k: int) -> Vector:
+        step = np.zeros(len(v))
+        step[k] = 0.05
+        return (_displacements(space, fit.camera, v + step) - at) / 0.05
+
+    def by_lens(name: str) -> Vector:
+        step = max(fit.deviations[name], 1e-9)
+        moved = {name: lens_values(fit.camera, [name])[name] + step}
+        return (_displacements(space, with_lens_values(fit.camera, moved), v) - at) / step
+
+    prism = np.stack([by_prism(k) for k in range(len(v))], axis=1)
+    lens = np.stack([by_lens(name) for name in fit.names], axis=1)
+    seen = np.isfinite(prism).all(axis=1) & np.isfinite(lens).all(axis=1)
+    prism, follows = prism[seen], -np.linalg.lstsq(prism[seen], lens[seen], rcond=None)[0]
+    centre = at.reshape(ROWS * COLUMNS, TURN, 2)[ROWS * COLUMNS // 2]
+    error_px = ORBIT_ERROR / rms(centre) ** 3
+    by_shape = np.zeros(len(v))
+    for k in range(2, len(v)):
+        others = np.delete(prism, k, axis=1)
+        own = prism[:, k] - others @ np.linalg.lstsq(others, prism[:, k], rcond=None)[0]
+        by_shape[k] = error_px / math.sqrt(2.0 * float(np.mean(own**2)))
+    return np.asarray(follows @ fit.covariance @ follows.T + np.diag(by_shape**2))
+
+
+def _displacements(space: ParameterSpace, camera: Camera, v: Vector) -> Vector:
+    """Return the displacements of a grid of pixels over a turn [px], without their means, flattened.
+
+    The mean of a pixel moves its picture, not its events against each other.
+    """
+    space = replace(space, camera=camera)
+    x, y = np.meshgrid(np.linspace(0, camera.width - 1, COLUMNS), np.linspace(0, camera.height - 1, ROWS))
+    xy, theta = np.stack([x.ravel(), y.ravel()], axis=1), np.linspace(0.0, math.tau, TURN, endpoint=False)
+    points, angles = np.repeat(xy, TURN, axis=0).astype(np.float32), np.tile(theta, len(xy)).astype(np.float32)
+    moved = space.build(space.to_values(v)).compensate_points(points, angles)
+    away = (np.asarray(moved, np.float64) - points).reshape(len(xy), TURN, 2)
+    return np.asarray((away - away.mean(axis=1, keepdims=True)).ravel())
 
 
 def _total(each: Sequence[Slopes]) -> Slopes:
