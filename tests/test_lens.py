@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import amiwarp
+from amiwarp.calib.parameters import make_space
 from amiwarp.cli.app import app
 from amiwarp.lens import calibration, corner_fit
 from amiwarp.lens import live as lens_live
@@ -192,6 +193,21 @@ def test_the_index_is_where_the_cost_of_the_poses_is_least(
         return
     assert index == pytest.approx(1.57, abs=1e-9 + 3.0 * off)
     assert off == pytest.approx(scatter / math.sqrt(12), rel=0.5, abs=1e-9)
+
+
+def test_a_small_orbit_tells_less_of_the_index_than_its_noise_says() -> None:
+    """The systematic error falls with the cube of the orbit, and the index's effect grows with the orbit."""
+    fit, off = fit_lens(ROUGH, BOARD, seen(0, CAMERA, noise=0.001)), []
+    for apex in (PRISM.apex, 2.0 * PRISM.apex):
+        full = make_space(
+            "exact", CAMERA, replace(PRISM, apex=apex), free=("apex", "phase", "index"), start={}, bounds={},
+            rad_per_us=75e-6, duration_us=250e3,
+        )  # fmt: skip
+        off.append(JointPrism({}, full, {}).systematic_of_index(fit))
+    assert off[0] > 0.05
+    assert off[1] == pytest.approx(off[0] / 16.0, rel=0.1)
+    worse = fit_lens(ROUGH, BOARD, seen(0, CAMERA, noise=0.05))
+    assert JointPrism({}, full, {}).systematic_of_index(worse) > 2.0 * off[1]  # so does an uncertain lens
 
 
 def test_two_boards_are_noticed() -> None:
