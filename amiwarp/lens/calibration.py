@@ -262,7 +262,7 @@ class LensWork:
     def run(self) -> LensCalibration:
         """Calibrate; raise :class:`AmiwarpError` as :func:`calibrate_lens` does."""
         began = time.perf_counter()
-        self._check_count(len(self.poses), "are given")
+        self._check_count(len(self.poses), "given")
         values = self._first_prism()
         joint = JointPrism(self._equations(values), self.full, values)
         shown, fit = None, None
@@ -308,8 +308,8 @@ class LensWork:
         if count < LEAST_POSES:
             reasons = "".join(f"; {name}: {why}" for name, why in self.left_out.items())
             raise AmiwarpError(
-                f"{count} poses of the board {what}, but a lens needs {LEAST_POSES} at least, better {GOOD_POSES}, "
-                f"tilted in different directions{reasons}"
+                f"a lens needs {LEAST_POSES} poses of the board or more, better {GOOD_POSES}, tilted in different "
+                f"directions; {what}: {count}{reasons}"
             )
 
     def _first_prism(self) -> dict[str, float]:
@@ -346,7 +346,7 @@ class LensWork:
                 out[pose.name] = Equations(pose.recording, search, search.settings.photometric.sensor)
             except AmiwarpError as error:
                 self.left_out[pose.name] = str(error).removeprefix(f"{pose.recording.name}: ")
-        self._check_count(len(out), "have enough events")
+        self._check_count(len(out), "with enough events")
         return out
 
     def pictures(
@@ -377,7 +377,7 @@ class LensWork:
         for name, corners in found.items():
             if corners is None:
                 self.left_out[name] = self.board.missing(pictures[name])
-        self._check_count(len(seen), "are seen")
+        self._check_count(len(seen), "seen")
         if matched:
             fit = fit_lens(self.camera, self.board, list(seen.values()))
             seen = {
@@ -395,7 +395,7 @@ class LensWork:
                 f"its corners miss by {misses[worst]:.2f} px rms, those of the others by {usual:.2f} px"
             )
             del seen[worst]
-            self._check_count(len(seen), "fit together")
+            self._check_count(len(seen), "that fit together")
         return fit, seen
 
     def _drop_unexplained(self, joint: JointPrism) -> None:
@@ -413,7 +413,7 @@ class LensWork:
                     "the board moves, or the encoder's zero changed; use an index pulse"
                 )
                 del joint.equations[name]
-        self._check_count(len(joint.equations), "agree on the prism")
+        self._check_count(len(joint.equations), "that agree on the prism")
 
     def _whole_prism(self, joint: JointPrism, fit: Fit) -> tuple[dict[str, float], dict[str, float], tuple[str, ...]]:
         """Return all parameters of the prism, their standard deviations, and what the events do not determine.
