@@ -32,13 +32,13 @@ from amiwarp.lens.corner_fit import first_pose, fit_lens, match_corners
 from amiwarp.lens.live import StillSpans
 from amiwarp.lens.poses import Pose, still_poses
 from amiwarp.live.stream import session
+from tests.test_stream_returning import LONG_S
 
 BOARD = amiwarp.Board(6, 5, 0.03)
 CAMERA = amiwarp.Camera(320, 240, 262.0, 261.0, 163.0, 117.0, amiwarp.RadialTangential(k1=-0.1, k2=0.02))
 ROUGH = amiwarp.Camera.from_fov(320, 240, 2.0 * math.atan(160.0 / 240.0))
 FISHEYE = amiwarp.Camera(320, 240, 150.0, 150.5, 161.0, 118.0, amiwarp.Fisheye(-0.02, 0.004))
 PRISM, PHASE = amiwarp.Prism(math.radians(1.0)), 0.7
-LONG_S = 60.0
 
 
 def placed(rng: np.random.Generator, camera: amiwarp.Camera, count: int, tilt: tuple[float, float]) -> list[tuple]:

@@ -458,13 +458,14 @@ class LensWork:
                 joint.refine(self.camera, ("apex", "phase"))
                 index, off = ask(names)
         sure = off < LARGEST_DEVIATION["index"]
+        another = sure and differs(CERTAIN)
         if joint.values != given:
             joint.values = given
-            joint.set_index(index if sure and differs(CERTAIN) else given["index"])
+            joint.set_index(index if another else given["index"])
             joint.refine(self.camera, ("apex", "phase"))
         if not sure:
             notes.append(f"the index of the prism is not determined, and stays as given, {given['index']:g}")
-        return off if sure and differs(CERTAIN) else 0.0
+        return off if another else 0.0
 
 
 ALL_FREE = ("apex", "phase", "tilt_x", "tilt_y", "index")

@@ -67,7 +67,7 @@ class Panel(layout.Actions):
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
         self._rates: EventRates
         self._progress: JobProgress | None = None
-        self._knobs_shown: dict[str, Any] = {}  # parameters and model as the page was last told
+        self._knobs_shown: dict[str, Any] = {}  # parameters and model that were last sent to the page
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
         self._downloads = 0
         use_page(server, layout.template(), self._folder.name)
