@@ -87,6 +87,35 @@ def test_corners_give_the_lens_within_its_deviations(camera: amiwarp.Camera) -> 
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.6
 
 
+def test_deviations_hold_errors_that_the_corners_of_a_pose_share() -> None:
+    ratios = []
+    for seed in range(5):
+        rng, corners = np.random.default_rng(seed), []
+        for each in seen(seed, CAMERA, noise=0.005):
+            u, v = (BOARD.points[each.ids][:, :2] / BOARD.points.max() - 0.4).T
+            bent = np.stack([u * u, u * v, v * v, u**3, v**3], axis=1) @ rng.normal(0.0, 0.06, (5, 2))
+            corners.append(replace(each, xy=each.xy + bent))
+        fit = fit_lens(ROUGH, BOARD, corners)
+        ratios += [(getattr(fit.camera, n) - getattr(CAMERA, n)) / fit.deviations[n] for n in ("fx", "fy", "cx", "cy")]
+    assert 0.5 < np.sqrt(np.mean(np.square(ratios))) < 1.6
+
+
+def test_only_events_for_which_the_lens_is_known_determine_the_prism() -> None:
+    wide = calibration.first_camera((320, 240), None, math.radians(120.0), fisheye=True)
+    work = calibration.LensWork(BOARD, wide, [], "cpu", lambda *_: None)
+    y, x = np.indices((240, 320))
+    angle = np.hypot(x - 159.5, y - 119.5) / wide.fx
+    assert work.inside[angle < math.radians(44.9)].all()
+    assert not work.inside[angle > math.radians(45.1)].any()
+    assert calibration.LensWork(BOARD, ROUGH, [], "cpu", lambda *_: None).inside.all()  # 67 deg across
+    corners = Corners(np.arange(4), np.array([[50.0, 40.0], [200.0, 60.0], [190.0, 180.0], [60.0, 170.0]]))
+    between = work._between({"pose": corners})
+    assert between[100, 100]
+    assert between[180, 190]
+    assert not between[100, 210]
+    assert not between[45, 150]  # above the line from the first corner to the second
+
+
 def test_a_corner_far_off_hardly_counts() -> None:
     corners = seen(3, CAMERA, noise=0.05)
     corners[4].xy[7] += 5.0
@@ -211,7 +240,7 @@ def test_a_small_orbit_tells_less_of_the_index_than_its_noise_says() -> None:
         off.append(JointPrism({}, full, {}).systematic_of_index(fit))
     assert off[0] > 0.05
     assert off[1] == pytest.approx(off[0] / 16.0, rel=0.1)
-    worse = fit_lens(ROUGH, BOARD, seen(0, CAMERA, noise=0.05))
+    worse = fit_lens(ROUGH, BOARD, seen(0, CAMERA, noise=0.1))
     assert JointPrism({}, full, {}).systematic_of_index(worse) > 2.0 * off[1]  # so does an uncertain lens
 
 

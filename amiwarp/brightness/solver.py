@@ -1048,8 +1048,12 @@ class BrightnessMap:
         squares, number = partial.numpy().sum(axis=1).tolist()
         if squares <= CONTRAST * number:
             return False
-        self._prior.damping.fill_(DAMPING * CONTRAST * number / squares)
+        self.set_damping(DAMPING * CONTRAST * number / squares)
         return True
+
+    def set_damping(self, damping: float) -> None:
+        """Change the damping; the map remains, and must be solved again."""
+        self._prior.damping.fill_(damping)
 
     def prepare_projection(self) -> None:
         """Prepare :meth:`unexplained` with the weights that the last :meth:`solve` set."""

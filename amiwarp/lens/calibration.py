@@ -25,12 +25,12 @@ from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import PhotometricSettings, Settings
 from amiwarp.calib.sharpness import Search
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
-from amiwarp.lens.board import Board, Corners
+from amiwarp.events.recording import MemoryEvents, Recording
+from amiwarp.lens.board import Board, Corners, opencv
 from amiwarp.lens.corner_fit import Fit, fit_lens, lens_values, match_corners, tilt_of, with_lens_values
 from amiwarp.lens.poses import Pose, still_poses
 from amiwarp.optics.camera import Camera, Fisheye
-from amiwarp.optics.models import ExactModel, predicted_error, rms
+from amiwarp.optics.models import ExactModel, Model, rms
 from amiwarp.optics.prism import Prism
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.picture import Reconstruction
@@ -46,7 +46,7 @@ SMOOTHNESS = 0.02
 """Weight of the pictures' smoothness prior. Choosing it for each picture takes as long as the picture; the corners'
 errors change by a tenth between 0.02 and 0.1."""
 FIRST_POSES = 6
-"""Number of poses whose pictures give the first lens, with which the pictures of all poses are made."""
+"""Number of poses that give the first prism and lens, with which the pictures of all poses are made."""
 MOST_PASSES, ENOUGH_PX = 4, 0.08
 """Largest number of times that the pictures are made, and the change of the compensation by a new lens from which on
 they are made again [px rms]. A change of 0.36 px moved the principal point by 1.5 px."""
@@ -55,14 +55,20 @@ SIZES = (0.6, 1.6)
 the nominal prism by 20 %. A wider range lets an orbit as large as a square of the board match another square."""
 SEARCHED = 3
 """Number of poses in which the prism is searched by sharpness. Each answer is tried on the others."""
-PAIRS = 600_000
-"""Number of pairs of events of all poses together, and at most a sixth of it in one pose."""
+PAIRS, FINE_PAIRS = 600_000, 1_200_000
+"""Number of pairs of events of all poses together, and at most a sixth of it in one pose: at first, and with the last
+lens, when maps have several nodes per pixel. Maps with one make small orbits too large, a radius of 3 px by 0.4 %."""
+BOARD_DAMPING = 0.00125
+"""Damping of the fine maps. Most of a board is flat, so it gets no smaller damping for its contrast; the usual one, of
+0.02, made orbits of 2.4 px too large by 0.1 %."""
+STEEPEST = math.radians(45.0)
+"""Largest angle from the optical axis of the events that are used with the rough lens [rad]. Farther out, orbits grow
+so fast with the angle that a wrong focal length gives a wrong prism."""
 FIRST_TOLERANCE_PX = 0.01
 """Length of a step that ends the search for the prism with a lens that is not the last one [px]."""
-MOST_STEPS, STEPS_OF_ALL, TOLERANCE_PX, LARGEST_GAIN = 10, 2, 0.001, 5.0
-"""Largest number of steps towards size and phase of the prism, and to see whether its other parameters differ from
-their nominal values; length of a step that ends them [px]; and the largest factor by which a step is lengthened,
-because the weights of outliers make Gauss-Newton steps too short."""
+MOST_STEPS, TOLERANCE_PX, LARGEST_GAIN = 10, 0.001, 5.0
+"""Largest number of steps towards the prism; length of a step that ends them [px]; and the largest factor by which a
+step is lengthened, because the weights of outliers make Gauss-Newton steps too short."""
 PROBED, PROBE_PX = 3, 0.05
 """Every which pose tells how the gradient changes, and the step of the parameters that shows it [px]."""
 BAD_COST = 1.6
@@ -76,11 +82,11 @@ CERTAIN, DOUBTFUL = 4.0, 1.5
 the index from which on a third of the poses let all of them be asked."""
 LARGEST_DEVIATION = {"index": 0.02, "tilt": math.radians(0.5)}
 """Standard deviation above which an index or a tilt [rad] counts as not determined."""
-ORBIT_ERROR = 0.35
-"""Standard deviation of errors of the orbits' shape that all poses share [px], times the cube of the orbits' radius at
-the centre of the image [px]. Maps are looked up bilinearly, which follows the picture less within a small orbit:
-indices came out too large, by 0.003 px of shape in orbits of 4.7 px, 0.012 to 0.018 px in 3 px, and less than 0.001 px
-in 6 px."""
+SIZE_ERROR, SHAPE_ERROR = 0.08, 0.35
+"""Standard deviations of errors of the orbits' size and of their shape that all poses share [px], times the cube of the
+orbits' radius at the centre of the image [px]. Maps are looked up bilinearly, which follows the picture less within a
+small orbit: indices came out too large, by 0.003 px of shape in orbits of 4.7 px, 0.012 to 0.018 px in 3 px, and less
+than 0.001 px in 6 px."""
 REGIONS = (("upper", "middle", "lower"), ("left", "centre", "right"))
 """Names of the nine regions of the image in which corners are counted."""
 STEEP = math.radians(15.0)
@@ -258,26 +264,41 @@ class LensWork:
     progress: Progress
     left_out: dict[str, str] = field(default_factory=dict)
     """Reason by name of each pose that was left out."""
+    inside: NDArray[np.bool_] = field(init=False)
+    """Pixels whose events determine the prism, those for which the lens is known; shape (height, width)."""
+
+    def __post_init__(self) -> None:
+        self.inside = self._before_the_lens()
 
     def run(self) -> LensCalibration:
         """Calibrate; raise :class:`AmiwarpError` as :func:`calibrate_lens` does."""
         began = time.perf_counter()
         self._check_count(len(self.poses), "given")
         values = self._first_prism()
-        joint = JointPrism(self._equations(values), self.full, values)
-        shown, fit = None, None
-        for k in range(MOST_PASSES):
+        everyone = [pose.name for pose in self.poses]
+        equations = self._equations(_some(everyone), values, 0)
+        if len(equations) < LEAST_POSES:
+            equations |= self._equations([name for name in everyone if name not in _some(everyone)], values, 0)
+        self._check_count(len(equations), "with enough events")
+        joint = JointPrism(equations, self.full, values)
+        shown, fit, seen = joint.model(self.camera, values), None, dict[str, Corners]()
+        for k in range(MOST_PASSES + 1):
             self.progress("prism", (k + 0.1) / (MOST_PASSES + 1))
+            if k == 2:  # the first lens was that of some of the poses
+                self.inside = self._between(seen)
+                equations = self._equations(everyone, joint.values, k, fine=True)
+                self._check_count(len(equations), "with enough events")
+                joint.use(equations, self.inside)
             values = joint.refine(
                 self.camera, ("apex", "phase"), tolerance=TOLERANCE_PX if k > 1 else FIRST_TOLERANCE_PX
             )
-            if k > 0:  # the rough lens explains no pose well
-                self._drop_unexplained(joint)
+            bad = self._drop_unexplained(joint) if k > 1 else []  # the first lenses explain no pose well
             model = joint.model(self.camera, values)
-            if k > 1 and shown is not None and predicted_error(model, shown, grid=12).rms < ENOUGH_PX:
+            if k == MOST_PASSES or (k > 1 and not bad and self._change(shown, model) < ENOUGH_PX):
                 break
-            shown, names = model, [name for name in joint.equations if k == 1 or name not in self.left_out]
-            first = names if k else names[:: max(1, len(names) // FIRST_POSES)]
+            everyone = [name for name in everyone if name not in bad]
+            shown, names = model, [name for name in everyone if k == 1 or name not in self.left_out]
+            first = names if k else _some(names)
             pictures = self.pictures(model, first, k, turns=1.0 if k else 0.5)
             try:
                 fit, seen = self._lens(pictures, matched=k > 0)
@@ -286,6 +307,7 @@ class LensWork:
                 if not rest:
                     raise
                 fit, seen = self._lens(pictures | self.pictures(model, rest, k, turns=0.5), matched=k > 0)
+            joint.values["apex"] *= self.camera.fx / fit.camera.fx  # the orbit stays as large
             self.camera = fit.camera
         assert fit is not None
         values, uncertainty, notes = self._whole_prism(joint, fit)
@@ -315,7 +337,7 @@ class LensWork:
     def _first_prism(self) -> dict[str, float]:
         """Return the prism's parameters by sharpness: the answer of one pose that is best for all poses searched."""
         chosen = self.poses[:: max(1, len(self.poses) // SEARCHED)][:SEARCHED]
-        searches = [self.search(pose, ("apex", "phase"), {}) for pose in chosen]
+        searches = [self.search(pose, ("apex", "phase"), {})[1] for pose in chosen]
         for k, search in enumerate(searches):
             self.progress("search", 0.1 * k / len(searches) / (MOST_PASSES + 1))
             search.run()
@@ -323,30 +345,38 @@ class LensWork:
         totals = [sum(s.fine.measure(a)[0] / s.score for s in searches) for a in answers]
         return answers[int(np.argmax(totals))]
 
-    def search(self, pose: Pose, free: tuple[str, ...], start: Mapping[str, float]) -> Search:
-        """Return the search for some parameters of the prism by sharpness, in one pose."""
-        recording = replace(pose.recording, camera=self.camera)
+    def search(
+        self, pose: Pose, free: tuple[str, ...], start: Mapping[str, float], *, fine: bool = False
+    ) -> tuple[Recording, Search]:
+        """Return the search for some parameters of the prism by sharpness, in one pose, and its recording."""
+        events, size = pose.recording.events.slice(0, len(pose.recording.events)), pose.recording.events.size
+        events = events[self.inside[events.y, events.x]]
+        recording = replace(pose.recording, camera=self.camera, events=MemoryEvents(events, *size))
         prism = recording.prism
         bounds = {"apex": (SIZES[0] * prism.apex, SIZES[1] * prism.apex)} if isinstance(prism, Prism) else {}
-        pairs = min(PAIRS // 6, PAIRS // len(self.poses))
-        settings = Settings(
-            model="exact", free=free, start=start, bounds=bounds, photometric=PhotometricSettings(pairs=pairs)
-        )
-        return prepare(recording, settings, device=self.device)[0]
+        pairs, density = (FINE_PAIRS, 2.0) if fine else (PAIRS, 1.0)
+        pairs = min(pairs // 6, pairs // len(self.poses))
+        photometric = PhotometricSettings(pairs=pairs, density=density)
+        settings = Settings(model="exact", free=free, start=start, bounds=bounds, photometric=photometric)
+        return recording, prepare(recording, settings, device=self.device)[0]
 
-    def _equations(self, values: Mapping[str, float]) -> dict[str, Equations]:
-        """Return the photometric equations of every pose, by name; a pose without enough events is left out."""
-        out = {}
-        for k, pose in enumerate(self.poses):
-            self.progress("events", (0.1 + 0.4 * k / len(self.poses)) / (MOST_PASSES + 1))
-            search = self.search(pose, ALL_FREE, values)
+    def _equations(
+        self, names: Sequence[str], values: Mapping[str, float], done: int, *, fine: bool = False
+    ) -> dict[str, Equations]:
+        """Return the photometric equations of some poses, by name, with fine maps or not. ``done`` passes are over.
+
+        A pose without enough events is left out.
+        """
+        out, poses = {}, [pose for pose in self.poses if pose.name in names]
+        for k, pose in enumerate(poses):
+            self.progress("events", (done + 0.1 * k / len(poses)) / (MOST_PASSES + 1))
+            recording, search = self.search(pose, ALL_FREE, values, fine=fine)
             self.full, search.best = search.full_space, dict(search.full_space.start) | dict(values)
             search.full_space = self.full.without(like_size(self.full.names))  # those would ask for a coarse map
             try:
-                out[pose.name] = Equations(pose.recording, search, search.settings.photometric.sensor)
+                out[pose.name] = Equations(recording, search, search.settings.photometric.sensor)
             except AmiwarpError as error:
                 self.left_out[pose.name] = str(error).removeprefix(f"{pose.recording.name}: ")
-        self._check_count(len(out), "with enough events")
         return out
 
     def pictures(
@@ -398,22 +428,42 @@ class LensWork:
             self._check_count(len(seen), "that fit together")
         return fit, seen
 
-    def _drop_unexplained(self, joint: JointPrism) -> None:
-        """Leave out the poses whose events the prism of all poses does not explain."""
+    def _before_the_lens(self) -> NDArray[np.bool_]:
+        """Return the pixels whose events are used with the rough lens, shape (height, width)."""
+        camera = self.camera
+        xy = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).reshape(-1, 2)
+        along = np.asarray(camera.pixels_to_rays(xy.astype(np.float64)))[:, 2]
+        return (along > math.cos(STEEPEST)).reshape(camera.height, camera.width)
+
+    def _between(self, seen: Mapping[str, Corners]) -> NDArray[np.bool_]:
+        """Return the pixels between the corners of all poses, shape (height, width)."""
+        cv2, inside = opencv(), np.zeros((self.camera.height, self.camera.width), np.uint8)
+        xy = np.concatenate([corners.xy for corners in seen.values()])
+        cv2.fillConvexPoly(inside, cv2.convexHull(np.rint(xy).astype(np.int32)), 1)
+        return inside > 0
+
+    def _change(self, old: ExactModel, new: ExactModel) -> float:
+        """Return the change of the compensation from one model to another [px rms]."""
+        xy = _places(self.inside)
+        return rms((_moved(new, xy) - _moved(old, xy)).reshape(-1, 2))
+
+    def _drop_unexplained(self, joint: JointPrism) -> list[str]:
+        """Leave out the poses whose events the prism of all poses does not explain, and return their names."""
         usual = float(np.median([*joint.costs.values()]))
         if usual > LARGEST_COST:
             raise AmiwarpError(
                 f"no prism explains the events of the poses (cost {usual:.2f}, at most {LARGEST_COST:g}): hold "
                 "the board still, with the same zero of the encoder in all recordings"
             )
-        for name, cost in joint.costs.items():
-            if cost > BAD_COST * usual:
-                self.left_out[name] = (
-                    f"the prism of the other poses does not explain its events (cost {cost:.2f}, usual {usual:.2f}): "
-                    "the board moves, or the encoder's zero changed; use an index pulse"
-                )
-                del joint.equations[name]
+        bad = [name for name, cost in joint.costs.items() if cost > BAD_COST * usual]
+        for name in bad:
+            self.left_out[name] = (
+                f"the prism of the other poses does not explain its events (cost {joint.costs[name]:.2f}, usual "
+                f"{usual:.2f}): the board moves, or the encoder's zero changed; use an index pulse"
+            )
+            del joint.equations[name]
         self._check_count(len(joint.equations), "that agree on the prism")
+        return bad
 
     def _whole_prism(self, joint: JointPrism, fit: Fit) -> tuple[dict[str, float], dict[str, float], tuple[str, ...]]:
         """Return all parameters of the prism, their standard deviations, and what the events do not determine.
@@ -422,15 +472,15 @@ class LensWork:
         """
         notes = list[str]()
         index_off = self._free_index(joint, fit, notes)
-        values, deviations = dict(joint.values), joint.deviations(fit)
-        whole = joint.refine(self.camera, TILTED, STEPS_OF_ALL)
-        off = joint.deviations(fit)
-        joint.values = values
+        joint.linearise(self.camera, TILTED)
+        values, deviations, off = dict(joint.values), joint.deviations(TILTED[:2], fit), joint.deviations(TILTED, fit)
+        better = joint.step()
         if max(off[n] for n in TILTED[2:]) > LARGEST_DEVIATION["tilt"]:
             notes.append("the tilt of the prism is not determined, and stays as given")
-        elif any(abs(whole[n] - values[n]) > CERTAIN * off[n] for n in TILTED[2:]):
+        elif any(abs(better[n] - values[n]) > CERTAIN * off[n] for n in TILTED[2:]):
             values = joint.refine(self.camera, TILTED)
-            deviations = joint.deviations(fit)
+            joint.linearise(self.camera, TILTED)
+            deviations = joint.deviations(TILTED, fit)
         if index_off:
             by_index = values["apex"] / (values["index"] - 1.0) * index_off
             deviations = {**deviations, "apex": math.hypot(deviations["apex"], by_index), "index": index_off}
@@ -476,8 +526,8 @@ INDEX_STEP, INDEX_STEPS, INDEX_ROUNDS = 0.1, 4, 2
 the comparison is repeated about its answer: the maps are biased to the index of their fit."""
 
 
-ROWS, COLUMNS, TURN = 7, 9, 12
-"""Numbers of rows and columns of pixels, and of angles of a turn, on which displacements are compared."""
+PLACES, TURN = 63, 12
+"""Numbers of pixels, and of angles of a turn, on which displacements are compared."""
 
 
 class JointPrism:
@@ -488,15 +538,27 @@ class JointPrism:
         self.equations, self.full = dict(equations), full
         self.values = dict(full.start) | dict(values)
         """Present values of all parameters."""
+        self.inside: NDArray[np.bool_] | None = None
+        """Pixels whose events are used, shape (height, width); all if None."""
         self.costs: dict[str, float] = {}
         """Cost of each pose relative to that without a map, by name."""
         self.space: ParameterSpace
-        """Space of the last fit, its vector, and the derivatives of each pose's cost there."""
-        self._v, self._each = np.zeros(0), list[Slopes]()
+        """Space of the last fit or linearisation."""
+        self._each: list[Slopes]
+        self._longer = 1.0
 
     def model(self, camera: Camera, values: Mapping[str, float]) -> ExactModel:
         """Return the optical model of some parameter values."""
         return ExactModel.from_values(camera, self.full.prism, values)
+
+    def use(self, equations: Mapping[str, Equations], inside: NDArray[np.bool_]) -> None:
+        """Go on with the equations of the events ``inside``, weighted alike in all poses, and with little damping."""
+        self.equations, self.inside = dict(equations), inside
+        costs = [each.answers.cost for each in self.equations.values()]
+        usual = float(np.median([cost.scale for cost in costs]))
+        for cost in costs:
+            cost.scale = usual
+            cost.brightness.set_damping(BOARD_DAMPING)
 
     def refine(
         self, camera: Camera, names: tuple[str, ...], most: int = MOST_STEPS, tolerance: float = TOLERANCE_PX,
@@ -506,14 +568,11 @@ class JointPrism:
 
         A step shorter than ``tolerance`` [px] ends the fit. Without names of ``poses`` all are used.
         """
-        costs = {name: self.equations[name].answers.cost for name in poses or self.equations}
-        for cost in costs.values():
-            cost.space = replace(self.full, camera=camera, names=names).holding(self.values)
-        self.space = space = next(iter(costs.values())).space
-        v, last, gain = space.to_vector(self.values), np.zeros(0), 1.0
+        costs = self._costs(camera, names, poses)
+        space = self.space
+        v, last, gain = space.to_vector(self.values), np.zeros(0), self._longer
         for _ in range(most):
-            self._each = self._slopes(costs.values(), v)
-            step = _total(self._each).step()
+            step = _total(self._slopes(costs.values(), v)).step()
             if len(last):  # the weights of outliers make steps too short, by the same factor: take their sum
                 left = 1.0 - (1.0 - float(step @ last) / max(float(last @ last), 1e-12)) / gain
                 gain = 1.0 / (1.0 - min(max(left, 0.0), 1.0 - 1.0 / LARGEST_GAIN))
@@ -521,7 +580,7 @@ class JointPrism:
             if len(last) and gain * float(np.abs(step).max()) < tolerance:
                 break
             last = step
-        self._v = v
+        self._longer = gain
         self.costs = {name: cost.mean() for name, cost in costs.items()}
         self.values = {**self.values, **space.to_values(v)}
         return dict(self.values)
@@ -562,6 +621,14 @@ class JointPrism:
         off = 0.5 * INDEX_STEP * math.sqrt((len(without) - 1) * float(np.var(without)))
         return middle - 0.5 * INDEX_STEP * float(slope.sum() / bend.sum()), off
 
+    def _costs(self, camera: Camera, names: tuple[str, ...], poses: Iterable[str] = ()) -> dict[str, Cost]:
+        """Return the costs of some poses, or of all, by name, as functions of the parameters ``names``."""
+        self.space = replace(self.full, camera=camera, names=names).holding(self.values)
+        costs = {name: self.equations[name].answers.cost for name in poses or self.equations}
+        for cost in costs.values():
+            cost.space = self.space
+        return costs
+
     def _slopes(self, costs: Iterable[Cost], v: Vector) -> list[Slopes]:
         """Return the derivatives of the cost of each pose at a vector of parameters."""
         out = []
@@ -571,31 +638,80 @@ class JointPrism:
             out.append(cost.slopes(v, with_parts=True))
         return out
 
-    def covariance(self) -> Vector:
-        """Return the covariance of the fitted parameters [px²], from the scatter of the poses and within them.
+    def linearise(self, camera: Camera, names: tuple[str, ...]) -> None:
+        """Find how the costs of all poses change with the parameters ``names`` at the present values.
 
         The weights of outliers change with the parameters. So the gradient at a board changes only a third as fast as
         the Gauss-Newton Hessian says. Some of the poses tell the factor, for size and phase.
         """
-        total, some = _total(self._each), [*self.equations.values()][::PROBED]
-        of_poses = replace(total, parts=np.stack([s.gradient for s in self._each], axis=1))
-        at, changes = _total(self._slopes([e.answers.cost for e in some], self._v)), []
-        for unit in np.eye(len(self._v))[:2]:
-            moved = _total(self._slopes([e.answers.cost for e in some], self._v + PROBE_PX * unit))
-            changes.append((moved.gradient - at.gradient)[:2] / PROBE_PX)
-        shares = np.linalg.eigvals(np.linalg.solve(at.hessian[:2, :2], np.stack(changes, axis=1))).real
-        longer = 1.0 / np.clip(shares.mean(), 1.0 / LARGEST_GAIN, 1.0)
-        return np.asarray(longer**2 * (total.covariance() + of_poses.covariance()))
+        some = self._costs(camera, TILTED[:2], [*self.equations][::PROBED]).values()
+        v, changes = self.space.to_vector(self.values), []
+        at = _total(self._slopes(some, v))
+        for unit in np.eye(2):
+            moved = _total(self._slopes(some, v + PROBE_PX * unit))
+            changes.append((moved.gradient - at.gradient) / PROBE_PX)
+        shares = np.linalg.eigvals(np.linalg.solve(at.hessian, np.stack(changes, axis=1))).real
+        self._longer = 1.0 / float(np.clip(shares.mean(), 1.0 / LARGEST_GAIN, 1.0))
+        costs = self._costs(camera, names).values()
+        self._each = self._slopes(costs, self.space.to_vector(self.values))
 
-    def deviations(self, fit: Fit) -> dict[str, float]:
-        """Return the standard deviations of the fitted parameters, with those that lens and orbits' shape cause."""
-        return self.space.deviations(self._v, self.covariance() + _systematic(self.space, self._v, fit))
+    def step(self) -> dict[str, float]:
+        """Return the values to which :meth:`linearise` points."""
+        return self.space.to_values(self.space.to_vector(self.values) + self._longer * _total(self._each).step())
+
+    def deviations(self, names: tuple[str, ...], fit: Fit) -> dict[str, float]:
+        """Return the standard deviations of some parameters that are linearised, with the others held.
+
+        They come from the scatter of the poses and within them, and from errors of the lens and of the orbits.
+        """
+        each = [slopes.restricted_to([self.space.names.index(n) for n in names]) for slopes in self._each]
+        total, space = _total(each), replace(self.space, names=names)
+        of_poses = replace(total, parts=np.stack([s.gradient for s in each], axis=1))
+        v, random = space.to_vector(self.values), self._longer**2 * (total.covariance() + of_poses.covariance())
+        return space.deviations(v, random + self._systematic(space, v, fit))
 
     def systematic_of_index(self, fit: Fit) -> float:
         """Return the standard deviation of the index that errors of the lens and of the orbits' shape cause."""
         space = replace(self.full, camera=fit.camera, names=("apex", "phase", "index")).holding(self.values)
         v = space.to_vector(self.values)
-        return space.deviations(v, _systematic(space, v, fit))["index"]
+        return space.deviations(v, self._systematic(space, v, fit))["index"]
+
+    def _systematic(self, space: ParameterSpace, v: Vector, fit: Fit) -> Vector:
+        """Return the covariance of the prism's parameters that errors of the lens and of the orbits cause [px²].
+
+        The first two parameters are the orbits' size and phase. The others change the shape of the orbits only, and how
+        it varies over the image.
+        """
+        size = (fit.camera.height, fit.camera.width)
+        xy = _places(np.ones(size, bool) if self.inside is None else self.inside)
+
+        def with_prism(k: int) -> Vector:
+            step = np.zeros(len(v))
+            step[k] = 0.05
+            return (_displacements(space, fit.camera, v + step, xy) - at) / 0.05
+
+        def with_lens(name: str) -> Vector:
+            step = max(fit.deviations[name], 1e-9)
+            moved = {name: lens_values(fit.camera, [name])[name] + step}
+            return (_displacements(space, with_lens_values(fit.camera, moved), v, xy) - at) / step
+
+        at = _displacements(space, fit.camera, v, xy)
+        prism = np.stack([with_prism(k) for k in range(len(v))], axis=1)
+        lens = np.stack([with_lens(name) for name in fit.names], axis=1)
+        seen = np.isfinite(prism).all(axis=1) & np.isfinite(lens).all(axis=1)
+        prism, follows = prism[seen], -np.linalg.lstsq(prism[seen], lens[seen], rcond=None)[0]
+        middle = np.array([[fit.camera.cx, fit.camera.cy]])
+        cube = rms(_displacements(space, fit.camera, v, middle).reshape(-1, 2)) ** 3
+        larger = np.zeros(len(v))
+        larger[:2] = v[:2] / np.linalg.norm(v[:2]) if space.cartesian else (1.0, 0.0)
+        by_size = SIZE_ERROR / cube / math.sqrt(2.0 * float(np.mean((prism @ larger) ** 2))) * larger
+        by_shape = np.zeros(len(v))
+        for k in range(2, len(v)):
+            others = np.delete(prism, k, axis=1)
+            own = prism[:, k] - others @ np.linalg.lstsq(others, prism[:, k], rcond=None)[0]
+            by_shape[k] = SHAPE_ERROR / cube / math.sqrt(2.0 * float(np.mean(own**2)))
+        by_lens = follows @ fit.covariance @ follows.T
+        return np.asarray(by_lens + np.outer(by_size, by_size) + np.diag(by_shape**2))
 
     def calibration(
         self, camera: Camera, values: Mapping[str, float], uncertainty: Mapping[str, float], seconds: float
@@ -613,49 +729,31 @@ class JointPrism:
         )  # fmt: skip
 
 
-def _systematic(space: ParameterSpace, v: Vector, fit: Fit) -> Vector:
-    """Return the covariance of the prism's parameters that errors of the lens and of the orbits' shape cause [px²].
-
-    All but the first two parameters, the orbits' size and phase, change the shape of the orbits only, and how it varies
-    over the image.
-    """
-    at = _displacements(space, fit.camera, v)
-
-    def by_prism(k: int) -> Vector:
-        step = np.zeros(len(v))
-        step[k] = 0.05
-        return (_displacements(space, fit.camera, v + step) - at) / 0.05
-
-    def by_lens(name: str) -> Vector:
-        step = max(fit.deviations[name], 1e-9)
-        moved = {name: lens_values(fit.camera, [name])[name] + step}
-        return (_displacements(space, with_lens_values(fit.camera, moved), v) - at) / step
-
-    prism = np.stack([by_prism(k) for k in range(len(v))], axis=1)
-    lens = np.stack([by_lens(name) for name in fit.names], axis=1)
-    seen = np.isfinite(prism).all(axis=1) & np.isfinite(lens).all(axis=1)
-    prism, follows = prism[seen], -np.linalg.lstsq(prism[seen], lens[seen], rcond=None)[0]
-    centre = at.reshape(ROWS * COLUMNS, TURN, 2)[ROWS * COLUMNS // 2]
-    error_px = ORBIT_ERROR / rms(centre) ** 3
-    by_shape = np.zeros(len(v))
-    for k in range(2, len(v)):
-        others = np.delete(prism, k, axis=1)
-        own = prism[:, k] - others @ np.linalg.lstsq(others, prism[:, k], rcond=None)[0]
-        by_shape[k] = error_px / math.sqrt(2.0 * float(np.mean(own**2)))
-    return np.asarray(follows @ fit.covariance @ follows.T + np.diag(by_shape**2))
+def _some(names: Sequence[str]) -> Sequence[str]:
+    """Return about :data:`FIRST_POSES` of the names of poses, evenly chosen."""
+    return names[:: max(1, len(names) // FIRST_POSES)]
 
 
-def _displacements(space: ParameterSpace, camera: Camera, v: Vector) -> Vector:
-    """Return the displacements of a grid of pixels over a turn [px], without their means, flattened.
+def _places(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return :data:`PLACES` of the pixels that are marked in an image, evenly chosen, as x and y."""
+    yx = np.argwhere(inside)
+    return yx[np.linspace(0, len(yx) - 1, PLACES).astype(np.int64), ::-1]
+
+
+def _moved(model: Model, xy: NDArray[Any]) -> Vector:
+    """Return how a model moves pixels, shape (n, 2), over a turn [px], shape (n, TURN, 2)."""
+    theta = np.linspace(0.0, math.tau, TURN, endpoint=False)
+    points, angles = np.repeat(xy, TURN, axis=0).astype(np.float32), np.tile(theta, len(xy)).astype(np.float32)
+    moved = np.asarray(model.compensate_points(points, angles), np.float64) - points
+    return np.asarray(moved.reshape(len(xy), TURN, 2))
+
+
+def _displacements(space: ParameterSpace, camera: Camera, v: Vector, xy: NDArray[Any]) -> Vector:
+    """Return the displacements of pixels over a turn [px] without their means, flattened.
 
     The mean of a pixel moves its picture, not its events against each other.
     """
-    space = replace(space, camera=camera)
-    x, y = np.meshgrid(np.linspace(0, camera.width - 1, COLUMNS), np.linspace(0, camera.height - 1, ROWS))
-    xy, theta = np.stack([x.ravel(), y.ravel()], axis=1), np.linspace(0.0, math.tau, TURN, endpoint=False)
-    points, angles = np.repeat(xy, TURN, axis=0).astype(np.float32), np.tile(theta, len(xy)).astype(np.float32)
-    moved = space.build(space.to_values(v)).compensate_points(points, angles)
-    away = (np.asarray(moved, np.float64) - points).reshape(len(xy), TURN, 2)
+    away = _moved(replace(space, camera=camera).build(space.to_values(v)), xy)
     return np.asarray((away - away.mean(axis=1, keepdims=True)).ravel())
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,9 @@ out."""
 LARGEST_FOCAL_DEVIATION = 0.005
 """Largest relative standard deviation of the focal length of an answer."""
 UNDETERMINED, TILT = "the poses do not determine the focal length", "tilt it by 20 to 40 deg in different directions"
+ENOUGH_TO_LEAVE_ONE = 8
+"""Number of poses from which on the lens is determined without any one of them, so that their scatter tells its
+deviation; with fewer, the scatter of the corners does."""
 HUBER = 2.0
 """Residual from which on a corner gets less weight [standard deviations]."""
 ROUNDS, MOST_STEPS = 3, 60
@@ -266,11 +270,30 @@ def _fit(
         weight = np.minimum(1.0, limit / np.maximum(np.abs(r), 1e-12))
     j = jacobian(v) * np.sqrt(weight)[:, None]
     freedom, cost = len(r) - len(v), float((weight * r**2).sum())
-    spread = np.linalg.pinv(j.T @ j) * cost / max(freedom, 1)
+    if len(seen) < ENOUGH_TO_LEAVE_ONE:
+        covariance = np.linalg.pinv(j.T @ j)[:count, :count] * cost / max(freedom, 1)
+    else:
+        covariance = _jackknife(j, np.sqrt(weight) * r, count, [0, *ends])
     return Fit(
-        lens_of(v), v[count:].reshape(-1, 6), names, spread[:count, :count],
+        lens_of(v), v[count:].reshape(-1, 6), names, covariance,
         tuple(np.split(r.reshape(-1, 2), [end // 2 for end in ends[:-1]])), cost, freedom,
     )  # fmt: skip
+
+
+def _jackknife(jacobian: Vector, residuals: Vector, count: int, ends: list[int]) -> Vector:
+    """Return the covariance of the first ``count`` parameters, of the lens: the jackknife over the poses, linearised.
+
+    The errors of the corners of a pose are correlated, so the scatter of the residuals alone would give too small
+    deviations. ``ends`` are the rows at which the poses begin and end.
+    """
+    parts = list[tuple[Vector, Vector]]()
+    for k, (a, b) in enumerate(pairwise(ends)):
+        lens, pose = jacobian[a:b, :count], jacobian[a:b, count + 6 * k : count + 6 * k + 6]
+        lens = lens - pose @ np.linalg.lstsq(pose, lens, rcond=None)[0]
+        parts.append((lens.T @ lens, lens.T @ residuals[a:b]))
+    total = np.sum([hessian for hessian, _ in parts], axis=0)
+    moved = np.stack([np.linalg.pinv(total - hessian) @ gradient for hessian, gradient in parts])
+    return np.asarray((len(parts) - 1) * np.cov(moved.T, bias=True))
 
 
 def tilt_of(pose: Vector) -> float:

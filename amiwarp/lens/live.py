@@ -213,7 +213,7 @@ class LiveLens:
             yield self._model
         if len(self.poses) >= 2:
             return
-        search = work.search(work.poses[0], ("apex", "phase"), {})
+        _, search = work.search(work.poses[0], ("apex", "phase"), {})
         search.run()
         yield ExactModel.from_values(self._camera, search.full_space.prism, search.best)
 
