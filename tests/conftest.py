@@ -13,7 +13,7 @@ import pytest
 import warp as wp
 
 from amiwarp import Calibration, Camera, PhotometricSettings, Prism, PrismMotion, Recording, calibrate, simulate
-from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
+from amiwarp.tasks import cpu_threads, limited_cpu_threads
 
 wp.init()
 # The many processes that tests start would otherwise compile the package each time.

@@ -39,7 +39,6 @@ from amiwarp import (
     truth_model,
 )
 from amiwarp.cli.app import app
-from amiwarp.compensation.recordings import compensated_blocks
 from amiwarp.events.device_events import encoder_params
 from amiwarp.events.encoder import TWO_PI
 from amiwarp.events.recording import inside_image
@@ -220,13 +219,6 @@ def test_compensation_sharpens(recording: Recording, calibration: Calibration) -
     blur = edge_blur(places, width, height)
     was = edge_blur(places, width, height, of=np.stack([raw.x, raw.y], axis=1).astype(np.float32))
     assert blur < was / 3
-
-
-def test_blocks_by_time_hold_every_event_once(recording: Recording, calibration: Calibration) -> None:
-    assert recording.encoder is not None
-    blocks = list(compensated_blocks(recording, calibration.model, recording.encoder, duration_us=33_000))
-    assert sum(map(len, blocks)) == len(recording.events)
-    assert all(np.ptp(b.t) < 33_000 for b in blocks)
 
 
 def test_files_and_memory_give_the_same(
