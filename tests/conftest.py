@@ -13,7 +13,8 @@ import pytest
 import warp as wp
 
 from amiwarp import Calibration, Camera, PhotometricSettings, Prism, PrismMotion, Recording, calibrate, simulate
-from amiwarp.tasks import cpu_threads, limited_cpu_threads
+from amiwarp.tasks import limited_cpu_threads
+from tests import SHARE
 
 wp.init()
 # The many processes that tests start would otherwise compile the package each time.
@@ -50,8 +51,8 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def own_cores() -> Iterator[None]:
-    """Give each of xdist's processes its share of the cores: threads of several processes hinder each other."""
-    with limited_cpu_threads(max(1, cpu_threads() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))):
+    """Give each of xdist's processes its share of the cores."""
+    with limited_cpu_threads(SHARE):
         yield
 
 
