@@ -10,7 +10,6 @@ import importlib
 import inspect
 import subprocess
 import sys
-import textwrap
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import FunctionType, ModuleType
@@ -155,7 +154,8 @@ def _types_of(name: str) -> Iterator[str]:
     public = getattr(amiwarp, name)
     if not isinstance(public, type | FunctionType):
         return
-    node = ast.parse(textwrap.dedent(inspect.getsource(public))).body[0]
+    body = tree_of(Path(inspect.getfile(inspect.unwrap(public)))).body
+    node = [node for node in body if getattr(node, "name", None) == public.__name__][-1]  # after its overloads
     inner = [node] if isinstance(node, ast.FunctionDef) else list(ast.iter_child_nodes(node))
     for part in inner:
         if isinstance(part, ast.FunctionDef) and (part is node or part.name == "__init__" or part.name[0] != "_"):
