@@ -97,7 +97,6 @@ from .optics.prism import Prism as Prism
 from .optics.prism import UnsizedPrism as UnsizedPrism
 from .optics.prism import apex_from_deflection as apex_from_deflection
 from .optics.prism import deflection_from_apex as deflection_from_apex
-from .progress import Progress as Progress
 from .reconstruction.picture import Picture as Picture
 from .reconstruction.picture import Reconstruction as Reconstruction
 from .reconstruction.picture import reconstruct as reconstruct
@@ -133,6 +132,7 @@ from .studies.dataset.making import make_dataset as make_dataset
 from .studies.dataset.making import plan_dataset as plan_dataset
 from .studies.evaluate.evaluation import EvaluationSummary as EvaluationSummary
 from .studies.evaluate.evaluation import evaluate as evaluate
+from .tasks import Progress as Progress
 from .translation.sources import DataSet as DataSet
 from .translation.sources import Interpolation as Interpolation
 from .translation.translator import translate as translate

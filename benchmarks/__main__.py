@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from amiwarp.cpu_threads import cpu_threads
 from amiwarp.studies.cluster import processor
+from amiwarp.tasks import cpu_threads
 from benchmarks import report
 from benchmarks.cases import CASES, SCENES, Case
 from benchmarks.job import Job

@@ -37,9 +37,9 @@ import warp as wp
 
 from amiwarp import Calibration, Camera, Encoder, Events, Model, Prism, RecordingWriter, compensate, open_recording
 from amiwarp.compensation.recordings import PIECE, BlockCompensator
-from amiwarp.cpu_threads import cpu_threads, in_order
 from amiwarp.events.recording import inside_image
 from amiwarp.optics.models import MODELS
+from amiwarp.tasks import cpu_threads, in_order
 from benchmarks.simulate import FOV, HEIGHT, INDEX, WIDTH, blocks_picture
 from reference import optics as oracle
 

@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp import CornerDetector, CornerMethod, DeviceEvents, Events, open_recording
-from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.studies.cluster import machine, versions
+from amiwarp.tasks import cpu_threads, limited_cpu_threads
 from reference import corners as oracle
 
 RESULTS = Path(__file__).parent / "results"

@@ -31,7 +31,6 @@ import warp as wp
 from PIL import Image
 
 from amiwarp import DatasetSummary, make_dataset
-from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.io.json_files import read_journal
 from amiwarp.kernels.launch import start_quietly
 from amiwarp.simulation.simulator import Engine
@@ -39,6 +38,7 @@ from amiwarp.studies.cluster import ANY_GPU, machine, threads_of_worker, version
 from amiwarp.studies.dataset import making
 from amiwarp.studies.dataset.making import Item, list_items, simulation_of
 from amiwarp.studies.dataset.specification import content_digest, load_specification
+from amiwarp.tasks import cpu_threads, limited_cpu_threads
 
 RESULTS = Path(__file__).parent / "results"
 SPECIFICATION = """

@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 from amiwarp import AmiwarpError
-from amiwarp.cpu_threads import cpu_threads
+from amiwarp.tasks import cpu_threads
 
 LONGEST_S = 300.0
 """Time after which a decoder that still works on one input is considered hanging [s]."""

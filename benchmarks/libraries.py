@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from amiwarp.cpu_threads import cpu_threads
+from amiwarp.tasks import cpu_threads
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from amiwarp import Calibration, Events, ExactModel, Prism, model_error, open_recording
-from amiwarp.cpu_threads import cpu_threads
 from amiwarp.studies.cluster import processor
+from amiwarp.tasks import cpu_threads
 from benchmarks.compensate import CAMERA, PRISM, SAMPLE, SAMPLES, error_of, make, pieces
 from benchmarks.simulate import blocks_picture
 

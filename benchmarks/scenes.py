@@ -28,8 +28,8 @@ from amiwarp import (
     apex_from_deflection,
     truth_model,
 )
-from amiwarp.cpu_threads import cpu_threads
 from amiwarp.studies.demo import Demo, simulation
+from amiwarp.tasks import cpu_threads
 from benchmarks import compensate
 from benchmarks.libraries import Missing
 

@@ -32,7 +32,6 @@ import numpy as np
 import warp as wp
 
 from amiwarp import compensate, make_dataset, open_recording
-from amiwarp.cpu_threads import cpu_threads
 from amiwarp.kernels.launch import start_quietly
 from amiwarp.studies.cluster import ANY_GPU, LOCAL_CONFIGURATION, machine, processor, run_jobs, start_workers, versions
 from amiwarp.studies.dataset import making
@@ -40,6 +39,7 @@ from amiwarp.studies.dataset.making import Item, list_items, simulation_of, writ
 from amiwarp.studies.dataset.specification import content_digest, load_specification
 from amiwarp.studies.stability.cells import AXES, METHODS, Axis, Cell, Store, Stored, cells_of, run_cell
 from amiwarp.studies.stability.cells import run as run_cells
+from amiwarp.tasks import cpu_threads
 from benchmarks import compensate as file_benchmark
 from benchmarks import simulate
 from benchmarks.dataset import RESULTS, leave_out_tables, write_inputs

@@ -13,19 +13,22 @@ import pytest
 import warp as wp
 
 from amiwarp import Calibration, Camera, PhotometricSettings, Prism, PrismMotion, Recording, calibrate, simulate
-from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
+from amiwarp.tasks import limited_cpu_threads
+from tests import SHARE
 
 wp.init()
 # The many processes that tests start would otherwise compile the package each time.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 LONGEST_FIRST = (
-    "test_view_browser", "test_photometric", "test_consistency", "test_stability", "test_moving", "test_public_values",
-    "test_cli", "test_sparse", "test_lens", "test_refusals", "test_dataset", "test_session", "test_chart",
-    "test_named_worlds", "test_design", "test_calibrate", "test_stream_cli", "test_evaluate_motion", "test_live_writer",
-    "test_world_truth", "test_link", "test_examples", "test_output", "test_window", "test_demo", "test_io_mutation",
-    "test_benchmarks", "test_benchmarks_gpu", "test_sensor_timing", "test_prism_path", "test_translate",
-    "test_structure", "test_stream_returning", "test_compensate", "test_view_cli",
+    "test_photometric", "test_lens", "test_consistency", "test_sensor_timing", "test_moving", "test_world_truth",
+    "test_prism_path", "test_stability", "test_view_browser", "test_live_writer", "test_named_worlds", "test_window",
+    "test_io_mutation", "test_public_values", "test_reconstruct", "test_chart", "test_refusals", "test_cli",
+    "test_dataset", "test_examples", "test_pixels", "test_compensate", "test_structure", "test_link", "test_demo",
+    "test_sparse", "test_translate", "test_session", "test_stream_cli", "test_view_cli", "test_design",
+    "test_evaluate", "test_output", "test_optics_properties", "test_evaluate_motion", "test_stream_returning",
+    "test_calibrate", "test_optics", "test_auto", "test_benchmarks_gpu", "test_adaptive", "test_pixel_map",
+    "test_io_writers", "test_new_model",
 )  # fmt: skip
 """Files whose tests take longest, in this order. They are run first, so that no process works alone at the end."""
 
@@ -50,8 +53,8 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def own_cores() -> Iterator[None]:
-    """Give each of xdist's processes its share of the cores: threads of several processes hinder each other."""
-    with limited_cpu_threads(max(1, cpu_threads() // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))):
+    """Give each of xdist's processes its share of the cores."""
+    with limited_cpu_threads(SHARE):
         yield
 
 

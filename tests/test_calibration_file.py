@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from amiwarp import AmiwarpError, Calibration, Camera, Fisheye, RadialTangential
-from amiwarp.io.rig_files import camera_from_json, camera_to_json
+from amiwarp.io.json_files import camera_from_json
+from amiwarp.optics.camera import camera_to_json
 
 
 def test_there_and_back(calibration: Calibration, tmp_path: Path) -> None:

@@ -37,7 +37,6 @@ from amiwarp.calib.presets import Preset, check, settings_from, settings_to, sim
 from amiwarp.cli.app import app
 from amiwarp.optics.models import MODELS
 from amiwarp.plotting import figures
-from amiwarp.progress import silent
 from amiwarp.studies.chart import Charts, measurement
 from amiwarp.studies.chart.measurement import (
     KnownRecording,
@@ -56,6 +55,7 @@ from amiwarp.studies.chart.measurement import (
     slowness,
     told_apart,
 )
+from amiwarp.tasks import silent
 from benchmarks import libraries as peers
 from reference import optics as oracle
 

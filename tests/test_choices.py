@@ -42,7 +42,6 @@ from amiwarp import (
     sharpness,
 )
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
-from amiwarp.calib.parameters import build_model
 from amiwarp.calib.presets import simplified
 from amiwarp.calib.settings import STAGES
 from amiwarp.choices import Axis, Colour, Tone, View
@@ -50,7 +49,7 @@ from amiwarp.imaging.export import IweFiles, to_picture
 from amiwarp.imaging.iwe import CanvasShape
 from amiwarp.imaging.metrics import SharpnessMeter
 from amiwarp.live.queues import PacketQueue, Policy
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, build_model
 from amiwarp.reconstruction.picture import save_picture, tones
 from amiwarp.viewer.drawing import Look
 

@@ -79,7 +79,7 @@ def test_the_speed_of_threads_does_not_change_a_file(tmp_path, monkeypatch):
         monkeypatch.setattr(
             "amiwarp.io.hdf5_files.encode_parts", lambda *a: (time.sleep(next(delays)), encode_parts(*a))[1]
         )
-        monkeypatch.setattr("amiwarp.cpu_threads.cpu_threads", lambda: 4)
+        monkeypatch.setattr("amiwarp.tasks.cpu_threads", lambda: 4)
         with RecordingWriter(path.with_suffix(".filled.h5"), width=99, height=99) as writer:
             pieces = [lambda s=slice(k, k + CHUNK): (events[s], flags[s], {}) for k in range(0, n, CHUNK)]
             writer.fill(pieces, count=CHUNK, t_first=int(t[0]), done=lambda *_: None)

@@ -21,7 +21,7 @@ from typer.testing import CliRunner, Result
 
 from amiwarp import AmiwarpError, Calibration, PrismMotion, open_recording
 from amiwarp.cli.app import COMMANDS, app, function_of
-from amiwarp.cli.options import number
+from amiwarp.cli.common import number
 
 
 def test_help_and_info_load_only_what_they_need(made: tuple[Path, str]) -> None:

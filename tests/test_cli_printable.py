@@ -14,8 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amiwarp import AmiwarpError, Events, RecordingWriter, open_recording
-from amiwarp.cli.console import report, table
-from amiwarp.cli.options import Common
+from amiwarp.cli.common import Common, report, table
 from amiwarp.errors import printable
 from reference.io_samples_extra import arrays, write_ros2
 

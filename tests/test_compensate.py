@@ -19,6 +19,7 @@ from amiwarp import (
     Calibration,
     Camera,
     CircleModel,
+    CompensationSummary,
     Encoder,
     Events,
     ExactModel,
@@ -39,7 +40,6 @@ from amiwarp import (
     truth_model,
 )
 from amiwarp.cli.app import app
-from amiwarp.compensation.recordings import compensated_blocks
 from amiwarp.events.device_events import encoder_params
 from amiwarp.events.encoder import TWO_PI
 from amiwarp.events.recording import inside_image
@@ -222,13 +222,6 @@ def test_compensation_sharpens(recording: Recording, calibration: Calibration) -
     assert blur < was / 3
 
 
-def test_blocks_by_time_hold_every_event_once(recording: Recording, calibration: Calibration) -> None:
-    assert recording.encoder is not None
-    blocks = list(compensated_blocks(recording, calibration.model, recording.encoder, duration_us=33_000))
-    assert sum(map(len, blocks)) == len(recording.events)
-    assert all(np.ptp(b.t) < 33_000 for b in blocks)
-
-
 def test_files_and_memory_give_the_same(
     recording: Recording, calibration: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str
 ) -> None:
@@ -323,20 +316,39 @@ def events_of(path: Path) -> list[np.ndarray]:
     return [events.x, events.y, events.t, events.p]
 
 
+@pytest.fixture(scope="module")
+def turn(recording: Recording) -> Recording:
+    """One turn of the shared recording."""
+    events = recording.events.between(0, 84_000)
+    return replace(recording, events=MemoryEvents(events, *recording.events.size))
+
+
+@pytest.fixture(scope="module")
+def native(
+    turn: Recording, exact: Calibration, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, CompensationSummary]:
+    """The turn compensated into the native format, and its summary."""
+    path = tmp_path_factory.mktemp("native") / "native.h5"
+    blocks: list[Events] = []
+    summary = compensate(turn, exact, path, on_block=blocks.append)
+    assert sum(map(len, blocks)) == summary.events
+    return path, summary
+
+
 @pytest.mark.parametrize("file", FORMATS)
 def test_other_formats_hold_what_the_native_one_holds(
-    recording: Recording, exact: Calibration, tmp_path: Path, file: str
+    turn: Recording, exact: Calibration, native: tuple[Path, CompensationSummary], tmp_path: Path, file: str
 ) -> None:
     """Compensated into a format, or into the native one and converted, with any size of the blocks."""
     chosen, rounding = FORMATS[file]
     options = {"format": chosen, "rounding": rounding, "seed": 4}
     blocks: list[Events] = []
-    native = compensate(recording, exact, tmp_path / "native.h5", on_block=blocks.append)
-    found = compensate(recording, exact, tmp_path / file, on_block=blocks.append, **options)
+    path, summary = native
+    found = compensate(turn, exact, tmp_path / file, on_block=blocks.append, **options)
     (tmp_path / "converted").mkdir()
-    converted = convert(tmp_path / "native.h5", tmp_path / "converted" / file, **options)
-    assert (found.events, found.outside) == (native.events, native.outside)
-    assert sum(len(block) for block in blocks) == 2 * native.events
+    converted = convert(path, tmp_path / "converted" / file, **options)
+    assert (found.events, found.outside) == (summary.events, summary.outside)
+    assert sum(map(len, blocks)) == summary.events
     assert (found.rounding, found.dropped) == (rounding, converted.dropped)
     assert found.events - found.dropped == converted.events
     assert (found.dropped > 0) == (rounding is not None)
@@ -346,7 +358,7 @@ def test_other_formats_hold_what_the_native_one_holds(
     ours, theirs = events_of(tmp_path / file), events_of(tmp_path / "converted" / file)
     for a, b in zip(ours, theirs, strict=True):
         np.testing.assert_array_equal(a, b)
-    expected = events_of(tmp_path / "native.h5")
+    expected = events_of(path)
     if rounding == "nearest":
         x, y = (np.floor(values.astype(np.float64) + 0.5) for values in expected[:2])
         kept = (x >= 0) & (x < 200) & (y >= 0) & (y < 150)

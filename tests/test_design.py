@@ -30,8 +30,7 @@ from amiwarp import (
 )
 from amiwarp.calib.model_choice import QUANTISATION_PX
 from amiwarp.cli import studies as command_line
-from amiwarp.cli.console import report
-from amiwarp.cli.options import Common, command
+from amiwarp.cli.common import Common, command, report
 from amiwarp.studies.design import (
     ACROSS,
     LEAST_SWING,

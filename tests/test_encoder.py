@@ -350,7 +350,7 @@ def test_csv_refuses(tmp_path, text, message):
 
 
 def test_csv_has_a_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr("amiwarp.io.rig_files.MOST_ROWS", 5)
+    monkeypatch.setattr("amiwarp.io.encoder_files.MOST_ROWS", 5)
     path = tmp_path / "long.csv"
     path.write_text("t_us,angle_deg\n" + "".join(f"{k},{k}\n" for k in range(5)))
     assert len(read_encoder_csv(path).t) == 5

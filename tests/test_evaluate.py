@@ -19,9 +19,8 @@ from scipy.spatial.distance import cdist
 from scipy.special import ndtr
 
 import amiwarp
-from amiwarp.cli.console import made_again
+from amiwarp.cli.common import made_again
 from amiwarp.io.json_files import sealed
-from amiwarp.progress import silent
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.evaluate import apex_speed, corners, fading, texture
 from amiwarp.studies.evaluate.edges import Counts, best_f, binary_entropy, geometric_edges, match
@@ -58,6 +57,7 @@ from amiwarp.studies.evaluate.study import (
     where_calibrated,
 )
 from amiwarp.studies.evaluate.texture import density_variance, event_counts
+from amiwarp.tasks import silent
 from reference.mutation_files import stored_edges, stored_fading
 
 SMALL = replace(QUICK, width=64, height=48, duration_s=0.1, seeds=1)

@@ -32,10 +32,9 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
-from amiwarp.cpu_threads import in_order
-from amiwarp.io.hdf5_files import CHUNK, StoredColumn, checksum, decode, encode
-from amiwarp.io.rig_files import camera_attributes, read_camera
+from amiwarp.io.hdf5_files import CHUNK, StoredColumn, camera_attributes, checksum, decode, encode, read_camera
 from amiwarp.kernels.checksum import Checksums
+from amiwarp.tasks import in_order
 
 SIZE = (320, 240)
 

@@ -539,7 +539,7 @@ def test_answers_to_no_command_are_not_kept() -> None:
 def motor(*args: object) -> tuple[int, str, BaseException | None]:
     import typer
 
-    from amiwarp.cli.options import command as register
+    from amiwarp.cli.common import command as register
 
     app = typer.Typer()
     register(app, command.run_motor, name="motor", example="")

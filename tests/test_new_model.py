@@ -134,8 +134,10 @@ def test_nothing_is_left_of_it() -> None:
 
 def knows(path: Path, model: type[amiwarp.Model]) -> bool:
     """Whether a source file names a model, its struct or its text in files; documentation does not count."""
-    names, found = {model.__name__, model.STRUCT.key}, False
-    for node in ast.walk(ast.parse(path.read_text())):
+    names, found, source = {model.__name__, model.STRUCT.key}, False, path.read_text()
+    if not any(name in source for name in (*names, model.NAME)):
+        return False
+    for node in ast.walk(ast.parse(source)):
         match node:
             case ast.Name(id=name) | ast.Attribute(attr=name) | ast.alias(name=name) | ast.ClassDef(name=name):
                 found |= name in names

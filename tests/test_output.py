@@ -45,7 +45,7 @@ from amiwarp import (
     save_recording,
 )
 from amiwarp.cli.app import COMMANDS, app, function_of
-from amiwarp.cli.options import NO_FILE, OUTPUT, OUTPUT_FOLDER
+from amiwarp.cli.common import NO_FILE, OUTPUT, OUTPUT_FOLDER
 from amiwarp.events.truth import MAPS, MemoryFrames
 from amiwarp.imaging.export import IweFiles
 from amiwarp.io import files as output

@@ -6,6 +6,7 @@ import inspect
 import itertools
 import math
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
@@ -99,11 +100,21 @@ def outcome(call: PublicCall, **changed: Any) -> str:
 CALLS = list(public_calls())
 
 
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The files that the calls read, not to be written to."""
+    folder = tmp_path_factory.mktemp("calls")
+    with contextlib.chdir(folder):
+        write_files()
+    return list(folder.iterdir())
+
+
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make an empty folder the current one, with the files that the calls read."""
+def folder(files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make a folder with copies of the files that the calls read the current one."""
     monkeypatch.chdir(tmp_path)
-    write_files()
+    for file in files:
+        shutil.copy(file, tmp_path)
 
 
 @pytest.mark.parametrize("call", CALLS, ids=lambda call: call.label)

@@ -25,7 +25,7 @@ from amiwarp.calib.checks import check_pulses, check_texture
 from amiwarp.calib.first_guess import encoder_turns_per_period
 from amiwarp.calib.model_choice import LARGEST_MOTION_PX, in_pixels
 from amiwarp.calib.photometric.stage import judge_optimum
-from amiwarp.cli.options import interval, number
+from amiwarp.cli.common import interval, number
 from amiwarp.events.encoder import TWO_PI
 from tests.conftest import COARSE, TRUE_PRISM
 

@@ -10,8 +10,7 @@ import importlib
 import inspect
 import subprocess
 import sys
-import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import FunctionType, ModuleType
 
@@ -48,16 +47,24 @@ def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
+@functools.cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    """Return the imports, functions and calls in a file. A walk through all files takes seconds."""
+    kinds = (ast.Import, ast.ImportFrom, ast.FunctionDef, ast.Call)
+    return [node for node in ast.walk(tree_of(path)) if isinstance(node, kinds)]
+
+
 @pytest.fixture(scope="module", autouse=True)
 def trees() -> Iterator[None]:
     """Free the syntax trees after this file's tests."""
     yield
     tree_of.cache_clear()
+    nodes_of.cache_clear()
 
 
 def imports_of(path: Path) -> Iterator[str]:
     """Yield the modules that a file imports: in functions, and for types only, too."""
-    for node in ast.walk(tree_of(path)):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -70,7 +77,7 @@ def device_code() -> list[tuple[str, str, ast.FunctionDef]]:
     """Return the place, the decorator and the syntax tree of every Warp kernel and device function."""
     found = []
     for path in MODULES:
-        for node in ast.walk(tree_of(path)):
+        for node in nodes_of(path):
             if isinstance(node, ast.FunctionDef):
                 for decorator in node.decorator_list:
                     text = ast.unparse(decorator)
@@ -147,7 +154,8 @@ def _types_of(name: str) -> Iterator[str]:
     public = getattr(amiwarp, name)
     if not isinstance(public, type | FunctionType):
         return
-    node = ast.parse(textwrap.dedent(inspect.getsource(public))).body[0]
+    body = tree_of(Path(inspect.getfile(inspect.unwrap(public)))).body
+    node = [node for node in body if getattr(node, "name", None) == public.__name__][-1]  # after its overloads
     inner = [node] if isinstance(node, ast.FunctionDef) else list(ast.iter_child_nodes(node))
     for part in inner:
         if isinstance(part, ast.FunctionDef) and (part is node or part.name == "__init__" or part.name[0] != "_"):
@@ -242,9 +250,9 @@ def last_name(node: ast.AST) -> str:
     return function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
 
 
-def opened_otherwise(source: str) -> Iterator[str]:
+def opened_otherwise(nodes: Iterable[ast.AST]) -> Iterator[str]:
     """Yield the calls that open a file for reading, other than ``open_input(path)`` and ``f(input_path(path))``."""
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes:
         last = last_name(node)
         if last not in OPENING_NAMES | {name.rpartition(".")[2] for name in OPENERS}:
             continue
@@ -265,7 +273,7 @@ def opened_otherwise(source: str) -> Iterator[str]:
 
 def test_inputs_are_opened_in_one_way() -> None:
     """So each is checked to be a regular file, and no command can write over it."""
-    found = {f"{name_of(path)}: {call}" for path in MODULES for call in opened_otherwise(path.read_text())}
+    found = {f"{name_of(path)}: {call}" for path in MODULES for call in opened_otherwise(nodes_of(path))}
     assert found == set(OPENED_OTHERWISE)
 
 
@@ -275,7 +283,7 @@ def test_paths_reach_the_reading_process_as_paths() -> None:
         name_of(path)
         for path in MODULES
         if path.name != "reading_process.py"
-        for node in ast.walk(tree_of(path))
+        for node in nodes_of(path)
         if last_name(node) == "abspath" and ast.unparse(node.func) == "os.path.abspath"
     ]
     assert texts == []
@@ -290,7 +298,7 @@ def test_paths_reach_the_reading_process_as_paths() -> None:
      "shutil.copyfile(path, part)"],
 )  # fmt: skip
 def test_another_way_would_be_seen(code: str) -> None:
-    assert list(opened_otherwise(f"def read(path):\n    return {code}")) != []
+    assert list(opened_otherwise(ast.walk(ast.parse(f"def read(path):\n    return {code}")))) != []
 
 
 @pytest.mark.parametrize(
@@ -299,4 +307,4 @@ def test_another_way_would_be_seen(code: str) -> None:
      "os.open(path, os.O_RDWR | os.O_CREAT)", "np.load(input_path(path))", "av.open(str(input_path(path)))"],
 )  # fmt: skip
 def test_other_calls_are_no_inputs(code: str) -> None:
-    assert list(opened_otherwise(code)) == []
+    assert list(opened_otherwise(ast.walk(ast.parse(code)))) == []

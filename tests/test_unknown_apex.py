@@ -25,8 +25,8 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.cli.app import app
-from amiwarp.cli.options import NominalPrismOptions
-from amiwarp.io.rig_files import prism_attributes, read_prism
+from amiwarp.cli.common import NominalPrismOptions
+from amiwarp.io.hdf5_files import prism_attributes, read_prism
 from amiwarp.viewer.inspector import Inspector
 
 APEX, INDEX = math.radians(1.0), 1.55

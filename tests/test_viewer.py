@@ -26,9 +26,8 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.calib.bad_pixels import MaskedEventSource
-from amiwarp.calib.parameters import build_model
 from amiwarp.choices import Axis, Colour, View
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, build_model
 from amiwarp.viewer.drawing import WIDEST_PX, Look, Scene, axis_range, colours_of, orbit_lines, residual, third_axis
 from amiwarp.viewer.inspector import Inspector, Knobs, Selection, read_span, recorded_counts
 from reference.calibration_sample import exact_calibration

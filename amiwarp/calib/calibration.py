@@ -24,7 +24,7 @@ from amiwarp.calib import checks, first_guess
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
 from amiwarp.calib.model_choice import ModelChooser
-from amiwarp.calib.parameters import LENS, MOTION, RATES, ParameterSpace, make_space, nominal, with_lens
+from amiwarp.calib.parameters import MOTION, RATES, ParameterSpace, make_space, nominal
 from amiwarp.calib.photometric import stage
 from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
@@ -34,10 +34,10 @@ from amiwarp.calib.sharpness import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, MemoryEvents, Recording
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import LENS, Camera, with_lens
 from amiwarp.optics.models import MODELS, predicted_error, size_names
 from amiwarp.optics.prism import Prism
-from amiwarp.progress import Progress
+from amiwarp.tasks import Progress
 from amiwarp.validation import check_names, guarded
 
 

@@ -20,7 +20,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.iwe import UploadedEvents, upload_events
 from amiwarp.kernels.launch import pool
-from amiwarp.memory import no_garbage_collection
+from amiwarp.tasks import no_garbage_collection
 
 SlopeOf = Callable[[NDArray[np.int64]], NDArray[np.float64]]
 

@@ -20,7 +20,7 @@ from amiwarp.calib.settings import STAGES, Settings
 from amiwarp.calib.sharpness import Search
 from amiwarp.choices import Sharpness
 from amiwarp.events.recording import MemoryEvents, Recording
-from amiwarp.progress import Progress
+from amiwarp.tasks import Progress
 
 WINDOW_US = 2_000_000
 """Duration of the events that the paper calibrates on [us]."""

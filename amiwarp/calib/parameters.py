@@ -16,15 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera import Camera, CameraRotation, RadialTangential
+from amiwarp.optics.camera import LENS, Camera, CameraRotation
 from amiwarp.optics.models import (
     MODELS,
     PHASE,
     Model,
     Parameter,
+    build_model,
     check_given,
     compensate_by_each,
-    model_of,
     rms,
     size_names,
     wrap_angle,
@@ -42,9 +42,6 @@ CHANGES = ("change_x", "change_y", "change_z")
 """Angular acceleration of the camera about its x, y and z axes: names of the parameters."""
 MOTION = (*RATES, *CHANGES)
 """Names of all parameters of the camera's rotation."""
-LENS = ("focal_length", "center_x", "center_y", "k1", "fy_over_fx")
-"""Parameters of the camera's lens. All but the focal length are freed by the photometric stage only, if the events
-contradict the given camera: the principal point (px), the first radial coefficient of distortion, and fy / fx."""
 _UNITS = {
     "clock_offset": "us",
     "rpm": "1/min",
@@ -334,24 +331,6 @@ def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraR
     x, y, z = (values.get(n, 0.0) for n in RATES)
     a, b, c = (values.get(n, 0.0) for n in CHANGES)
     return CameraRotation((x, y, z), (a, b, c), middle_us)
-
-
-def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
-    """Return the camera with those of its lens parameters (:data:`LENS`) that ``values`` contain."""
-    if values.keys().isdisjoint(LENS):
-        return camera
-    fx = values.get("focal_length", camera.fx)
-    fy = fx * values.get("fy_over_fx", camera.fy / camera.fx)
-    lens = camera.distortion
-    if "k1" in values:
-        lens = replace(lens or RadialTangential(), k1=values["k1"])
-    cx, cy = values.get("center_x", camera.cx), values.get("center_y", camera.cy)
-    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=lens)
-
-
-def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
-    """Build the optical model of the parameter values; ``camera`` and ``prism`` give all other values."""
-    return model_of(MODELS[one_of(model, MODELS, "model")], with_lens(camera, values), prism, values)
 
 
 def values_of(model: str, values: Mapping[str, float]) -> dict[str, float]:

@@ -14,16 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.calib.nlopt_solver import SearchStage
-from amiwarp.calib.parameters import MOTION, build_model, rotation_from_values, units
+from amiwarp.calib.parameters import MOTION, rotation_from_values, units
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.io.files import errors_name, write_text
 from amiwarp.io.formats import check_ending
-from amiwarp.io.json_files import build, fields_of, read_json
-from amiwarp.io.rig_files import camera_from_json, camera_to_json
-from amiwarp.optics.camera import Camera, CameraRotation
-from amiwarp.optics.models import MODELS, ExactModel, Model
+from amiwarp.io.json_files import build, camera_from_json, fields_of, read_json
+from amiwarp.optics.camera import Camera, CameraRotation, camera_to_json
+from amiwarp.optics.models import MODELS, ExactModel, Model, build_model
 from amiwarp.optics.prism import Prism
 from amiwarp.validation import guarded, one_of, real, shown
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from amiwarp.calib import checks
 from amiwarp.calib.calibration_events import CalibrationEvents, EventsAhead
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import MOTION, ParameterSpace, build_model, like_size, units
+from amiwarp.calib.parameters import MOTION, ParameterSpace, like_size, units
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.settings import Settings, stage_share
 from amiwarp.choices import Sharpness
@@ -24,8 +24,8 @@ from amiwarp.events.recording import Events
 from amiwarp.imaging.iwe import CanvasShape, Image, TileVotes, UploadedEvents, Votes, upload_events
 from amiwarp.imaging.metrics import SharpnessMeter
 from amiwarp.optics.camera import Camera, border
-from amiwarp.optics.models import MODELS, Model, points_on_host
-from amiwarp.progress import Progress
+from amiwarp.optics.models import MODELS, Model, build_model, points_on_host
+from amiwarp.tasks import Progress
 
 Vector = NDArray[np.float64]
 

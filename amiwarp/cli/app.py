@@ -173,7 +173,7 @@ class _LoadedCommands(Mapping[str, Any]):
 @cache
 def _loaded(name: str) -> Any:
     """Load the module of a command and return the command."""
-    from amiwarp.cli.options import command  # NumPy is loaded with it
+    from amiwarp.cli.common import command  # NumPy is loaded with it
 
     one = typer.Typer(rich_markup_mode="rich", add_completion=False)
     command(one, function_of(name), name=name, example=COMMANDS[name].example)

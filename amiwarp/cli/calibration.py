@@ -16,27 +16,34 @@ import numpy as np
 import typer
 
 from amiwarp.choices import CONTRAST, OPTICAL_MODELS, Fill, Layers, Sharpness, Tone
-from amiwarp.cli.console import choose_device, progress, report, table
-from amiwarp.cli.options import (
+from amiwarp.cli.common import (
     OUTPUT,
     CameraOptions,
     Common,
+    EncoderOptions,
+    Format,
+    HdfCodec,
     NominalPrismOptions,
+    Round,
     Topic,
+    choose_device,
     complete,
+    format_notes,
     interval,
     number,
     numbers,
+    progress,
+    report,
     span,
+    table,
 )
-from amiwarp.cli.recordings import EncoderOptions, Format, HdfCodec, Round, format_notes
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.io import open_recording
 from amiwarp.io.files import check_output
 from amiwarp.io.formats import COMPENSATED_HELP, Codec, check_ending
 from amiwarp.optics.camera import CameraRotation
-from amiwarp.progress import Progress
+from amiwarp.tasks import Progress
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.cli.console import choose_device, progress, report, table
-from amiwarp.cli.options import OUTPUT, Common, NominalPrismOptions, parse_size
+from amiwarp.cli.common import OUTPUT, Common, NominalPrismOptions, choose_device, parse_size, progress, report, table
 from amiwarp.cli.rig import SourceOptions, StatusLine, check_angles, check_whole, stopped_by_interrupt
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording

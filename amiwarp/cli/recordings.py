@@ -4,8 +4,7 @@ import contextlib
 import math
 import re
 import time
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,17 +12,31 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from amiwarp.cli.console import progress, report, table
-from amiwarp.cli.options import OUTPUT, OUTPUT_FOLDER, CameraOptions, Common, NominalPrismOptions, Topic
+from amiwarp.cli.common import (
+    OUTPUT,
+    OUTPUT_FOLDER,
+    CameraOptions,
+    Common,
+    EncoderOptions,
+    Format,
+    HdfCodec,
+    NominalPrismOptions,
+    Round,
+    Topic,
+    format_notes,
+    progress,
+    report,
+    table,
+)
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, rpm_between
 from amiwarp.events.recording import DEFAULT_BLOCK, EventSource, ImageStore, ImuSamples, Recording, mean_rate
 from amiwarp.events.truth import Cause, Truth
-from amiwarp.io import convert, open_recording, read_encoder_csv, read_encoder_triggers
+from amiwarp.io import convert, open_recording
 from amiwarp.io.export import GAP_INTERVALS, save_flow_dsec, save_flow_mvsec, save_poses_tum
 from amiwarp.io.file_scan import head_only
-from amiwarp.io.formats import EXTENSION_HELP, LIMITS, Codec, OutputFormat, Rounding, make_folder
-from amiwarp.io.rig_files import camera_to_json
+from amiwarp.io.formats import EXTENSION_HELP, Codec, make_folder
+from amiwarp.optics.camera import camera_to_json
 from amiwarp.optics.prism import Prism
 
 # ``amiwarp info``: description of the content of a recording.
@@ -315,80 +328,6 @@ def _encoder_text(e: dict[str, Any] | None) -> str:
 
 # ``amiwarp convert``: conversion of recordings to the native format and to others.
 
-Format = Annotated[
-    OutputFormat | None, typer.Option(help="Format to write, if not that of the extension: dsec.", show_default=False)
-]
-"""Option that chooses a format whose extension means another one."""
-HdfCodec = Annotated[Codec, typer.Option(help="Compression of HDF5. Programs without HDF5's Blosc filter read gzip.")]
-"""Option for the compression of HDF5."""
-Round = Annotated[
-    Rounding | None,
-    typer.Option(
-        help="Round compensated events to whole pixels, as RAW, AEDAT 4, DSEC and ROS 2 need. nearest: to the nearest "
-        "pixel; dithered: up or down at random (--seed), unbiased. Events outside the image are dropped.",
-        show_default=False,
-    ),
-]
-"""Option for the rounding of compensated events."""
-
-_in_panel = partial(typer.Option, rich_help_panel="Encoder")
-
-
-@dataclass(frozen=True)
-class EncoderOptions:
-    """Options for a log of the prism's encoder."""
-
-    encoder: Annotated[
-        Path | None,
-        _in_panel(help="Encoder log: CSV with the header t_us,angle_deg or t_us,count, and optionally index (0 or 1)."),
-    ] = None
-    encoder_from: Annotated[
-        str | None,
-        _in_panel(
-            help="Take the encoder from the trigger edges in the recording: triggers:CHANNEL. Each rising edge is one "
-            "count; by default it is the index pulse, one per turn.",
-            metavar="triggers:CHANNEL",
-        ),
-    ] = None
-    counts_per_turn: Annotated[int | None, _in_panel(min=1, help="Encoder counts per turn.")] = None
-    counter_bits: Annotated[
-        int | None,
-        _in_panel(
-            min=0,
-            max=64,
-            help="Width of the encoder's counter (bits); 0: the counter restarts at every turn. "
-            "Default: inferred from the counts.",
-        ),
-    ] = None
-    direction: Annotated[Literal["1", "-1"], _in_panel(help="Counting direction; -1: backwards.")] = "1"
-
-    def build(self, source: Path, topic: str | None) -> Encoder | None:
-        """Return the encoder of the log or of the recording's triggers, or None if neither is given."""
-        if self.encoder_from is not None:
-            return self._from_triggers(self.encoder_from, source, topic)
-        if self.encoder is None:
-            if self != EncoderOptions():
-                what = "--counts-per-turn, --counter-bits and --direction describe an encoder log"
-                raise AmiwarpError(f"{what}; give --encoder or --encoder-from too")
-            return None
-        return read_encoder_csv(
-            self.encoder,
-            counts_per_turn=self.counts_per_turn,
-            counter_bits=self.counter_bits,
-            direction=int(self.direction),
-        )
-
-    def _from_triggers(self, text: str, source: Path, topic: str | None) -> Encoder:
-        kind, colon, channel = text.partition(":")
-        if kind != "triggers" or (colon and not channel.isdecimal()):
-            raise AmiwarpError(f"--encoder-from {text!r} is unknown; write triggers:CHANNEL, for example triggers:0")
-        if self.encoder is not None or self.counter_bits is not None:
-            raise AmiwarpError("--encoder and --counter-bits describe an encoder log; leave them or --encoder-from out")
-        return read_encoder_triggers(
-            source, int(channel or 0), counts_per_turn=self.counts_per_turn or 1, direction=int(self.direction),
-            topic=topic,
-        )  # fmt: skip
-
 
 def run_convert(
     source: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
@@ -429,16 +368,6 @@ def run_convert(
     slip = data.pop("index_slip")
     data["slip_deg"] = None if slip is None else math.degrees(slip)
     report(common, data, _convert_lines(data))
-
-
-def format_notes(d: dict[str, Any]) -> list[str]:
-    """Return what the format of the output has changed and left out."""
-    lines = []
-    if d["rounding"] is not None:
-        lines.append(f"note: rounded to whole pixels ({d['rounding']}); {d['dropped']:,} events outside are dropped")
-    if d["left_out"]:
-        lines.append(f"note: {LIMITS[d['format']].label} does not hold, and leaves out: {', '.join(d['left_out'])}")
-    return lines
 
 
 def _convert_lines(d: dict[str, Any]) -> list[str]:

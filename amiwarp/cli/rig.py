@@ -21,8 +21,7 @@ from rich.live import Live
 from rich.text import Text
 
 from amiwarp.cli import say
-from amiwarp.cli.console import choose_device, report, table
-from amiwarp.cli.options import NO_FILE, OUTPUT, CameraOptions, Common, NominalPrismOptions
+from amiwarp.cli.common import NO_FILE, OUTPUT, CameraOptions, Common, NominalPrismOptions, choose_device, report, table
 from amiwarp.errors import AmiwarpError, printable
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.choices import Seeing
-from amiwarp.cli.console import choose_device, progress, report
-from amiwarp.cli.options import OUTPUT, Common, numbers, parse_size
+from amiwarp.cli.common import OUTPUT, Common, choose_device, numbers, parse_size, progress, report
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.io.camera_files import load_camera

@@ -17,16 +17,26 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.cli import say
-from amiwarp.cli.console import choose_device, made_again, plain, progress, report, table
-from amiwarp.cli.options import OUTPUT_FOLDER, CameraOptions, Common, numbers, parse_size
-from amiwarp.cpu_threads import cpu_threads
+from amiwarp.cli.common import (
+    OUTPUT_FOLDER,
+    CameraOptions,
+    Common,
+    choose_device,
+    made_again,
+    numbers,
+    parse_size,
+    plain,
+    progress,
+    report,
+    table,
+)
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.io.files import check_output, own_folder, write_text
 from amiwarp.io.formats import make_folder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.progress import part
+from amiwarp.tasks import cpu_threads, part
 
 if TYPE_CHECKING:
     from amiwarp.studies.chart import Charts

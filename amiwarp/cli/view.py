@@ -14,8 +14,17 @@ import typer
 
 from amiwarp.choices import OPTICAL_MODELS, Axis, Colour, View
 from amiwarp.cli import say
-from amiwarp.cli.console import choose_device, report
-from amiwarp.cli.options import OUTPUT, CameraOptions, Common, NominalPrismOptions, complete, parse_size, span
+from amiwarp.cli.common import (
+    OUTPUT,
+    CameraOptions,
+    Common,
+    NominalPrismOptions,
+    choose_device,
+    complete,
+    parse_size,
+    report,
+    span,
+)
 from amiwarp.cli.rig import SourceOptions, check_angles
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording

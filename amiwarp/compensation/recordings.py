@@ -17,7 +17,6 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.calib.result import Calibration
-from amiwarp.cpu_threads import in_order
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
 from amiwarp.events.device_events import DeviceEvents, azimuths, device_for, limits, wait
@@ -35,7 +34,7 @@ from amiwarp.kernels.events import join_columns
 from amiwarp.kernels.launch import RecordedLaunch, launch, load, page_locked, specialised
 from amiwarp.optics.camera import camera_params, pinhole_params
 from amiwarp.optics.models import Model
-from amiwarp.progress import Progress
+from amiwarp.tasks import Progress, in_order
 from amiwarp.validation import guarded
 
 # Choice of the compensation kernel, and its launch arguments.
@@ -186,10 +185,6 @@ class GpuPieces:
             return PieceBuffers(1 << (n - 1).bit_length(), self._plan, self._encoder, self._device)
 
 
-DEFAULT_BLOCK = 1 << 20
-"""Number of events per block if the caller does not give one."""
-
-
 @guarded
 @dataclass(frozen=True, slots=True)
 class CompensationSummary:
@@ -327,21 +322,6 @@ def _compensate_on_device(events: DeviceEvents, model: Model, encoder: Encoder) 
         launch(join_columns, len(events), compensator.on_device(events), [xy], device=events.device)
     wait(events.device)
     return xy
-
-
-def compensated_blocks(
-    recording: Recording, model: Model, encoder: Encoder, *, device: Any = "cpu", **blocks: int
-) -> Iterator[Events]:
-    """Yield all events of the recording in order, compensated.
-
-    ``blocks`` gives the block size: ``count=`` events or ``duration_us=``.
-    """
-    source = recording.events
-    if not len(source):
-        return
-    compensator = BlockCompensator(model, encoder, source.t_first, source.t_last, device)
-    for block in source.blocks(**(blocks or {"count": DEFAULT_BLOCK})):
-        yield compensator(block, all_cores=True)[0]
 
 
 @guarded

@@ -9,7 +9,6 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.choices import CornerMethod
-from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, check_sensor, device_for, limits, wait
 from amiwarp.events.recording import Events, check_events
@@ -17,6 +16,7 @@ from amiwarp.kernels import corners as kernels
 from amiwarp.kernels import events as event_kernels
 from amiwarp.kernels.launch import launch, load
 from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.tasks import cpu_threads
 from amiwarp.validation import TIME_LIMIT, choice, guarded, instance, vector, whole
 
 REDUNDANT_US = 50_000

@@ -13,7 +13,6 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.choices import Vote
-from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
 from amiwarp.events.device_events import DeviceEvents, azimuths, cast, device_for, wait
@@ -30,6 +29,7 @@ from amiwarp.kernels.pixel_votes import BLOCK, CAPACITY
 from amiwarp.kernels.word_votes import TRASH, Cells, vote_events, vote_points, vote_quickly, vote_rotating_camera
 from amiwarp.optics.camera import LARGEST_SIZE, CameraRotation, pinhole_params
 from amiwarp.optics.models import Model, model_camera
+from amiwarp.tasks import cpu_threads
 from amiwarp.validation import choice, guarded, whole
 
 

@@ -3,10 +3,10 @@
 :func:`open_recording` reads every format. :class:`RecordingWriter` writes the native format.
 """
 
+from amiwarp.io.encoder_files import read_encoder_csv, read_encoder_triggers
 from amiwarp.io.export import ConversionSummary, convert
 from amiwarp.io.formats import Format, detect_format, open_recording
 from amiwarp.io.native_writer import RecordingWriter, save_recording
-from amiwarp.io.rig_files import read_encoder_csv, read_encoder_triggers
 
 __all__ = [
     "ConversionSummary",

@@ -18,10 +18,9 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name, open_input, write_text
 from amiwarp.io.formats import check_ending
-from amiwarp.io.json_files import LARGEST_INTEGER, read_json
+from amiwarp.io.json_files import LARGEST_INTEGER, camera_from_json, read_json
 from amiwarp.io.plain_files import read_calib
-from amiwarp.io.rig_files import camera_from_json, camera_to_json
-from amiwarp.optics.camera import Camera, Fisheye, RadialTangential
+from amiwarp.optics.camera import Camera, Fisheye, RadialTangential, camera_to_json
 from amiwarp.validation import guarded, one_of, real, shown, vector, whole
 
 ROS_MODELS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4, "fisheye": 4}

@@ -27,7 +27,7 @@ from amiwarp.io.formats import LIMITS, Bag, Codec, Outline, OutputFormat, Roundi
 from amiwarp.io.native_writer import write_recording
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import NominalPrism
-from amiwarp.progress import Progress
+from amiwarp.tasks import Progress
 from amiwarp.validation import guarded, instance, shown, whole
 
 # Writing of events in formats other than the native one, in constant memory and completely or not at all.

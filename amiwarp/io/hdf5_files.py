@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.cpu_threads import in_order
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import recording as checks
 from amiwarp.events.encoder import Encoder
@@ -29,10 +28,21 @@ from amiwarp.events.truth import EVENT_COLUMNS, MAPS, FrameTruth, Poses, Truth, 
 from amiwarp.io.file_scan import FileEvents, Packet, head_limit, read_sensors, smallest_sensor
 from amiwarp.io.files import errors_name, input_path, interrupts_later, register_reader
 from amiwarp.io.formats import Codec
+from amiwarp.io.json_files import LARGEST_INTEGER
 from amiwarp.io.reading_process import ReadingProcess, borrow, give_back, packets, run
-from amiwarp.io.rig_files import attribute, read_camera, read_prism
-from amiwarp.optics.camera import check_size
-from amiwarp.validation import rounded_times
+from amiwarp.optics.camera import (
+    CAMERA_NUMBERS,
+    COEFFICIENTS,
+    DISTORTIONS,
+    Camera,
+    Distortion,
+    camera_to_json,
+    check_size,
+)
+from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
+from amiwarp.tasks import in_order
+from amiwarp.validation import array as as_numbers
+from amiwarp.validation import instance, one_of, real, rounded_times, shown, whole
 
 # Chunks of native recordings, which parallel threads encode, decode, read and write. HDF5 itself uses one thread.
 #
@@ -727,6 +737,71 @@ def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
         return None
     offset = attribute(_attributes(file, "encoder"), f"{path}: /encoder", "clock_offset_us", float, 0.0)
     return Encoder(t, angle, offset, index_t)
+
+
+# Camera and prism as attributes of an HDF5 group, or of a JSON object in a stream.
+
+
+def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[Any], default: Any = None) -> Any:
+    """Return an attribute as type ``kind``; raise :class:`AmiwarpError` if it is missing or of another type."""
+    if name not in attributes and default is None:
+        raise AmiwarpError(f"{where} has no attribute '{name}'; add this attribute")
+    value = attributes.get(name, default)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    what = f"{where} attribute '{name}'"
+    if kind is int:
+        return whole(value, what, -LARGEST_INTEGER, LARGEST_INTEGER)
+    if kind is float:
+        return real(value, what)
+    try:
+        text = value.decode() if isinstance(value, bytes) else value
+    except UnicodeDecodeError:
+        text = value
+    return instance(text, kind, what)
+
+
+def camera_attributes(camera: Camera) -> dict[str, Any]:
+    """Return a camera as attributes of an HDF5 group, by name."""
+    attributes = camera_to_json(camera)
+    lens = attributes.pop("distortion", {"kind": "none"})
+    attributes["distortion_model"] = lens.pop("kind")
+    if lens:
+        attributes["distortion"] = [float(value) for value in lens.values()]
+    return attributes
+
+
+def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
+    """Return the camera stored in the attributes of a file or stream.
+
+    Raises :class:`AmiwarpError` if an attribute is missing or unusable.
+    """
+    model = one_of(attribute(attributes, where, "distortion_model", str, "none"), (*DISTORTIONS, "none"),
+                   f"{where} attribute 'distortion_model'")  # fmt: skip
+    distortion: Distortion | None = None
+    if model in DISTORTIONS:
+        lens, lengths = DISTORTIONS[model], COEFFICIENTS[model]
+        k = as_numbers(attributes.get("distortion", ()), f"{where} attribute 'distortion'")
+        if k.ndim != 1 or len(k) not in lengths:
+            expected = " or ".join(map(str, lengths))
+            raise AmiwarpError(f"camera distortion is {shown(k)}; expected {expected} numbers for {model}")
+        distortion = lens(*k.tolist())
+    kinds = dict(zip(CAMERA_NUMBERS, (int, int, float, float, float, float), strict=True))
+    numbers = {name: attribute(attributes, where, name, kind) for name, kind in kinds.items()}
+    return Camera(**numbers, distortion=distortion)
+
+
+def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
+    """Return the attributes of a nominal prism, without ``apex`` if that is unknown."""
+    known: dict[str, float | str] = {"apex": prism.apex} if isinstance(prism, Prism) else {}
+    return {**known, "index": prism.index, "flat_side": prism.flat_side.value}
+
+
+def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
+    """Return the nominal prism stored in attributes. The apex angle is unknown if ``apex`` is missing."""
+    side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
+    prism = UnsizedPrism(attribute(attributes, where, "index", float), side)
+    return prism.with_apex(attribute(attributes, where, "apex", float)) if "apex" in attributes else prism
 
 
 # Events of native recordings and of files of DSEC and M3ED, whose layouts are alike.

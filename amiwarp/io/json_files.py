@@ -1,4 +1,4 @@
-"""Untrusted JSON and TOML files, read strictly and into dataclasses, and finished work that JSON files keep."""
+"""Untrusted JSON and TOML files, read strictly and into dataclasses and cameras, and stores of finished work."""
 
 import dataclasses
 import difflib
@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, NoReturn, TypeVar, get_args, get_ori
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import check_output, errors_name, open_input, write_text
+from amiwarp.optics.camera import CAMERA_NUMBERS, DISTORTIONS, Camera
 from amiwarp.validation import choice, instance, one_of, real, shown, whole
 
 # Reader of untrusted JSON and TOML files: limited in size, strict, and converted to dataclasses field by field.
@@ -219,6 +220,21 @@ def _container(kind: Any, value: Any, where: str) -> Any:
         raise AmiwarpError(f"field {where} has {len(value)} entries; expected {len(inner)}")
     kinds = inner if fixed else (inner[0],) * len(value)
     return origin(value_of(k, entry, f"{where}[{i}]") for i, (k, entry) in enumerate(zip(kinds, value, strict=True)))
+
+
+def camera_from_json(data: Any, where: str = "") -> Camera:
+    """Return a camera from a JSON object.
+
+    ``where`` is the object's name in messages. Raises :class:`AmiwarpError` naming the field.
+    """
+    given = fields_of(data, where, *CAMERA_NUMBERS, optional=("distortion",))
+    prefix, lens = f"{where}." if where else "", given.get("distortion")
+    distortion = None
+    if lens is not None:
+        numbers = dict(lens) if isinstance(lens, dict) else fields_of(lens, f"{prefix}distortion")
+        kind = one_of(numbers.pop("kind", None), DISTORTIONS, f"field {prefix}distortion.kind")
+        distortion = build(DISTORTIONS[kind], numbers, f"{prefix}distortion")
+    return Camera(**{name: given[name] for name in CAMERA_NUMBERS}, distortion=distortion)
 
 
 # Finished work that a later run continues from, as JSON with a checksum: folders of cells, and journals.

@@ -20,7 +20,6 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.cpu_threads import in_order
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import recording as checks
 from amiwarp.events import truth as ground_truth
@@ -30,11 +29,10 @@ from amiwarp.events.truth import EventTruth, FrameTruth, Poses, Truth, WorldLabe
 from amiwarp.io import hdf5_files
 from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
-from amiwarp.io.hdf5_files import CHUNK, ChunkFile, EncodedChunk, open_hdf5
-from amiwarp.io.rig_files import camera_attributes, prism_attributes
+from amiwarp.io.hdf5_files import CHUNK, ChunkFile, EncodedChunk, camera_attributes, open_hdf5, prism_attributes
 from amiwarp.optics.camera import Camera, check_size
 from amiwarp.optics.prism import NominalPrism
-from amiwarp.progress import Progress
+from amiwarp.tasks import Progress, in_order
 from amiwarp.validation import as_times, choice, guarded, shown
 
 # Layout of the file: header, datasets, chunks and the millisecond index.

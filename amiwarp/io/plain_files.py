@@ -13,13 +13,13 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from amiwarp.cpu_threads import in_order
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, Recording, regroup
 from amiwarp.io.file_scan import FileEvents, Packet, microseconds, read_pieces, whole_pixels
 from amiwarp.io.files import LONGEST_LINE, errors_name, input_path, open_input, scratch_folder
 from amiwarp.io.formats import BIN_EVENT_BYTES, BIN_MARK_ROW, Outline, bin_columns, looks_like_bin
 from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp.tasks import in_order
 
 # Reader of text in the format of the Event Camera Dataset: one event ``t x y p`` per line, t in seconds, p 1 or 0.
 #

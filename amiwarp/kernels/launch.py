@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.cpu_threads import cpu_threads
+from amiwarp.tasks import cpu_threads
 
 # Kernel launches: a single launch on CUDA, slices on a thread pool on the CPU.
 #

@@ -32,8 +32,8 @@ from amiwarp.lens.poses import Pose, still_poses
 from amiwarp.optics.camera import Camera, Fisheye
 from amiwarp.optics.models import ExactModel, Model, rms
 from amiwarp.optics.prism import Prism
-from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.picture import Reconstruction
+from amiwarp.tasks import Progress, silent
 from amiwarp.validation import array, guarded, instance, real
 
 Vector = NDArray[np.float64]

@@ -20,7 +20,7 @@ from amiwarp.lens.corner_fit import first_pose, fit_lens, tilt_of
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import NominalPrism
-from amiwarp.progress import Progress, silent
+from amiwarp.tasks import Progress, silent
 
 SETTLED_TURNS = 5
 """Length of a still span from which on it is used before it ends [turns]: three, and one to settle on either side."""

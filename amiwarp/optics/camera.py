@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, astuple, dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, astuple, dataclass, fields, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -448,6 +449,33 @@ def fold_radius(*k: float, below: tuple[float, ...] = (), largest: float) -> flo
 # Rotation of the camera itself during a time window, with an angular velocity that is constant or linear in time.
 
 Vector = tuple[float, float, float]
+
+
+def camera_to_json(camera: Camera) -> dict[str, Any]:
+    """Return a camera as a JSON object."""
+    out = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
+    if camera.distortion is not None:
+        [kind] = (name for name, lens in DISTORTIONS.items() if isinstance(camera.distortion, lens))
+        out["distortion"] = {"kind": kind, **coefficients(camera.distortion)}
+    return out
+
+
+LENS = ("focal_length", "center_x", "center_y", "k1", "fy_over_fx")
+"""Parameters of the camera's lens. A calibration may free them: the focal length (px), the principal point (px), the
+first radial coefficient of distortion, and fy / fx."""
+
+
+def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
+    """Return the camera with those of its lens parameters (:data:`LENS`) that ``values`` contain."""
+    if values.keys().isdisjoint(LENS):
+        return camera
+    fx = values.get("focal_length", camera.fx)
+    fy = fx * values.get("fy_over_fx", camera.fy / camera.fx)
+    lens = camera.distortion
+    if "k1" in values:
+        lens = replace(lens or RadialTangential(), k1=values["k1"])
+    cx, cy = values.get("center_x", camera.cx), values.get("center_y", camera.cy)
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=lens)
 
 
 @guarded

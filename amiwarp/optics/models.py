@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import refraction as kernels
 from amiwarp.kernels.launch import RecordedLaunch, launch
-from amiwarp.optics.camera import Camera, camera_params
+from amiwarp.optics.camera import Camera, camera_params, with_lens
 from amiwarp.optics.prism import (
     FlatSide,
     NominalPrism,
@@ -30,7 +30,7 @@ from amiwarp.optics.prism import (
     check_phase,
     deflection_from_apex,
 )
-from amiwarp.validation import array, choice, guarded, instance, real, whole
+from amiwarp.validation import array, choice, guarded, instance, one_of, real, whole
 
 # Base class of the optical models: what a model knows of itself, and the displacement of points on any device.
 
@@ -341,6 +341,11 @@ def model_of(kind: type[Made], camera: Camera, prism: Prism, values: Mapping[str
     """Create a model as :meth:`Model.from_values` does, but without its checks of types: a search calls it often."""
     check_given(values, kind.FREE[:2])
     return kind._of_values(camera, prism, values)
+
+
+def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
+    """Build the optical model of the parameter values; ``camera`` and ``prism`` give all other values."""
+    return model_of(MODELS[one_of(model, MODELS, "model")], with_lens(camera, values), prism, values)
 
 
 def check_given(values: Mapping[str, float], names: Iterable[str]) -> None:

@@ -26,7 +26,6 @@ from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.recording import Events, Recording
 from amiwarp.io.pixel_map import THRESHOLDS, PixelMap
 from amiwarp.optics.models import Model
-from amiwarp.progress import Progress
 from amiwarp.reconstruction.picture import (
     SCALES,
     STEPS,
@@ -35,6 +34,7 @@ from amiwarp.reconstruction.picture import (
     off_excess_by_counts,
     solve_rounds,
 )
+from amiwarp.tasks import Progress
 from amiwarp.validation import TIME_LIMIT, guarded, whole
 
 DENSITY = 2.0

@@ -26,12 +26,12 @@ from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.optics.camera import Camera, camera_params
 from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
 from amiwarp.optics.prism import Prism
-from amiwarp.progress import Progress
 from amiwarp.simulation import scenery
 from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel, SimulationValues
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.scenery import DeviceWorld, MapRing, WorldMapRing, WorldSight
 from amiwarp.simulation.worlds.world import WorldScene
+from amiwarp.tasks import Progress
 from amiwarp.validation import TIME_LIMIT, array, guarded, real, shown
 
 # Ground truth of a simulated world at an instant: depth, normals, instances, optical flow and luminance.

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from amiwarp._version import __version__
-from amiwarp.cpu_threads import cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels import launch
+from amiwarp.tasks import cpu_threads
 from amiwarp.validation import whole
 
 Job = TypeVar("Job")

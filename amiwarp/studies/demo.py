@@ -44,10 +44,10 @@ from amiwarp.optics.models import MODELS, ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting.clouds import Renderer
 from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
-from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.picture import Picture, Reconstruction, save_picture
 from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.simulator import Simulation
+from amiwarp.tasks import Progress, silent
 
 # Kernels that the steps after a simulation need on a CPU, to be compiled before they are needed.
 #

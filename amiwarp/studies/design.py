@@ -17,10 +17,10 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import EllipseModel, ExactModel, Model, predicted_error, rungs
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting import figures
-from amiwarp.progress import Progress, part, silent
 from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.scenery import place_scene, seen_bearings
 from amiwarp.simulation.simulator import Simulation
+from amiwarp.tasks import Progress, part, silent
 
 # Effect of a prism on a camera's image: radii of the pixels' orbits, and error of each refraction model.
 

@@ -23,11 +23,11 @@ from amiwarp.io.formats import detect_format, open_recording
 from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism
-from amiwarp.progress import Progress
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.simulation.description import CameraMotion, EncoderModel, Frames, PrismMotion, Scene, SensorModel, Still
 from amiwarp.simulation.pictures import PICTURE_SUFFIXES, Pictures, open_pictures, read_picture
 from amiwarp.simulation.simulator import Simulation
+from amiwarp.tasks import Progress
 from amiwarp.translation import sources
 from amiwarp.translation.sources import DataSet, EventPictures, Interpolation, KnownPictures, MotionPictures
 from amiwarp.validation import check_names, choice, guarded

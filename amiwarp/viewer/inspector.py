@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.calib.bad_pixels import strange_pixels, stretch
-from amiwarp.calib.parameters import build_model, nominal, optical_parameters
+from amiwarp.calib.parameters import nominal, optical_parameters
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.choices import Colour, Sharpness, Vote
 from amiwarp.compensation.recordings import compensate_events
@@ -31,7 +31,7 @@ from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, upload_event
 from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_variance
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, PHASE, Model, size_names
+from amiwarp.optics.models import MODELS, PHASE, Model, build_model, size_names
 from amiwarp.optics.prism import NominalPrism
 from amiwarp.reconstruction.picture import Picture, border_displacements
 

@@ -28,8 +28,8 @@ from amiwarp.io.file_scan import FileEvents
 from amiwarp.io.files import NewFile
 from amiwarp.io.formats import check_ending
 from amiwarp.live.stream.session import RecentEvents
-from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.picture import save_film
+from amiwarp.tasks import Progress, silent
 from amiwarp.viewer.drawing import Look, Scene, SelectedPart, ShownImages, caption, select_part, shown_lines
 from amiwarp.viewer.inspector import (
     CURVE_HALF_WIDTH,

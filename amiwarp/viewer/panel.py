@@ -22,7 +22,7 @@ from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io.files import check_output, interrupts_later
-from amiwarp.progress import Progress
+from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look, Scene

@@ -23,7 +23,7 @@ import msgpack  # type: ignore[import-untyped]
 from yarl import URL
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.memory import release_memory
+from amiwarp.tasks import release_memory
 
 if TYPE_CHECKING:
     from aiohttp import web

@@ -18,8 +18,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.io.files import interrupts_later
-from amiwarp.memory import no_garbage_collection
 from amiwarp.optics.models import MODELS
+from amiwarp.tasks import no_garbage_collection
 from amiwarp.viewer import jobs, layout
 from amiwarp.viewer.drawing import (
     BACKGROUND_AND_INK,

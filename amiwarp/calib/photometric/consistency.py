@@ -17,12 +17,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.calib.parameters import DRIFTS, LENS, RATES, ParameterSpace, widened
+from amiwarp.calib.parameters import DRIFTS, RATES, ParameterSpace, widened
 from amiwarp.calib.photometric.cost import place_arguments, size_and_phase_directions
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.equations import by_shift, multiply
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.camera import Camera, CameraRotation
+from amiwarp.optics.camera import LENS, Camera, CameraRotation
 from amiwarp.optics.models import Model, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from amiwarp.brightness.solver import BrightnessMap, SensorTiming, Tiles, darkness, off_excess, set_lags
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import LENS, MOTION, ParameterSpace, like_size, units
+from amiwarp.calib.parameters import MOTION, ParameterSpace, like_size, units
 from amiwarp.calib.photometric import consistency
 from amiwarp.calib.photometric.cost import (
     GRID,
@@ -36,7 +36,7 @@ from amiwarp.calib.result import PhotometricSummary, StageSummary
 from amiwarp.calib.settings import GAUSS_NEWTON, LINEAR_UNKNOWNS, PhotometricSettings
 from amiwarp.calib.sharpness import LEAST_INSIDE_PX, Search
 from amiwarp.events.recording import Recording
-from amiwarp.optics.camera import Camera
+from amiwarp.optics.camera import LENS, Camera
 
 Vector = NDArray[np.float64]
 

@@ -24,12 +24,12 @@ from amiwarp.io.files import check_output, read_text, write_text
 from amiwarp.io.formats import make_folder
 from amiwarp.optics.models import MODELS, rungs
 from amiwarp.plotting import figures
-from amiwarp.progress import Progress, part, silent
 from amiwarp.simulation.description import SensorModel
 from amiwarp.studies.chart import measurement
 from amiwarp.studies.chart.measurement import KnownRecording, Row
 from amiwarp.studies.cluster import machine, versions
 from amiwarp.studies.demo import Demo, simulation
+from amiwarp.tasks import Progress, part, silent
 
 # Drawing of the speed-error charts as PNG and SVG.
 #

@@ -30,11 +30,10 @@ from amiwarp.imaging.iwe import TURNS, CanvasShape, Image, UploadedEvents, Votes
 from amiwarp.imaging.metrics import model_error, truth_model
 from amiwarp.io import open_recording, save_recording
 from amiwarp.io.files import scratch_folder
-from amiwarp.memory import only_new_garbage, release_memory
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel, Model, axis_rotation, rungs, wrap_angle
 from amiwarp.optics.prism import FlatSide
-from amiwarp.progress import Progress
+from amiwarp.tasks import Progress, only_new_garbage, release_memory
 
 # Ground truth of the charts: the recording's true parameters, and the exact model in float64.
 

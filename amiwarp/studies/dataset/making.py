@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from amiwarp._version import __version__
-from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import convert, open_recording
 from amiwarp.io.files import NewFile, put_in_place, scratch_folder, write_text
@@ -33,13 +32,13 @@ from amiwarp.io.formats import FORMAT, MANIFEST, VERSION, make_folder
 from amiwarp.io.json_files import LARGEST_INTEGER, append_line, build, create_journal, read_journal
 from amiwarp.kernels import launch
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
-from amiwarp.progress import Progress, silent
 from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.simulation.worlds.world_files import POSE_FILES, open_world
 from amiwarp.studies import cluster
 from amiwarp.studies.dataset import specification as spec
+from amiwarp.tasks import Progress, cpu_threads, limited_cpu_threads, silent
 from amiwarp.translation.translator import translation
 from amiwarp.validation import guarded, real, shown, whole
 

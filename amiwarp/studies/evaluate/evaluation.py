@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 import numpy as np
 
 from amiwarp._version import __version__
-from amiwarp.cpu_threads import cpu_threads, limited_cpu_threads
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import BLACK, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, VERMILION
 from amiwarp.io import open_recording
@@ -26,11 +25,11 @@ from amiwarp.io.files import NewFile, check_output, own_folder, write_text
 from amiwarp.io.formats import make_folder
 from amiwarp.io.json_files import CellStore, fields_of, value_of
 from amiwarp.kernels.launch import load_all, load_kernels
-from amiwarp.progress import Progress, silent
 from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs, start_workers, versions, worker_count
 from amiwarp.studies.demo import EXACT_KERNELS
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Table, Value
+from amiwarp.tasks import Progress, cpu_threads, limited_cpu_threads, silent
 from amiwarp.translation.sources import limited_opencv
 from amiwarp.validation import guarded, real, whole
 

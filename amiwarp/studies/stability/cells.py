@@ -19,7 +19,6 @@ from amiwarp._version import __version__
 from amiwarp.brightness.solver import SensorTiming
 from amiwarp.calib import Calibration, Settings, calibrate
 from amiwarp.calib.paper_method import calibrate_as_paper
-from amiwarp.calib.parameters import build_model
 from amiwarp.calib.presets import settings_to
 from amiwarp.calib.settings import AUTO, STAGES
 from amiwarp.choices import Sharpness
@@ -28,12 +27,12 @@ from amiwarp.events.encoder import TWO_PI, Encoder
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.io.json_files import CellStore, build, fields_of, value_of
 from amiwarp.optics.camera import Camera, RadialTangential
-from amiwarp.optics.models import ExactModel, predicted_error
+from amiwarp.optics.models import ExactModel, build_model, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.progress import Progress
 from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel, Still
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs
+from amiwarp.tasks import Progress
 from amiwarp.validation import instance, real, whole
 
 # Scenes of the stability study, drawn from a seed: from a dense texture to a blank wall.

@@ -1,25 +1,38 @@
-"""Groups of command line options that several commands use, as dataclasses: each group is defined once."""
+"""What commands share: groups of options as dataclasses, choice of the device, progress bar, printed result."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
+import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, Literal, get_type_hints
 
+import rich.progress
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, printable
+from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
 from amiwarp.io import files as output
+from amiwarp.io import read_encoder_csv, read_encoder_triggers
 from amiwarp.io.camera_files import load_camera
 from amiwarp.io.files import check_regular
+from amiwarp.io.formats import LIMITS, Codec, OutputFormat, Rounding
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, NominalPrism, UnsizedPrism
+from amiwarp.tasks import Progress
+
+# Options that several commands use. A group of options is a dataclass.
 
 Topic = Annotated[
     str | None, typer.Option(help="Topic of a ROS bag, or camera of an HDF5 file, if the file holds several.")
@@ -29,6 +42,7 @@ Topic = Annotated[
 _in_common = partial(typer.Option, rich_help_panel="Common")
 _in_camera = partial(typer.Option, rich_help_panel="Camera")
 _in_prism = partial(typer.Option, rich_help_panel="Prism")
+_in_log = partial(typer.Option, rich_help_panel="Encoder")
 
 
 @dataclass(frozen=True)
@@ -95,6 +109,83 @@ def complete(recording: Recording, camera: CameraOptions, prism: NominalPrismOpt
     if prism is not None:
         changes["prism"] = prism.build(recording.prism)
     return replace(recording, **changes)
+
+
+@dataclass(frozen=True)
+class EncoderOptions:
+    """Options for a log of the prism's encoder."""
+
+    encoder: Annotated[
+        Path | None,
+        _in_log(help="Encoder log: CSV with the header t_us,angle_deg or t_us,count, and optionally index (0 or 1)."),
+    ] = None
+    encoder_from: Annotated[
+        str | None,
+        _in_log(
+            help="Take the encoder from the trigger edges in the recording: triggers:CHANNEL. Each rising edge is one "
+            "count; by default it is the index pulse, one per turn.",
+            metavar="triggers:CHANNEL",
+        ),
+    ] = None
+    counts_per_turn: Annotated[int | None, _in_log(min=1, help="Encoder counts per turn.")] = None
+    counter_bits: Annotated[
+        int | None,
+        _in_log(
+            min=0,
+            max=64,
+            help="Width of the encoder's counter (bits); 0: the counter restarts at every turn. "
+            "Default: inferred from the counts.",
+        ),
+    ] = None
+    direction: Annotated[Literal["1", "-1"], _in_log(help="Counting direction; -1: backwards.")] = "1"
+
+    def build(self, source: Path, topic: str | None) -> Encoder | None:
+        """Return the encoder of the log or of the recording's triggers, or None if neither is given."""
+        if self.encoder_from is not None:
+            return self._from_triggers(self.encoder_from, source, topic)
+        if self.encoder is None:
+            if self != EncoderOptions():
+                what = "--counts-per-turn, --counter-bits and --direction describe an encoder log"
+                raise AmiwarpError(f"{what}; give --encoder or --encoder-from too")
+            return None
+        return read_encoder_csv(
+            self.encoder,
+            counts_per_turn=self.counts_per_turn,
+            counter_bits=self.counter_bits,
+            direction=int(self.direction),
+        )
+
+    def _from_triggers(self, text: str, source: Path, topic: str | None) -> Encoder:
+        kind, colon, channel = text.partition(":")
+        if kind != "triggers" or (colon and not channel.isdecimal()):
+            raise AmiwarpError(f"--encoder-from {text!r} is unknown; write triggers:CHANNEL, for example triggers:0")
+        if self.encoder is not None or self.counter_bits is not None:
+            raise AmiwarpError("--encoder and --counter-bits describe an encoder log; leave them or --encoder-from out")
+        return read_encoder_triggers(
+            source, int(channel or 0), counts_per_turn=self.counts_per_turn or 1, direction=int(self.direction),
+            topic=topic,
+        )  # fmt: skip
+
+
+Format = Annotated[
+    OutputFormat | None, typer.Option(help="Format to write, if not that of the extension: dsec.", show_default=False)
+]
+"""Option that chooses a format whose extension means another one."""
+
+
+HdfCodec = Annotated[Codec, typer.Option(help="Compression of HDF5. Programs without HDF5's Blosc filter read gzip.")]
+"""Option for the compression of HDF5."""
+
+
+Round = Annotated[
+    Rounding | None,
+    typer.Option(
+        help="Round compensated events to whole pixels, as RAW, AEDAT 4, DSEC and ROS 2 need. nearest: to the nearest "
+        "pixel; dithered: up or down at random (--seed), unbiased. Events outside the image are dropped.",
+        show_default=False,
+    ),
+]
+"""Option for the rounding of compensated events."""
 
 
 SCALES = {
@@ -275,3 +366,94 @@ def _option_parameters(group: type) -> list[inspect.Parameter]:
         )
         for f in fields(group)
     ]
+
+
+# What commands do alike: choice of the device, progress bar, printed result.
+
+
+def choose_device(name: str | None) -> str:
+    """Initialise Warp and return the device to run on.
+
+    Raises :class:`AmiwarpError` if the named device is not available.
+    """
+    from amiwarp.kernels.launch import start_quietly
+
+    known = start_quietly()
+    chosen = name or ("cuda:0" if "cuda:0" in known else "cpu")
+    if chosen not in known:
+        raise AmiwarpError(f"device {chosen!r} is not available; choose one of {', '.join(known)}")
+    return chosen
+
+
+@contextlib.contextmanager
+def progress(what: str, *, average_s: float = 30.0) -> Iterator[Progress]:
+    """Show a progress bar on stderr and remove it at the end. Print nothing if stderr is not a terminal.
+
+    The remaining time follows from the mean speed of the last ``average_s`` [s].
+    """
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with rich.progress.Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal, speed_estimate_period=average_s
+    ) as bar:
+        task = bar.add_task(printable(what), total=1.0)
+        yield lambda what, share: bar.update(task, completed=share, description=printable(what))
+
+
+def report(common: Common, data: dict[str, Any], lines: Iterable[str | Table]) -> None:
+    """Print the result: ``data`` as one JSON object with ``--json``, otherwise ``lines`` as text.
+
+    Each string in ``lines`` is printed as a single line, see :func:`printable`. In JSON, numbers that are not finite
+    become null.
+    """
+    if common.json:
+        print(json.dumps(plain(data), allow_nan=False), flush=True)
+        return
+    # Lines are not wrapped if stdout is a file or a pipe.
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else 1000)
+    with console.capture() as text:
+        for line in lines:
+            console.print(printable(line) if isinstance(line, str) else line, markup=False)
+    print("\n".join(row.rstrip() for row in text.get().splitlines()), flush=True)
+
+
+def plain(value: Any) -> Any:
+    """Convert ``value`` to types that JSON supports. Numbers that are not finite become None."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if isinstance(value, str | int | float | bool | None) else str(value)
+
+
+def made_again(damaged: Sequence[str]) -> list[str]:
+    """Return a line of text about damaged files of an earlier run that were made again; none without such files."""
+    more = f", and {len(damaged) - 1:,} more" if len(damaged) > 1 else ""
+    return [f"damaged, and made again: {damaged[0]}{more}"] if damaged else []
+
+
+def table(rows: Iterable[tuple[str, ...]], *headings: str) -> Table:
+    """Return a table without rules. Cells are shown without markup, see :func:`printable`."""
+    from rich.text import Text
+
+    grid = Table(box=None, show_header=bool(headings), pad_edge=False, header_style="bold")
+    cells = [[Text(printable(cell)) for cell in row] for row in rows]
+    for k in range(max((len(row) for row in cells), default=len(headings))):
+        grid.add_column(headings[k] if headings else "", style="dim" if k == 0 and not headings else None)
+    for row in cells:
+        grid.add_row(*row)
+    return grid
+
+
+def format_notes(d: dict[str, Any]) -> list[str]:
+    """Return what the format of the output has changed and left out."""
+    lines = []
+    if d["rounding"] is not None:
+        lines.append(f"note: rounded to whole pixels ({d['rounding']}); {d['dropped']:,} events outside are dropped")
+    if d["left_out"]:
+        lines.append(f"note: {LIMITS[d['format']].label} does not hold, and leaves out: {', '.join(d['left_out'])}")
+    return lines

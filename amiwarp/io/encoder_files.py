@@ -1,9 +1,9 @@
-"""Camera, prism and encoder in files: JSON objects, attributes in HDF5, CSV logs, and the triggers of a camera."""
+"""Encoder of the prism from files: CSV logs, and the triggers that a camera recorded with its events."""
 
 import contextlib
 import os
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,103 +14,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder, UnwrapError
 from amiwarp.io.files import errors_name, text_lines
 from amiwarp.io.formats import TRIGGERS, Format, detect_format, io_function
-from amiwarp.io.json_files import LARGEST_INTEGER, build, fields_of
-from amiwarp.optics.camera import CAMERA_NUMBERS, COEFFICIENTS, DISTORTIONS, Camera, Distortion, coefficients
-from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
-from amiwarp.validation import array as as_numbers
-from amiwarp.validation import instance, one_of, real, shown, whole
-
-# Camera as a JSON object, in files of calibrations and cameras.
-
-
-def camera_to_json(camera: Camera) -> dict[str, Any]:
-    """Return a camera as a JSON object."""
-    out = {name: getattr(camera, name) for name in CAMERA_NUMBERS}
-    if camera.distortion is not None:
-        [kind] = (name for name, lens in DISTORTIONS.items() if isinstance(camera.distortion, lens))
-        out["distortion"] = {"kind": kind, **coefficients(camera.distortion)}
-    return out
-
-
-def camera_from_json(data: Any, where: str = "") -> Camera:
-    """Return a camera from a JSON object.
-
-    ``where`` is the object's name in messages. Raises :class:`AmiwarpError` naming the field.
-    """
-    given = fields_of(data, where, *CAMERA_NUMBERS, optional=("distortion",))
-    prefix, lens = f"{where}." if where else "", given.get("distortion")
-    distortion = None
-    if lens is not None:
-        numbers = dict(lens) if isinstance(lens, dict) else fields_of(lens, f"{prefix}distortion")
-        kind = one_of(numbers.pop("kind", None), DISTORTIONS, f"field {prefix}distortion.kind")
-        distortion = build(DISTORTIONS[kind], numbers, f"{prefix}distortion")
-    return Camera(**{name: given[name] for name in CAMERA_NUMBERS}, distortion=distortion)
-
-
-# Camera and prism as attributes of an HDF5 group, or of a JSON object in a stream.
-
-
-def attribute(attributes: Mapping[str, Any], where: str, name: str, kind: type[Any], default: Any = None) -> Any:
-    """Return an attribute as type ``kind``; raise :class:`AmiwarpError` if it is missing or of another type."""
-    if name not in attributes and default is None:
-        raise AmiwarpError(f"{where} has no attribute '{name}'; add this attribute")
-    value = attributes.get(name, default)
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.item()
-    what = f"{where} attribute '{name}'"
-    if kind is int:
-        return whole(value, what, -LARGEST_INTEGER, LARGEST_INTEGER)
-    if kind is float:
-        return real(value, what)
-    try:
-        text = value.decode() if isinstance(value, bytes) else value
-    except UnicodeDecodeError:
-        text = value
-    return instance(text, kind, what)
-
-
-def camera_attributes(camera: Camera) -> dict[str, Any]:
-    """Return a camera as attributes of an HDF5 group, by name."""
-    attributes = camera_to_json(camera)
-    lens = attributes.pop("distortion", {"kind": "none"})
-    attributes["distortion_model"] = lens.pop("kind")
-    if lens:
-        attributes["distortion"] = [float(value) for value in lens.values()]
-    return attributes
-
-
-def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
-    """Return the camera stored in the attributes of a file or stream.
-
-    Raises :class:`AmiwarpError` if an attribute is missing or unusable.
-    """
-    model = one_of(attribute(attributes, where, "distortion_model", str, "none"), (*DISTORTIONS, "none"),
-                   f"{where} attribute 'distortion_model'")  # fmt: skip
-    distortion: Distortion | None = None
-    if model in DISTORTIONS:
-        lens, lengths = DISTORTIONS[model], COEFFICIENTS[model]
-        k = as_numbers(attributes.get("distortion", ()), f"{where} attribute 'distortion'")
-        if k.ndim != 1 or len(k) not in lengths:
-            expected = " or ".join(map(str, lengths))
-            raise AmiwarpError(f"camera distortion is {shown(k)}; expected {expected} numbers for {model}")
-        distortion = lens(*k.tolist())
-    kinds = dict(zip(CAMERA_NUMBERS, (int, int, float, float, float, float), strict=True))
-    numbers = {name: attribute(attributes, where, name, kind) for name, kind in kinds.items()}
-    return Camera(**numbers, distortion=distortion)
-
-
-def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
-    """Return the attributes of a nominal prism, without ``apex`` if that is unknown."""
-    known: dict[str, float | str] = {"apex": prism.apex} if isinstance(prism, Prism) else {}
-    return {**known, "index": prism.index, "flat_side": prism.flat_side.value}
-
-
-def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
-    """Return the nominal prism stored in attributes. The apex angle is unknown if ``apex`` is missing."""
-    side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
-    prism = UnsizedPrism(attribute(attributes, where, "index", float), side)
-    return prism.with_apex(attribute(attributes, where, "apex", float)) if "apex" in attributes else prism
-
+from amiwarp.validation import whole
 
 # Reader of encoder logs in CSV: columns ``t_us``, ``angle_deg`` or ``count``, and optionally ``index`` (0 or 1).
 

@@ -1,14 +1,17 @@
-"""CPU threads: how many to use, and the results of jobs in order.
+"""What long tasks need: a number of CPU threads, the results of jobs in order, progress, and freed memory.
 
 This module does not import Warp, so that file readers start fast.
 """
 
 import contextlib
+import ctypes
+import gc
 import os
+import sys
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from typing import TypeAlias, TypeVar
 
 Result = TypeVar("Result")
 
@@ -60,3 +63,55 @@ def in_order(jobs: Iterable[Callable[[], Result]]) -> Generator[Result, None, No
             yield waiting.popleft().result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+Progress: TypeAlias = Callable[[str, float], None]
+"""Callback that gets the name of the current step, and the finished fraction of the whole task, 0 to 1."""
+
+
+def part(progress: Progress, start: float, end: float) -> Progress:
+    """Return the callback for a part of a task, which covers the fractions ``start`` to ``end`` of the whole."""
+    return lambda what, share: progress(what, start + (end - start) * share)
+
+
+def silent(what: str, share: float) -> None:
+    """Ignore the progress: callback for callers that do not report progress."""
+
+
+def release_memory() -> None:
+    """Collect garbage, and return freed memory to the operating system.
+
+    Objects that refer to each other in cycles are freed by the garbage collector only. glibc keeps freed memory in the
+    arena of each thread until ``malloc_trim`` is called.
+    """
+    gc.collect()
+    if sys.platform.startswith("linux"):
+        with contextlib.suppress(AttributeError):  # musl has no malloc_trim
+            ctypes.CDLL(None).malloc_trim(0)
+
+
+@contextlib.contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Stop the garbage collector in all threads, inside a ``with`` block. What is due then is collected at its end."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.collect(0)  # in this thread, or the next thread that allocates anything would do it
+            gc.enable()
+
+
+@contextlib.contextmanager
+def only_new_garbage() -> Iterator[None]:
+    """Make the garbage collector ignore the objects that exist now, inside a ``with`` block.
+
+    Modules create several 100,000 objects, and to visit them all may take as long as a calibration on a GPU.
+    """
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
