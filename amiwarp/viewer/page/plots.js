@@ -14,7 +14,7 @@ function placed(low, high, most) {
 }
 
 export const CurvePlot = {
-  props: { x: Array, y: Array, mark: Number, best: Number, truth: Number, xTitle: String, yTitle: String, label: String },
+  props: { x: Array, y: Array, mark: Number, truth: Number, xTitle: String, yTitle: String, label: String },
   emits: ['pick'],
   template: `<div class="plot" role="img" :aria-label="label">
     <div class="plot-y">{{ yTitle }}</div>
@@ -65,7 +65,7 @@ export const CostSurface = {
   template: `<div class="plot surface" role="img" :aria-label="label">
     <div class="plot-y">{{ yTitle }}</div>
     <div class="plot-box"><img :src="image" alt=""/>
-      <span v-for="m in within" class="cross" :class="m.kind" :style="{ left: share(m.x, x), bottom: share(m.y, y) }"
+      <span v-for="m in within" class="cross" :style="{ left: share(m.x, x), bottom: share(m.y, y) }"
         :title="m.title">{{ m.sign }}</span>
       <span v-for="t in placed(y[0], y[y.length - 1], 4)" class="tick-y" :style="{ bottom: 100 * t.at + '%' }">{{ t.text }}</span>
       <span v-for="t in placed(x[0], x[x.length - 1], 4)" class="tick-x" :style="{ left: 100 * t.at + '%' }">{{ t.text }}</span>
