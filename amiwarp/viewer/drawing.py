@@ -289,35 +289,31 @@ class ShownImages:
 
 
 def make_images(
-    inspector: Inspector, kind: ImageKind, knobs: Knobs | None = None, *, against: Knobs | None = None
+    inspector: Inspector, kind: ImageKind, *, against: Knobs | None = None, shown: DisplayedWindow | None = None
 ) -> ShownImages:
     """Return the images of the inspector's window.
 
-    ``knobs``: parameters of the second image, by default the current ones. ``against``: parameters of the first image
-    instead of none. Raises :class:`AmiwarpError` if a log intensity cannot be reconstructed.
+    ``against``: parameters of the first image instead of none. ``shown``: the window with these parameters, if it is
+    known: its counts are not made again. Raises :class:`AmiwarpError` if a log intensity cannot be reconstructed.
     """
-    window, knobs = inspector.loaded, knobs or inspector.knobs
+    window, knobs = inspector.loaded, inspector.knobs
     left, top, right, bottom = window.region
-    cut = np.s_[..., top:bottom, left:right]
     if kind is ImageKind.LOG_INTENSITY:
         return _log_images(inspector, window, knobs, against)
     first = inspector.beside if against is None and inspector.beside is not None else inspector
     pair = (first, first.loaded, against), (inspector, window, knobs)
     if kind is ImageKind.TIME_SURFACE:
-        images = [_time_surface(*each)[cut] for each in pair]
+        images = [_time_surface(*each) for each in pair]
+    elif kind is ImageKind.COUNT and shown is not None:
+        images = [shown.image_before, shown.image_after]
+    else:
+        images = [each.counts(w, k, per_polarity=kind is ImageKind.POLARITY) for each, w, k in pair]
+    before, after = (each[..., top:bottom, left:right] for each in images)
+    if kind is ImageKind.TIME_SURFACE:
         scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, "viridis")
-        return ShownImages(kind, images[0], images[1], scale)
-    per_polarity = kind is ImageKind.POLARITY
-    images = [each.counts(w, k, per_polarity=per_polarity)[cut] for each, w, k in pair]
-    colours = "polarity" if per_polarity else "gray"
-    return ShownImages(kind, images[0], images[1], _count_scale(images, colours))
-
-
-def count_images(shown: DisplayedWindow) -> ShownImages:
-    """Return the images of kind :attr:`ImageKind.COUNT` of a window that is already shown."""
-    left, top, right, bottom = shown.region
-    images = [each[top:bottom, left:right] for each in (shown.image_before, shown.image_after)]
-    return ShownImages(ImageKind.COUNT, images[0], images[1], _count_scale(images))
+    else:
+        scale = _count_scale((before, after), "polarity" if kind is ImageKind.POLARITY else "gray")
+    return ShownImages(kind, before, after, scale)
 
 
 def with_difference(images: ShownImages) -> ShownImages:

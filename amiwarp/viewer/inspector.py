@@ -101,22 +101,22 @@ class EventRates:
         curve has fewer bins. Times outside the recording have rate 0.
         """
         start_us, end_us = int(start_us), max(int(end_us), int(start_us) + 1)
-        edges = start_us + (end_us - start_us) * np.arange(bins + 1, dtype=np.int64) // bins
-        edges = np.unique(edges)
+        edges = np.unique(start_us + (end_us - start_us) * np.arange(bins + 1, dtype=np.int64) // bins)
         finest = (self._stop - self._first) / (len(self._edges) - 1)
-        if edges[1] - edges[0] < 4.0 * finest and finest > 1.0:
-            exact = self._exact(edges)
-            if exact is not None:
-                return _curve(edges, exact)
+        fine = edges[1] - edges[0] < 4.0 * finest and finest > 1.0
+        counts = self._exact(edges) if fine else None
+        if fine and counts is None:
             within = (self._edges > start_us) & (self._edges < end_us)
             edges = np.concatenate([[start_us], self._edges[within], [end_us]])
             edges = edges[np.unique(np.r_[0 : len(edges) - 1 : max(1, len(edges) // bins), len(edges) - 1])]
-        sums, read_us = self._read
-        before = np.searchsorted(self._edges, edges)  # a bin of the recording belongs to where it begins
-        counts = np.diff(sums[:, np.minimum(before, sums.shape[1] - 1)], axis=1).astype(np.float64)
-        if read_us < self._stop:
-            counts[:, edges[1:] > read_us] = np.nan
-        return _curve(edges, counts)
+        if counts is None:
+            sums, read_us = self._read
+            before = np.searchsorted(self._edges, edges)  # a bin of the recording belongs to where it begins
+            counts = np.diff(sums[:, np.minimum(before, sums.shape[1] - 1)], axis=1).astype(np.float64)
+            if read_us < self._stop:
+                counts[:, edges[1:] > read_us] = np.nan
+        off, on = counts / np.diff(edges) * 1e6
+        return RateCurve(edges, on, off)
 
     def _count(self, block: Events) -> None:
         low, high = np.searchsorted(self._edges, (block.t[0], block.t[-1]), side="right") - 1
@@ -136,11 +136,6 @@ class EventRates:
             return None
         events = self._source.slice(first, stop)
         return np.array([np.diff(np.searchsorted(events.t[events.p == p], edges)) for p in (0, 1)], np.float64)
-
-
-def _curve(edges: NDArray[np.int64], counts: NDArray[np.float64]) -> RateCurve:
-    rates = counts / np.diff(edges) * 1e6
-    return RateCurve(edges, rates[1], rates[0])
 
 
 # Events of a time window, read without loading the other events.
@@ -318,7 +313,7 @@ class WindowImager:
 
     def __init__(self, size: tuple[int, int], device: Any) -> None:
         self._votes, self._device = Votes(CanvasShape(*size, dither=True), device), device
-        self._meters: dict[tuple[int, int], SharpnessMeter] = {}
+        self._meter: SharpnessMeter | None = None
 
     def measure(self, model: Model, events: UploadedEvents, offset_us: float, region: Region) -> tuple[float, float]:
         """Return variance and sharpness in the region, see :class:`MeasuredImage`.
@@ -328,7 +323,10 @@ class WindowImager:
         self._votes.clear()
         self._votes.add_events(model, events, drift=offset_us)
         left, top, right, bottom = region
-        meter = self._meter(right - left, bottom - top)
+        canvas, meter = CanvasShape(right - left, bottom - top, dither=True), self._meter
+        if meter is None or meter.image.shape != canvas.shape:
+            meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
+            self._meter = meter
         if meter.image.shape == self._votes.canvas.shape:
             self._votes.read(meter.image)
             part = meter.image.numpy()[0]
@@ -337,14 +335,6 @@ class WindowImager:
             meter.image.write(part[None])
         variance, mean = meter.measure(), float(part.mean())
         return variance, relative_variance(variance, mean, SMOOTHING_PX) if mean > 0.0 else 0.0
-
-    def _meter(self, width: int, height: int) -> SharpnessMeter:
-        """Return the meter of images of this size. Only the last one is kept."""
-        if (width, height) not in self._meters:
-            canvas = CanvasShape(width, height, dither=True)
-            meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
-            self._meters = {(width, height): meter}
-        return self._meters[width, height]
 
 
 def recorded_counts(events: Events, size: tuple[int, int], *, per_polarity: bool = False) -> NDArray[np.float32]:
@@ -572,84 +562,12 @@ class Statistics:
         return (self.on + self.off) / self.duration_us * 1e6
 
 
-def find_statistics(window: LoadedWindow) -> Statistics:
-    """Return the statistics of the selected events of a window. Intervals between two runs are not counted."""
-    left, top, right, bottom = window.region
-    events, span = window.events, window.span
-    events = events[inside(events, window.region)]
-    starts = span.events.t[np.cumsum([0, *(run.stop - run.start for run in span.runs)])[:-1]]
-    run = np.searchsorted(starts, events.t, side="right")
-    pixel = (run * (bottom - top) + events.y.astype(np.int64) - top) * (right - left) + events.x - left
-    order = np.argsort(pixel, kind="stable")
-    steps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
-    counts, _ = np.histogram(np.clip(steps, 1, 999_999), INTERVALS_US)
-    on, read = int(events.p.sum()), len(span.events)
-    return Statistics(
-        on=on, off=len(events) - on, duration_us=max(1, round(span.length_us * read / span.count)),
-        pixels=len(np.unique(pixel % ((bottom - top) * (right - left)))), area=(bottom - top) * (right - left),
-        intervals=counts, median_us=float(np.median(steps)) if len(steps) else math.nan,
-    )  # fmt: skip
-
-
 # Selected events of a time window, on the host and with their prism angles on the device.
 
 MOST_POINTS, WINDOW_POINTS = 100_000, 1_000_000
 """Largest number of points in each event cloud: of the page, which sends them to a browser, and of the window."""
 CURVE_EVENTS = 200_000
 """Largest number of events that a sharpness curve uses."""
-
-
-def load_window(
-    recording: Recording, span: Span, selection: Selection, *, margin_px: int, hot: NDArray[np.bool_] | None,
-    most_points: int,
-) -> LoadedWindow:  # fmt: skip
-    """Select the events of a time window.
-
-    ``margin_px``: how far outside the region events belong to its images. ``hot``: the hot pixels to leave out.
-    ``most_points``: largest number of events that are drawn.
-    Raises :class:`AmiwarpError` if no event meets the selection.
-    """
-    region = selection.region or (0, 0, *recording.events.size)
-    left, top, right, bottom = region
-    wide = (left - margin_px, top - margin_px, right + margin_px, bottom + margin_px)
-    keep = kept(recording, span.events, selection, wide, hot)
-    if span.places is not None:  # compensated events outside of the image have no pixel
-        half = np.array(recording.events.size) / 2.0
-        keep &= (np.abs(span.places + 0.5 - half) <= half).all(axis=1)
-    near = None if keep.all() else np.flatnonzero(keep)  # None stands for all
-    events = span.events if near is None else span.events[near]
-    within = np.flatnonzero(inside(events, region)) if selection.region else None
-    n = len(events) if within is None else len(within)
-    if not n:
-        what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
-        raise AmiwarpError(f"{what} from {(span.start_us - recording.events.t_first) * 1e-3:.3f} ms on for "
-                           f"{span.length_us * 1e-3:.3f} ms; take another window")  # fmt: skip
-    thin = np.arange(min(n, most_points)) * n // min(n, most_points)
-    thin = thin if within is None else within[thin]
-    drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
-    xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
-    xy = xy if span.places is None else span.places[truth.positions]
-    curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
-    return LoadedWindow(span, region, n, drawn, truth, xy, events, curve_events)
-
-
-def kept(
-    recording: Recording, events: Events, selection: Selection, region: Region, hot: NDArray[np.bool_] | None
-) -> NDArray[np.bool_]:
-    """Return whether each event meets the selection, with another region, shape ``(n,)``."""
-    keep = np.ones(len(events), np.bool_)
-    if recording.encoder is not None:
-        first, last = recording.encoder.coverage
-        keep &= (events.t >= first) & (events.t <= last)
-    if selection.polarity is not None:
-        keep &= events.p == selection.polarity
-    if selection.region is not None:
-        keep &= inside(events, region)
-    if hot is not None:
-        keep &= ~hot[events.y, events.x]
-    if selection.noise_us is not None:
-        keep &= ~find_background_activity(events, recording.events.size, window_us=selection.noise_us)
-    return keep
 
 
 def inside(events: Events, region: Region) -> NDArray[np.bool_]:
@@ -740,7 +658,8 @@ def _best_box(
     factor = (over_mean_after - noise) / mean_after / (np.maximum(over_mean, noise) / mean)
     variance = mean_after * over_mean_after - mean * over_mean
     variance = np.where(mean >= LEAST_SHARE * mean_after, variance, 0.0)
-    inner = _inner(variance.shape, margin)
+    margins = (min(margin, (n - 1) // 2) for n in variance.shape)  # at least the middle is searched
+    inner = tuple(slice(m, n - m) for m, n in zip(margins, variance.shape, strict=True))
     gains = bool((over_mean_after - over_mean)[inner].max() > LEAST_SIGMA * noise * (2.0 / (width * height)) ** 0.5)
     if not gains:
         variance = factor = mean * over_mean
@@ -748,12 +667,6 @@ def _best_box(
     candidates[inner] = np.where(variance[inner] >= NEARLY_BEST * variance[inner].max(), factor[inner], -np.inf)
     top, left = np.unravel_index(int(np.argmax(candidates)), candidates.shape)
     return int(left), int(top), gains
-
-
-def _inner(shape: tuple[int, ...], margin: int) -> tuple[slice, ...]:
-    """Return the part of an array without a margin on each side, at least its middle."""
-    margins = (min(margin, (n - 1) // 2) for n in shape)
-    return tuple(slice(m, n - m) for m, n in zip(margins, shape, strict=True))
 
 
 def _of_boxes(image: NDArray[np.float32], width: int, height: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -1174,8 +1087,21 @@ class Inspector:
         return sharpness
 
     def statistics(self) -> Statistics:
-        """Return the statistics of the selected events of the time window."""
-        return find_statistics(self.loaded)
+        """Return the statistics of the selected events of the time window. Intervals between runs are not counted."""
+        events, span, (left, top, right, bottom) = self.loaded.events, self.loaded.span, self.loaded.region
+        events = events[inside(events, self.loaded.region)]
+        starts = span.events.t[np.cumsum([0, *(run.stop - run.start for run in span.runs)])[:-1]]
+        run = np.searchsorted(starts, events.t, side="right")
+        pixel = (run * (bottom - top) + events.y.astype(np.int64) - top) * (right - left) + events.x - left
+        order = np.argsort(pixel, kind="stable")
+        steps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
+        counts, _ = np.histogram(np.clip(steps, 1, 999_999), INTERVALS_US)
+        on, read = int(events.p.sum()), len(span.events)
+        return Statistics(
+            on=on, off=len(events) - on, duration_us=max(1, round(span.length_us * read / span.count)),
+            pixels=len(np.unique(pixel % ((bottom - top) * (right - left)))), area=(bottom - top) * (right - left),
+            intervals=counts, median_us=float(np.median(steps)) if len(steps) else math.nan,
+        )  # fmt: skip
 
     def orbit(self, x: float, y: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Return the orbit of the scene point that would appear at (x, y) [px] without the prism.
@@ -1252,9 +1178,44 @@ class Inspector:
         return self._select(span, self.selection).events
 
     def _select(self, span: Span, selection: Selection) -> LoadedWindow:
-        hot = self.hot if selection.hide_hot else None
-        return load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot,
-                           most_points=self.most_points)  # fmt: skip
+        """Select the events of a time window. Raises :class:`AmiwarpError` if no event meets the selection."""
+        recording, m = self.recording, self.margin_px
+        left, top, right, bottom = region = selection.region or (0, 0, *recording.events.size)
+        keep = self.kept(span.events, selection, (left - m, top - m, right + m, bottom + m))
+        if span.places is not None:  # compensated events outside of the image have no pixel
+            half = np.array(recording.events.size) / 2.0
+            keep &= (np.abs(span.places + 0.5 - half) <= half).all(axis=1)
+        near = None if keep.all() else np.flatnonzero(keep)  # None stands for all
+        events = span.events if near is None else span.events[near]
+        within = np.flatnonzero(inside(events, region)) if selection.region else None
+        n = len(events) if within is None else len(within)
+        if not n:
+            what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
+            raise AmiwarpError(f"{what} from {span.start_ms:.3f} ms on for {span.length_us * 1e-3:.3f} ms; "
+                               "take another window")  # fmt: skip
+        thin = np.arange(min(n, self.most_points)) * n // min(n, self.most_points)
+        thin = thin if within is None else within[thin]
+        drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
+        xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
+        xy = xy if span.places is None else span.places[truth.positions]
+        curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
+        return LoadedWindow(span, region, n, drawn, truth, xy, events, curve_events)
+
+    def kept(self, events: Events, selection: Selection, region: Region) -> NDArray[np.bool_]:
+        """Return whether each event meets the selection, with another region, shape ``(n,)``."""
+        keep = np.ones(len(events), np.bool_)
+        if self.recording.encoder is not None:
+            first, last = self.recording.encoder.coverage
+            keep &= (events.t >= first) & (events.t <= last)
+        if selection.polarity is not None:
+            keep &= events.p == selection.polarity
+        if selection.region is not None:
+            keep &= inside(events, region)
+        if selection.hide_hot:
+            keep &= ~self.hot[events.y, events.x]
+        if selection.noise_us is not None:
+            keep &= ~find_background_activity(events, self.recording.events.size, window_us=selection.noise_us)
+        return keep
 
     def _drift_us(self, knobs: Knobs) -> float:
         """Return how far the clock offset is from that of the recording's own encoder [us]."""
@@ -1348,7 +1309,10 @@ class Library:
 
     def files(self) -> list[list[str]]:
         """Return names and sizes of the files, in the order of their names."""
-        found = sorted(path for path in self.folder.iterdir() if self._is_recording(path))
+        found = sorted(
+            path for path in self.folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+            and path.is_file() and path.resolve().parent == self.folder  # also if it is a link
+        )  # fmt: skip
         return [[path.name, f"{path.stat().st_size / 1e6:,.1f} MB"] for path in found[:MOST_FILES]]
 
     def open(self, name: str) -> Inspector:
@@ -1356,8 +1320,3 @@ class Library:
         if name not in [file for file, _ in self.files()]:
             raise AmiwarpError(f"{name!r}: is no recording in {self.folder}; choose one from the list")
         return self._open_file(self.folder / name)
-
-    def _is_recording(self, path: Path) -> bool:
-        """Return whether a file looks like a recording, and lies in the folder even if it is a link."""
-        visible = path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
-        return visible and path.is_file() and path.resolve().parent == self.folder

@@ -6,7 +6,7 @@ import logging
 import math
 import re
 import weakref
-from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,15 +31,7 @@ from amiwarp.live.stream.session import RecentEvents
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.viewer.drawing import Look, Scene, SelectedPart, ShownImages, caption, select_part, shown_lines
-from amiwarp.viewer.inspector import (
-    CURVE_HALF_WIDTH,
-    MOST_SEARCHED,
-    Inspector,
-    Knobs,
-    Source,
-    busiest,
-    kept,
-)
+from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, MOST_SEARCHED, Inspector, Knobs, Source, busiest
 
 # Work of one page: its threads, jobs and updates, and the messages about their errors.
 
@@ -95,13 +87,8 @@ class PageWork:
     waits for an update is marked on the page. Nothing is computed while the page does not keep up with the messages.
     """
 
-    def __init__(
-        self, server: Any, device: Any, make: Callable[[set[str]], Awaitable[None]],
-        make_slow: Callable[[str], Awaitable[None]],
-    ) -> None:  # fmt: skip
-        """``make`` makes a set of quick updates, and ``make_slow`` one slow update."""
-        self._server, self._state = server, server.state
-        self._make, self._make_slow = make, make_slow
+    def __init__(self, server: Any, device: Any) -> None:
+        self.server, self.state = server, server.state
         self.buffers_lock = asyncio.Lock()
         """Lock of the inspector's buffers on the device, which only one thread may use at a time."""
         self.device_lock: Any = _CUDA_LOCK if "cuda" in str(device) else contextlib.nullcontext()
@@ -114,6 +101,14 @@ class PageWork:
         self._error_source = ""
         # A tab's own pool, which ends with the tab: calibration or film; curve or picture; quick updates.
         self._threads = ThreadPoolExecutor(3, "amiwarp-tab")
+
+    async def make(self, todo: set[str]) -> None:
+        """Make a set of quick updates."""
+        raise NotImplementedError
+
+    async def make_slow(self, name: str) -> None:
+        """Make one slow update."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Stop all work. A thread ends when its current work is done."""
@@ -150,8 +145,8 @@ class PageWork:
         return await asyncio.get_running_loop().run_in_executor(self._threads, partial(work, *args, **options))
 
     def show_message(self, text: str, severity: str) -> None:
-        with self._state:
-            self._state.update({"message": text, "severity": severity})
+        with self.state:
+            self.state.update({"message": text, "severity": severity})
 
     @contextlib.contextmanager
     def errors_shown(self, what: str) -> Iterator[None]:
@@ -160,16 +155,16 @@ class PageWork:
             yield
         except (AmiwarpError, OSError) as error:
             self._error_source = what
-            self._state.update({"message": str(error), "severity": "error"})
+            self.state.update({"message": str(error), "severity": "error"})
         else:
-            if self._state.severity == "error" and self._error_source == what:
-                self._state.update({"message": "", "severity": "info"})
+            if self.state.severity == "error" and self._error_source == what:
+                self.state.update({"message": "", "severity": "info"})
 
     def _show_pending(self) -> None:
         """Show which parts of the page wait for an update."""
         quick = self._quick_requests | self._doing
         parts = {part for what in quick for part in QUICK.get(what, ())} | (self._slow_requests | self._doing) & {*SLOW}
-        self._state.updating = sorted(parts)
+        self.state.updating = sorted(parts)
 
     def _task(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)
@@ -189,14 +184,14 @@ class PageWork:
                     await asyncio.sleep(WAIT_S)
                 todo, self._quick_requests = self._quick_requests, set()
                 async with self._done(todo), self.device_lock, self.buffers_lock:
-                    await self._make(todo)
+                    await self.make(todo)
                 await asyncio.sleep(0)
         finally:
             self._quick = None
 
     def _in_flight(self) -> int:
         """Return the number of unsent messages to the page."""
-        return 0 if self._server.protocol is None else int(self._server.protocol.network_monitor.pending)
+        return 0 if self.server.protocol is None else int(self.server.protocol.network_monitor.pending)
 
     async def _update_slowly(self) -> None:
         try:
@@ -206,7 +201,7 @@ class PageWork:
                 self._slow_requests.discard(name)
                 async with self._done({name}), self.device_lock:
                     with self.errors_shown(name):
-                        await self._make_slow(name)
+                        await self.make_slow(name)
         finally:
             self._slow = None
 
@@ -218,7 +213,7 @@ class PageWork:
             yield
         finally:
             self._doing -= todo
-            with self._state:
+            with self.state:
                 self._show_pending()
 
 
@@ -356,12 +351,6 @@ class CostSurface:
     sharpness: NDArray[np.float64]
     """Sharpness, shape ``(rows, columns)``."""
 
-    @property
-    def best(self) -> tuple[float, float]:
-        """Values of both parameters with the largest sharpness."""
-        row, column = np.unravel_index(int(np.argmax(self.sharpness)), self.sharpness.shape)
-        return float(self.values[0][column]), float(self.values[1][row])
-
 
 def cost_surface(
     inspector: Inspector, *, points: tuple[int, int] = SURFACE_POINTS, progress: Progress | None = None
@@ -455,8 +444,6 @@ class LiveSource:
 
 BLOCK = 1 << 20
 """Number of events that are written at a time."""
-IMAGE_SUFFIXES = (".tif", ".npy")
-"""Suffixes of files with the values of an image, float32."""
 COLUMNS = ("t", "x", "y", "p", "theta", "x_compensated", "y_compensated")
 """Columns of a table of events: time [us], pixel, polarity, prism angle [rad] and compensated place [px]."""
 
@@ -492,11 +479,8 @@ def write_table(inspector: Inspector, path: Path) -> None:
 
     Raises :class:`AmiwarpError` for another suffix, or if the file exists.
     """
-    ending, encoder, knobs = (
-        check_ending(path, "tables are written", (".csv", ".npz")),
-        inspector.adjusted_encoder,
-        inspector.knobs,
-    )
+    ending = check_ending(path, "tables are written", (".csv", ".npz"))
+    encoder, knobs = inspector.adjusted_encoder, inspector.knobs
 
     def table(e: Events) -> tuple[NDArray[Any], ...]:
         theta, moved = np.mod(encoder.angle_at(e.t), math.tau), inspector.positions(e, knobs)
@@ -516,26 +500,18 @@ def write_table(inspector: Inspector, path: Path) -> None:
             np.savetxt(file, np.column_stack(each), fmt="%d,%d,%d,%d,%.6f,%.3f,%.3f")
 
 
-def write_image(images: ShownImages, path: Path, *, before: bool = False) -> None:
-    """Write the values of one of the images to a new file, .tif or .npy.
+def write_image(images: ShownImages, path: Path) -> None:
+    """Write the values of the second image to a new .tif file, float32; two polarities on two pages, OFF and ON.
 
-    ``before``: write the first image instead of the second. A .tif of two polarities has two pages, OFF and ON. Raises
-    :class:`AmiwarpError` for another suffix, if the file exists, or if there is no such image.
+    Raises :class:`AmiwarpError` for another suffix, or if the file exists.
     """
     from PIL import Image
 
-    values = images.before if before else images.after
-    if values is None:
-        raise AmiwarpError(f"there is no image of {images.kind.value} before compensation; export the compensated one")
-    ending = check_ending(path, "values of images are written", IMAGE_SUFFIXES)
+    check_ending(path, "values of images are written", (".tif",))
     with NewFile(path) as new:
-        if ending == ".npy":
-            with open(new.part, "wb") as file:
-                np.save(file, np.asarray(values, np.float32))
-        else:
-            pages = values if values.ndim == 3 else values[None]
-            first, *more = (Image.fromarray(np.asarray(page, np.float32)) for page in pages)
-            encode_image(new.part, first, "TIFF", save_all=bool(more), append_images=more)
+        pages = images.after if images.after.ndim == 3 else images.after[None]
+        first, *more = (Image.fromarray(np.asarray(page, np.float32)) for page in pages)
+        encode_image(new.part, first, "TIFF", save_all=bool(more), append_images=more)
 
 
 def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
@@ -543,11 +519,10 @@ def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
 
     The noise filter of a block sees the last events of the block before it.
     """
-    window, hot = inspector.loaded, inspector.hot if inspector.selection.hide_hot else None
     noise_us, last = inspector.selection.noise_us or 0, None
     for block in filter(len, _blocks(inspector)):
         events = block if last is None else Events.concatenate([last, block])
-        chosen = kept(inspector.recording, events, inspector.selection, window.region, hot)[-len(block) :]
+        chosen = inspector.kept(events, inspector.selection, inspector.loaded.region)[-len(block) :]
         yield block if chosen.all() else block[chosen]
         last = events[int(np.searchsorted(events.t, block.t[-1] - noise_us)) :] if noise_us else None
 

@@ -1,8 +1,8 @@
 """Contents of the inspector's page: its state and history, names, units, keys and texts, and its template."""
 
+import contextlib
 import math
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
@@ -11,6 +11,7 @@ import numpy as np
 
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
+from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look, Scale, picture_state
 from amiwarp.viewer.inspector import (
@@ -401,13 +402,17 @@ class Actions:
     def released(self) -> None:
         """End a change that lasts, such as a drag."""
 
-    def errors_shown(self, what: str) -> AbstractContextManager[None]:
-        """Show errors of the enclosed code as a message. ``what``: kind of the action."""
-        raise NotImplementedError
-
     def say(self, text: str) -> None:
         """Show a message."""
         raise NotImplementedError
+
+    @contextlib.contextmanager
+    def errors_shown(self, what: str) -> Iterator[None]:
+        """Show errors of the enclosed code as a message. ``what``: kind of the action."""
+        try:
+            yield
+        except (AmiwarpError, OSError) as error:
+            self.say(str(error))
 
     def knobs_taken(self) -> None:
         """Show parameters that the inspector has taken from elsewhere."""
@@ -460,6 +465,18 @@ class Actions:
         with self.errors_shown("knobs"):
             self.inspector.take_truth()
         self.knobs_taken()
+
+    def accept(self) -> None:
+        """Set the parameters to the result of the calibration."""
+        if self.found is not None:
+            with self.errors_shown("knobs"):
+                self.inspector.accept(self.found)
+            self.discard()
+            self.knobs_taken()
+
+    def discard(self) -> None:
+        """Forget the result of the calibration."""
+        self.found = None
 
     # Time
 

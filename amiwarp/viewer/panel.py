@@ -26,14 +26,7 @@ from amiwarp.progress import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look, Scene
-from amiwarp.viewer.inspector import (
-    DisplayedWindow,
-    EventRates,
-    Inspector,
-    Knobs,
-    Library,
-    Selection,
-)
+from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection
 from amiwarp.viewer.jobs import SLOW, JobCancelled, JobProgress, PageWork
 from amiwarp.viewer.serve import finite, serve, use_page
 
@@ -48,7 +41,7 @@ PLAY_S, FOLLOW_S, RATES_S = 0.05, 0.1, 1.0
 two counts of a live stream's events for the timeline [s]."""
 
 
-class Panel(layout.Actions):
+class Panel(PageWork, layout.Actions):
     """Panel that connects the page of one browser tab with its inspector. Call :meth:`close` when the tab is closed.
 
     The page may call the methods in :data:`amiwarp.viewer.layout.CALLS`. The server checks their arguments by their
@@ -57,8 +50,8 @@ class Panel(layout.Actions):
 
     def __init__(self, server: Any, inspector: Inspector, library: Library | None = None) -> None:
         """Build the page on a new trame server. ``library``: other recordings that the page may open."""
-        self.state, self.inspector, self._server, self._library = server.state, inspector, server, library
-        self.work = PageWork(server, inspector.device, self.make, self.make_slow)
+        super().__init__(server, inspector.device)
+        self.inspector, self._library = inspector, library
         self.shown: DisplayedWindow | None = None
         """Window as the page shows it; None before the first update."""
         self.plays = False
@@ -79,7 +72,7 @@ class Panel(layout.Actions):
         """Show an inspector from its first state."""
         self.inspector, self.shown, self.b, self.found, self._picked = inspector, None, None, None, -1
         self.history, self.steps = None, ()
-        self._give_points()
+        self.use_card(self._card)
         inspector.renew()  # a live stream may have gone on since the inspector was made
         files = [] if self._library is None else self._library.files()
         folder = "" if self._library is None else str(self._library.folder)
@@ -90,18 +83,18 @@ class Panel(layout.Actions):
         self._count_events()
         self.request("window", *(["suggestion"] if self.compensates else []))
         self.released()
-        self.work.request_slow("preparation")
+        self.request_slow("preparation")
         if inspector.latest is not None:
             self.play()
         if isinstance(inspector.latest, jobs.LiveSource):
-            self.work.start_job(self._watch(inspector.latest))
+            self.start_job(self._watch(inspector.latest))
 
     def close(self) -> None:
         """Stop all work of the browser tab, and remove its downloads."""
         self._folder.cleanup()
         self.cancel()
         self.inspector.closed = True
-        self.work.close()
+        super().close()
 
     def cancel(self) -> None:
         """Stop the calibration or the film that is being made."""
@@ -151,11 +144,7 @@ class Panel(layout.Actions):
 
     def say(self, text: str) -> None:
         """Show a message."""
-        self.work.show_message(text, "info")
-
-    def errors_shown(self, what: str) -> contextlib.AbstractContextManager[None]:
-        """Show errors of the enclosed code as a message, until the same kind of action succeeds."""
-        return self.work.errors_shown(what)
+        self.show_message(text, "info")
 
     def request(self, *what: str, change: str = "") -> None:
         """Request quick updates of the page.
@@ -163,7 +152,7 @@ class Panel(layout.Actions):
         ``change``: name of a change that lasts, such as a drag; it is undone in one step.
         """
         self._change = f"{change} {self._drags}" if change else ""
-        self.work.request(*what)
+        super().request(*what)
 
     def _listen(self) -> None:
         """Follow the state variables that the page sets, and offer the methods that it calls."""
@@ -178,20 +167,20 @@ class Panel(layout.Actions):
         follow(("model", "against", "kind", "difference"), self.request, "knobs")
         follow(("model", "kind", "polarity", "hide_hot", "noise_filter"), self.released)
         for name in layout.CALLS:
-            self._server.trigger(name)(getattr(self, name))
+            self.server.trigger(name)(getattr(self, name))
 
     # Buttons, keys, fields and the mouse
 
     def released(self) -> None:
         """Update the slow parts of the page after a change, and end what is undone in one step."""
         self._drags += 1
-        self.work.request_slow(*SLOW)
+        self.request_slow(*SLOW)
 
     def choose(self, name: str) -> None:
         """Select the parameter over which the sharpness curve is drawn."""
         if name in layout.NAMES and name != self.state.knob:
             self.state.knob = name
-            self.work.request_slow("curve")
+            self.request_slow("curve")
 
     def typed(self, name: str, text: str) -> None:
         """Set the value that a user typed into a number field."""
@@ -200,19 +189,19 @@ class Panel(layout.Actions):
         try:
             value = finite(text)
         except ValueError:
-            self.work.show_message(f"{text!r} is not a number; give a number such as 1.5", "error")
+            self.show_message(f"{text!r} is not a number; give a number such as 1.5", "error")
             return
         if name in layout.FIELD_LIMITS:
             (low, high), (label, unit, *_) = layout.FIELD_LIMITS[name], {**layout.SLIDERS, **layout.GIVEN}[name]
             if not low <= value <= high:
                 text = f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}"
-                self.work.show_message(text, "error")
+                self.show_message(text, "error")
                 return
         if name == "turns":
             name, value = "length_ms", value * float(self.state.turn_ms)
         self.state[name] = round(value, 4)
         if name in layout.GIVEN:
-            self.work.start_job(self._give(name, value))
+            self.start_job(self._give(name, value))
             return
         if name in layout.NAMES:
             self.state.knob = name
@@ -221,8 +210,8 @@ class Panel(layout.Actions):
 
     async def _give(self, name: str, value: float) -> None:
         """Set the camera or the prism's index, which the recording lacks."""
-        await self.work.until_drawn()
-        with self.work.errors_shown("knobs"), self.state as state:
+        await self.until_drawn()
+        with self.errors_shown("knobs"), self.state as state:
             give = self.inspector.set_camera if name == "fov_deg" else self.inspector.set_index
             give(value)
             state.update(layout.given_state(self.inspector))
@@ -233,15 +222,9 @@ class Panel(layout.Actions):
     def use_card(self, found: bool) -> None:
         """Show more points if the browser has a graphics card to draw them."""
         self._card = found
-        if self._give_points():
-            self.request("window")
-
-    def _give_points(self) -> bool:
-        """Give the inspector the number of points that a graphics card draws. Return whether it had fewer."""
-        more = self._card and self.inspector.most_points < CARD_POINTS
-        if more:
+        if found and self.inspector.most_points < CARD_POINTS:
             self.inspector.most_points = CARD_POINTS
-        return more
+            self.request("window")
 
     def answer(self) -> None:
         """Do nothing: the page asks only whether the server answers."""
@@ -264,7 +247,7 @@ class Panel(layout.Actions):
     def open_file(self, name: str) -> None:
         """Show another recording of the folder."""
         self.state.open_shown = False
-        self.work.start_job(self._open_file(name))
+        self.start_job(self._open_file(name))
 
     async def _open_file(self, name: str) -> None:
         if self._library is None:
@@ -272,9 +255,9 @@ class Panel(layout.Actions):
         if self.state.calibrating:
             self.cancel()
         self.state.playing = False
-        with self.work.errors_shown("file"):
-            inspector = await self.work.in_thread(self._library.open, name)
-            await self.work.until_drawn()
+        with self.errors_shown("file"):
+            inspector = await self.in_thread(self._library.open, name)
+            await self.until_drawn()
             self.start(inspector)
         self.state.flush()
 
@@ -336,7 +319,7 @@ class Panel(layout.Actions):
             state.playing = False
             return
         self.plays = True
-        self.work.start_job(self._play())
+        self.start_job(self._play())
 
     async def _play(self) -> None:
         try:
@@ -350,26 +333,26 @@ class Panel(layout.Actions):
             start_s = loop.time()
             with state:
                 state.playing = self.advance(1e6 * elapsed_s * float(state.speed), loop=bool(state.loop))
-            await self.work.until_drawn()
+            await self.until_drawn()
             await asyncio.sleep(max(0.0, PLAY_S - (loop.time() - start_s)))
             elapsed_s = loop.time() - start_s
         self.released()
 
     async def _follow(self) -> None:
         """Show the current events of a live stream, again and again."""
-        await self.work.until_drawn()  # with the suggested region
+        await self.until_drawn()  # with the suggested region
         loop, counted_s = asyncio.get_running_loop(), -math.inf
         while self.state.playing:
             start_s = loop.time()
             with self.state:
-                with self.work.errors_shown("stream"):
+                with self.errors_shown("stream"):
                     self.inspector.renew()
                 self.state.update(layout.source_state(self.inspector))
                 if start_s >= counted_s + RATES_S:
                     counted_s = start_s
                     self._count_events()
                 self.move(self.inspector.recording.events.t_last)
-            await self.work.until_drawn()
+            await self.until_drawn()
             await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
 
@@ -386,12 +369,12 @@ class Panel(layout.Actions):
     def _count_events(self) -> None:
         """Count the recording's events in the background, for the timeline."""
         self._rates = EventRates(self.inspector.recording.events)
-        self.work.start_job(self._fill(self._rates))
+        self.start_job(self._fill(self._rates))
 
     async def _fill(self, rates: EventRates) -> None:
         finished = False
         while not finished and rates is self._rates:
-            finished = await self.work.in_thread(rates.fill, STEP_S)
+            finished = await self.in_thread(rates.fill, STEP_S)
             with self.state:
                 self._show_rates()
 
@@ -418,7 +401,7 @@ class Panel(layout.Actions):
         """Exchange the current parameters and B."""
         if self.b is not None:
             now = self.inspector.knobs
-            with self.work.errors_shown("knobs"):
+            with self.errors_shown("knobs"):
                 self.inspector.set(self.b)
                 self.show_b(now)
             self.knobs_taken()
@@ -487,7 +470,7 @@ class Panel(layout.Actions):
             self.found = None
             self.state.update({"busy": "calibrating", "calibrating": True, "progress": 0, "found": "", "surface": None})
             self._progress = JobProgress(self._show_progress)
-            self.work.start_job(self._calibrate(self._progress))
+            self.start_job(self._calibrate(self._progress))
         elif self.state.calibrating:
             self.cancel()
             self.state.busy = "calibrating: cancelling"
@@ -500,7 +483,7 @@ class Panel(layout.Actions):
             found = await self._guarded_in_thread(find, inspector, progress)
             if isinstance(found, str):
                 text, severity = ("calibration cancelled", "info") if progress.cancelled else (found, "error")
-                self.work.show_message(text, severity)
+                self.show_message(text, severity)
                 return
             self.found = found.calibration
             with state:
@@ -515,25 +498,17 @@ class Panel(layout.Actions):
 
     async def _guarded_in_thread(self, call: Callable[..., Any], inspector: Inspector, progress: Progress) -> Any:
         """Return the result of a call with progress, or the text of its error."""
-        async with self.work.device_lock:
-            return await self.work.in_thread(_guarded, call, weakref.ref(inspector), progress)
+        async with self.device_lock:
+            return await self.in_thread(_guarded, call, weakref.ref(inspector), progress)
 
     def _show_progress(self, what: str, share: float) -> None:
         """Show the current step of a calibration or a film, and the finished share, 0 to 1."""
         with self.state:
             self.state.update({"busy": what, "progress": round(100 * min(share, 1.0))})
 
-    def accept(self) -> None:
-        """Set the prism's parameters to the result of the calibration."""
-        if self.found is not None:
-            with self.work.errors_shown("knobs"):
-                self.inspector.accept(self.found)
-            self.discard()
-            self.knobs_taken()
-
     def discard(self) -> None:
         """Forget the result of the calibration."""
-        self.found = None
+        super().discard()
         self.state.update({"found": "", "surface": None})
         if self.state.against == "found":
             self.show_b(self.b)
@@ -545,9 +520,9 @@ class Panel(layout.Actions):
         s = self.state
         if what in ("picture", "image") and self.shown is not None:
             words = drawing.caption(self.inspector, self.shown).split("; ")
-            self._server.js_call("page", what, jobs.download_name(self.inspector.recording.name, what), words)
+            self.server.js_call("page", what, jobs.download_name(self.inspector.recording.name, what), words)
         elif what in jobs.EXPORTS and what not in ("picture", "image") and not (what in jobs.FILMS and s.busy):
-            self.work.start_job(self._film(what) if what in jobs.FILMS else self._write(what))
+            self.start_job(self._film(what) if what in jobs.FILMS else self._write(what))
 
     async def _write(self, what: str) -> None:
         inspector, kind, against = self.inspector, self.image, self.against
@@ -563,7 +538,7 @@ class Panel(layout.Actions):
             "compensated": partial(jobs.write_events, inspector, compensated=True),
             "calibration": lambda path: inspector.as_calibration().save(path),
         }  # fmt: skip
-        async with self.work.device_lock, self.work.buffers_lock:
+        async with self.device_lock, self.buffers_lock:
             await self._download(what, write[what])
 
     async def _film(self, what: str) -> None:
@@ -579,7 +554,7 @@ class Panel(layout.Actions):
             s.update({"busy": f"making the {jobs.EXPORTS[what][0]}", "progress": 0})
         try:
             with contextlib.suppress(JobCancelled):
-                async with self.work.device_lock:
+                async with self.device_lock:
                     await self._download(what, film)
         finally:
             with s:
@@ -588,14 +563,14 @@ class Panel(layout.Actions):
     async def _download(self, what: str, write: Callable[[Path], object]) -> None:
         """Write a file in a thread, and give it to the browser."""
         name = jobs.download_name(self.inspector.recording.name, what)
-        with self.work.errors_shown("export"):
+        with self.errors_shown("export"):
             path = Path(self._folder.name) / name
             path.unlink(missing_ok=True)
-            await self.work.in_thread(write, path)
+            await self.in_thread(write, path)
             self._downloads += 1  # a browser keeps what it has loaded from an address
-            self._server.js_call("page", "download", name, f"{self._server.name}/{name}?{self._downloads}")
+            self.server.js_call("page", "download", name, f"{self.server.name}/{name}?{self._downloads}")
             size = f"{path.stat().st_size / 1e3:,.0f} kB"
-            self.work.show_message(f"{name}: {size}, in the browser's downloads", "success")
+            self.show_message(f"{name}: {size}, in the browser's downloads", "success")
         self.state.flush()
 
     # Undo, redo, reset, and the state in the page's address
@@ -608,7 +583,7 @@ class Panel(layout.Actions):
         size = self.inspector.recording.events.size
         state, wrong = layout.decode_state(address, history.first, size=size, duration_us=self.whole_us)
         if wrong:
-            self.work.show_message("; ".join(wrong), "error")
+            self.show_message("; ".join(wrong), "error")
         return state
 
     def remember(self, change: str) -> layout.History:
@@ -623,7 +598,7 @@ class Panel(layout.Actions):
         wanted = self.travelled()
         if wanted is None:
             return
-        await self.work.in_thread(layout.apply_state, self.inspector, wanted)
+        await self.in_thread(layout.apply_state, self.inspector, wanted)
         s, selection = self.state, wanted.selection
         region = list(selection.region or (0, 0, *s.size))
         kind = s.region_kind if region == s.region_wanted else "whole" if selection.region is None else "drawn"
@@ -651,13 +626,15 @@ class Panel(layout.Actions):
             await self.make(todo - {"state"})
             todo = {"state"}
         if todo & {"window", "suggestion"}:
-            with self.work.errors_shown("window"):
+            with self.errors_shown("window"):
                 try:
                     await self._open(suggest="suggestion" in todo)
-                except AmiwarpError:
-                    self._return_to_open_window()
+                except AmiwarpError:  # show again what is still open; playback goes on through a time without events
+                    if self.inspector.window is not None and not state.playing:
+                        self.time_window = self.inspector.window
+                        state.region_wanted = list(self.inspector.loaded.region)
                     raise
-        with self.work.errors_shown("knobs"):
+        with self.errors_shown("knobs"):
             good = self.inspector.knobs, dict(self.inspector.sources)
             try:
                 if "knobs" in todo:
@@ -667,7 +644,7 @@ class Panel(layout.Actions):
                 if "state" in todo:
                     await self._apply_steps()
                 self.show_knobs()
-                self.shown, values = await self.work.in_thread(self._compute)
+                self.shown, values = await self.in_thread(self._compute)
             except AmiwarpError:
                 self.inspector.knobs, self.inspector.sources = good
                 self.show_knobs()
@@ -682,15 +659,20 @@ class Panel(layout.Actions):
     async def make_slow(self, name: str) -> None:
         """Make a slow update: "curve", "picture", "statistics", or "preparation" of the first picture."""
         if name == "preparation":
-            await self.work.in_thread(drawing.prepare, self.inspector)
+            await self.in_thread(drawing.prepare, self.inspector)
         elif name == "statistics":
-            self.state.statistics = layout.statistics_state(await self.work.in_thread(self.inspector.statistics))
-        else:
-            await (self._curve() if name == "curve" else self._picture())
+            self.state.statistics = layout.statistics_state(await self.in_thread(self.inspector.statistics))
+        elif name == "curve":
+            await self._curve()
+        elif self.image is ImageKind.LOG_INTENSITY and self.shown is not None:
+            try:
+                self.state.update(await self.in_thread(self._images, self.shown))
+            except AmiwarpError as error:
+                self.state.update({"before": None, "after": None, "image_note": str(error)})
 
     async def _open(self, *, suggest: bool) -> None:
         """Read the window and the selection that the page shows."""
-        s, inspector, in_thread = self.state, self.inspector, self.work.in_thread
+        s, inspector, in_thread = self.state, self.inspector, self.in_thread
         if not float(s.length_ms) > 0.0:
             raise AmiwarpError(f"a window of {s.length_ms:g} ms; give a length above 0")
         start_us, length_us = self.time_window
@@ -712,19 +694,17 @@ class Panel(layout.Actions):
         return Selection({"both": None, "ON": 1, "OFF": 0}[s.polarity], None if region == whole else region,
                          bool(s.hide_hot), noise_us)  # fmt: skip
 
-    def _return_to_open_window(self) -> None:
-        """Show time and region of the window that is still shown. Playback goes on through a time without events."""
-        s, window = self.state, self.inspector.window
-        if window is not None and not s.playing:
-            self.time_window = window
-            s.region_wanted = list(self.inspector.loaded.region)
-
     def _compute(self) -> tuple[DisplayedWindow, dict[str, Any]]:
         """Return what is to be shown, and the state variables that show it."""
         s, before, against = self.state, self.shown, self.against
         shown = self.inspector.show(against=against)
         values = drawing.cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
-        values |= self._images(shown) | self._orbit(shown)
+        values |= {"image_slow": self.image is ImageKind.LOG_INTENSITY, **drawing.NO_ORBIT}
+        if not values["image_slow"]:
+            values |= self._images(shown)
+        if lines := drawing.shown_lines(self.inspector, shown, self.look.axis, against, self._picked):
+            orbit, column = map(drawing.float_bytes, lines)
+            values |= {"orbit": orbit, "column": column, "has_orbit": True} if s.orbit_shown else {}
         if before is None or shown.span is not before.span:
             values["overview"] = drawing.whole_image(shown.span.events, self.inspector.recording.events.size)
         left = "recorded" if against is None else s.against
@@ -737,33 +717,24 @@ class Panel(layout.Actions):
         }  # fmt: skip
 
     def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
-        """Return the state variables of the images of the region; of slow kinds, only that they are."""
-        kind = self.image
-        if kind is ImageKind.LOG_INTENSITY:
-            return {"image_slow": True}
-        if kind is not ImageKind.COUNT:
-            return {"image_slow": False, **self._other_images()}
-        pair = drawing.count_images(shown)
-        return {"image_slow": False, **_image_state(drawing.with_difference(pair) if self.state.difference else pair)}
-
-    def _other_images(self) -> dict[str, Any]:
-        return _image_state(drawing.make_images(self.inspector, self.image, against=self.against))
-
-    def _orbit(self, shown: DisplayedWindow) -> dict[str, Any]:
-        """Return the orbit of the scene point of the picked event, or of the middle of the region."""
-        lines = drawing.shown_lines(self.inspector, shown, self.look.axis, self.against, self._picked)
-        if not (lines and self.state.orbit_shown):
-            return drawing.NO_ORBIT
-        orbit, column = map(drawing.float_bytes, lines)
-        return {"orbit": orbit, "column": column, "has_orbit": True}
+        """Return the state variables of the images of the region."""
+        pair = drawing.make_images(self.inspector, self.image, against=self.against, shown=shown)
+        pair = drawing.with_difference(pair) if self.state.difference else pair
+        scales = pair.scale, pair.after_scale or pair.scale
+        before, after = (
+            None if image is None else drawing.picture_state(image, scale)
+            for image, scale in zip((pair.before, pair.after), scales, strict=True)
+        )
+        first, second = map(drawing.scale_state, scales)
+        return {"before": before, "after": after, "image_scale": first, "after_scale": second, "image_note": pair.note}
 
     async def _curve(self) -> None:
         s, name = self.state, self.state.knob
         find = partial(jobs.scope_text, self.inspector)
-        s.calibrate_on = [await self.work.in_thread(find, whole=whole) for whole in (False, True)]
+        s.calibrate_on = [await self.in_thread(find, whole=whole) for whole in (False, True)]
         if not self.compensates:
             return
-        values, scores = await self.work.in_thread(self.inspector.curve, name)
+        values, scores = await self.in_thread(self.inspector.curve, name)
         x: list[float] = (values / layout.UNITS[name]).tolist()
         if not x:
             return
@@ -773,27 +744,6 @@ class Panel(layout.Actions):
         s.curve = {"name": label, "title": f"{label} ({unit})", "text": f"peak {peak}, now {s[name]:.4g}", "x": x,
                    "y": scores.tolist(), "truth": layout.truths(self.inspector)[name]}  # fmt: skip
         s.curve_mark = float(s[name])
-
-    async def _picture(self) -> None:
-        """Make images of a slow kind."""
-        s = self.state
-        if s.kind != ImageKind.LOG_INTENSITY.value or self.shown is None:
-            return
-        try:
-            s.update(await self.work.in_thread(self._other_images))
-        except AmiwarpError as error:
-            s.update({"before": None, "after": None, "image_note": str(error)})
-
-
-def _image_state(pair: drawing.ShownImages) -> dict[str, Any]:
-    """Return the state variables of the images of the region."""
-    scales = pair.scale, pair.after_scale or pair.scale
-    before, after = (
-        None if image is None else drawing.picture_state(image, scale)
-        for image, scale in zip((pair.before, pair.after), scales, strict=True)
-    )
-    first, second = map(drawing.scale_state, scales)
-    return {"before": before, "after": after, "image_scale": first, "after_scale": second, "image_note": pair.note}
 
 
 def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progress: Progress) -> Any:

@@ -349,14 +349,6 @@ class Window(layout.Actions):
         self._progress = False
         self.request("look")
 
-    def accept(self) -> None:
-        """Set the parameters to the result of the calibration."""
-        if self.found is not None:
-            with self.errors_shown("window"):
-                self.inspector.accept(self.found)
-            self.found = None
-            self.request("knobs")
-
     def export(self, what: str) -> None:
         """Save the calibration, or a picture of the window, under a new name in the current folder."""
         path = self._new_name(what)
@@ -384,14 +376,6 @@ class Window(layout.Actions):
         """Show a message."""
         self.message = text
         self.request("look")
-
-    @contextlib.contextmanager
-    def errors_shown(self, what: str) -> Iterator[None]:
-        """Show errors of the enclosed code as a message."""
-        try:
-            yield
-        except (AmiwarpError, OSError) as error:
-            self.say(str(error))
 
     def _select(self, **changes: Any) -> None:
         inspector = self.inspector
