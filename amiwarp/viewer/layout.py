@@ -157,8 +157,6 @@ class History:
 
 # text in the address
 
-ANGLES = ("apex", "phase", *(name for name, p in OTHERS.items() if p.unit == "rad"))
-"""Parameters that the address gives in degrees."""
 LIMITS = {
     "apex": (0.0, 29.9), "phase": (-3600.0, 3600.0), "clock_offset": (-LARGEST_OFFSET_US, LARGEST_OFFSET_US),
     **{name: p.limits for name, p in SLIDING.items()}, "rpm": (-LARGEST_RPM, LARGEST_RPM),
@@ -166,6 +164,11 @@ LIMITS = {
 }  # fmt: skip
 """Smallest and largest value of each parameter in an address and a field: angles in degrees, others in their own units.
 """
+UNITS = {
+    **dict.fromkeys(LIMITS, 1.0),
+    **dict.fromkeys(("apex", "phase", *(name for name, p in OTHERS.items() if p.unit == "rad")), math.radians(1.0)),
+}
+"""Conversion from the units of page and address (angles in degrees) to the parameters' units (radians): factors."""
 HAND_LIMITS = {"fov_deg": (1.0, 170.0), "prism_index": (1.01, 3.5)}
 """Smallest and largest value of the properties of camera and prism that can be set by hand."""
 CHOICES: dict[str, Any] = {"image": ImageKind, "colour": Colour, "axis": Axis, "view": View}
@@ -220,7 +223,7 @@ def _knob_texts(knobs: Knobs, before: str) -> dict[str, str]:
     out = {f"{before}model": knobs.model}
     for name in LIMITS:
         if (value := knobs.value(name)) is not None:
-            out[before + name] = f"{math.degrees(value) if name in ANGLES else value:.10g}"
+            out[before + name] = f"{value / UNITS[name]:.10g}"
     return out
 
 
@@ -254,8 +257,7 @@ def _with_knob(knobs: Knobs, name: str, text: str) -> Knobs:
     """Return parameters with one value of an address."""
     if name == "model" and text in MODELS:
         return replace(knobs, model=text)
-    value = _within(float(text), *LIMITS[name])
-    return knobs.with_values({name: math.radians(value) if name in ANGLES else value})
+    return knobs.with_values({name: _within(float(text), *LIMITS[name]) * UNITS[name]})
 
 
 def _selected(state: ViewState, **changes: Any) -> ViewState:
@@ -294,12 +296,7 @@ def _within(value: float, low: float, high: float) -> float:
     return value
 
 
-UNITS = {
-    "apex": math.radians(1.0), "phase": math.radians(1.0), "clock_offset": 1.0,
-    **{name: math.radians(1.0) if p.unit == "rad" else 1.0 for name, p in SLIDING.items()}, "rpm": 1.0,
-}  # fmt: skip
-"""Conversion from the page's units (angles in degrees) to the parameters' units (radians): factor per parameter."""
-NAMES = tuple(UNITS)
+NAMES = ("apex", "phase", "clock_offset", "rpm", *SLIDING)
 """Names of the prism parameters that have a slider."""
 GIVEN = {"fov_deg": ("field of view", "°", "gives_camera"), "index": ("refractive index", "", "gives_prism")}
 """Properties of camera and prism that a recording may lack: label, unit, and the condition for showing the field."""
@@ -320,14 +317,8 @@ SLIDERS = {
     },
 }  # fmt: skip
 """Sliders of the page by parameter: label, unit, (minimum, maximum, step), and the condition for showing the slider."""
-SPEEDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10)
-"""Choices of the playback speed, relative to real time."""
-VIEWS = ((View.FREE.value, "corner"), (View.XY.value, "x-y"), (View.X_AXIS.value, "x-θ"), (View.Y_AXIS.value, "y-θ"))
-"""Viewpoints of the clouds, with the texts of their buttons."""
 SCOPES = ("selection", "whole recording")
 """Choices of the events that a calibration uses."""
-TOOLS = (("region", "draw region"), ("move", "move"), ("measure", "measure"))
-"""What a drag of the mouse does on the images: name and text."""
 KEYS = (
     ("ArrowRight", ("step", 1), "forward by one turn, or by the window's length"),
     ("ArrowLeft", ("step", -1), "back by one turn, or by the window's length"),
@@ -354,15 +345,14 @@ KEYS = (
 )
 """Keys of the page: name of the key, method of the panel with its arguments, and help text."""
 CALLS = (
-    "key", "released", "choose", "typed", "edge", "draw", "whole", "suggest", "look_from", "step", "move_window",
-    "resize_window", "take_from_curve", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline",
-    "undo", "redo", "reset", "restore", "answer", "keep_b", "swap_b", "compare_found", "export", "open_file",
-    "use_card", "end_film",
+    "key", "released", "choose", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
+    "resize_window", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline", "undo", "redo",
+    "reset", "restore", "answer", "keep_b", "swap_b", "export", "open_file", "use_card", "end_film",
 )  # fmt: skip
 """Methods of the panel that the page may call."""
 SETTABLE: dict[str, Check] = {
     **dict.fromkeys(NAMES, number()), "point_size": number(1.0, 20.0), "opacity": number(0.0, 1.0),
-    "speed": one_of(*SPEEDS), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
+    "speed": number(0.001, 10.0), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
     "colour": one_of(*(each.value for each in Colour)), "axis": one_of(*(each.value for each in Axis)),
     "kind": one_of(*(each.value for each in ImageKind)), "against": one_of(*AGAINST), "scope": one_of(*SCOPES),
     "message": one_of(""),
@@ -594,14 +584,13 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "apex_most": apex_most(inspector), "truths": truths(inspector),
         "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth),
         "exports": [[name, text, name in FILMS] for name, (text, _) in EXPORTS.items()],
-        "open_shown": False, "playing": False, "speed": 0.1, "speeds": list(SPEEDS), "loop": False, "polarity": "both",
+        "help_shown": False, "open_shown": False, "playing": False, "speed": 0.1, "loop": False, "polarity": "both",
         "hide_hot": False, "noise_filter": False, "noise_ms": 2.0, "region_kind": "whole",
         "region_wanted": [0, 0, *size], "region": [0, 0, *size], "knob": "apex",
         "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
         "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
-        "views": [list(each) for each in VIEWS], "tool": "region", "tools": [list(each) for each in TOOLS],
-        "hover": "", "measured": "", "late": 0, "slice": [0.0, 1.0], "orbit_shown": True, "help_shown": False,
+        "tool": "region", "hover": "", "measured": "", "late": 0, "slice": [0.0, 1.0], "orbit_shown": True,
         "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
         "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
         "rate_on": b"", "rate_off": b"", "rate_note": "", "picked_text": "",
@@ -633,7 +622,7 @@ def source_state(inspector: Inspector) -> dict[str, Any]:
 
 def knob_values(inspector: Inspector) -> dict[str, float]:
     """Return the prism's parameters in the page's units, rounded as the page shows them."""
-    return {name: round((inspector.knobs.value(name) or 0.0) / scale, 4) for name, scale in UNITS.items()}
+    return {name: round((inspector.knobs.value(name) or 0.0) / UNITS[name], 4) for name in NAMES}
 
 
 def knob_state(inspector: Inspector) -> dict[str, Any]:
@@ -661,7 +650,7 @@ def given_state(inspector: Inspector) -> dict[str, Any]:
 def truths(inspector: Inspector) -> dict[str, float | None]:
     """Return the known true parameters in the page's units; None for an unknown one."""
     known = inspector.truth
-    return {n: None if known is None else round((known.value(n) or 0.0) / scale, 4) for n, scale in UNITS.items()}
+    return {n: None if known is None else round((known.value(n) or 0.0) / UNITS[n], 4) for n in NAMES}
 
 
 def notes(inspector: Inspector) -> list[str]:

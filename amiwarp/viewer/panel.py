@@ -263,29 +263,18 @@ class Panel(PageWork, layout.Actions):
 
     # Region of the image
 
-    def edge(self, side: int, text: str) -> None:
-        """Set one side of the region (0: left, 1: top, 2: right, 3: bottom) to a typed number [px]."""
-        with contextlib.suppress(ValueError):
-            wanted = [*self.state.region]
-            if side in (0, 1, 2, 3):
-                wanted[int(side)] = round(finite(text))
-                self.draw(*wanted)
-
     def draw(self, left: float, top: float, right: float, bottom: float) -> None:
         """Show a region of the image [px] that was drawn or typed."""
-        self._show_region([int(each) for each in (left, top, right, bottom)], "drawn")
+        sides, limits = (left, top, right, bottom), 2 * self.state.size
+        region = [min(max(round(each), 0), limit) for each, limit in zip(sides, limits, strict=True)]
+        whole = region == [0, 0, *self.state.size]
+        self.state.update({"region_wanted": region, "region_kind": "whole" if whole else "drawn"})
+        self.request("window")
+        self.released()
 
     def whole(self) -> None:
         """Show the whole image."""
-        self._show_region([0, 0, *self.state.size], "whole")
-
-    def _show_region(self, region: list[int], kind: str) -> None:
-        width, height = self.state.size
-        left, right = (min(max(x, 0), width) for x in region[::2])
-        top, bottom = (min(max(y, 0), height) for y in region[1::2])
-        self.state.update({"region_wanted": [left, top, right, bottom], "region_kind": kind})
-        self.request("window")
-        self.released()
+        self.draw(0, 0, *self.state.size)
 
     # Time: window, timeline and playback. The page counts all times from the recording's first event.
 
@@ -387,12 +376,6 @@ class Panel(PageWork, layout.Actions):
 
     # Parameters of the prism, and those to compare with
 
-    def take_from_curve(self, value: float) -> None:
-        """Set the parameter of the sharpness curve to a clicked value."""
-        self.state[self.state.knob] = round(float(value), 4)
-        self.request("knobs")
-        self.released()
-
     def keep_b(self) -> None:
         """Keep the current parameters as B, and show them on the left."""
         self.show_b(self.inspector.knobs)
@@ -416,12 +399,6 @@ class Panel(PageWork, layout.Actions):
         self.state.update({"has_b": knobs is not None, "b_text": text, "against": against})
         self.request("knobs")
 
-    def compare_found(self) -> None:
-        """Show the result of the calibration on the left."""
-        if self.found is not None:
-            self.state.against = "found"
-            self.request("knobs")
-
     def set_knobs(self) -> None:
         """Give the inspector the parameters that the page shows, where they differ from the inspector's."""
         known, shown = layout.knob_values(self.inspector), self.state
@@ -432,7 +409,7 @@ class Panel(PageWork, layout.Actions):
     def show_knobs(self) -> None:
         """Show the inspector's parameters on the page, but leave those that a user has changed since the last time."""
         state = layout.knob_state(self.inspector)
-        was, self._knobs_shown = self._knobs_shown, {name: state[name] for name in ("model", *layout.UNITS)}
+        was, self._knobs_shown = self._knobs_shown, {name: state[name] for name in ("model", *layout.NAMES)}
         self.state.update({name: value for name, value in state.items() if value != was.get(name)})
 
     def knobs_taken(self) -> None:
