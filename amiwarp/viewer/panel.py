@@ -21,6 +21,7 @@ from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
+from amiwarp.imaging.export import save_png
 from amiwarp.io.files import check_output, interrupts_later
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded
@@ -876,4 +877,4 @@ def save_screenshot(
     ):  # VTK crashes if an exception leaves it half-drawn
         scene.show(clouds, look, caption=drawing.caption(inspector, clouds))
         scene.look_from(view, look)
-        scene.save(path)
+        save_png(path, scene.picture())
