@@ -79,16 +79,14 @@ class EventRates:
     def fill(self, seconds: float) -> bool:
         """Count events for about ``seconds`` [s], at least one block. Return whether all events are counted."""
         until, read_us = time.perf_counter() + seconds, self._read[1]
-        while read_us < self._stop:
-            block = next(self._blocks, None)
-            if block is None:
-                read_us = self._stop
-                break
+        for block in self._blocks:
             if len(block):
                 self._count(block)
                 read_us = int(block.t[-1])
             if time.perf_counter() >= until:
                 break
+        else:
+            read_us = self._stop
         sums = np.zeros((2, len(self._edges)), np.int64)
         np.cumsum(self._counts, axis=1, out=sums[:, 1:])
         self._read = sums, read_us
@@ -291,20 +289,6 @@ Region = tuple[int, int, int, int]
 """Part of the image: left, top, right and bottom [px]; right and bottom are exclusive."""
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredImage:
-    """Image of warped events with its sharpness in a region."""
-
-    image: NDArray[np.float32]
-    """Number of events at each pixel of the whole image, shape ``(height, width)``."""
-    variance: float
-    """Variance over mean of the smoothed region, as :attr:`amiwarp.Sharpness.VARIANCE`. It grows with the number of
-    events."""
-    sharpness: float
-    """Relative variance of the smoothed region, see
-    :func:`amiwarp.imaging.metrics.relative_variance`. It does not depend on the number of events."""
-
-
 class WindowImager:
     """Measures the sharpness of images of warped events, as calibration does: bilinear votes at dithered places.
 
@@ -316,9 +300,11 @@ class WindowImager:
         self._meter: SharpnessMeter | None = None
 
     def measure(self, model: Model, events: UploadedEvents, offset_us: float, region: Region) -> tuple[float, float]:
-        """Return variance and sharpness in the region, see :class:`MeasuredImage`.
+        """Return variance and sharpness of the smoothed region.
 
-        ``offset_us`` is added to the encoder's clock offset [us].
+        The variance over mean, as :attr:`amiwarp.Sharpness.VARIANCE`, grows with the number of events. The sharpness,
+        see :func:`amiwarp.imaging.metrics.relative_variance`, does not depend on it. ``offset_us`` is added to the
+        encoder's clock offset [us].
         """
         self._votes.clear()
         self._votes.add_events(model, events, drift=offset_us)
@@ -470,8 +456,8 @@ class LoadedWindow:
     wrapped: dict[tuple[float, float], NDArray[np.float64]] = field(default_factory=dict)
     """Prism angles of the drawn events from 0 to 2π [rad], by speed and drift of the clock offset; the last ones only.
     """
-    unmoved: list[MeasuredImage] = field(default_factory=list)
-    """Image of the events as recorded, once it is measured."""
+    unmoved: list[tuple[NDArray[np.float32], float]] = field(default_factory=list)
+    """Image of the events as recorded and its sharpness, once it is measured."""
     chosen: list[Picture] = field(default_factory=list)
     """Reconstructed picture for which the weight of the smoothness prior was chosen last."""
 
@@ -963,10 +949,11 @@ class Inspector:
         others = [name for name in kind.FREE if name in SLIDING]
         time = {"clock_offset": k.clock_offset} if self.has_encoder else {"rpm": k.rpm}
         kept = {name: values[name] for name in (kind.SIZE, *others, "phase", *k.calibrated_only)} | time
-        before, after = self._unmoved(w), self._measured(w, k)
+        with self.lock:
+            before, after = (self._imager.measure(*self.warped(w, each), w.region)[0] for each in (None, k))
         return Calibration(
             model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
-            sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before.variance, sharpness_after=after.variance,
+            sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before, sharpness_after=after,
             stages=(), events=len(w.events), seconds=0.0, warnings=("set by hand in the inspector",),
             zero_us=None if self.has_encoder else self.zero_us, harmonics=self._harmonics,
         )  # fmt: skip
@@ -992,7 +979,7 @@ class Inspector:
         loaded = self.loaded
         if self.selection.region is not None:
             loaded = self._load(loaded.span.start_us, loaded.span.length_us, replace(self.selection, region=None))
-        before, after = self._unmoved(loaded).image, self._measured(loaded, self.knobs).image
+        (before, _), (after, _) = self._unmoved(loaded), self._measured(loaded, self.knobs)
         orbit_px = np.abs(border_displacements(self.model)).max(initial=0.0)
         return suggest_region(before, after, margin=math.ceil(orbit_px))
 
@@ -1024,10 +1011,10 @@ class Inspector:
         if (window, selection) != (self.window, self.selection):
             self.open(*window, selection)
         w = self.loaded
-        first = self._unmoved(w)
+        image, sharpness = self._unmoved(w)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.drawn, w.truth, w.xy, w.xy, self._wrapped(w, self.knobs), first.image,
-            image_after, first.sharpness, first.sharpness, is_beside=True,
+            w.span, w.region, w.selected, w.drawn, w.truth, w.xy, w.xy, self._wrapped(w, self.knobs), image,
+            image_after, sharpness, sharpness, is_beside=True,
         )  # fmt: skip
 
     def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:
@@ -1039,17 +1026,15 @@ class Inspector:
         """
         w, knobs = self.loaded, knobs or self.knobs
         xy = w.xy if against is None else self._moved(w, against)
-        second, theta = self._measured(w, knobs), self._wrapped(w, knobs)
-        other = None
+        (image_after, sharpness_after), other = self._measured(w, knobs), None
         if self.beside is not None and against is None:
-            other = self.beside._beside(w.span, self.selection, second.image)
+            other = self.beside._beside(w.span, self.selection, image_after)
             image, sharpness = other.image_before, other.sharpness_before
         else:
-            first = self._unmoved(w) if against is None else self._measured(w, against)
-            image, sharpness = first.image, first.sharpness
+            image, sharpness = self._unmoved(w) if against is None else self._measured(w, against)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), theta, image, second.image,
-            sharpness, second.sharpness, other,
+            w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), self._wrapped(w, knobs), image,
+            image_after, sharpness, sharpness_after, other,
         )  # fmt: skip
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -1277,14 +1262,14 @@ class Inspector:
             image = votes.take()
         return image if per_polarity else image[0]
 
-    def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> MeasuredImage:
-        """Return the image of a window with these parameters; as recorded if ``knobs`` is None."""
+    def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[NDArray[np.float32], float]:
+        """Return the image of a window with these parameters, and its sharpness; as recorded if ``knobs`` is None."""
         with self.lock:
-            variance, sharpness = self._imager.measure(*self.warped(w, knobs), w.region)
-        return MeasuredImage(self.counts(w, knobs), variance, sharpness)
+            _, sharpness = self._imager.measure(*self.warped(w, knobs), w.region)
+        return self.counts(w, knobs), sharpness
 
-    def _unmoved(self, w: LoadedWindow) -> MeasuredImage:
-        """Return the image of a window as recorded."""
+    def _unmoved(self, w: LoadedWindow) -> tuple[NDArray[np.float32], float]:
+        """Return the image of a window as recorded, and its sharpness."""
         if not w.unmoved:
             w.unmoved.append(self._measured(w, None))
         return w.unmoved[0]

@@ -144,7 +144,8 @@ class PageWork:
         """Call ``work`` in one of the browser tab's threads, and return its result."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, partial(work, *args, **options))
 
-    def show_message(self, text: str, severity: str) -> None:
+    def say(self, text: str, severity: str = "info") -> None:
+        """Show a message."""
         with self.state:
             self.state.update({"message": text, "severity": severity})
 
@@ -175,7 +176,7 @@ class PageWork:
         if not task.cancelled() and (error := task.exception()) is not None:
             logging.getLogger(__name__).error("the page's work failed", exc_info=error)
             text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
-            self.show_message(text, "error")
+            self.say(text, "error")
 
     async def _update(self) -> None:
         try:
@@ -604,21 +605,15 @@ def write_film(
         with contextlib.closing(Scene(FILM_SIZE)) as scene:
             draw(scene)
             scene.look_from(view, look)
-            if turns:
-                yield from scene.turntable(frames)
-                return
-            yield scene.picture()
-            for k in range(1, frames):
-                with contextlib.suppress(AmiwarpError):  # there are no events at this time
-                    inspector.open(span.start_us + round(k * step_us), span.length_us)
-                    draw(scene)
-                yield scene.picture()
+            turning = scene.turntable(frames)
+            for k in range(frames):
+                if k and ended():
+                    return
+                progress(f"making the {EXPORTS[what][0]}, {k / FPS:.0f} of {frames / FPS:.0f} s", k / frames)
+                if k and not turns:
+                    with contextlib.suppress(AmiwarpError):  # there are no events at this time
+                        inspector.open(span.start_us + round(k * step_us), span.length_us)
+                        draw(scene)
+                yield next(turning) if turns else scene.picture()
 
-    def counted() -> Iterator[NDArray[np.uint8]]:
-        for k, picture in enumerate(pictures()):
-            if k and ended():
-                return
-            progress(f"making the {EXPORTS[what][0]}, {k / FPS:.0f} of {frames / FPS:.0f} s", k / frames)
-            yield picture
-
-    return save_film(counted(), path, fps=FPS)
+    return save_film(pictures(), path, fps=FPS)

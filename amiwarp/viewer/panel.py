@@ -81,7 +81,7 @@ class Panel(PageWork, layout.Actions):
         self._knobs_shown = {}
         self.show_knobs()
         self.time_window = inspector.window or inspector.first_window()
-        self._count_events()
+        self.start_job(self._count_events())
         self.request("window", *(["suggestion"] if self.compensates else []))
         self.released()
         self.request_slow("preparation")
@@ -111,9 +111,7 @@ class Panel(PageWork, layout.Actions):
     def look(self) -> Look:
         """Style of the clouds."""
         s = self.state
-        return Look(
-            Colour(s.colour), Axis(s.axis), float(s.point_size), float(s.opacity), bool(s.dark), bool(s.overlaid)
-        )
+        return Look(s.colour, s.axis, s.point_size, s.opacity, s.dark, s.overlaid)
 
     @look.setter
     def look(self, look: Look) -> None:
@@ -142,10 +140,6 @@ class Panel(PageWork, layout.Actions):
     def time_window(self, window: tuple[int, int]) -> None:
         start_us, length_us = window[0] - self.inspector.recording.events.t_first, window[1]
         self.state.update({"start_ms": round(start_us * 1e-3, 3), "length_ms": round(length_us * 1e-3, 3)})
-
-    def say(self, text: str) -> None:
-        """Show a message."""
-        self.show_message(text, "info")
 
     def request(self, *what: str, change: str = "") -> None:
         """Request quick updates of the page.
@@ -190,13 +184,13 @@ class Panel(PageWork, layout.Actions):
         try:
             value = finite(text)
         except ValueError:
-            self.show_message(f"{text!r} is not a number; give a number such as 1.5", "error")
+            self.say(f"{text!r} is not a number; give a number such as 1.5", "error")
             return
         if name in layout.FIELD_LIMITS:
             (low, high), (label, unit, *_) = layout.FIELD_LIMITS[name], {**layout.SLIDERS, **layout.GIVEN}[name]
             if not low <= value <= high:
                 text = f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}"
-                self.show_message(text, "error")
+                self.say(text, "error")
                 return
         if name == "turns":
             name, value = "length_ms", value * float(self.state.turn_ms)
@@ -340,7 +334,7 @@ class Panel(PageWork, layout.Actions):
                 self.state.update(layout.source_state(self.inspector))
                 if start_s >= counted_s + RATES_S:
                     counted_s = start_s
-                    self._count_events()
+                    self.start_job(self._count_events())
                 self.move(self.inspector.recording.events.t_last)
             await self.until_drawn()
             await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
@@ -356,13 +350,10 @@ class Panel(PageWork, layout.Actions):
     def _clock_us(self, time_ms: float) -> int:
         return int(self.inspector.recording.events.t_first) + round(time_ms * 1e3)
 
-    def _count_events(self) -> None:
+    async def _count_events(self) -> None:
         """Count the recording's events in the background, for the timeline."""
-        self._rates = EventRates(self.inspector.recording.events)
-        self.start_job(self._fill(self._rates))
-
-    async def _fill(self, rates: EventRates) -> None:
-        finished = False
+        rates, finished = EventRates(self.inspector.recording.events), False
+        self._rates = rates
         while not finished and rates is self._rates:
             finished = await self.in_thread(rates.fill, STEP_S)
             with self.state:
@@ -427,18 +418,17 @@ class Panel(PageWork, layout.Actions):
     @property
     def against(self) -> Knobs | None:
         """Parameters that the left cloud and image show; None for the recorded events."""
-        return self._compared(self.state.against)
+        return self._comparable().get(self.state.against)
 
-    def _compared(self, name: str) -> Knobs | None:
-        """Return the parameters of a name in :data:`AGAINST`; None if there are none."""
-        if name == "found":
-            return None if self.found is None else self.inspector.knobs_of(self.found)
-        return {"B": self.b, "truth": self.inspector.truth}.get(name)
+    def _comparable(self) -> dict[str, Knobs | None]:
+        """Return what the left cloud can show now, by the names in :data:`amiwarp.viewer.drawing.AGAINST`."""
+        found = None if self.found is None else self.inspector.knobs_of(self.found)
+        known = {"B": self.b, "found": found, "truth": self.inspector.truth}
+        return {"recorded": None, **{name: knobs for name, knobs in known.items() if knobs is not None}}
 
     def _against_choices(self) -> list[list[str]]:
         """Return names and titles of what the left cloud can show now."""
-        known = [name for name in drawing.AGAINST if name == "recorded" or self._compared(name) is not None]
-        return [[name, drawing.against_title(self.inspector, name)] for name in known]
+        return [[name, drawing.against_title(self.inspector, name)] for name in self._comparable()]
 
     # Calibration
 
@@ -461,7 +451,7 @@ class Panel(PageWork, layout.Actions):
             found = await self._guarded_in_thread(find, inspector, progress)
             if isinstance(found, str):
                 text, severity = ("calibration cancelled", "info") if progress.cancelled else (found, "error")
-                self.show_message(text, severity)
+                self.say(text, severity)
                 return
             self.found = found.calibration
             with state:
@@ -548,7 +538,7 @@ class Panel(PageWork, layout.Actions):
             self._downloads += 1  # a browser keeps what it has loaded from an address
             self.server.js_call("page", "download", name, f"{self.server.name}/{name}?{self._downloads}")
             size = f"{path.stat().st_size / 1e3:,.0f} kB"
-            self.show_message(f"{name}: {size}, in the browser's downloads", "success")
+            self.say(f"{name}: {size}, in the browser's downloads", "success")
         self.state.flush()
 
     # Undo, redo, reset, and the state in the page's address
@@ -561,7 +551,7 @@ class Panel(PageWork, layout.Actions):
         size = self.inspector.recording.events.size
         state, wrong = layout.decode_state(address, history.first, size=size, duration_us=self.whole_us)
         if wrong:
-            self.show_message("; ".join(wrong), "error")
+            self.say("; ".join(wrong), "error")
         return state
 
     def remember(self, change: str) -> layout.History:
