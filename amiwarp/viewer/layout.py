@@ -28,7 +28,7 @@ from amiwarp.viewer.inspector import (
     truth_text,
 )
 from amiwarp.viewer.jobs import EXPORTS, FILMS, CostSurface, FoundCalibration, LiveFigures
-from amiwarp.viewer.serve import Check, flag, number, one_of, read_template
+from amiwarp.viewer.serve import FOLDER, Check, flag, number, one_of
 
 # State of the inspector's page: what it shows, with which parameters; its history, and its text in the address.
 
@@ -544,7 +544,8 @@ class Actions:
 def template() -> str:
     """Return the page's template with its sliders."""
     fields = "\n".join(map(_given, GIVEN))
-    return read_template().replace("@KNOBS@", "\n".join(map(_knob, SLIDERS))).replace("@GIVEN@", fields)
+    page = (FOLDER / "page.html").read_text(encoding="utf-8")
+    return page.replace("@KNOBS@", "\n".join(map(_knob, SLIDERS))).replace("@GIVEN@", fields)
 
 
 def _given(name: str) -> str:

@@ -493,15 +493,10 @@ class Panel(PageWork, layout.Actions):
             self.start_job(self._film(what) if what in jobs.FILMS else self._write(what))
 
     async def _write(self, what: str) -> None:
-        inspector, kind, against = self.inspector, self.image, self.against
-        difference = bool(self.state.difference)
-
-        def write_image(path: Path) -> None:
-            images = drawing.make_images(inspector, kind, against=against)
-            jobs.write_image(drawing.with_difference(images) if difference else images, path)
-
+        inspector = self.inspector
         write: dict[str, Callable[[Path], object]] = {
-            "values": write_image, **dict.fromkeys(("csv", "npz"), partial(jobs.write_table, inspector)),
+            "values": lambda path: jobs.write_image(self._pair(), path),
+            **dict.fromkeys(("csv", "npz"), partial(jobs.write_table, inspector)),
             "events": partial(jobs.write_events, inspector, compensated=False),
             "compensated": partial(jobs.write_events, inspector, compensated=True),
             "calibration": lambda path: inspector.as_calibration().save(path),
@@ -686,8 +681,7 @@ class Panel(PageWork, layout.Actions):
 
     def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
         """Return the state variables of the images of the region."""
-        pair = drawing.make_images(self.inspector, self.image, against=self.against, shown=shown)
-        pair = drawing.with_difference(pair) if self.state.difference else pair
+        pair = self._pair(shown)
         scales = pair.scale, pair.after_scale or pair.scale
         before, after = (
             None if image is None else drawing.picture_state(image, scale)
@@ -695,6 +689,10 @@ class Panel(PageWork, layout.Actions):
         )
         first, second = map(drawing.scale_state, scales)
         return {"before": before, "after": after, "image_scale": first, "after_scale": second, "image_note": pair.note}
+
+    def _pair(self, shown: DisplayedWindow | None = None) -> drawing.ShownImages:
+        pair = drawing.make_images(self.inspector, self.image, against=self.against, shown=shown)
+        return drawing.with_difference(pair) if self.state.difference else pair
 
     async def _curve(self) -> None:
         s, name = self.state, self.state.knob

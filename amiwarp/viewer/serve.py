@@ -276,11 +276,6 @@ def first_page(path: Path) -> str:
                   flags=re.DOTALL)  # fmt: skip
 
 
-def read_template() -> str:
-    """Return the page's template."""
-    return (FOLDER / "page.html").read_text(encoding="utf-8")
-
-
 def use_page(server: Any, template: str, downloads: str) -> None:
     """Give a trame server the page's style and scripts, its template, and the folder ``downloads`` below its name."""
     server.enable_module({
