@@ -7,7 +7,7 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from ctypes import CDLL, c_void_p
 from ctypes.util import find_library
 from dataclasses import dataclass, replace
@@ -22,9 +22,10 @@ from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, MemoryEvents, Recording
-from amiwarp.imaging.export import GAMMA, PERCENTILE
+from amiwarp.imaging.export import GAMMA, PERCENTILE, save_png
 from amiwarp.imaging.metrics import random_variance
 from amiwarp.imaging.palette import BLUE, OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK, ORANGE, PINK, VERMILION
+from amiwarp.io.files import check_output, interrupts_later
 from amiwarp.plotting.figures import instance_colours
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.validation import choice, guarded, vector, whole
@@ -1129,6 +1130,19 @@ class Scene:
         actors.append(self.plotter.add_text(title, position="upper_edge", font_size=9, color=ink, render=False,
                                             font_file=str(font())))  # fmt: skip
         return actors
+
+
+def save_screenshot(
+    inspector: Inspector, path: Path, *, view: View = View.FREE, look: Look | None = None, size: tuple[int, int]
+) -> None:
+    """Write a picture of both event clouds as PNG; ``size`` is its width and height [px]."""
+    check_output(path)
+    look = (look or Look()).for_clouds(cloud_titles(inspector, "recorded"))
+    clouds = inspector.show()
+    with interrupts_later(), closing(Scene(size)) as scene:  # VTK crashes if an exception leaves it half-drawn
+        scene.show(clouds, look, caption=caption(inspector, clouds))
+        scene.look_from(view, look)
+        save_png(path, scene.picture())
 
 
 def ticks(low: float, high: float, most: int = 5, *, whole: bool = False) -> NDArray[np.float64]:

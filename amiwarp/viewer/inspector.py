@@ -547,6 +547,21 @@ class Statistics:
         """Number of events per time [1/s]."""
         return (self.on + self.off) / self.duration_us * 1e6
 
+    def state(self) -> dict[str, Any]:
+        """Return what page and window show: rows of name and value, and the histogram of the intervals."""
+        n, known, decades = self.on + self.off, bool(self.intervals.any()), np.log10(INTERVALS_US)
+        rows = [
+            ("rate", f"{self.rate:,.0f} events/s"), ("events per pixel", f"{n / self.area:.3g}"),
+            ("ON", f"{100.0 * self.on_share:.1f} %"),
+            ("pixels with events", f"{100.0 * self.pixels / self.area:.1f} %"),
+            ("median interval of a pixel", f"{self.median_us:,.0f} µs" if known else "–"),
+        ]  # fmt: skip
+        return {
+            "rows": [list(row) for row in rows], "x": (0.5 * (decades[1:] + decades[:-1])).tolist() if known else [],
+            "y": (100.0 * self.intervals / max(1, self.intervals.sum())).tolist(),
+            "median": math.log10(max(self.median_us, 1.0)) if known else None,
+        }  # fmt: skip
+
 
 # Selected events of a time window, on the host and with their prism angles on the device.
 
@@ -779,7 +794,8 @@ class Inspector:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is missing to compensate the prism's motion, one sentence each."""
-        return (NO_ENCODER,) * self._no_speed + (NO_CAMERA,) * (self.sources["camera"] is Source.ASSUMED)
+        no_speed = self._no_speed and not self.knobs.rpm
+        return (NO_ENCODER,) * no_speed + (NO_CAMERA,) * (self.sources["camera"] is Source.ASSUMED)
 
     @property
     def fov_deg(self) -> float:

@@ -7,26 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
-import numpy as np
-
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look, Scale, picture_state
-from amiwarp.viewer.inspector import (
-    INTERVALS_US,
-    NO_ENCODER,
-    OTHERS,
-    SLIDING,
-    Inspector,
-    Knobs,
-    Selection,
-    Source,
-    Statistics,
-    colours_on_offer,
-    truth_text,
-)
+from amiwarp.viewer.inspector import OTHERS, SLIDING, Inspector, Knobs, Selection, Source, colours_on_offer, truth_text
 from amiwarp.viewer.jobs import EXPORTS, FILMS, CostSurface, FoundCalibration, LiveFigures
 from amiwarp.viewer.serve import FOLDER, Check, flag, number, one_of
 
@@ -661,28 +647,10 @@ def notes(inspector: Inspector) -> list[str]:
         Source.ESTIMATED: "phase estimated from the events: calibrate for an accurate one",
     }
     phase = texts.get(inspector.sources["phase"], "") if math.isfinite(inspector.turn_us) else ""
-    missing = [note for note in inspector.notes if not (note == NO_ENCODER and inspector.knobs.rpm)]
-    return [*missing, *filter(None, [phase])]
+    return [*inspector.notes, *filter(None, [phase])]
 
 
-# Texts and figures about the shown window, a live stream and a calibration.
-
-
-def statistics_state(found: Statistics) -> dict[str, Any]:
-    """Return statistics for the page: rows of name and value, and the histogram of the intervals."""
-    n, known = found.on + found.off, bool(found.intervals.any())
-    rows = [
-        ("rate", f"{found.rate:,.0f} events/s"), ("events per pixel", f"{n / found.area:.3g}"),
-        ("ON", f"{100.0 * found.on_share:.1f} %"),
-        ("pixels with events", f"{100.0 * found.pixels / found.area:.1f} %"),
-        ("median interval of a pixel", f"{found.median_us:,.0f} µs" if known else "–"),
-    ]  # fmt: skip
-    decades = np.log10(INTERVALS_US)
-    return {
-        "rows": [list(row) for row in rows], "x": (0.5 * (decades[1:] + decades[:-1])).tolist() if known else [],
-        "y": (100.0 * found.intervals / max(1, found.intervals.sum())).tolist(),
-        "median": math.log10(max(found.median_us, 1.0)) if known else None,
-    }  # fmt: skip
+# Texts and figures about a live stream and a calibration.
 
 
 def live_state(f: LiveFigures) -> dict[str, Any]:

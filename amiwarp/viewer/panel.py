@@ -21,12 +21,10 @@ from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.imaging.export import save_png
-from amiwarp.io.files import check_output, interrupts_later
 from amiwarp.progress import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
-from amiwarp.viewer.drawing import ImageKind, Look, Scene
+from amiwarp.viewer.drawing import ImageKind, Look
 from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection
 from amiwarp.viewer.jobs import SLOW, JobCancelled, JobProgress, PageWork
 from amiwarp.viewer.serve import finite, serve, use_page
@@ -624,7 +622,7 @@ class Panel(PageWork, layout.Actions):
         if name == "preparation":
             await self.in_thread(drawing.prepare, self.inspector)
         elif name == "statistics":
-            self.state.statistics = layout.statistics_state(await self.in_thread(self.inspector.statistics))
+            self.state.statistics = (await self.in_thread(self.inspector.statistics)).state()
         elif name == "curve":
             await self._curve()
         elif self.image is ImageKind.LOG_INTENSITY and self.shown is not None:
@@ -727,7 +725,7 @@ def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progre
         known = None
 
 
-# Ways to show the page, in a browser or in a notebook, and a picture of the clouds.
+# Ways to show the page, in a browser or in a notebook.
 
 LOCALHOST = "127.0.0.1"
 
@@ -849,20 +847,3 @@ def view(
     make_inspector()  # raises errors in the cell, before the page is served
     serving = _serve(make_inspector, None, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
     return NotebookPage(loop.create_task(serving))
-
-
-def save_screenshot(
-    inspector: Inspector, path: Path, *, view: View = View.FREE, look: Look | None = None, size: tuple[int, int]
-) -> None:
-    """Write a picture of both event clouds as PNG; ``size`` is its width and height [px]."""
-
-    check_output(path)
-    look = (look or Look()).for_clouds(drawing.cloud_titles(inspector, "recorded"))
-    clouds = inspector.show()
-    with (
-        interrupts_later(),
-        contextlib.closing(Scene(size)) as scene,
-    ):  # VTK crashes if an exception leaves it half-drawn
-        scene.show(clouds, look, caption=drawing.caption(inspector, clouds))
-        scene.look_from(view, look)
-        save_png(path, scene.picture())

@@ -143,9 +143,8 @@ class Window(layout.Actions):
         """Follow the user until the window is closed or the command is interrupted."""
         with contextlib.suppress(KeyboardInterrupt), contextlib.closing(self.scene):
             while not (self.closed or self.plotter.iren.interactor.GetDone()):
-                with (
-                    interrupts_later() as self._interrupts
-                ):  # VTK ends the process if an exception leaves one of its callbacks
+                # VTK ends the process if an exception leaves one of its callbacks
+                with interrupts_later() as self._interrupts:
                     if not self.turn():
                         time.sleep(IDLE_S)
 
@@ -614,7 +613,7 @@ class Window(layout.Actions):
 
     def _show_statistics(self) -> None:
         """Show the statistics of the selected events, as the page does."""
-        found, (chart, (line, mark)) = layout.statistics_state(self.inspector.statistics()), self._plots["intervals"]
+        found, (chart, (line, mark)) = self.inspector.statistics().state(), self._plots["intervals"]
         rows = [f"{name}:  {text}" for name, text in found["rows"]]
         self._texts[3].input = "\n".join(["Statistics of the selected events", *rows])
         x, y = found["x"] or [0.0, 6.0], found["y"] if found["x"] else [0.0, 0.0]
