@@ -80,15 +80,20 @@ def apply_state(inspector: Inspector, state: ViewState) -> None:
     window = state.start_us + inspector.recording.events.t_first, state.length_us
     if (window, state.selection) != (inspector.window, inspector.selection):
         inspector.open(*window, state.selection)
-    given = given_state(inspector)
-    if state.fov_deg is not None and state.fov_deg != given["fov_deg"]:
-        inspector.set_camera(state.fov_deg)
-    if state.prism_index is not None and state.prism_index != given["index"]:
-        inspector.set_index(state.prism_index)
+    set_given(inspector, state.fov_deg, state.prism_index)
     inspector.set(state.knobs)
     known = {name: source for name, source in inspector.sources.items() if name in ("camera", "prism")}
     held = {name: source for name, source in known.items() if source is Source.FILE}
     inspector.sources = dict(state.sources) | held
+
+
+def set_given(inspector: Inspector, fov_deg: float | None, index: float | None) -> None:
+    """Set the camera and the prism's index by hand where they differ from the inspector's; None keeps them."""
+    given = given_state(inspector)
+    if fov_deg is not None and fov_deg != given["fov_deg"]:
+        inspector.set_camera(fov_deg)
+    if index is not None and index != given["index"]:
+        inspector.set_index(index)
 
 
 class History:
@@ -563,7 +568,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
     recording = inspector.recording
     size = recording.events.size
     return {
-        **source_state(inspector), **knob_state(inspector), **prism_state(inspector), **given_state(inspector),
+        **source_state(inspector), **knob_state(inspector), **prism_state(inspector),
         **NO_ORBIT,
         "trame__title": f"amiwarp: {recording.name}", "trame_error_report_msg": "", "name": recording.name,
         "size": list(size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
@@ -615,7 +620,8 @@ def knob_values(inspector: Inspector) -> dict[str, float]:
 def knob_state(inspector: Inspector) -> dict[str, Any]:
     """Return the state variables of the prism's parameters."""
     sources = {name: str(source.value) for name, source in inspector.sources.items()}
-    return {**knob_values(inspector), "model": inspector.knobs.model, "sources": sources, "notes": notes(inspector)}
+    return {**knob_values(inspector), **given_state(inspector), "model": inspector.knobs.model, "sources": sources,
+            "notes": notes(inspector)}  # fmt: skip
 
 
 def prism_state(inspector: Inspector) -> dict[str, Any]:

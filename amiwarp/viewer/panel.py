@@ -193,23 +193,9 @@ class Panel(PageWork, layout.Actions):
         if name == "turns":
             name, value = "length_ms", value * float(self.state.turn_ms)
         self.state[name] = round(value, 4)
-        if name in layout.GIVEN:
-            self.start_job(self._give(name, value))
-            return
         if name in layout.NAMES:
             self.state.knob = name
-        self.request("knobs" if name in layout.NAMES else "window")
-        self.released()
-
-    async def _give(self, name: str, value: float) -> None:
-        """Set the camera or the prism's index, which the recording lacks."""
-        await self.until_drawn()
-        with self.errors_shown("knobs"), self.state as state:
-            give = self.inspector.set_camera if name == "fov_deg" else self.inspector.set_index
-            give(value)
-            state.update(layout.given_state(self.inspector))
-        self.show_knobs()
-        self.request("window")
+        self.request("knobs" if name in layout.FIELD_LIMITS else "window")
         self.released()
 
     def use_card(self, found: bool) -> None:
@@ -366,10 +352,6 @@ class Panel(PageWork, layout.Actions):
 
     # Parameters of the prism, and those to compare with
 
-    def keep_b(self) -> None:
-        """Keep the current parameters as B, and show them on the left."""
-        self.show_b(self.inspector.knobs)
-
     def swap_b(self) -> None:
         """Exchange the current parameters and B."""
         if self.b is not None:
@@ -378,6 +360,10 @@ class Panel(PageWork, layout.Actions):
                 self.inspector.set(self.b)
                 self.show_b(now)
             self.knobs_taken()
+
+    def keep_b(self) -> None:
+        """Keep the current parameters as B, and show them on the left."""
+        self.show_b(self.inspector.knobs)
 
     def show_b(self, knobs: Knobs | None) -> None:
         """Show parameters on the left as B; None for the recorded events."""
@@ -391,6 +377,7 @@ class Panel(PageWork, layout.Actions):
 
     def set_knobs(self) -> None:
         """Give the inspector the parameters that the page shows, where they differ from the inspector's."""
+        layout.set_given(self.inspector, self.state.fov_deg, self.state.index)
         known, shown = layout.knob_values(self.inspector), self.state
         values = {name: float(shown[name]) * layout.UNITS[name] for name in layout.NAMES if shown[name] != known[name]}
         self._knobs_shown = {name: shown[name] for name in self._knobs_shown}
@@ -399,7 +386,8 @@ class Panel(PageWork, layout.Actions):
     def show_knobs(self) -> None:
         """Show the inspector's parameters on the page, but leave those that a user has changed since the last time."""
         state = layout.knob_state(self.inspector)
-        was, self._knobs_shown = self._knobs_shown, {name: state[name] for name in ("model", *layout.NAMES)}
+        was, names = self._knobs_shown, ("model", *layout.FIELD_LIMITS)
+        self._knobs_shown = {name: state[name] for name in names}
         self.state.update({name: value for name, value in state.items() if value != was.get(name)})
 
     def knobs_taken(self) -> None:
@@ -565,7 +553,7 @@ class Panel(PageWork, layout.Actions):
         kind = s.region_kind if region == s.region_wanted else "whole" if selection.region is None else "drawn"
         self.time_window = self.inspector.window or self.time_window
         s.update({
-            **layout.given_state(self.inspector), "polarity": {None: "both", 1: "ON", 0: "OFF"}[selection.polarity],
+            "polarity": {None: "both", 1: "ON", 0: "OFF"}[selection.polarity],
             "hide_hot": selection.hide_hot, "noise_filter": selection.noise_us is not None, "region_wanted": region,
             "region_kind": kind, "kind": wanted.image.value,
         })  # fmt: skip
