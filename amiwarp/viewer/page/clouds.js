@@ -1,7 +1,7 @@
 // Component with the event clouds: draws the points in the browser, and lets the mouse and the keys turn them.
 
 import { Camera, MARGIN, VIEWS, seenPart } from './camera.js';
-import { act, drag, sizedCanvas } from './canvas.js';
+import { act, drag, numbers, sizedCanvas } from './canvas.js';
 import { drawFrame } from './frame.js';
 import { GpuRaster } from './gpu.js';
 import { Raster, nearest } from './raster.js';
@@ -30,10 +30,6 @@ function newRaster() {
   } catch {
     return new Raster();
   }
-}
-
-export function floats(bytes, Numbers = Float32Array) {
-  return new Numbers(bytes && bytes.byteLength ? bytes.slice().buffer : 0);
 }
 
 export const EventClouds = {
@@ -65,13 +61,13 @@ export const EventClouds = {
       const key = JSON.stringify([props.box, props.axis, frame.half]);
       scene.half = frame.half;
       scene.places = [[props.before, props.thirdBefore], [props.after, props.third]].map(
-        ([cloud, third], k) => places[k](() => place(frame, floats(cloud), floats(third)), cloud, third, key),
+        ([cloud, third], k) => places[k](() => place(frame, numbers(cloud), numbers(third)), cloud, third, key),
       );
       scene.colours = [props.coloursBefore, props.coloursAfter].map(
-        (bytes, k) => colours[k](() => floats(bytes, Uint32Array), bytes),
+        (bytes, k) => colours[k](() => numbers(bytes, Uint32Array), bytes),
       );
-      const turns = floats(props.orbit).filter((_, k) => k % 3 === 2);
-      const xy = (bytes) => floats(bytes).filter((_, k) => k % 3 !== 2);
+      const turns = numbers(props.orbit).filter((_, k) => k % 3 === 2);
+      const xy = (bytes) => numbers(bytes).filter((_, k) => k % 3 !== 2);
       scene.lines = [props.orbit, props.column].map((bytes) => place(frame, xy(bytes), turns));
       ask();
     }

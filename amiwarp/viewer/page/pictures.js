@@ -1,7 +1,6 @@
 // Component with an image of the sensor: zoom, pan, draw a region, measure a distance. Linked images move together.
 
-import { act, cleared, drag, sizedCanvas } from './canvas.js';
-import { text as round } from './ticks.js';
+import { act, cleared, drag, numbers, sizedCanvas, text as round } from './canvas.js';
 
 const { computed, onMounted, reactive, watch } = window.Vue;
 const linked = {}; // zoom and place of linked images
@@ -11,14 +10,10 @@ const ARRAYS = { uint8: Uint8Array, uint16: Uint16Array, float32: Float32Array }
 
 const clamp = (value, low, high) => Math.max(low, Math.min(high, value));
 
-function numbers({ values, kind }) {
-  return new ARRAYS[kind](values.slice().buffer);
-}
-
 // Return a canvas with a picture of the server: each value's place on its scale gives its colour.
 export function painted(picture) {
   const { width, height, low, high, gamma, pair } = picture;
-  const values = numbers(picture);
+  const values = numbers(picture.values, ARRAYS[picture.kind]);
   const canvas = Object.assign(document.createElement('canvas'), { width, height });
   const image = new ImageData(width, height);
   const pixels = new Uint32Array(image.data.buffer);
@@ -28,7 +23,7 @@ export function painted(picture) {
     if (!known.has(value)) known.set(value, share(value) ** gamma);
     return known.get(value);
   };
-  const table = pair ? [] : new Uint32Array(picture.table.slice().buffer);
+  const table = numbers(picture.table, Uint32Array);
   for (let i = 0; i < pixels.length; i++) {
     if (pair) {
       const [off, on] = [at(values[i]), at(values[pixels.length + i])];
@@ -42,7 +37,7 @@ export function painted(picture) {
 
 // Return the value of a picture at a pixel as text.
 function valueAt(picture, x, y) {
-  const values = numbers(picture);
+  const values = numbers(picture.values, ARRAYS[picture.kind]);
   const { width, height, unit, pair, step } = picture;
   const [column, row] = [x, y].map((each) => Math.floor(each / step));
   if (column < 0 || row < 0 || column >= width || row >= height) return '';

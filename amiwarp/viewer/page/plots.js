@@ -1,7 +1,7 @@
 // Components with plots: the sharpness over a parameter, and the sharpness over two parameters as a map.
 
 import { painted } from './pictures.js';
-import { text, ticks } from './ticks.js';
+import { text, ticks } from './canvas.js';
 
 const LEAST_SHARE = 0.18; // of a colour bar between two numbers
 const WIDE_SHARE = 0.45; // of an axis between two wide numbers

@@ -1,8 +1,6 @@
 // Component with the rates of ON and OFF events over time: click or drag to move the window, wheel to zoom.
 
-import { act, cleared, drag, sizedCanvas } from './canvas.js';
-import { floats } from './clouds.js';
-import { short, text, ticks } from './ticks.js';
+import { act, cleared, drag, numbers, short, sizedCanvas, text, ticks } from './canvas.js';
 
 const { computed, watch } = window.Vue;
 const GRIP_PX = 7; // distance within which an end of the window can be dragged
@@ -32,7 +30,7 @@ export const RateTimeline = {
       const style = window.getComputedStyle(canvas.value);
       const colour = (name) => style.getPropertyValue(name).trim();
       const [W, H] = [width(), canvas.value.clientHeight - BOTTOM];
-      const [on, off] = [floats(props.on), floats(props.off)];
+      const [on, off] = [numbers(props.on), numbers(props.off)];
       const top = Math.max(0, ...[...on, ...off].filter(Number.isFinite)); // parts that are not counted yet are NaN
       context.fillStyle = colour('--window');
       const left = Math.max(LEFT, ends()[0]);
