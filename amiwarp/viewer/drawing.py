@@ -11,7 +11,7 @@ from contextlib import closing, suppress
 from ctypes import CDLL, c_void_p
 from ctypes.util import find_library
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -328,13 +328,10 @@ def _count_scale(images: Sequence[NDArray[np.float32]], colours: str = "gray") -
 def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:
     """Return the time of the latest event of each pixel from the start of the window on [ms]; NaN without events."""
     events, (width, height) = window.events, inspector.recording.events.size
-    if knobs is None:
-        pixel = events.y.astype(np.int64) * width + events.x
-    else:
-        x, y = np.rint(inspector.positions(events, knobs)).T
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        with np.errstate(invalid="ignore"):
-            pixel = np.where(inside, y.astype(np.int64) * width + x.astype(np.int64), width * height)
+    x, y = (events.x, events.y) if knobs is None else np.rint(inspector.positions(events, knobs)).T
+    within = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    with np.errstate(invalid="ignore"):
+        pixel = np.where(within, y.astype(np.int64) * width + x.astype(np.int64), width * height)
     surface = np.full(width * height + 1, np.nan, np.float32)  # the last element takes the events outside of the image
     # events are in order of time; of several values for one pixel, NumPy keeps the last
     surface[pixel] = (events.t - window.span.start_us) * 1e-3
@@ -1376,21 +1373,18 @@ def event_clouds(
     inspector = Inspector(
         recording, calibration, device=device, most_events=max(len(source), 1), most_points=max(len(source), 1)
     )
-    start, stop = vector((source.t_first, source.t_last + 1) if window is None else window, 2, "window", _whole)
+    integer = partial(whole, low=-(2**62), high=2**62)
+    start, stop = vector((source.t_first, source.t_last + 1) if window is None else window, 2, "window", integer)
     if stop <= start:
         raise AmiwarpError(f"window is {window}; give start and end [us], the end after the start")
     width, height = source.size
-    left, top, right, bottom = vector((0, 0, *source.size) if region is None else region, 4, "region", _whole)
+    left, top, right, bottom = vector((0, 0, *source.size) if region is None else region, 4, "region", integer)
     if not (0 <= left < right <= width and 0 <= top < bottom <= height):
         raise AmiwarpError(f"region is {region}; give left, top, right and bottom in an image of {width}x{height} px")
     inspector.open(start, stop - start, Selection(region=None if region is None else (left, top, right, bottom)))
     shown = inspector.show()
     before, after = (_cloud(shown, third, after=after) for after in (False, True))
     return before, after
-
-
-def _whole(value: object, what: str) -> int:
-    return whole(value, what, -(2**62), 2**62)
 
 
 def _cloud(shown: DisplayedWindow, axis: Axis, *, after: bool) -> pyvista.PolyData:

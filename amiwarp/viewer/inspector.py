@@ -325,12 +325,10 @@ class WindowImager:
 
 def recorded_counts(events: Events, size: tuple[int, int], *, per_polarity: bool = False) -> NDArray[np.float32]:
     """Return the number of events at each pixel, shape ``(height, width)``; with polarities ``(2, height, width)``."""
-    width, height = size
-    layers, pixel = 1 + per_polarity, events.y.astype(np.int64) * width + events.x
+    shape, pixel = (*(2,) * per_polarity, *size[::-1]), events.y.astype(np.int64) * size[0] + events.x
     if per_polarity:
-        pixel += events.p.astype(np.int64) * (width * height)
-    counts = np.bincount(pixel, minlength=layers * width * height).astype(np.float32)
-    return counts.reshape(layers, height, width) if per_polarity else counts.reshape(height, width)
+        pixel += events.p.astype(np.int64) * math.prod(size)
+    return np.bincount(pixel, minlength=math.prod(shape)).astype(np.float32).reshape(shape)
 
 
 # Parameters of the prism and selection of events under which the inspector shows a recording.
