@@ -133,9 +133,9 @@ never splits them into parts."""
 HEADER_BYTES = 12
 """Size of the header of each message part [bytes]: message number, start of the part and length of the message, 32 bits
 each."""
-MOST_CHARACTERS = 2000
-"""Largest accepted length of a text that the page gives to a function of the server, such as the state in its address.
-"""
+MOST_CHARACTERS, MOST_ID = 2000, 120
+"""Largest accepted length of a text that the page gives to a function of the server, such as the state in its address,
+and of the number of a call."""
 LARGEST = 1e12
 """Largest accepted number in a message; in ms it is 30 years."""
 
@@ -152,43 +152,15 @@ def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
     return check
 
 
-def text(most: int) -> Check:
-    """Return a check that accepts strings of at most ``most`` characters."""
-    return lambda value: isinstance(value, str) and len(value) <= most
-
-
 def one_of(*known: Any) -> Check:
     """Return a check that accepts the ``known`` values, types included."""
     return lambda value: any(type(value) is type(each) and value == each for each in known)
 
 
-def list_of(*checks: Check) -> Check:
-    """Return a check that accepts lists with one item for each of ``checks``."""
-    return lambda value: (
-        isinstance(value, list)
-        and len(value) == len(checks)
-        and all(check(each) for check, each in zip(checks, value, strict=True))
-    )
-
-
-def record(required: Mapping[str, Check], optional: Mapping[str, Check] | None = None) -> Check:
-    """Return a check that accepts dictionaries with all ``required`` keys, and no others except ``optional`` ones."""
-    known = {**required, **(optional or {})}
-
-    def check(value: Any) -> bool:
-        return (
-            isinstance(value, dict)
-            and required.keys() <= value.keys() <= known.keys()
-            and all(known[name](each) for name, each in value.items())
-        )
-
-    return check
-
-
 flag = one_of(True, False)
 ARGUMENTS: Mapping[type, Check] = {
-    str: text(MOST_CHARACTERS), float: number(), int: lambda value: type(value) is int and abs(value) <= LARGEST,
-    bool: flag,
+    str: lambda value: isinstance(value, str) and len(value) <= MOST_CHARACTERS, float: number(),
+    int: lambda value: type(value) is int and abs(value) <= LARGEST, bool: flag,
 }  # fmt: skip
 """Checks of the arguments of functions that the page calls, by their annotation."""
 
@@ -201,20 +173,7 @@ class MessageFilter:
 
         ``settable`` maps each state variable that the page may set to the check of its values.
         """
-        self._server, self._warned = server, False
-        shape = record({"key": text(60), "value": lambda _: True})
-
-        def change(value: Any) -> bool:
-            return shape(value) and value["key"] in settable and settable[value["key"]](value["value"])
-
-        self._calls: dict[str, Check] = {
-            "wslink.hello": list_of(record({"secret": text(64)})),
-            "trame.state.get": list_of(),
-            "trame.lifecycle.update": list_of(one_of("client_connected", "client_exited", "client_unmounted")),
-            "trame.error.client": list_of(text(4000)),
-            "trame.state.update": list_of(lambda changes: isinstance(changes, list) and all(map(change, changes))),
-            "trame.trigger": self._is_trigger,
-        }
+        self._server, self._settable, self._warned = server, settable, False
 
     def passes(self, message: bytes) -> bool:
         """Return whether the message is allowed. Log the first message that is not."""
@@ -230,15 +189,39 @@ class MessageFilter:
         return allowed
 
     def _is_call(self, call: Any) -> bool:
-        known = {"id": text(120), "method": text(60), "args": lambda args: isinstance(args, list)}
-        more = {"wslink": text(10), "kwargs": one_of({})}
-        return record(known, more)(call) and call["method"] in self._calls and self._calls[call["method"]](call["args"])
+        """Return whether a decoded message is a call that a page makes, and nothing more."""
+        match call:
+            case {"id": str(number), "method": method, "args": list(args), **more} if len(number) <= MOST_ID:
+                plain = more.get("kwargs", {}) == {} and isinstance(more.get("wslink", ""), str)
+                return plain and more.keys() <= {"wslink", "kwargs"} and self._takes(method, args)
+        return False
 
-    def _is_trigger(self, args: list[Any]) -> bool:
+    def _takes(self, method: Any, args: list[Any]) -> bool:
+        """Return whether a page may call a method with these arguments."""
+        match method, args:
+            case "wslink.hello", [{"secret": str(), **more}]:
+                return not more
+            case "trame.state.get", []:
+                return True
+            case "trame.lifecycle.update", [event]:
+                return event in ("client_connected", "client_exited", "client_unmounted")
+            case "trame.error.client", [str(report)]:
+                return len(report) <= 2 * MOST_CHARACTERS
+            case "trame.state.update", [list(changes)]:
+                return all(map(self._is_change, changes))
+            case "trame.trigger", [str(name), list(given), {**more}]:
+                return not more and self._is_trigger(name, given)
+        return False
+
+    def _is_change(self, change: Any) -> bool:
+        """Return whether the page may give a state variable this value."""
+        match change:
+            case {"key": str(key), "value": value, **more} if key in self._settable and not more:
+                return self._settable[key](value)
+        return False
+
+    def _is_trigger(self, name: str, given: list[Any]) -> bool:
         """Return whether a function that the page may call exists and takes arguments of these types."""
-        if not list_of(text(60), lambda given: isinstance(given, list), one_of({}))(args):
-            return False
-        name, given, _ = args
         called = self._server.controller.trigger_fn(name)
         if called is None:
             return False
