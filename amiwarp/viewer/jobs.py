@@ -112,7 +112,7 @@ class PageWork:
 
     def close(self) -> None:
         """Stop all work. A thread ends when its current work is done."""
-        for task in [*self._jobs, *filter(None, [self._quick, self._slow])]:
+        for task in self._jobs:
             task.cancel()
         self._threads.shutdown(wait=False, cancel_futures=True)
 
@@ -120,25 +120,26 @@ class PageWork:
         """Request quick updates: "window", "knobs", "look", "suggestion" or "state"."""
         self._quick_requests.update(what)
         self._show_pending()
-        if self._quick is None:
-            self._quick = self._task(self._update())
+        if self._quick is None or self._quick.done():
+            self._quick = self.start_job(self._update())
 
     def request_slow(self, *what: str) -> None:
         """Request updates that run in a thread after all quick updates: "curve", "picture" or "preparation"."""
         self._slow_requests.update(what)
         self._show_pending()
-        if self._slow is None:
-            self._slow = self._task(self._update_slowly())
+        if self._slow is None or self._slow.done():
+            self._slow = self.start_job(self._update_slowly())
 
     async def until_drawn(self) -> None:
         """Wait until no quick update is pending."""
-        while self._quick is not None:
+        while self._quick is not None and not self._quick.done():
             await asyncio.sleep(0.005)
 
-    def start_job(self, work: Coroutine[Any, Any, None]) -> None:
+    def start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run a job until it ends or the browser tab is closed."""
-        self._jobs.add(task := self._task(work))
-        task.add_done_callback(self._jobs.discard)
+        self._jobs.add(task := asyncio.get_running_loop().create_task(work))
+        task.add_done_callback(self._ended)
+        return task
 
     async def in_thread(self, work: Callable[..., Any], *args: Any, **options: Any) -> Any:
         """Call ``work`` in one of the browser tab's threads, and return its result."""
@@ -167,44 +168,34 @@ class PageWork:
         parts = {part for what in quick for part in QUICK.get(what, ())} | (self._slow_requests | self._doing) & {*SLOW}
         self.state.updating = sorted(parts)
 
-    def _task(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        task = asyncio.get_running_loop().create_task(work)
-        task.add_done_callback(self._ended)
-        return task
-
     def _ended(self, task: asyncio.Task[None]) -> None:
+        self._jobs.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             logging.getLogger(__name__).error("the page's work failed", exc_info=error)
             text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
             self.say(text, "error")
 
     async def _update(self) -> None:
-        try:
-            while self._quick_requests:
-                while self._in_flight() > MOST_IN_FLIGHT:
-                    await asyncio.sleep(WAIT_S)
-                todo, self._quick_requests = self._quick_requests, set()
-                async with self._done(todo), self.device_lock, self.buffers_lock:
-                    await self.make(todo)
-                await asyncio.sleep(0)
-        finally:
-            self._quick = None
+        while self._quick_requests:
+            while self._in_flight() > MOST_IN_FLIGHT:
+                await asyncio.sleep(WAIT_S)
+            todo, self._quick_requests = self._quick_requests, set()
+            async with self._done(todo), self.device_lock, self.buffers_lock:
+                await self.make(todo)
+            await asyncio.sleep(0)
 
     def _in_flight(self) -> int:
         """Return the number of unsent messages to the page."""
         return 0 if self.server.protocol is None else int(self.server.protocol.network_monitor.pending)
 
     async def _update_slowly(self) -> None:
-        try:
-            while self._slow_requests:
-                await self.until_drawn()
-                name = min(self._slow_requests)  # in alphabetical order: the curve first, the preparation last
-                self._slow_requests.discard(name)
-                async with self._done({name}), self.device_lock:
-                    with self.errors_shown(name):
-                        await self.make_slow(name)
-        finally:
-            self._slow = None
+        while self._slow_requests:
+            await self.until_drawn()
+            name = min(self._slow_requests)  # in alphabetical order: the curve first, the preparation last
+            self._slow_requests.discard(name)
+            async with self._done({name}), self.device_lock:
+                with self.errors_shown(name):
+                    await self.make_slow(name)
 
     @contextlib.asynccontextmanager
     async def _done(self, todo: set[str]) -> Any:
