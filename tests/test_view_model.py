@@ -40,10 +40,10 @@ from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.drawing import ImageKind, Scale, events_text, make_images
 from amiwarp.viewer.inspector import EventRates, Inspector, Knobs, Selection, Source, suggest_region
 from amiwarp.viewer.jobs import (
+    calibrated_events,
     cost_surface,
     estimate_phase,
     find_calibration,
-    scope_text,
     write_events,
     write_image,
 )
@@ -692,7 +692,7 @@ def test_a_calibration_uses_what_is_selected(
     assert found.after == pytest.approx(inspector.show(truth).sharpness_after, rel=0.1)
     assert found.scope.startswith(f"{inspector.loaded.selected:,} events from 0.020 s to 0.200 s")
     assert ("x 20 to 139, y 10 to 109 px" in found.scope) is (region is not None)
-    assert scope_text(inspector) == found.scope
+    assert calibrated_events(inspector)[1] == found.scope
     assert inspector.knobs.apex == 0.5 * truth.apex  # nothing is accepted yet
     inspector.accept(found.calibration)
     assert inspector.sources["apex"] is Source.CALIBRATED
@@ -703,9 +703,10 @@ def test_a_calibration_uses_what_is_selected(
 def test_a_selection_that_determines_nothing_is_refused(inspector: Inspector) -> None:
     start, length = inspector.first_window()
     inspector.open(start, length // 10, Selection(1, (20, 10, 140, 110), noise_us=3000))
-    assert scope_text(inspector).count(",") >= 3
-    assert "ON events" in scope_text(inspector)
-    assert "without background activity (3 ms)" in scope_text(inspector)
+    _, scope = calibrated_events(inspector)
+    assert scope.count(",") >= 3
+    assert "ON events" in scope
+    assert "without background activity (3 ms)" in scope
     with pytest.raises(AmiwarpError, match=r"quarter turn|too few"):
         find_calibration(inspector)
 

@@ -865,7 +865,7 @@ class Scene:
         """Distance between the events that are drawn: 1 for all."""
         self._clouds: list[Any] = []
         self._meshes: list[Any] = [None, None]
-        self._drawn: list[tuple[Any, ...]] = [(), ()]
+        self._drawn: list[tuple[Any, ...]] = [((), (), None)] * 2
         self._frame: list[tuple[int, Any]] = []
         self._lines: list[tuple[int, Any]] = []
         self._explained: tuple[Any, ...] = ()
@@ -981,17 +981,15 @@ class Scene:
         import pyvista
 
         drawn = k == 1 or len(look.titles) > 1
-        places = (xy, shown.theta if look.axis is Axis.ANGLE else shown.events, self.box, self.stride, drawn)
-        colours: tuple[Any, ...] = (shown.events, shown.theta, look.colour, look.dark, look.overlaid)
+        places = (id(xy), id(shown.theta if look.axis is Axis.ANGLE else shown.events), self.box, self.stride, drawn)
+        colours: tuple[Any, ...] = (id(shown.events), id(shown.theta), look.colour, look.dark, look.overlaid)
         if look.colour is Colour.DENSITY:  # the scale is that of the second image
-            colours = (*colours, shown.image_before, shown.image_after)
+            colours = (*colours, id(shown.image_before), id(shown.image_after))
         elif look.colour is Colour.RESIDUAL:
-            colours = (*colours, shown.image_after if k else shown.image_before)
-        mesh = self._meshes[k]
-        same = [len(a) == len(b) and all(x is y or (not isinstance(x, np.ndarray | Events) and x == y)
-                                         for x, y in zip(a, b, strict=True))
-                for a, b in zip((places, colours), self._drawn[k] or ((), ()), strict=True)]  # fmt: skip
-        self._drawn[k] = places, colours
+            colours = (*colours, id(shown.image_after if k else shown.image_before))
+        mesh, (old_places, old_colours, _) = self._meshes[k], self._drawn[k]
+        same = places == old_places, colours == old_colours
+        self._drawn[k] = places, colours, shown  # which keeps the arrays, so that no others get their identities
         if not all(same):
             few = shown.every(self.stride if drawn else len(xy))
             points = self.box.positions(few.after if k else few.before, third_axis(few, look.axis))

@@ -30,7 +30,7 @@ from amiwarp.io.formats import check_ending
 from amiwarp.live.stream.session import RecentEvents
 from amiwarp.progress import Progress, silent
 from amiwarp.reconstruction.picture import save_film
-from amiwarp.viewer.drawing import Look, Scene, SelectedPart, ShownImages, caption, select_part, shown_lines
+from amiwarp.viewer.drawing import Look, Scene, ShownImages, caption, select_part, shown_lines
 from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, MOST_SEARCHED, Inspector, Knobs, Source, busiest
 
 # Work of one page: its threads, jobs and updates, and the messages about their errors.
@@ -284,11 +284,20 @@ class FoundCalibration:
     """Sharpness of the shown region with the calibrated parameters."""
 
 
-def scope_text(inspector: Inspector, *, whole: bool = False) -> str:
-    """Return which events :func:`find_calibration` uses, for the page."""
+def calibrated_events(inspector: Inspector, *, whole: bool = False) -> tuple[Recording, str]:
+    """Return the events that :func:`find_calibration` uses, and a description of them for the page."""
     if whole:
-        return f"the whole recording, {len(inspector.recording.events):,} events"
-    return _text(inspector, select_part(inspector, inspector.loaded, inspector.loaded.region))
+        return inspector.recording, f"the whole recording, {len(inspector.recording.events):,} events"
+    part = select_part(inspector, inspector.loaded, inspector.loaded.region)
+    s, start_s = inspector.selection, (part.start_us - inspector.recording.events.t_first) * 1e-6
+    kind, end_s = "" if s.polarity is None else ("OFF ", "ON ")[s.polarity], start_s + part.length_us * 1e-6
+    texts = [f"{len(part.recording.events):,} {kind}events from {start_s:.3f} s to {end_s:.3f} s"]
+    if s.region is not None:
+        left, top, right, bottom = s.region
+        texts.append(f"x {left} to {right - 1}, y {top} to {bottom - 1} px")
+    texts += ["without hot pixels"] if s.hide_hot else []
+    texts += [f"without background activity ({s.noise_us * 1e-3:g} ms)"] if s.noise_us is not None else []
+    return part.recording, ", ".join(texts)
 
 
 def find_calibration(
@@ -299,12 +308,7 @@ def find_calibration(
     Without an encoder, the search starts at the speed set on the page. Raises :class:`AmiwarpError` if these events
     cannot determine the parameters.
     """
-    recording, rpm = inspector.recording, inspector.knobs.rpm
-    if whole:
-        scope = scope_text(inspector, whole=True)
-    else:
-        part = select_part(inspector, inspector.loaded, inspector.loaded.region)
-        recording, scope = part.recording, _text(inspector, part)
+    (recording, scope), rpm = calibrated_events(inspector, whole=whole), inspector.knobs.rpm
     settings = settings or Settings()
     if rpm and not inspector.has_encoder:
         settings = replace(settings, start={"rpm": rpm, **settings.start})
@@ -314,22 +318,6 @@ def find_calibration(
     sharpness = inspector.sharpness_meter()
     values = (sharpness(each) for each in (None, inspector.knobs, inspector.knobs_of(found)))
     return FoundCalibration(found, scope, *values)
-
-
-def _text(inspector: Inspector, part: SelectedPart) -> str:
-    """Return a description of the events of a part."""
-    s, first = inspector.selection, inspector.recording.events.t_first
-    start_s = (part.start_us - first) * 1e-6
-    kind = "" if s.polarity is None else ("OFF ", "ON ")[s.polarity]
-    texts = [
-        f"{len(part.recording.events):,} {kind}events from {start_s:.3f} s to {start_s + part.length_us * 1e-6:.3f} s"
-    ]
-    if s.region is not None:
-        left, top, right, bottom = s.region
-        texts.append(f"x {left} to {right - 1}, y {top} to {bottom - 1} px")
-    texts += ["without hot pixels"] if s.hide_hot else []
-    texts += [f"without background activity ({s.noise_us * 1e-3:g} ms)"] if s.noise_us is not None else []
-    return ", ".join(texts)
 
 
 @dataclass(frozen=True, eq=False)

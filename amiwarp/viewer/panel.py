@@ -682,8 +682,8 @@ class Panel(PageWork, layout.Actions):
 
     async def _curve(self) -> None:
         s, name = self.state, self.state.knob
-        find = partial(jobs.scope_text, self.inspector)
-        s.calibrate_on = [await self.in_thread(find, whole=whole) for whole in (False, True)]
+        find = partial(jobs.calibrated_events, self.inspector)
+        s.calibrate_on = [(await self.in_thread(find, whole=whole))[1] for whole in (False, True)]
         if not self.compensates:
             return
         values, scores = await self.in_thread(self.inspector.curve, name)
