@@ -132,12 +132,12 @@ const PageFrame = {
   },
 };
 
-// Dialog that takes the focus while it exists. It closes by its button, by Escape, or by a click outside.
+// Dialog that has the focus while it exists. It closes by its button, by Escape, or by a click outside.
 const PageDialog = {
   props: { title: String, name: String },
   emits: ['close'],
-  template: `<dialog @vue:mounted="({ el }) => el.showModal()" :id="name" :aria-label="title" @close="$emit('close')"
-    @click.self="$emit('close')">
+  template: `<dialog @vue:mounted="({ el }) => el.showModal()" @vue:before-unmount="({ el }) => el.close()" :id="name"
+    :aria-label="title" @close="$emit('close')" @click.self="$emit('close')">
     <header><h2>{{ title }}</h2><button type="button" :id="name + '-close'" @click="$emit('close')">close</button></header>
     <slot/></dialog>`,
 };
