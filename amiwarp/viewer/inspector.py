@@ -696,10 +696,8 @@ FOV_DEG = 60.0
 """Horizontal field of view that is assumed if the camera is unknown [deg]."""
 NO_ENCODER = "no encoder: set the prism's speed (rpm), or calibrate, to compensate its motion"
 NO_CAMERA = f"camera unknown: {FOV_DEG:g}° field of view assumed; set it, or give it with --fov-deg or --camera"
-CURVE_POINTS = 25
-"""Number of points of a sharpness curve."""
-ORBIT_POINTS = 181
-"""Number of points of the drawn orbit of a scene point."""
+CURVE_POINTS, ORBIT_POINTS = 25, 181
+"""Number of points of a sharpness curve, and of the drawn orbit of a scene point."""
 LARGEST_APEX = math.radians(3.0)
 """Apex angle up to which events that move into the region are in its images, if the nominal apex is smaller [rad]."""
 WINDOW_US = 100_000

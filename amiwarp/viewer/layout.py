@@ -24,8 +24,6 @@ LONGEST_HISTORY = 200
 """Largest number of states that can be undone."""
 LONGEST_NOISE_US = 10_000_000
 """Largest time of the noise filter in an address [us]."""
-LARGEST_RPM, LARGEST_OFFSET_US = 100_000.0, 1e9
-"""Largest speed [1/min] and clock offset [us] in an address."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +147,8 @@ class History:
 # text in the address
 
 LIMITS = {
-    "apex": (0.0, 29.9), "phase": (-3600.0, 3600.0), "clock_offset": (-LARGEST_OFFSET_US, LARGEST_OFFSET_US),
-    **{name: p.limits for name, p in SLIDING.items()}, "rpm": (-LARGEST_RPM, LARGEST_RPM),
+    "apex": (0.0, 29.9), "phase": (-3600.0, 3600.0), "clock_offset": (-1e9, 1e9),
+    **{name: p.limits for name, p in SLIDING.items()}, "rpm": (-1e5, 1e5),
     **{name: p.limits for name, p in OTHERS.items()}, "focal_length": (0.1, 1e6),
 }  # fmt: skip
 """Smallest and largest value of each parameter in an address and a field: angles in degrees, others in their own units.
@@ -221,8 +219,8 @@ def _knob_texts(knobs: Knobs, before: str) -> dict[str, str]:
 def _with_value(state: ViewState, key: str, text: str, size: tuple[int, int], duration_us: int) -> ViewState:
     """Return a state with one value of an address. Raises ValueError, KeyError or OverflowError for a wrong value."""
     plain: dict[str, Callable[[], ViewState]] = {
-        "start_ms": lambda: replace(state, start_us=_time(text, 0, duration_us - 1)),
-        "length_ms": lambda: replace(state, length_us=_time(text, 1, duration_us)),
+        "start_ms": lambda: replace(state, start_us=int(_within(round(float(text) * 1e3), 0, duration_us - 1))),
+        "length_ms": lambda: replace(state, length_us=int(_within(round(float(text) * 1e3), 1, duration_us))),
         "polarity": lambda: _selected(state, polarity=POLARITIES[text]),
         "region": lambda: _selected(state, region=_region(text, size)),
         "hide_hot": lambda: _selected(state, hide_hot=FLAGS[text]),
@@ -269,11 +267,6 @@ def _sources(text: str, known: tuple[tuple[str, Source], ...]) -> tuple[tuple[st
     return tuple((dict(known) | given).items())
 
 
-def _time(text: str, low: int, high: int) -> int:
-    """Return a time in us from a text in ms."""
-    return int(_within(round(float(text) * 1e3), low, high))
-
-
 def _whole(text: str, low: int, high: int) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 12):
         raise ValueError(text)
@@ -294,8 +287,6 @@ GIVEN = {"fov_deg": ("field of view", "°", "gives_camera"), "index": ("refracti
 FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, "fov_deg": HAND_LIMITS["fov_deg"],
                 "index": HAND_LIMITS["prism_index"]}  # fmt: skip
 """Smallest and largest value of the fields of the prism and the camera, in the page's units."""
-EDITABLE = ("start_ms", "length_ms", "turns", "noise_ms", *GIVEN)
-"""State variables with a number field, next to the prism's parameters."""
 SLIDERS = {
     "apex": ("apex angle", "°", ("0", "apex_most", "0.005"), "true"),
     "phase": ("phase", "°", ("-180", "180", "0.25"), "true"),

@@ -177,7 +177,7 @@ class Panel(PageWork, layout.Actions):
 
     def typed(self, name: str, text: str) -> None:
         """Set the value that a user typed into a number field."""
-        if name not in (*layout.NAMES, *layout.EDITABLE):
+        if name not in (*layout.FIELD_LIMITS, "start_ms", "length_ms", "turns", "noise_ms"):
             return
         try:
             value = finite(text)
@@ -434,7 +434,8 @@ class Panel(PageWork, layout.Actions):
         inspector, state = self.inspector, self.state
         try:
             find = partial(jobs.find_calibration, whole=state.scope != layout.SCOPES[0])
-            found = await self._guarded_in_thread(find, inspector, progress)
+            async with self.device_lock:
+                found = await self.in_thread(_guarded, find, weakref.ref(inspector), progress)
             if isinstance(found, str):
                 text, severity = ("calibration cancelled", "info") if progress.cancelled else (found, "error")
                 self.say(text, severity)
@@ -442,18 +443,14 @@ class Panel(PageWork, layout.Actions):
             self.found = found.calibration
             with state:
                 state.update({"found": layout.found_text(found), "against_choices": self._against_choices()})
-            surface = await self._guarded_in_thread(jobs.cost_surface, inspector, progress)
+            async with self.device_lock:
+                surface = await self.in_thread(_guarded, jobs.cost_surface, weakref.ref(inspector), progress)
             if not isinstance(surface, str) and self.inspector is inspector:
                 with state:
                     state.surface = layout.surface_state(surface, inspector, self.found)
         finally:
             with state:
                 state.update({"busy": "", "calibrating": False})
-
-    async def _guarded_in_thread(self, call: Callable[..., Any], inspector: Inspector, progress: Progress) -> Any:
-        """Return the result of a call with progress, or the text of its error."""
-        async with self.device_lock:
-            return await self.in_thread(_guarded, call, weakref.ref(inspector), progress)
 
     def _show_progress(self, what: str, share: float) -> None:
         """Show the current step of a calibration or a film, and the finished share, 0 to 1."""

@@ -43,12 +43,10 @@ IDLE_S, FOLLOW_S = 0.005, 0.25
 """Interval between two looks for input, and between two pictures of a live stream [s]."""
 COLUMN_LETTERS = 34
 """Length of the lines of text above the sliders [characters]."""
-HELP_PLACE = (0.35, 0.48, 0.72, 0.97)
-"""Left, bottom, right and top of the help, in shares of the window's size."""
+HELP_PLACE, STATISTICS_PLACE = (0.35, 0.48, 0.72, 0.97), (0.735, 0.0, 1.0, 0.25)
+"""Left, bottom, right and top of help and statistics, in shares of the window's size."""
 VTK_FONT_FILE = 4
 """Number by which VTK knows that a text has a font of a file."""
-STATISTICS_PLACE = (0.735, 0.0, 1.0, 0.25)
-"""Left, bottom, right and top of the statistics, in shares of the window's size."""
 HELP_PAPER = {False: "#f0f0ea", True: "#24282e"}
 """Background of help and statistics, for light (False) and dark (True) mode."""
 LEGEND_SHARE = 0.5
@@ -73,10 +71,10 @@ X_KEYS = {
 MORE_KEYS = (
     ("Up", ("nudge", 1), "the parameter moved last: up by a step"),
     ("Down", ("nudge", -1), "the parameter moved last: down by a step"),
-    ("Tab", ("choose_next",), "choose the next parameter for these keys and the curve"),
-    ("m", ("next_model",), "next optical model"),
-    ("k", ("next_colour",), "next quantity shown by colour"),
-    ("n", ("next_polarity",), "ON, OFF or both"),
+    ("Tab", ("choose_next", "knob"), "choose the next parameter for these keys and the curve"),
+    ("m", ("choose_next", "model"), "next optical model"),
+    ("k", ("choose_next", "colour"), "next quantity shown by colour"),
+    ("n", ("choose_next", "polarity"), "ON, OFF or both"),
     ("i", ("toggle", "statistics_shown"), "statistics of the selected events of the region: show or hide"),
     ("v", ("take_truth",), "take the known true parameters of a simulation"),
     ("+", ("resize_points", 1.0), "larger points"),
@@ -237,25 +235,19 @@ class Window(layout.Actions):
         _, _, (_, _, step), _ = layout.SLIDERS[self.knob]
         self.slide(self.knob, layout.knob_values(self.inspector)[self.knob] + steps * float(step))
 
-    def choose_next(self) -> None:
-        """Choose the next parameter for the keys and the sharpness curve."""
-        names = [name for name in self.sliders if name not in FINE]
-        self.knob = _following(names, self.knob)
-        self.request("look")
-
-    def next_model(self) -> None:
-        """Show the next optical model."""
-        knobs = self.inspector.knobs
-        self.inspector.set(replace(knobs, model=_following(list(MODELS), knobs.model)))
-        self.request("knobs")
-
-    def next_colour(self) -> None:
-        """Show the next quantity by colour."""
-        self.restyle(colour=_following(colours_on_offer(self.inspector.recording.truth), self.look.colour))
-
-    def next_polarity(self) -> None:
-        """Show only ON events, only OFF events, or both."""
-        self._select(polarity=_following([None, 1, 0], self.inspector.selection.polarity))
+    def choose_next(self, what: str) -> None:
+        """Choose the next parameter for the keys and the curve, or the next model, colour or polarity that is shown."""
+        inspector, knobs = self.inspector, self.inspector.knobs
+        if what == "knob":
+            self.knob = _following([name for name in self.sliders if name not in FINE], self.knob)
+            self.request("look")
+        elif what == "model":
+            inspector.set(replace(knobs, model=_following(list(MODELS), knobs.model)))
+            self.request("knobs")
+        elif what == "colour":
+            self.restyle(colour=_following(colours_on_offer(inspector.recording.truth), self.look.colour))
+        else:
+            self._select(polarity=_following([None, 1, 0], inspector.selection.polarity))
 
     def resize_points(self, px: float) -> None:
         """Make the points larger."""

@@ -23,15 +23,6 @@ function memory() {
   };
 }
 
-// Return what draws points: a graphics card if there is one.
-function newRaster() {
-  try {
-    return new GpuRaster();
-  } catch {
-    return new Raster();
-  }
-}
-
 export const EventClouds = {
   props: {
     before: null, after: null, third: null, thirdBefore: null, coloursBefore: null, coloursAfter: null, orbit: null, column: null,
@@ -44,7 +35,13 @@ export const EventClouds = {
   setup(props, { emit }) {
     const canvas = sizedCanvas(() => (props.titles.length === 1 ? build() : draw()));
     const camera = new Camera();
-    const rasters = [newRaster(), newRaster()];
+    const rasters = [0, 1].map(() => { // a graphics card draws the points if there is one
+      try {
+        return new GpuRaster();
+      } catch {
+        return new Raster();
+      }
+    });
     const [pictures, places, colours] = [0, 1, 2].map(() => [memory(), memory()]);
     const scene = { places: [new Float32Array(0), new Float32Array(0)], colours: [], half: [1, 1, 1] };
     const label = computed(() => {
@@ -190,13 +187,6 @@ export const EventClouds = {
       return [xs[0] - 2, ys[0] - 2, xs[1] + 3, ys[1] + 3];
     }
 
-    function pick(x, y) {
-      const pane = paneAt(x, y);
-      const cloud = pane.clouds.at(-1);
-      if (!cloud && props.beside) return; // events of another recording
-      emit('pick', nearest(scene.places[cloud], projected(pane), x - pane.left, y - pane.top, REACH_PX));
-    }
-
     function paneAt(x, y) {
       const all = panes();
       return all.find((each) => x < each.left + each.width && y < each.top + each.height) || all[0];
@@ -219,7 +209,13 @@ export const EventClouds = {
         if (event.button > 0 || event.shiftKey) camera.move(...by);
         else camera.turn(...by);
         ask();
-      }, (end) => !moved && end.type === 'pointerup' && pick(...placeOf(end)));
+      }, (end) => {
+        const [x, y] = placeOf(end);
+        const pane = paneAt(x, y);
+        const cloud = pane.clouds.at(-1);
+        if (moved || end.type !== 'pointerup' || (!cloud && props.beside)) return; // events of another recording
+        emit('pick', nearest(scene.places[cloud], projected(pane), x - pane.left, y - pane.top, REACH_PX));
+      });
     }
 
     function wheeled(event) {

@@ -67,21 +67,12 @@ const PageFrame = {
     }
 
     // The browser keeps how the page looks, where a frame of another site lets it.
-    function recall() {
+    function kept(look = null) {
       try {
-        for (const [name, value] of Object.entries(JSON.parse(window.localStorage.getItem(LOOK) || '{}'))) {
-          if (name in props.look && value !== props.look[name]) trame.state.set(name, value);
-        }
+        if (look) window.localStorage.setItem(LOOK, JSON.stringify(look));
+        return JSON.parse(window.localStorage.getItem(LOOK)) || {};
       } catch {
-        // no storage
-      }
-    }
-
-    function keep(look) {
-      try {
-        window.localStorage.setItem(LOOK, JSON.stringify(look));
-      } catch {
-        // no storage
+        return {}; // no storage
       }
     }
 
@@ -121,8 +112,10 @@ const PageFrame = {
       window.addEventListener('keydown', pressed, gone);
       window.addEventListener('hashchange', restore, gone);
       restore();
-      recall();
-      watch(() => JSON.stringify(props.look), () => keep(props.look));
+      for (const [name, value] of Object.entries(kept())) {
+        if (name in props.look && value !== props.look[name]) trame.state.set(name, value);
+      }
+      watch(() => JSON.stringify(props.look), () => kept(props.look));
     });
     onBeforeUnmount(() => {
       gone.abort();

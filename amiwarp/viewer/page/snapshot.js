@@ -34,18 +34,11 @@ function bar(context, css, x, y, width) {
 
 // Return the lines of texts that are at most as wide as the picture.
 function wrapped(context, texts, width) {
-  const lines = [];
-  for (const text of texts) {
-    let line = '';
-    for (const word of text.split(' ')) {
-      if (line && context.measureText(`${line} ${word}`).width > width) {
-        lines.push(line);
-        line = word;
-      } else line = line ? `${line} ${word}` : word;
-    }
-    lines.push(line);
-  }
-  return lines;
+  const add = (lines, word) => {
+    const longer = `${lines.at(-1)} ${word}`;
+    return context.measureText(longer).width > width ? [...lines, word] : [...lines.slice(0, -1), longer];
+  };
+  return texts.map((text) => text.split(' ')).flatMap(([first, ...words]) => words.reduce(add, [first]));
 }
 
 function save(context, name, download) {

@@ -12,7 +12,8 @@ export const RateTimeline = {
   emits: ['move', 'resize', 'zoom', 'release'],
   template: `<canvas ref="canvas" class="timeline" tabindex="0" role="slider" :aria-label="label"
     aria-valuemin="0" :aria-valuemax="whole" :aria-valuenow="start" :aria-valuetext="text" @pointerdown="pressed"
-    @dblclick="$emit('zoom', [0, whole])" @contextmenu.prevent @keydown="typed" @wheel.prevent="wheeled"></canvas>`,
+    @dblclick="$emit('zoom', [0, whole])" @contextmenu.prevent @keydown="typed"
+    @wheel.prevent="zoom(Math.exp(0.002 * $event.deltaY), time($event))"></canvas>`,
   setup(props, { emit }) {
     const canvas = sizedCanvas(draw);
     const text_ = computed(() => `window from ${text(props.start)} to ${text(props.start + props.length)} ms`);
@@ -98,10 +99,6 @@ export const RateTimeline = {
       emit('zoom', [start, start + length]);
     }
 
-    function wheeled(event) {
-      zoom(Math.exp(0.002 * event.deltaY), time(event));
-    }
-
     function typed(event) {
       const to = (start) => () => {
         emit('move', start);
@@ -117,6 +114,6 @@ export const RateTimeline = {
 
     watch(['on', 'off', 'span', 'start', 'length', 'whole'].map((name) => () => props[name]), draw);
     watch(() => props.dark, () => setTimeout(draw));
-    return { canvas, text: text_, pressed, typed, wheeled };
+    return { canvas, text: text_, pressed, time, typed, zoom };
   },
 };
