@@ -949,8 +949,10 @@ class Scene:
 
     def picture(self) -> NDArray[np.uint8]:
         """Return the drawn picture, shape ``(height, width, 3)``."""
+        from pyvista.plotting.utilities.regression import image_from_window  # a Plotter asks for its show() first
+
         self.plotter.render_window.Render()
-        return np.asarray(self.plotter.screenshot(None, return_img=True), np.uint8)
+        return np.asarray(image_from_window(self.plotter.render_window, ignore_alpha=True), np.uint8)
 
     def turntable(self, frames: int) -> Any:
         """Yield pictures while the camera moves once around the clouds, each of shape ``(height, width, 3)``."""
