@@ -501,15 +501,9 @@ def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> NDArray[
     """Return the displayed quantity of each point, in the unit of its scale, shape ``(n,)``."""
     if colour in (Colour.ANGLE, Colour.TIME):
         return third_axis(shown, Axis(colour.value))
-    if colour is Colour.RESIDUAL:
-        return residuals(shown, after=after)
     image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
-    return at_pixels(image, xy)
-
-
-def residuals(shown: DisplayedWindow, *, after: bool) -> NDArray[np.float64]:
-    """Return the :func:`residual` of each point of the first or the second cloud [px], shape ``(n,)``."""
-    image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
+    if colour is Colour.DENSITY:
+        return at_pixels(image, xy)
     left, top, right, bottom = shown.region
     return residual(image, xy, (slice(top, bottom), slice(left, right)))
 
@@ -1396,7 +1390,7 @@ def _cloud(shown: DisplayedWindow, axis: Axis, *, after: bool) -> pyvista.PolyDa
     arrays: dict[str, NDArray[Any]] = {
         "t_us": shown.events.t - shown.span.first_us, "theta_rad": shown.theta, "polarity": shown.events.p,
         "index": np.concatenate([np.arange(run.start, run.stop) for run in shown.span.runs])[shown.truth.positions],
-        "residual_px": residuals(shown, after=after).astype(np.float32),
+        "residual_px": _measure(shown, Colour.RESIDUAL, after=after).astype(np.float32),
     }  # fmt: skip
     for name, attribute in TRUTHS.items():
         if (store := getattr(shown.truth.truth, attribute, None)) is not None:
