@@ -852,6 +852,7 @@ class Scene:
         self.plotter = pyvista.Plotter(off_screen=off_screen, shape=parts, border=False, window_size=list(size))
         self.plotter.render_window.SetMultiSamples(0)  # doubles the speed of a software renderer
         self.plotter.link_views((0, 1))
+        self._views = list(self.plotter.renderers)[:2]  # of the clouds
         self._corner, self._foot = corner, 0.0
         self._divide(0.0, overlaid=False)
         self.view = View.FREE
@@ -957,15 +958,6 @@ class Scene:
     def close(self) -> None:
         """Release the VTK renderer and its memory."""
         self.plotter.close()
-
-    @property
-    def _views(self) -> list[Any]:
-        """Renderers of the two clouds."""
-        return list(self.plotter.renderers)[:2]
-
-    @property
-    def _overlaid(self) -> bool:
-        return bool(self.plotter.renderers[0].GetViewport()[2] > 0.9)
 
     def _add(self, k: int, mesh: Any, **how: Any) -> Any:
         self.plotter.subplot(0, k)
@@ -1078,7 +1070,7 @@ class Scene:
 
     def _divide(self, strip: float, *, overlaid: bool) -> None:
         """Divide the scene's part of the picture into the legend's strip, a share of the width, and the clouds."""
-        self._strip, (left, right, legend, foot, *_) = strip, self.plotter.renderers
+        self._strip, self._overlaid, (left, right, legend, foot, *_) = strip, overlaid, self.plotter.renderers
         start, low = self._corner[0] + strip, self._corner[1] + self._foot
         middle = (1.0 + start) / 2.0
         legend.SetViewport(self._corner[0], low, start, 1.0)

@@ -177,16 +177,12 @@ class PageWork:
 
     async def _update(self) -> None:
         while self._quick_requests:
-            while self._in_flight() > MOST_IN_FLIGHT:
+            while (page := self.server.protocol) is not None and page.network_monitor.pending > MOST_IN_FLIGHT:
                 await asyncio.sleep(WAIT_S)
             todo, self._quick_requests = self._quick_requests, set()
             async with self._done(todo), self.device_lock, self.buffers_lock:
                 await self.make(todo)
             await asyncio.sleep(0)
-
-    def _in_flight(self) -> int:
-        """Return the number of unsent messages to the page."""
-        return 0 if self.server.protocol is None else int(self.server.protocol.network_monitor.pending)
 
     async def _update_slowly(self) -> None:
         while self._slow_requests:
