@@ -136,6 +136,6 @@ from .tasks import Progress as Progress
 from .translation.sources import DataSet as DataSet
 from .translation.sources import Interpolation as Interpolation
 from .translation.translator import translate as translate
-from .viewer.clouds import event_clouds as event_clouds
+from .viewer.drawing import event_clouds as event_clouds
 from .viewer.panel import NotebookPage as NotebookPage
 from .viewer.panel import view as view

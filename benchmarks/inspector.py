@@ -43,7 +43,6 @@ from amiwarp.studies.cluster import machine
 from amiwarp.viewer.drawing import (
     ImageKind,
     cloud_state,
-    count_images,
     make_images,
     picture_state,
     prepare,
@@ -139,7 +138,7 @@ def update(device: str, region: tuple[int, int, int, int] | None) -> dict[str, A
         inspector.set(replace(inspector.knobs, apex=0.01 + 0.0005 * k))
         shown = inspector.show()
         cloud_state(shown, Colour.POLARITY, Axis.ANGLE, dark=False)
-        images = count_images(shown)
+        images = make_images(inspector, ImageKind.COUNT, shown=shown)
         assert images.before is not None
         for image in (images.before, images.after):
             picture_state(image, images.scale)

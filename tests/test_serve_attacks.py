@@ -52,7 +52,7 @@ class Panels:
         from amiwarp.viewer.panel import Panel
 
         panel = Panel(server, Inspector(self.recording))
-        parts = (server, panel, panel.inspector, panel.work)
+        parts = (server, panel, panel.inspector)
         self.parts += map(weakref.ref, parts)
         if self.keep:
             self.panels.append(panel)
@@ -541,5 +541,5 @@ def test_closed_tabs_give_back_threads_and_memory(recording: Recording) -> None:
             run(lambda: visit(url, 2))
             until(lambda: all(part() is None for part in build.parts) and not ours())
             until(lambda: native_threads() <= before)
-    assert len(build.parts) == 5 * 4
+    assert len(build.parts) == 5 * 3
     assert ours() == []

@@ -399,6 +399,7 @@ def test_what_calibration_found_is_compared_accepted_and_saved(
 def test_two_sets_of_parameters_are_compared(page: Any, kept: Any) -> None:
     page.locator("#do-truth").click()
     until(lambda: field(page, "apex") == pytest.approx(APEX_DEG))
+    ready(page)
     until(lambda: sharpness(page)[1] > 1.1 * sharpness(page)[0])
     assert page.locator("i.truth").count() == 9  # a pair each of tilt, cylinder power and wobble, and three more
     best = sharpness(page)[1]

@@ -26,6 +26,7 @@ from typer.testing import CliRunner
 import amiwarp
 from amiwarp import Camera, MemoryEvents, Prism, open_recording, save_recording, simulate
 from amiwarp.cli.app import app
+from amiwarp.viewer import drawing
 from amiwarp.viewer import panel as viewer_app
 from amiwarp.viewer.inspector import Inspector, Library
 from reference.calibration_sample import exact_calibration
@@ -65,18 +66,18 @@ def test_a_picture_without_a_window(files: Path, tmp_path: Path) -> None:
 
 def test_an_interrupt_waits_until_vtk_has_drawn(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """VTK crashes if an exception leaves it half-drawn."""
-    look_from, closed = viewer_app.Scene.look_from, []
+    look_from, closed = drawing.Scene.look_from, []
 
-    def interrupted(scene: viewer_app.Scene, *given: Any) -> None:
+    def interrupted(scene: drawing.Scene, *given: Any) -> None:
         signal.raise_signal(signal.SIGINT)
         look_from(scene, *given)
 
-    monkeypatch.setattr(viewer_app.Scene, "look_from", interrupted)
-    close = viewer_app.Scene.close
-    monkeypatch.setattr(viewer_app.Scene, "close", lambda scene: closed.append(close(scene)))
+    monkeypatch.setattr(drawing.Scene, "look_from", interrupted)
+    close = drawing.Scene.close
+    monkeypatch.setattr(drawing.Scene, "close", lambda scene: closed.append(close(scene)))
     inspector = Inspector(open_recording(files / "recording.h5"))
     with pytest.raises(KeyboardInterrupt):
-        viewer_app.save_screenshot(inspector, tmp_path / "out.png", size=(400, 200))
+        drawing.save_screenshot(inspector, tmp_path / "out.png", size=(400, 200))
     assert closed == [None]
     assert np.asarray(Image.open(tmp_path / "out.png")).shape[:2] == (200, 400)
 

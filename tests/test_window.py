@@ -411,6 +411,7 @@ def test_the_calibration_and_a_picture_are_saved_under_new_names(
     window: Window, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    window.plotter.off_screen = False  # on a display, PyVista takes no picture before its own show()
     for key in ("s", "p", "p"):
         window.key(key)
         window.turn()

@@ -98,9 +98,9 @@ class LookOptions:
 
         Raises :class:`AmiwarpError` for a format other than .png, or a size out of range.
         """
+        from amiwarp.viewer.drawing import save_screenshot
         from amiwarp.viewer.jobs import estimate_phase
         from amiwarp.viewer.layout import notes
-        from amiwarp.viewer.panel import save_screenshot
 
         check_ending(path, "pictures are written", [".png"])
         size = self.pixels(PICTURE_PX)

@@ -7,26 +7,28 @@ import math
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from ctypes import CDLL, c_void_p
 from ctypes.util import find_library
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.export import GAMMA, PERCENTILE, save_png
 from amiwarp.imaging.metrics import random_variance
 from amiwarp.imaging.palette import BLUE, OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK, ORANGE, PINK, VERMILION
+from amiwarp.io.files import check_output, interrupts_later
 from amiwarp.plotting.figures import instance_colours
 from amiwarp.reconstruction.picture import Picture, Reconstruction
-from amiwarp.validation import choice
+from amiwarp.validation import choice, guarded, vector, whole
 from amiwarp.viewer.inspector import (
     SMOOTHING_PX,
     STORES,
@@ -36,11 +38,15 @@ from amiwarp.viewer.inspector import (
     Knobs,
     LoadedWindow,
     Region,
+    Selection,
     colours_on_offer,
     inside,
     read_span,
     recorded_counts,
 )
+
+if TYPE_CHECKING:
+    import pyvista
 
 # Selected events of the inspector's window as a recording of a smaller camera.
 
@@ -108,18 +114,6 @@ SAME_RESIDUAL = 0.25
 """Relative change of the residual up to which the weight of the smoothness prior is kept."""
 
 
-@dataclass(frozen=True, eq=False)
-class LogIntensity:
-    """Log intensity of a region."""
-
-    log: NDArray[np.float32]
-    """Log intensity [ON thresholds], shape ``(height, width)`` of the region."""
-    known: NDArray[np.bool_]
-    """Whether events determine each pixel, same shape."""
-    note: str
-    """Number of equations, their residual, and what limits the picture."""
-
-
 _prepared: set[str] = set()
 """Devices on which :func:`prepare` has run."""
 
@@ -134,18 +128,24 @@ def prepare(inspector: Inspector) -> None:
         _prepared.add(str(inspector.device))
 
 
-def log_intensity(inspector: Inspector, window: LoadedWindow, knobs: Knobs, *, share: float = 1.0) -> LogIntensity:
+def log_intensity(
+    inspector: Inspector, window: LoadedWindow, knobs: Knobs, *, share: float = 1.0
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], str]:
     """Reconstruct the log intensity of a window's region with given parameters.
 
-    ``share``: share of :data:`MOST_WORK` that it may use.
+    Returns the log intensity [ON thresholds] and whether events determine each pixel, shape ``(height, width)``, and a
+    text: number of equations, their residual, and what limits the picture. ``share``: share of :data:`MOST_WORK` that
+    it may use.
 
     Raises :class:`AmiwarpError` if the prism does not rotate, or if no pixel fires twice.
     """
     turn_us = inspector.turn_us if inspector.has_encoder or knobs.rpm else math.inf
     if not math.isfinite(turn_us):
         raise AmiwarpError("the log intensity needs a prism that rotates; set its speed (rpm), or calibrate")
-    left, top, right, bottom = _wide(inspector, window)
-    part = select_part(inspector, window, (left, top, right, bottom), most=share * MOST_WORK, longest_us=turn_us)
+    (left, top, right, bottom), m = window.region, inspector.margin_px  # from where the prism may move events into it
+    width, height = inspector.recording.events.size
+    left, top, right, bottom = wide = max(left - m, 0), max(top - m, 0), min(right + m, width), min(bottom + m, height)
+    part = select_part(inspector, window, wide, most=share * MOST_WORK, longest_us=turn_us)
     step = part.step
     if knobs.focal_length is not None:
         knobs = replace(knobs, focal_length=knobs.focal_length / step)
@@ -158,7 +158,7 @@ def log_intensity(inspector: Inspector, window: LoadedWindow, knobs: Knobs, *, s
     if part.length_us < window.span.length_us:
         limits.append(f"{part.length_us * 1e-3:.3g} ms in the middle")
     note = "; ".join([f"{picture.pairs:,} pairs, residual {picture.residual:.2f}", *limits])
-    return LogIntensity(picture.log[cut], picture.known[cut], note)
+    return picture.log[cut], picture.known[cut], note
 
 
 def _picture(work: Reconstruction, part: SelectedPart, chosen: list[Picture]) -> Picture:
@@ -175,14 +175,6 @@ def _picture(work: Reconstruction, part: SelectedPart, chosen: list[Picture]) ->
         work.smoothness = None
     chosen[:] = [work.window(part.start_us, part.length_us)]
     return chosen[0]
-
-
-def _wide(inspector: Inspector, window: LoadedWindow) -> Region:
-    """Return the part of the image whose events the prism may move into the region."""
-    left, top, right, bottom = window.region
-    width, height = inspector.recording.events.size
-    m = inspector.margin_px
-    return max(left - m, 0), max(top - m, 0), min(right + m, width), min(bottom + m, height)
 
 
 class ImageKind(enum.StrEnum):
@@ -289,35 +281,31 @@ class ShownImages:
 
 
 def make_images(
-    inspector: Inspector, kind: ImageKind, knobs: Knobs | None = None, *, against: Knobs | None = None
+    inspector: Inspector, kind: ImageKind, *, against: Knobs | None = None, shown: DisplayedWindow | None = None
 ) -> ShownImages:
     """Return the images of the inspector's window.
 
-    ``knobs``: parameters of the second image, by default the current ones. ``against``: parameters of the first image
-    instead of none. Raises :class:`AmiwarpError` if a log intensity cannot be reconstructed.
+    ``against``: parameters of the first image instead of none. ``shown``: the window with these parameters, if it is
+    known: its counts are not made again. Raises :class:`AmiwarpError` if a log intensity cannot be reconstructed.
     """
-    window, knobs = inspector.loaded, knobs or inspector.knobs
+    window, knobs = inspector.loaded, inspector.knobs
     left, top, right, bottom = window.region
-    cut = np.s_[..., top:bottom, left:right]
     if kind is ImageKind.LOG_INTENSITY:
         return _log_images(inspector, window, knobs, against)
     first = inspector.beside if against is None and inspector.beside is not None else inspector
     pair = (first, first.loaded, against), (inspector, window, knobs)
     if kind is ImageKind.TIME_SURFACE:
-        images = [_time_surface(*each)[cut] for each in pair]
+        images = [_time_surface(*each) for each in pair]
+    elif kind is ImageKind.COUNT and shown is not None:
+        images = [shown.image_before, shown.image_after]
+    else:
+        images = [each.counts(w, k, per_polarity=kind is ImageKind.POLARITY) for each, w, k in pair]
+    before, after = (each[..., top:bottom, left:right] for each in images)
+    if kind is ImageKind.TIME_SURFACE:
         scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, "viridis")
-        return ShownImages(kind, images[0], images[1], scale)
-    per_polarity = kind is ImageKind.POLARITY
-    images = [each.counts(w, k, per_polarity=per_polarity)[cut] for each, w, k in pair]
-    colours = "polarity" if per_polarity else "gray"
-    return ShownImages(kind, images[0], images[1], _count_scale(images, colours))
-
-
-def count_images(shown: DisplayedWindow) -> ShownImages:
-    """Return the images of kind :attr:`ImageKind.COUNT` of a window that is already shown."""
-    left, top, right, bottom = shown.region
-    images = [each[top:bottom, left:right] for each in (shown.image_before, shown.image_after)]
-    return ShownImages(ImageKind.COUNT, images[0], images[1], _count_scale(images))
+    else:
+        scale = _count_scale((before, after), "polarity" if kind is ImageKind.POLARITY else "gray")
+    return ShownImages(kind, before, after, scale)
 
 
 def with_difference(images: ShownImages) -> ShownImages:
@@ -340,13 +328,10 @@ def _count_scale(images: Sequence[NDArray[np.float32]], colours: str = "gray") -
 def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:
     """Return the time of the latest event of each pixel from the start of the window on [ms]; NaN without events."""
     events, (width, height) = window.events, inspector.recording.events.size
-    if knobs is None:
-        pixel = events.y.astype(np.int64) * width + events.x
-    else:
-        x, y = np.rint(inspector.positions(events, knobs)).T
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        with np.errstate(invalid="ignore"):
-            pixel = np.where(inside, y.astype(np.int64) * width + x.astype(np.int64), width * height)
+    x, y = (events.x, events.y) if knobs is None else np.rint(inspector.positions(events, knobs)).T
+    within = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    with np.errstate(invalid="ignore"):
+        pixel = np.where(within, y.astype(np.int64) * width + x.astype(np.int64), width * height)
     surface = np.full(width * height + 1, np.nan, np.float32)  # the last element takes the events outside of the image
     # events are in order of time; of several values for one pixel, NumPy keeps the last
     surface[pixel] = (events.t - window.span.start_us) * 1e-3
@@ -355,13 +340,12 @@ def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | Non
 
 def _log_images(inspector: Inspector, window: LoadedWindow, knobs: Knobs, against: Knobs | None) -> ShownImages:
     """Return log intensities of the region with one scale."""
-    found = [None if each is None else log_intensity(inspector, window, each) for each in (against, knobs)]
-    first, second = found
-    assert second is not None
-    known = np.concatenate([each.log[each.known] for each in found if each is not None])
+    found = [log_intensity(inspector, window, each) for each in (against, knobs) if each is not None]
+    known = np.concatenate([log[where] for log, where, _ in found])
     low, high = (float(np.percentile(known, share)) for share in (0.5, 99.5)) if known.size else (0.0, 1.0)
     scale = Scale("log intensity", "ON thresholds", low, max(high, low + 1e-3), "gray")
-    return ShownImages(ImageKind.LOG_INTENSITY, None if first is None else first.log, second.log, scale, second.note)
+    before = None if against is None else found[0][0]
+    return ShownImages(ImageKind.LOG_INTENSITY, before, found[-1][0], scale, found[-1][2])
 
 
 # Colours for events by cause, instance and depth, and the legend of these colours.
@@ -379,13 +363,6 @@ Legend: TypeAlias = tuple[tuple[str, str], ...]
 
 The colour of the title row is empty.
 """
-
-
-def truth_colours(truth: DrawnTruth, colour: Colour) -> NDArray[np.uint8]:
-    """Return red, green and blue (0 to 255) of each drawn event, shape ``(n, 3)``."""
-    values = truth.values(colour)
-    rgb = _depths(values, _scale(values)) if colour is Colour.DEPTH else _names(colour, values)
-    return np.rint(255.0 * rgb).astype(np.uint8)
 
 
 def legend_of(truth: DrawnTruth, colour: Colour, most: int) -> Legend:
@@ -445,9 +422,8 @@ def _depths(depth: NDArray[Any], scale: tuple[float, float]) -> NDArray[np.float
     """
     from matplotlib import colormaps, colors
 
-    low, high = scale
-    share = np.log(np.clip(depth, low, high) / low) / math.log(high / low)
-    return np.asarray(np.where(np.isfinite(depth)[:, None], colormaps[DEPTH_MAP](share)[:, :3], colors.to_rgb(GREY)))
+    rgb = colormaps[DEPTH_MAP](colors.LogNorm(*scale, clip=True)(depth))[:, :3]
+    return np.asarray(np.where(np.isfinite(depth)[:, None], rgb, colors.to_rgb(GREY)))
 
 
 def _scale(depth: NDArray[Any]) -> tuple[float, float]:
@@ -496,7 +472,9 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
     if shown.is_beside and look.colour not in colours_on_offer(shown.truth.truth):
         return np.full((len(shown.events), 3), 128, np.uint8)
     if look.colour in STORES:
-        return truth_colours(shown.truth, look.colour)
+        values = shown.truth.values(look.colour)
+        rgb = _depths(values, _scale(values)) if look.colour is Colour.DEPTH else _names(look.colour, values)
+        return np.asarray(np.rint(255.0 * rgb), np.uint8)
     scale = scale_of(shown, look.colour, dark=look.dark)
     assert scale is not None
     return scale.rgb(_measure(shown, look.colour, after=after))
@@ -523,15 +501,9 @@ def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> NDArray[
     """Return the displayed quantity of each point, in the unit of its scale, shape ``(n,)``."""
     if colour in (Colour.ANGLE, Colour.TIME):
         return third_axis(shown, Axis(colour.value))
-    if colour is Colour.RESIDUAL:
-        return residuals(shown, after=after)
     image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
-    return at_pixels(image, xy)
-
-
-def residuals(shown: DisplayedWindow, *, after: bool) -> NDArray[np.float64]:
-    """Return the :func:`residual` of each point of the first or the second cloud [px], shape ``(n,)``."""
-    image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
+    if colour is Colour.DENSITY:
+        return at_pixels(image, xy)
     left, top, right, bottom = shown.region
     return residual(image, xy, (slice(top, bottom), slice(left, right)))
 
@@ -608,11 +580,6 @@ FOOT_PX, OWN_RENDERERS = 22, 4
 """Height of the caption [px], and number of renderers of a scene: two clouds, their legend and the caption."""
 ROW_PX, LEAST_ROWS, MOST_ROWS = 40, 3, 12
 """Height of the picture per row of the legend [px], and smallest and largest number of rows."""
-
-
-def rows_in(height: int) -> int:
-    """Return the largest number of coloured rows of a legend in a picture of a given height [px]."""
-    return max(LEAST_ROWS, min(MOST_ROWS, height // ROW_PX))
 
 
 def strip_share(texts: Sequence[str], width: int) -> float:
@@ -759,7 +726,7 @@ ORBIT_COLOUR = "#009e73"
 PICK_PX = 4.0
 """Distance from the mouse up to which an event is found [px]."""
 ROUND_PX = 4.0
-"""Diameter of the points from which they are round [px]."""
+"""Diameter of the points from which they are round [px]. Smaller discs have no shape, and squares are faster."""
 VIEW_ANGLE = 26.0
 """Vertical field of view of the camera [deg]."""
 MARGIN = 0.1
@@ -784,11 +751,6 @@ class Look:
     """Whether both clouds are drawn in one frame, with the first one in grey."""
     titles: tuple[str, ...] = ("as recorded", "compensated")
     """Titles of the clouds. With a single title, only the second cloud is drawn."""
-
-    @property
-    def is_round(self) -> bool:
-        """Whether points are drawn as discs. Smaller ones have no visible shape, and squares are faster."""
-        return self.point_size >= ROUND_PX
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "colour", choice(Colour, self.colour, "colour"))
@@ -890,6 +852,7 @@ class Scene:
         self.plotter = pyvista.Plotter(off_screen=off_screen, shape=parts, border=False, window_size=list(size))
         self.plotter.render_window.SetMultiSamples(0)  # doubles the speed of a software renderer
         self.plotter.link_views((0, 1))
+        self._views = list(self.plotter.renderers)[:2]  # of the clouds
         self._corner, self._foot = corner, 0.0
         self._divide(0.0, overlaid=False)
         self.view = View.FREE
@@ -897,7 +860,7 @@ class Scene:
         """Distance between the events that are drawn: 1 for all."""
         self._clouds: list[Any] = []
         self._meshes: list[Any] = [None, None]
-        self._drawn: list[tuple[Any, ...]] = [(), ()]
+        self._drawn: list[tuple[Any, ...]] = [((), (), None)] * 2
         self._frame: list[tuple[int, Any]] = []
         self._lines: list[tuple[int, Any]] = []
         self._explained: tuple[Any, ...] = ()
@@ -981,12 +944,10 @@ class Scene:
 
     def picture(self) -> NDArray[np.uint8]:
         """Return the drawn picture, shape ``(height, width, 3)``."""
-        self.plotter.render_window.Render()
-        return np.asarray(self.plotter.screenshot(None, return_img=True), np.uint8)
+        from pyvista.plotting.utilities.regression import image_from_window  # a Plotter asks for its show() first
 
-    def save(self, path: Path) -> None:
-        """Write the picture as PNG, first under a temporary name."""
-        save_png(path, self.picture())
+        self.plotter.render_window.Render()
+        return np.asarray(image_from_window(self.plotter.render_window, ignore_alpha=True), np.uint8)
 
     def turntable(self, frames: int) -> Any:
         """Yield pictures while the camera moves once around the clouds, each of shape ``(height, width, 3)``."""
@@ -998,15 +959,6 @@ class Scene:
         """Release the VTK renderer and its memory."""
         self.plotter.close()
 
-    @property
-    def _views(self) -> list[Any]:
-        """Renderers of the two clouds."""
-        return list(self.plotter.renderers)[:2]
-
-    @property
-    def _overlaid(self) -> bool:
-        return bool(self.plotter.renderers[0].GetViewport()[2] > 0.9)
-
     def _add(self, k: int, mesh: Any, **how: Any) -> Any:
         self.plotter.subplot(0, k)
         return self.plotter.add_mesh(mesh, lighting=False, show_scalar_bar=False, reset_camera=False, render=False,
@@ -1014,18 +966,18 @@ class Scene:
 
     def _cloud(self, k: int, xy: NDArray[np.float32], shown: DisplayedWindow, look: Look) -> None:
         """Draw the points of a cloud. Only what has changed is computed, and the points are moved where they are."""
+        import pyvista
+
         drawn = k == 1 or len(look.titles) > 1
-        places = (xy, shown.theta if look.axis is Axis.ANGLE else shown.events, self.box, self.stride, drawn)
-        colours: tuple[Any, ...] = (shown.events, shown.theta, look.colour, look.dark, look.overlaid)
+        places = (id(xy), id(shown.theta if look.axis is Axis.ANGLE else shown.events), self.box, self.stride, drawn)
+        colours: tuple[Any, ...] = (id(shown.events), id(shown.theta), look.colour, look.dark, look.overlaid)
         if look.colour is Colour.DENSITY:  # the scale is that of the second image
-            colours = (*colours, shown.image_before, shown.image_after)
+            colours = (*colours, id(shown.image_before), id(shown.image_after))
         elif look.colour is Colour.RESIDUAL:
-            colours = (*colours, shown.image_after if k else shown.image_before)
-        mesh = self._meshes[k]
-        same = [len(a) == len(b) and all(x is y or (not isinstance(x, np.ndarray | Events) and x == y)
-                                         for x, y in zip(a, b, strict=True))
-                for a, b in zip((places, colours), self._drawn[k] or ((), ()), strict=True)]  # fmt: skip
-        self._drawn[k] = places, colours
+            colours = (*colours, id(shown.image_after if k else shown.image_before))
+        mesh, (old_places, old_colours, _) = self._meshes[k], self._drawn[k]
+        same = places == old_places, colours == old_colours
+        self._drawn[k] = places, colours, shown  # which keeps the arrays, so that no others get their identities
         if not all(same):
             few = shown.every(self.stride if drawn else len(xy))
             points = self.box.positions(few.after if k else few.before, third_axis(few, look.axis))
@@ -1037,22 +989,17 @@ class Scene:
             if fits and valid is ...:
                 mesh.points = points
             else:
-                mesh = self._new_cloud(k, points)
+                mesh = self._meshes[k] = pyvista.PolyData(points)
+                mesh["colour"] = np.zeros((len(points), 3), np.uint8)
+                if len(self._clouds) == k:
+                    self._clouds.append(self._add(k, mesh, style="points", scalars="colour", rgb=True))
+                self._clouds[k].mapper.dataset = mesh
             if not (same[1] and fits and valid is ...):
                 mesh["colour"] = colours_of(few, look, after=k == 1)[valid]
         prop = self._clouds[k].prop
         self._clouds[k].visibility = drawn
-        prop.point_size, prop.opacity, prop.render_points_as_spheres = look.point_size, look.opacity, look.is_round
-
-    def _new_cloud(self, k: int, points: NDArray[np.float32]) -> Any:
-        import pyvista
-
-        mesh = pyvista.PolyData(points)
-        mesh["colour"] = np.zeros((len(points), 3), np.uint8)
-        while len(self._clouds) <= k:
-            self._clouds.append(self._add(len(self._clouds), mesh, style="points", scalars="colour", rgb=True))
-        self._clouds[k].mapper.dataset = self._meshes[k] = mesh
-        return mesh
+        prop.point_size, prop.opacity = look.point_size, look.opacity
+        prop.render_points_as_spheres = look.point_size >= ROUND_PX
 
     def _draw_frame(self, look: Look) -> None:
         """Draw the box, the ticks and the axis titles, if they have changed."""
@@ -1098,7 +1045,7 @@ class Scene:
         home = self.plotter.renderers[2]
         width, height = self.plotter.window_size
         bar = scale_of(shown, look.colour, dark=look.dark)
-        rows = legend_of(shown.truth, look.colour, rows_in(height))
+        rows = legend_of(shown.truth, look.colour, max(LEAST_ROWS, min(MOST_ROWS, height // ROW_PX)))
         if look.overlaid and len(look.titles) > 1:
             rows = (*rows, (GREY, look.titles[0]))
         title = [] if bar is None else [bar.label]
@@ -1123,7 +1070,7 @@ class Scene:
 
     def _divide(self, strip: float, *, overlaid: bool) -> None:
         """Divide the scene's part of the picture into the legend's strip, a share of the width, and the clouds."""
-        self._strip, (left, right, legend, foot, *_) = strip, self.plotter.renderers
+        self._strip, self._overlaid, (left, right, legend, foot, *_) = strip, overlaid, self.plotter.renderers
         start, low = self._corner[0] + strip, self._corner[1] + self._foot
         middle = (1.0 + start) / 2.0
         legend.SetViewport(self._corner[0], low, start, 1.0)
@@ -1166,6 +1113,19 @@ class Scene:
         actors.append(self.plotter.add_text(title, position="upper_edge", font_size=9, color=ink, render=False,
                                             font_file=str(font())))  # fmt: skip
         return actors
+
+
+def save_screenshot(
+    inspector: Inspector, path: Path, *, view: View = View.FREE, look: Look | None = None, size: tuple[int, int]
+) -> None:
+    """Write a picture of both event clouds as PNG; ``size`` is its width and height [px]."""
+    check_output(path)
+    look = (look or Look()).for_clouds(cloud_titles(inspector, "recorded"))
+    clouds = inspector.show()
+    with interrupts_later(), closing(Scene(size)) as scene:  # VTK crashes if an exception leaves it half-drawn
+        scene.show(clouds, look, caption=caption(inspector, clouds))
+        scene.look_from(view, look)
+        save_png(path, scene.picture())
 
 
 def ticks(low: float, high: float, most: int = 5, *, whole: bool = False) -> NDArray[np.float64]:
@@ -1315,3 +1275,123 @@ def float_bytes(values: NDArray[Any]) -> bytes:
 def _pixels(colours: NDArray[np.uint8]) -> bytes:
     """Return colours, shape ``(n, 3)``, as opaque pixels of an image in the browser."""
     return np.column_stack([colours, np.full(len(colours), 255, np.uint8)]).tobytes()
+
+
+# Event clouds before and after compensation as PyVista meshes, for scenes and files of other programs.
+
+TRUTHS = {
+    "cause": "stored_causes", "instance": "stored_instances", "depth_m": "stored_depths", "place_m": "stored_places",
+}  # fmt: skip
+"""Arrays of the clouds by name, and the ground truth that they hold."""
+
+
+@guarded
+def event_clouds(
+    recording: Recording,
+    calibration: Calibration,
+    *,
+    window: tuple[int, int] | None = None,
+    region: tuple[int, int, int, int] | None = None,
+    axis: str = "angle",
+    device: Any = "cpu",
+) -> tuple[pyvista.PolyData, pyvista.PolyData]:
+    """Return the events as recorded and compensated as point clouds, to plot, slice and save with PyVista.
+
+    Parameters
+    ----------
+    recording : Recording
+        Events to show.
+    calibration : Calibration
+        Calibration of the recording.
+    window : tuple of int, optional
+        Start and end of the time window on the events' clock [us]; the end is exclusive. Default: the whole recording.
+    region : tuple of int, optional
+        Left, top, right and bottom of a part of the image [px]; right and bottom are exclusive. The clouds hold the
+        events that were recorded in it. Default: the whole image.
+    axis : str
+        Third axis: "angle" or "time".
+    device : str or warp.Device
+        Device that compensates the events.
+
+    Returns
+    -------
+    tuple of pyvista.PolyData
+        Clouds before and after compensation, with one vertex per event.
+
+    Raises
+    ------
+    AmiwarpError
+        If there are no events in window and region, or the calibration belongs to a camera of another size.
+
+    Notes
+    -----
+    A point lies at x [px], -y [px], as VTK's y axis points up, and the prism angle or the time times a scale: the whole
+    third axis is 0.75 times as long as the region is wide. Both clouds have these arrays:
+
+    - ``t_us`` (int64): time after the first event of the recording [us],
+    - ``theta_rad`` (float64): prism angle, from 0 to 2π [rad],
+    - ``polarity`` (uint8): 1 for ON, 0 for OFF,
+    - ``index`` (int64): index of the event in the recording,
+    - ``residual_px`` (float32): standard deviation across the edge on which the event lies [px], up to 6,
+    - of a simulation: ``cause``, ``instance``, ``depth_m`` [m] and ``place_m`` (point in the world that the event saw
+      [m], shape ``(n, 3)``), as far as the recording holds them.
+
+    The field data hold ``axes`` (names and units of the coordinates), ``z_scale`` (length of one unit of the third axis
+    [px]), ``z_start`` (its value at z = 0) and ``t_first_us`` (time of the first event on its clock [us], int64). All
+    events of the window are in the first cloud, but those outside of the encoder's record. Events for which the model
+    has no solution are not in the second cloud.
+
+    Examples
+    --------
+    >>> camera, prism = amiwarp.Camera.from_fov(32, 24, 1.0), amiwarp.Prism(0.02)
+    >>> events = amiwarp.Events.from_arrays([10, 20], [12, 14], [0, 1000], [0, 1])
+    >>> encoder = amiwarp.Encoder.constant_speed(720.0, 0, 2000)
+    >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, 32, 24), camera, encoder, prism)
+    >>> calibration = amiwarp.Calibration(
+    ...     model_name="circle", camera=camera, prism=prism, parameters={"deflection": 0.01, "phase": 0.3},
+    ...     uncertainty={}, free=(), sharpness_name="variance", sharpness_before=1.0, sharpness_after=2.0,
+    ...     stages=(), events=2, seconds=0.0)
+    >>> before, after = amiwarp.event_clouds(recording, calibration)
+    >>> after.n_points, after["t_us"].tolist()
+    (2, [0, 1000])
+    """
+    third, source = choice(Axis, axis, "axis"), recording.events
+    inspector = Inspector(
+        recording, calibration, device=device, most_events=max(len(source), 1), most_points=max(len(source), 1)
+    )
+    integer = partial(whole, low=-(2**62), high=2**62)
+    start, stop = vector((source.t_first, source.t_last + 1) if window is None else window, 2, "window", integer)
+    if stop <= start:
+        raise AmiwarpError(f"window is {window}; give start and end [us], the end after the start")
+    width, height = source.size
+    left, top, right, bottom = vector((0, 0, *source.size) if region is None else region, 4, "region", integer)
+    if not (0 <= left < right <= width and 0 <= top < bottom <= height):
+        raise AmiwarpError(f"region is {region}; give left, top, right and bottom in an image of {width}x{height} px")
+    inspector.open(start, stop - start, Selection(region=None if region is None else (left, top, right, bottom)))
+    shown = inspector.show()
+    before, after = (_cloud(shown, third, after=after) for after in (False, True))
+    return before, after
+
+
+def _cloud(shown: DisplayedWindow, axis: Axis, *, after: bool) -> pyvista.PolyData:
+    """Return one of the clouds."""
+    import pyvista
+
+    box, xy = Box(*shown.region, *axis_range(shown, axis)), shown.after if after else shown.before
+    valid = np.isfinite(xy).all(axis=1)
+    arrays: dict[str, NDArray[Any]] = {
+        "t_us": shown.events.t - shown.span.first_us, "theta_rad": shown.theta, "polarity": shown.events.p,
+        "index": np.concatenate([np.arange(run.start, run.stop) for run in shown.span.runs])[shown.truth.positions],
+        "residual_px": _measure(shown, Colour.RESIDUAL, after=after).astype(np.float32),
+    }  # fmt: skip
+    for name, attribute in TRUTHS.items():
+        if (store := getattr(shown.truth.truth, attribute, None)) is not None:
+            arrays[name] = shown.span.rows(store)[shown.truth.positions]
+    cloud = pyvista.PolyData(box.positions(xy, third_axis(shown, axis))[valid])
+    for name, values in arrays.items():
+        cloud.point_data[name] = values[valid]
+    unit = "theta [deg]" if axis is Axis.ANGLE else "t [ms]"
+    cloud.field_data["axes"] = ["x [px]", "-y [px]", f"({unit} - z_start) * z_scale"]
+    cloud.field_data["z_scale"], cloud.field_data["z_start"] = [box.stretch], [box.low]
+    cloud.field_data["t_first_us"] = np.array([shown.span.first_us], np.int64)
+    return cloud

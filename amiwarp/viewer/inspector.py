@@ -79,16 +79,14 @@ class EventRates:
     def fill(self, seconds: float) -> bool:
         """Count events for about ``seconds`` [s], at least one block. Return whether all events are counted."""
         until, read_us = time.perf_counter() + seconds, self._read[1]
-        while read_us < self._stop:
-            block = next(self._blocks, None)
-            if block is None:
-                read_us = self._stop
-                break
+        for block in self._blocks:
             if len(block):
                 self._count(block)
                 read_us = int(block.t[-1])
             if time.perf_counter() >= until:
                 break
+        else:
+            read_us = self._stop
         sums = np.zeros((2, len(self._edges)), np.int64)
         np.cumsum(self._counts, axis=1, out=sums[:, 1:])
         self._read = sums, read_us
@@ -101,22 +99,22 @@ class EventRates:
         curve has fewer bins. Times outside the recording have rate 0.
         """
         start_us, end_us = int(start_us), max(int(end_us), int(start_us) + 1)
-        edges = start_us + (end_us - start_us) * np.arange(bins + 1, dtype=np.int64) // bins
-        edges = np.unique(edges)
+        edges = np.unique(start_us + (end_us - start_us) * np.arange(bins + 1, dtype=np.int64) // bins)
         finest = (self._stop - self._first) / (len(self._edges) - 1)
-        if edges[1] - edges[0] < 4.0 * finest and finest > 1.0:
-            exact = self._exact(edges)
-            if exact is not None:
-                return _curve(edges, exact)
+        fine = edges[1] - edges[0] < 4.0 * finest and finest > 1.0
+        counts = self._exact(edges) if fine else None
+        if fine and counts is None:
             within = (self._edges > start_us) & (self._edges < end_us)
             edges = np.concatenate([[start_us], self._edges[within], [end_us]])
             edges = edges[np.unique(np.r_[0 : len(edges) - 1 : max(1, len(edges) // bins), len(edges) - 1])]
-        sums, read_us = self._read
-        before = np.searchsorted(self._edges, edges)  # a bin of the recording belongs to where it begins
-        counts = np.diff(sums[:, np.minimum(before, sums.shape[1] - 1)], axis=1).astype(np.float64)
-        if read_us < self._stop:
-            counts[:, edges[1:] > read_us] = np.nan
-        return _curve(edges, counts)
+        if counts is None:
+            sums, read_us = self._read
+            before = np.searchsorted(self._edges, edges)  # a bin of the recording belongs to where it begins
+            counts = np.diff(sums[:, np.minimum(before, sums.shape[1] - 1)], axis=1).astype(np.float64)
+            if read_us < self._stop:
+                counts[:, edges[1:] > read_us] = np.nan
+        off, on = counts / np.diff(edges) * 1e6
+        return RateCurve(edges, on, off)
 
     def _count(self, block: Events) -> None:
         low, high = np.searchsorted(self._edges, (block.t[0], block.t[-1]), side="right") - 1
@@ -136,11 +134,6 @@ class EventRates:
             return None
         events = self._source.slice(first, stop)
         return np.array([np.diff(np.searchsorted(events.t[events.p == p], edges)) for p in (0, 1)], np.float64)
-
-
-def _curve(edges: NDArray[np.int64], counts: NDArray[np.float64]) -> RateCurve:
-    rates = counts / np.diff(edges) * 1e6
-    return RateCurve(edges, rates[1], rates[0])
 
 
 # Events of a time window, read without loading the other events.
@@ -296,20 +289,6 @@ Region = tuple[int, int, int, int]
 """Part of the image: left, top, right and bottom [px]; right and bottom are exclusive."""
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredImage:
-    """Image of warped events with its sharpness in a region."""
-
-    image: NDArray[np.float32]
-    """Number of events at each pixel of the whole image, shape ``(height, width)``."""
-    variance: float
-    """Variance over mean of the smoothed region, as :attr:`amiwarp.Sharpness.VARIANCE`. It grows with the number of
-    events."""
-    sharpness: float
-    """Relative variance of the smoothed region, see
-    :func:`amiwarp.imaging.metrics.relative_variance`. It does not depend on the number of events."""
-
-
 class WindowImager:
     """Measures the sharpness of images of warped events, as calibration does: bilinear votes at dithered places.
 
@@ -318,17 +297,22 @@ class WindowImager:
 
     def __init__(self, size: tuple[int, int], device: Any) -> None:
         self._votes, self._device = Votes(CanvasShape(*size, dither=True), device), device
-        self._meters: dict[tuple[int, int], SharpnessMeter] = {}
+        self._meter: SharpnessMeter | None = None
 
     def measure(self, model: Model, events: UploadedEvents, offset_us: float, region: Region) -> tuple[float, float]:
-        """Return variance and sharpness in the region, see :class:`MeasuredImage`.
+        """Return variance and sharpness of the smoothed region.
 
-        ``offset_us`` is added to the encoder's clock offset [us].
+        The variance over mean, as :attr:`amiwarp.Sharpness.VARIANCE`, grows with the number of events. The sharpness,
+        see :func:`amiwarp.imaging.metrics.relative_variance`, does not depend on it. ``offset_us`` is added to the
+        encoder's clock offset [us].
         """
         self._votes.clear()
         self._votes.add_events(model, events, drift=offset_us)
         left, top, right, bottom = region
-        meter = self._meter(right - left, bottom - top)
+        canvas, meter = CanvasShape(right - left, bottom - top, dither=True), self._meter
+        if meter is None or meter.image.shape != canvas.shape:
+            meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
+            self._meter = meter
         if meter.image.shape == self._votes.canvas.shape:
             self._votes.read(meter.image)
             part = meter.image.numpy()[0]
@@ -338,23 +322,13 @@ class WindowImager:
         variance, mean = meter.measure(), float(part.mean())
         return variance, relative_variance(variance, mean, SMOOTHING_PX) if mean > 0.0 else 0.0
 
-    def _meter(self, width: int, height: int) -> SharpnessMeter:
-        """Return the meter of images of this size. Only the last one is kept."""
-        if (width, height) not in self._meters:
-            canvas = CanvasShape(width, height, dither=True)
-            meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
-            self._meters = {(width, height): meter}
-        return self._meters[width, height]
-
 
 def recorded_counts(events: Events, size: tuple[int, int], *, per_polarity: bool = False) -> NDArray[np.float32]:
     """Return the number of events at each pixel, shape ``(height, width)``; with polarities ``(2, height, width)``."""
-    width, height = size
-    layers, pixel = 1 + per_polarity, events.y.astype(np.int64) * width + events.x
+    shape, pixel = (*(2,) * per_polarity, *size[::-1]), events.y.astype(np.int64) * size[0] + events.x
     if per_polarity:
-        pixel += events.p.astype(np.int64) * (width * height)
-    counts = np.bincount(pixel, minlength=layers * width * height).astype(np.float32)
-    return counts.reshape(layers, height, width) if per_polarity else counts.reshape(height, width)
+        pixel += events.p.astype(np.int64) * math.prod(size)
+    return np.bincount(pixel, minlength=math.prod(shape)).astype(np.float32).reshape(shape)
 
 
 # Parameters of the prism and selection of events under which the inspector shows a recording.
@@ -480,8 +454,8 @@ class LoadedWindow:
     wrapped: dict[tuple[float, float], NDArray[np.float64]] = field(default_factory=dict)
     """Prism angles of the drawn events from 0 to 2π [rad], by speed and drift of the clock offset; the last ones only.
     """
-    unmoved: list[MeasuredImage] = field(default_factory=list)
-    """Image of the events as recorded, once it is measured."""
+    unmoved: list[tuple[NDArray[np.float32], float]] = field(default_factory=list)
+    """Image of the events as recorded and its sharpness, once it is measured."""
     chosen: list[Picture] = field(default_factory=list)
     """Reconstructed picture for which the weight of the smoothness prior was chosen last."""
 
@@ -571,24 +545,20 @@ class Statistics:
         """Number of events per time [1/s]."""
         return (self.on + self.off) / self.duration_us * 1e6
 
-
-def find_statistics(window: LoadedWindow) -> Statistics:
-    """Return the statistics of the selected events of a window. Intervals between two runs are not counted."""
-    left, top, right, bottom = window.region
-    events, span = window.events, window.span
-    events = events[inside(events, window.region)]
-    starts = span.events.t[np.cumsum([0, *(run.stop - run.start for run in span.runs)])[:-1]]
-    run = np.searchsorted(starts, events.t, side="right")
-    pixel = (run * (bottom - top) + events.y.astype(np.int64) - top) * (right - left) + events.x - left
-    order = np.argsort(pixel, kind="stable")
-    steps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
-    counts, _ = np.histogram(np.clip(steps, 1, 999_999), INTERVALS_US)
-    on, read = int(events.p.sum()), len(span.events)
-    return Statistics(
-        on=on, off=len(events) - on, duration_us=max(1, round(span.length_us * read / span.count)),
-        pixels=len(np.unique(pixel % ((bottom - top) * (right - left)))), area=(bottom - top) * (right - left),
-        intervals=counts, median_us=float(np.median(steps)) if len(steps) else math.nan,
-    )  # fmt: skip
+    def state(self) -> dict[str, Any]:
+        """Return what page and window show: rows of name and value, and the histogram of the intervals."""
+        n, known, decades = self.on + self.off, bool(self.intervals.any()), np.log10(INTERVALS_US)
+        rows = [
+            ("rate", f"{self.rate:,.0f} events/s"), ("events per pixel", f"{n / self.area:.3g}"),
+            ("ON", f"{100.0 * self.on_share:.1f} %"),
+            ("pixels with events", f"{100.0 * self.pixels / self.area:.1f} %"),
+            ("median interval of a pixel", f"{self.median_us:,.0f} µs" if known else "–"),
+        ]  # fmt: skip
+        return {
+            "rows": [list(row) for row in rows], "x": (0.5 * (decades[1:] + decades[:-1])).tolist() if known else [],
+            "y": (100.0 * self.intervals / max(1, self.intervals.sum())).tolist(),
+            "median": math.log10(max(self.median_us, 1.0)) if known else None,
+        }  # fmt: skip
 
 
 # Selected events of a time window, on the host and with their prism angles on the device.
@@ -597,59 +567,6 @@ MOST_POINTS, WINDOW_POINTS = 100_000, 1_000_000
 """Largest number of points in each event cloud: of the page, which sends them to a browser, and of the window."""
 CURVE_EVENTS = 200_000
 """Largest number of events that a sharpness curve uses."""
-
-
-def load_window(
-    recording: Recording, span: Span, selection: Selection, *, margin_px: int, hot: NDArray[np.bool_] | None,
-    most_points: int,
-) -> LoadedWindow:  # fmt: skip
-    """Select the events of a time window.
-
-    ``margin_px``: how far outside the region events belong to its images. ``hot``: the hot pixels to leave out.
-    ``most_points``: largest number of events that are drawn.
-    Raises :class:`AmiwarpError` if no event meets the selection.
-    """
-    region = selection.region or (0, 0, *recording.events.size)
-    left, top, right, bottom = region
-    wide = (left - margin_px, top - margin_px, right + margin_px, bottom + margin_px)
-    keep = kept(recording, span.events, selection, wide, hot)
-    if span.places is not None:  # compensated events outside of the image have no pixel
-        half = np.array(recording.events.size) / 2.0
-        keep &= (np.abs(span.places + 0.5 - half) <= half).all(axis=1)
-    near = None if keep.all() else np.flatnonzero(keep)  # None stands for all
-    events = span.events if near is None else span.events[near]
-    within = np.flatnonzero(inside(events, region)) if selection.region else None
-    n = len(events) if within is None else len(within)
-    if not n:
-        what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
-        raise AmiwarpError(f"{what} from {(span.start_us - recording.events.t_first) * 1e-3:.3f} ms on for "
-                           f"{span.length_us * 1e-3:.3f} ms; take another window")  # fmt: skip
-    thin = np.arange(min(n, most_points)) * n // min(n, most_points)
-    thin = thin if within is None else within[thin]
-    drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
-    xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
-    xy = xy if span.places is None else span.places[truth.positions]
-    curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
-    return LoadedWindow(span, region, n, drawn, truth, xy, events, curve_events)
-
-
-def kept(
-    recording: Recording, events: Events, selection: Selection, region: Region, hot: NDArray[np.bool_] | None
-) -> NDArray[np.bool_]:
-    """Return whether each event meets the selection, with another region, shape ``(n,)``."""
-    keep = np.ones(len(events), np.bool_)
-    if recording.encoder is not None:
-        first, last = recording.encoder.coverage
-        keep &= (events.t >= first) & (events.t <= last)
-    if selection.polarity is not None:
-        keep &= events.p == selection.polarity
-    if selection.region is not None:
-        keep &= inside(events, region)
-    if hot is not None:
-        keep &= ~hot[events.y, events.x]
-    if selection.noise_us is not None:
-        keep &= ~find_background_activity(events, recording.events.size, window_us=selection.noise_us)
-    return keep
 
 
 def inside(events: Events, region: Region) -> NDArray[np.bool_]:
@@ -740,7 +657,8 @@ def _best_box(
     factor = (over_mean_after - noise) / mean_after / (np.maximum(over_mean, noise) / mean)
     variance = mean_after * over_mean_after - mean * over_mean
     variance = np.where(mean >= LEAST_SHARE * mean_after, variance, 0.0)
-    inner = _inner(variance.shape, margin)
+    margins = (min(margin, (n - 1) // 2) for n in variance.shape)  # at least the middle is searched
+    inner = tuple(slice(m, n - m) for m, n in zip(margins, variance.shape, strict=True))
     gains = bool((over_mean_after - over_mean)[inner].max() > LEAST_SIGMA * noise * (2.0 / (width * height)) ** 0.5)
     if not gains:
         variance = factor = mean * over_mean
@@ -748,12 +666,6 @@ def _best_box(
     candidates[inner] = np.where(variance[inner] >= NEARLY_BEST * variance[inner].max(), factor[inner], -np.inf)
     top, left = np.unravel_index(int(np.argmax(candidates)), candidates.shape)
     return int(left), int(top), gains
-
-
-def _inner(shape: tuple[int, ...], margin: int) -> tuple[slice, ...]:
-    """Return the part of an array without a margin on each side, at least its middle."""
-    margins = (min(margin, (n - 1) // 2) for n in shape)
-    return tuple(slice(m, n - m) for m, n in zip(margins, shape, strict=True))
 
 
 def _of_boxes(image: NDArray[np.float32], width: int, height: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -784,10 +696,8 @@ FOV_DEG = 60.0
 """Horizontal field of view that is assumed if the camera is unknown [deg]."""
 NO_ENCODER = "no encoder: set the prism's speed (rpm), or calibrate, to compensate its motion"
 NO_CAMERA = f"camera unknown: {FOV_DEG:g}° field of view assumed; set it, or give it with --fov-deg or --camera"
-CURVE_POINTS = 25
-"""Number of points of a sharpness curve."""
-ORBIT_POINTS = 181
-"""Number of points of the drawn orbit of a scene point."""
+CURVE_POINTS, ORBIT_POINTS = 25, 181
+"""Number of points of a sharpness curve, and of the drawn orbit of a scene point."""
 LARGEST_APEX = math.radians(3.0)
 """Apex angle up to which events that move into the region are in its images, if the nominal apex is smaller [rad]."""
 WINDOW_US = 100_000
@@ -880,7 +790,8 @@ class Inspector:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is missing to compensate the prism's motion, one sentence each."""
-        return (NO_ENCODER,) * self._no_speed + (NO_CAMERA,) * (self.sources["camera"] is Source.ASSUMED)
+        no_speed = self._no_speed and not self.knobs.rpm
+        return (NO_ENCODER,) * no_speed + (NO_CAMERA,) * (self.sources["camera"] is Source.ASSUMED)
 
     @property
     def fov_deg(self) -> float:
@@ -1050,10 +961,11 @@ class Inspector:
         others = [name for name in kind.FREE if name in SLIDING]
         time = {"clock_offset": k.clock_offset} if self.has_encoder else {"rpm": k.rpm}
         kept = {name: values[name] for name in (kind.SIZE, *others, "phase", *k.calibrated_only)} | time
-        before, after = self._unmoved(w), self._measured(w, k)
+        with self.lock:
+            before, after = (self._imager.measure(*self.warped(w, each), w.region)[0] for each in (None, k))
         return Calibration(
             model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
-            sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before.variance, sharpness_after=after.variance,
+            sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before, sharpness_after=after,
             stages=(), events=len(w.events), seconds=0.0, warnings=("set by hand in the inspector",),
             zero_us=None if self.has_encoder else self.zero_us, harmonics=self._harmonics,
         )  # fmt: skip
@@ -1079,7 +991,7 @@ class Inspector:
         loaded = self.loaded
         if self.selection.region is not None:
             loaded = self._load(loaded.span.start_us, loaded.span.length_us, replace(self.selection, region=None))
-        before, after = self._unmoved(loaded).image, self._measured(loaded, self.knobs).image
+        (before, _), (after, _) = self._unmoved(loaded), self._measured(loaded, self.knobs)
         orbit_px = np.abs(border_displacements(self.model)).max(initial=0.0)
         return suggest_region(before, after, margin=math.ceil(orbit_px))
 
@@ -1111,10 +1023,10 @@ class Inspector:
         if (window, selection) != (self.window, self.selection):
             self.open(*window, selection)
         w = self.loaded
-        first = self._unmoved(w)
+        image, sharpness = self._unmoved(w)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.drawn, w.truth, w.xy, w.xy, self._wrapped(w, self.knobs), first.image,
-            image_after, first.sharpness, first.sharpness, is_beside=True,
+            w.span, w.region, w.selected, w.drawn, w.truth, w.xy, w.xy, self._wrapped(w, self.knobs), image,
+            image_after, sharpness, sharpness, is_beside=True,
         )  # fmt: skip
 
     def show(self, knobs: Knobs | None = None, *, against: Knobs | None = None) -> DisplayedWindow:
@@ -1126,17 +1038,15 @@ class Inspector:
         """
         w, knobs = self.loaded, knobs or self.knobs
         xy = w.xy if against is None else self._moved(w, against)
-        second, theta = self._measured(w, knobs), self._wrapped(w, knobs)
-        other = None
+        (image_after, sharpness_after), other = self._measured(w, knobs), None
         if self.beside is not None and against is None:
-            other = self.beside._beside(w.span, self.selection, second.image)
+            other = self.beside._beside(w.span, self.selection, image_after)
             image, sharpness = other.image_before, other.sharpness_before
         else:
-            first = self._unmoved(w) if against is None else self._measured(w, against)
-            image, sharpness = first.image, first.sharpness
+            image, sharpness = self._unmoved(w) if against is None else self._measured(w, against)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), theta, image, second.image,
-            sharpness, second.sharpness, other,
+            w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), self._wrapped(w, knobs), image,
+            image_after, sharpness, sharpness_after, other,
         )  # fmt: skip
 
     def curve(self, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -1174,8 +1084,21 @@ class Inspector:
         return sharpness
 
     def statistics(self) -> Statistics:
-        """Return the statistics of the selected events of the time window."""
-        return find_statistics(self.loaded)
+        """Return the statistics of the selected events of the time window. Intervals between runs are not counted."""
+        events, span, (left, top, right, bottom) = self.loaded.events, self.loaded.span, self.loaded.region
+        events = events[inside(events, self.loaded.region)]
+        starts = span.events.t[np.cumsum([0, *(run.stop - run.start for run in span.runs)])[:-1]]
+        run = np.searchsorted(starts, events.t, side="right")
+        pixel = (run * (bottom - top) + events.y.astype(np.int64) - top) * (right - left) + events.x - left
+        order = np.argsort(pixel, kind="stable")
+        steps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
+        counts, _ = np.histogram(np.clip(steps, 1, 999_999), INTERVALS_US)
+        on, read = int(events.p.sum()), len(span.events)
+        return Statistics(
+            on=on, off=len(events) - on, duration_us=max(1, round(span.length_us * read / span.count)),
+            pixels=len(np.unique(pixel % ((bottom - top) * (right - left)))), area=(bottom - top) * (right - left),
+            intervals=counts, median_us=float(np.median(steps)) if len(steps) else math.nan,
+        )  # fmt: skip
 
     def orbit(self, x: float, y: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Return the orbit of the scene point that would appear at (x, y) [px] without the prism.
@@ -1252,9 +1175,44 @@ class Inspector:
         return self._select(span, self.selection).events
 
     def _select(self, span: Span, selection: Selection) -> LoadedWindow:
-        hot = self.hot if selection.hide_hot else None
-        return load_window(self.recording, span, selection, margin_px=self.margin_px, hot=hot,
-                           most_points=self.most_points)  # fmt: skip
+        """Select the events of a time window. Raises :class:`AmiwarpError` if no event meets the selection."""
+        recording, m = self.recording, self.margin_px
+        left, top, right, bottom = region = selection.region or (0, 0, *recording.events.size)
+        keep = self.kept(span.events, selection, (left - m, top - m, right + m, bottom + m))
+        if span.places is not None:  # compensated events outside of the image have no pixel
+            half = np.array(recording.events.size) / 2.0
+            keep &= (np.abs(span.places + 0.5 - half) <= half).all(axis=1)
+        near = None if keep.all() else np.flatnonzero(keep)  # None stands for all
+        events = span.events if near is None else span.events[near]
+        within = np.flatnonzero(inside(events, region)) if selection.region else None
+        n = len(events) if within is None else len(within)
+        if not n:
+            what = "no events" if not len(span.events) else f"{span.count:,} events, none of them selected,"
+            raise AmiwarpError(f"{what} from {span.start_ms:.3f} ms on for {span.length_us * 1e-3:.3f} ms; "
+                               "take another window")  # fmt: skip
+        thin = np.arange(min(n, self.most_points)) * n // min(n, self.most_points)
+        thin = thin if within is None else within[thin]
+        drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
+        xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
+        xy = xy if span.places is None else span.places[truth.positions]
+        curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
+        return LoadedWindow(span, region, n, drawn, truth, xy, events, curve_events)
+
+    def kept(self, events: Events, selection: Selection, region: Region) -> NDArray[np.bool_]:
+        """Return whether each event meets the selection, with another region, shape ``(n,)``."""
+        keep = np.ones(len(events), np.bool_)
+        if self.recording.encoder is not None:
+            first, last = self.recording.encoder.coverage
+            keep &= (events.t >= first) & (events.t <= last)
+        if selection.polarity is not None:
+            keep &= events.p == selection.polarity
+        if selection.region is not None:
+            keep &= inside(events, region)
+        if selection.hide_hot:
+            keep &= ~self.hot[events.y, events.x]
+        if selection.noise_us is not None:
+            keep &= ~find_background_activity(events, self.recording.events.size, window_us=selection.noise_us)
+        return keep
 
     def _drift_us(self, knobs: Knobs) -> float:
         """Return how far the clock offset is from that of the recording's own encoder [us]."""
@@ -1316,14 +1274,14 @@ class Inspector:
             image = votes.take()
         return image if per_polarity else image[0]
 
-    def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> MeasuredImage:
-        """Return the image of a window with these parameters; as recorded if ``knobs`` is None."""
+    def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[NDArray[np.float32], float]:
+        """Return the image of a window with these parameters, and its sharpness; as recorded if ``knobs`` is None."""
         with self.lock:
-            variance, sharpness = self._imager.measure(*self.warped(w, knobs), w.region)
-        return MeasuredImage(self.counts(w, knobs), variance, sharpness)
+            _, sharpness = self._imager.measure(*self.warped(w, knobs), w.region)
+        return self.counts(w, knobs), sharpness
 
-    def _unmoved(self, w: LoadedWindow) -> MeasuredImage:
-        """Return the image of a window as recorded."""
+    def _unmoved(self, w: LoadedWindow) -> tuple[NDArray[np.float32], float]:
+        """Return the image of a window as recorded, and its sharpness."""
         if not w.unmoved:
             w.unmoved.append(self._measured(w, None))
         return w.unmoved[0]
@@ -1348,7 +1306,10 @@ class Library:
 
     def files(self) -> list[list[str]]:
         """Return names and sizes of the files, in the order of their names."""
-        found = sorted(path for path in self.folder.iterdir() if self._is_recording(path))
+        found = sorted(
+            path for path in self.folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+            and path.is_file() and path.resolve().parent == self.folder  # also if it is a link
+        )  # fmt: skip
         return [[path.name, f"{path.stat().st_size / 1e6:,.1f} MB"] for path in found[:MOST_FILES]]
 
     def open(self, name: str) -> Inspector:
@@ -1356,8 +1317,3 @@ class Library:
         if name not in [file for file, _ in self.files()]:
             raise AmiwarpError(f"{name!r}: is no recording in {self.folder}; choose one from the list")
         return self._open_file(self.folder / name)
-
-    def _is_recording(self, path: Path) -> bool:
-        """Return whether a file looks like a recording, and lies in the folder even if it is a link."""
-        visible = path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
-        return visible and path.is_file() and path.resolve().parent == self.folder

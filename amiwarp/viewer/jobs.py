@@ -6,7 +6,7 @@ import logging
 import math
 import re
 import weakref
-from collections.abc import Awaitable, Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -30,16 +30,8 @@ from amiwarp.io.formats import check_ending
 from amiwarp.live.stream.session import RecentEvents
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.tasks import Progress, silent
-from amiwarp.viewer.drawing import Look, Scene, SelectedPart, ShownImages, caption, select_part, shown_lines
-from amiwarp.viewer.inspector import (
-    CURVE_HALF_WIDTH,
-    MOST_SEARCHED,
-    Inspector,
-    Knobs,
-    Source,
-    busiest,
-    kept,
-)
+from amiwarp.viewer.drawing import Look, Scene, ShownImages, caption, select_part, shown_lines
+from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, MOST_SEARCHED, Inspector, Knobs, Source, busiest
 
 # Work of one page: its threads, jobs and updates, and the messages about their errors.
 
@@ -95,13 +87,8 @@ class PageWork:
     waits for an update is marked on the page. Nothing is computed while the page does not keep up with the messages.
     """
 
-    def __init__(
-        self, server: Any, device: Any, make: Callable[[set[str]], Awaitable[None]],
-        make_slow: Callable[[str], Awaitable[None]],
-    ) -> None:  # fmt: skip
-        """``make`` makes a set of quick updates, and ``make_slow`` one slow update."""
-        self._server, self._state = server, server.state
-        self._make, self._make_slow = make, make_slow
+    def __init__(self, server: Any, device: Any) -> None:
+        self.server, self.state = server, server.state
         self.buffers_lock = asyncio.Lock()
         """Lock of the inspector's buffers on the device, which only one thread may use at a time."""
         self.device_lock: Any = _CUDA_LOCK if "cuda" in str(device) else contextlib.nullcontext()
@@ -115,9 +102,17 @@ class PageWork:
         # A tab's own pool, which ends with the tab: calibration or film; curve or picture; quick updates.
         self._threads = ThreadPoolExecutor(3, "amiwarp-tab")
 
+    async def make(self, todo: set[str]) -> None:
+        """Make a set of quick updates."""
+        raise NotImplementedError
+
+    async def make_slow(self, name: str) -> None:
+        """Make one slow update."""
+        raise NotImplementedError
+
     def close(self) -> None:
         """Stop all work. A thread ends when its current work is done."""
-        for task in [*self._jobs, *filter(None, [self._quick, self._slow])]:
+        for task in self._jobs:
             task.cancel()
         self._threads.shutdown(wait=False, cancel_futures=True)
 
@@ -125,33 +120,35 @@ class PageWork:
         """Request quick updates: "window", "knobs", "look", "suggestion" or "state"."""
         self._quick_requests.update(what)
         self._show_pending()
-        if self._quick is None:
-            self._quick = self._task(self._update())
+        if self._quick is None or self._quick.done():
+            self._quick = self.start_job(self._update())
 
     def request_slow(self, *what: str) -> None:
         """Request updates that run in a thread after all quick updates: "curve", "picture" or "preparation"."""
         self._slow_requests.update(what)
         self._show_pending()
-        if self._slow is None:
-            self._slow = self._task(self._update_slowly())
+        if self._slow is None or self._slow.done():
+            self._slow = self.start_job(self._update_slowly())
 
     async def until_drawn(self) -> None:
         """Wait until no quick update is pending."""
-        while self._quick is not None:
+        while self._quick is not None and not self._quick.done():
             await asyncio.sleep(0.005)
 
-    def start_job(self, work: Coroutine[Any, Any, None]) -> None:
+    def start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run a job until it ends or the browser tab is closed."""
-        self._jobs.add(task := self._task(work))
-        task.add_done_callback(self._jobs.discard)
+        self._jobs.add(task := asyncio.get_running_loop().create_task(work))
+        task.add_done_callback(self._ended)
+        return task
 
     async def in_thread(self, work: Callable[..., Any], *args: Any, **options: Any) -> Any:
         """Call ``work`` in one of the browser tab's threads, and return its result."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, partial(work, *args, **options))
 
-    def show_message(self, text: str, severity: str) -> None:
-        with self._state:
-            self._state.update({"message": text, "severity": severity})
+    def say(self, text: str, severity: str = "info") -> None:
+        """Show a message."""
+        with self.state:
+            self.state.update({"message": text, "severity": severity})
 
     @contextlib.contextmanager
     def errors_shown(self, what: str) -> Iterator[None]:
@@ -160,55 +157,41 @@ class PageWork:
             yield
         except (AmiwarpError, OSError) as error:
             self._error_source = what
-            self._state.update({"message": str(error), "severity": "error"})
+            self.state.update({"message": str(error), "severity": "error"})
         else:
-            if self._state.severity == "error" and self._error_source == what:
-                self._state.update({"message": "", "severity": "info"})
+            if self.state.severity == "error" and self._error_source == what:
+                self.state.update({"message": "", "severity": "info"})
 
     def _show_pending(self) -> None:
         """Show which parts of the page wait for an update."""
         quick = self._quick_requests | self._doing
         parts = {part for what in quick for part in QUICK.get(what, ())} | (self._slow_requests | self._doing) & {*SLOW}
-        self._state.updating = sorted(parts)
-
-    def _task(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        task = asyncio.get_running_loop().create_task(work)
-        task.add_done_callback(self._ended)
-        return task
+        self.state.updating = sorted(parts)
 
     def _ended(self, task: asyncio.Task[None]) -> None:
+        self._jobs.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None:
             logging.getLogger(__name__).error("the page's work failed", exc_info=error)
             text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
-            self.show_message(text, "error")
+            self.say(text, "error")
 
     async def _update(self) -> None:
-        try:
-            while self._quick_requests:
-                while self._in_flight() > MOST_IN_FLIGHT:
-                    await asyncio.sleep(WAIT_S)
-                todo, self._quick_requests = self._quick_requests, set()
-                async with self._done(todo), self.device_lock, self.buffers_lock:
-                    await self._make(todo)
-                await asyncio.sleep(0)
-        finally:
-            self._quick = None
-
-    def _in_flight(self) -> int:
-        """Return the number of unsent messages to the page."""
-        return 0 if self._server.protocol is None else int(self._server.protocol.network_monitor.pending)
+        while self._quick_requests:
+            while (page := self.server.protocol) is not None and page.network_monitor.pending > MOST_IN_FLIGHT:
+                await asyncio.sleep(WAIT_S)
+            todo, self._quick_requests = self._quick_requests, set()
+            async with self._done(todo), self.device_lock, self.buffers_lock:
+                await self.make(todo)
+            await asyncio.sleep(0)
 
     async def _update_slowly(self) -> None:
-        try:
-            while self._slow_requests:
-                await self.until_drawn()
-                name = min(self._slow_requests)  # in alphabetical order: the curve first, the preparation last
-                self._slow_requests.discard(name)
-                async with self._done({name}), self.device_lock:
-                    with self.errors_shown(name):
-                        await self._make_slow(name)
-        finally:
-            self._slow = None
+        while self._slow_requests:
+            await self.until_drawn()
+            name = min(self._slow_requests)  # in alphabetical order: the curve first, the preparation last
+            self._slow_requests.discard(name)
+            async with self._done({name}), self.device_lock:
+                with self.errors_shown(name):
+                    await self.make_slow(name)
 
     @contextlib.asynccontextmanager
     async def _done(self, todo: set[str]) -> Any:
@@ -218,7 +201,7 @@ class PageWork:
             yield
         finally:
             self._doing -= todo
-            with self._state:
+            with self.state:
                 self._show_pending()
 
 
@@ -297,11 +280,20 @@ class FoundCalibration:
     """Sharpness of the shown region with the calibrated parameters."""
 
 
-def scope_text(inspector: Inspector, *, whole: bool = False) -> str:
-    """Return which events :func:`find_calibration` uses, for the page."""
+def calibrated_events(inspector: Inspector, *, whole: bool = False) -> tuple[Recording, str]:
+    """Return the events that :func:`find_calibration` uses, and a description of them for the page."""
     if whole:
-        return f"the whole recording, {len(inspector.recording.events):,} events"
-    return _text(inspector, select_part(inspector, inspector.loaded, inspector.loaded.region))
+        return inspector.recording, f"the whole recording, {len(inspector.recording.events):,} events"
+    part = select_part(inspector, inspector.loaded, inspector.loaded.region)
+    s, start_s = inspector.selection, (part.start_us - inspector.recording.events.t_first) * 1e-6
+    kind, end_s = "" if s.polarity is None else ("OFF ", "ON ")[s.polarity], start_s + part.length_us * 1e-6
+    texts = [f"{len(part.recording.events):,} {kind}events from {start_s:.3f} s to {end_s:.3f} s"]
+    if s.region is not None:
+        left, top, right, bottom = s.region
+        texts.append(f"x {left} to {right - 1}, y {top} to {bottom - 1} px")
+    texts += ["without hot pixels"] if s.hide_hot else []
+    texts += [f"without background activity ({s.noise_us * 1e-3:g} ms)"] if s.noise_us is not None else []
+    return part.recording, ", ".join(texts)
 
 
 def find_calibration(
@@ -312,12 +304,7 @@ def find_calibration(
     Without an encoder, the search starts at the speed set on the page. Raises :class:`AmiwarpError` if these events
     cannot determine the parameters.
     """
-    recording, rpm = inspector.recording, inspector.knobs.rpm
-    if whole:
-        scope = scope_text(inspector, whole=True)
-    else:
-        part = select_part(inspector, inspector.loaded, inspector.loaded.region)
-        recording, scope = part.recording, _text(inspector, part)
+    (recording, scope), rpm = calibrated_events(inspector, whole=whole), inspector.knobs.rpm
     settings = settings or Settings()
     if rpm and not inspector.has_encoder:
         settings = replace(settings, start={"rpm": rpm, **settings.start})
@@ -327,22 +314,6 @@ def find_calibration(
     sharpness = inspector.sharpness_meter()
     values = (sharpness(each) for each in (None, inspector.knobs, inspector.knobs_of(found)))
     return FoundCalibration(found, scope, *values)
-
-
-def _text(inspector: Inspector, part: SelectedPart) -> str:
-    """Return a description of the events of a part."""
-    s, first = inspector.selection, inspector.recording.events.t_first
-    start_s = (part.start_us - first) * 1e-6
-    kind = "" if s.polarity is None else ("OFF ", "ON ")[s.polarity]
-    texts = [
-        f"{len(part.recording.events):,} {kind}events from {start_s:.3f} s to {start_s + part.length_us * 1e-6:.3f} s"
-    ]
-    if s.region is not None:
-        left, top, right, bottom = s.region
-        texts.append(f"x {left} to {right - 1}, y {top} to {bottom - 1} px")
-    texts += ["without hot pixels"] if s.hide_hot else []
-    texts += [f"without background activity ({s.noise_us * 1e-3:g} ms)"] if s.noise_us is not None else []
-    return ", ".join(texts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,12 +326,6 @@ class CostSurface:
     """Values of these parameters, in their units, shapes ``(columns,)`` and ``(rows,)``."""
     sharpness: NDArray[np.float64]
     """Sharpness, shape ``(rows, columns)``."""
-
-    @property
-    def best(self) -> tuple[float, float]:
-        """Values of both parameters with the largest sharpness."""
-        row, column = np.unravel_index(int(np.argmax(self.sharpness)), self.sharpness.shape)
-        return float(self.values[0][column]), float(self.values[1][row])
 
 
 def cost_surface(
@@ -455,8 +420,6 @@ class LiveSource:
 
 BLOCK = 1 << 20
 """Number of events that are written at a time."""
-IMAGE_SUFFIXES = (".tif", ".npy")
-"""Suffixes of files with the values of an image, float32."""
 COLUMNS = ("t", "x", "y", "p", "theta", "x_compensated", "y_compensated")
 """Columns of a table of events: time [us], pixel, polarity, prism angle [rad] and compensated place [px]."""
 
@@ -492,11 +455,8 @@ def write_table(inspector: Inspector, path: Path) -> None:
 
     Raises :class:`AmiwarpError` for another suffix, or if the file exists.
     """
-    ending, encoder, knobs = (
-        check_ending(path, "tables are written", (".csv", ".npz")),
-        inspector.adjusted_encoder,
-        inspector.knobs,
-    )
+    ending = check_ending(path, "tables are written", (".csv", ".npz"))
+    encoder, knobs = inspector.adjusted_encoder, inspector.knobs
 
     def table(e: Events) -> tuple[NDArray[Any], ...]:
         theta, moved = np.mod(encoder.angle_at(e.t), math.tau), inspector.positions(e, knobs)
@@ -516,26 +476,18 @@ def write_table(inspector: Inspector, path: Path) -> None:
             np.savetxt(file, np.column_stack(each), fmt="%d,%d,%d,%d,%.6f,%.3f,%.3f")
 
 
-def write_image(images: ShownImages, path: Path, *, before: bool = False) -> None:
-    """Write the values of one of the images to a new file, .tif or .npy.
+def write_image(images: ShownImages, path: Path) -> None:
+    """Write the values of the second image to a new .tif file, float32; two polarities on two pages, OFF and ON.
 
-    ``before``: write the first image instead of the second. A .tif of two polarities has two pages, OFF and ON. Raises
-    :class:`AmiwarpError` for another suffix, if the file exists, or if there is no such image.
+    Raises :class:`AmiwarpError` for another suffix, or if the file exists.
     """
     from PIL import Image
 
-    values = images.before if before else images.after
-    if values is None:
-        raise AmiwarpError(f"there is no image of {images.kind.value} before compensation; export the compensated one")
-    ending = check_ending(path, "values of images are written", IMAGE_SUFFIXES)
+    check_ending(path, "values of images are written", (".tif",))
     with NewFile(path) as new:
-        if ending == ".npy":
-            with open(new.part, "wb") as file:
-                np.save(file, np.asarray(values, np.float32))
-        else:
-            pages = values if values.ndim == 3 else values[None]
-            first, *more = (Image.fromarray(np.asarray(page, np.float32)) for page in pages)
-            encode_image(new.part, first, "TIFF", save_all=bool(more), append_images=more)
+        pages = images.after if images.after.ndim == 3 else images.after[None]
+        first, *more = (Image.fromarray(np.asarray(page, np.float32)) for page in pages)
+        encode_image(new.part, first, "TIFF", save_all=bool(more), append_images=more)
 
 
 def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
@@ -543,11 +495,10 @@ def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
 
     The noise filter of a block sees the last events of the block before it.
     """
-    window, hot = inspector.loaded, inspector.hot if inspector.selection.hide_hot else None
     noise_us, last = inspector.selection.noise_us or 0, None
     for block in filter(len, _blocks(inspector)):
         events = block if last is None else Events.concatenate([last, block])
-        chosen = kept(inspector.recording, events, inspector.selection, window.region, hot)[-len(block) :]
+        chosen = inspector.kept(events, inspector.selection, inspector.loaded.region)[-len(block) :]
         yield block if chosen.all() else block[chosen]
         last = events[int(np.searchsorted(events.t, block.t[-1] - noise_us)) :] if noise_us else None
 
@@ -629,21 +580,15 @@ def write_film(
         with contextlib.closing(Scene(FILM_SIZE)) as scene:
             draw(scene)
             scene.look_from(view, look)
-            if turns:
-                yield from scene.turntable(frames)
-                return
-            yield scene.picture()
-            for k in range(1, frames):
-                with contextlib.suppress(AmiwarpError):  # there are no events at this time
-                    inspector.open(span.start_us + round(k * step_us), span.length_us)
-                    draw(scene)
-                yield scene.picture()
+            turning = scene.turntable(frames)
+            for k in range(frames):
+                if k and ended():
+                    return
+                progress(f"making the {EXPORTS[what][0]}, {k / FPS:.0f} of {frames / FPS:.0f} s", k / frames)
+                if k and not turns:
+                    with contextlib.suppress(AmiwarpError):  # there are no events at this time
+                        inspector.open(span.start_us + round(k * step_us), span.length_us)
+                        draw(scene)
+                yield next(turning) if turns else scene.picture()
 
-    def counted() -> Iterator[NDArray[np.uint8]]:
-        for k, picture in enumerate(pictures()):
-            if k and ended():
-                return
-            progress(f"making the {EXPORTS[what][0]}, {k / FPS:.0f} of {frames / FPS:.0f} s", k / frames)
-            yield picture
-
-    return save_film(counted(), path, fps=FPS)
+    return save_film(pictures(), path, fps=FPS)

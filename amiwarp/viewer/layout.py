@@ -1,33 +1,20 @@
 """Contents of the inspector's page: its state and history, names, units, keys and texts, and its template."""
 
+import contextlib
 import math
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
-import numpy as np
-
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
+from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look, Scale, picture_state
-from amiwarp.viewer.inspector import (
-    INTERVALS_US,
-    NO_ENCODER,
-    OTHERS,
-    SLIDING,
-    Inspector,
-    Knobs,
-    Selection,
-    Source,
-    Statistics,
-    colours_on_offer,
-    truth_text,
-)
+from amiwarp.viewer.inspector import OTHERS, SLIDING, Inspector, Knobs, Selection, Source, colours_on_offer, truth_text
 from amiwarp.viewer.jobs import EXPORTS, FILMS, CostSurface, FoundCalibration, LiveFigures
-from amiwarp.viewer.serve import Check, flag, number, one_of, read_template
+from amiwarp.viewer.serve import FOLDER, Check, flag, number, one_of
 
 # State of the inspector's page: what it shows, with which parameters; its history, and its text in the address.
 
@@ -37,8 +24,6 @@ LONGEST_HISTORY = 200
 """Largest number of states that can be undone."""
 LONGEST_NOISE_US = 10_000_000
 """Largest time of the noise filter in an address [us]."""
-LARGEST_RPM, LARGEST_OFFSET_US = 100_000.0, 1e9
-"""Largest speed [1/min] and clock offset [us] in an address."""
 
 
 @dataclass(frozen=True)
@@ -93,15 +78,20 @@ def apply_state(inspector: Inspector, state: ViewState) -> None:
     window = state.start_us + inspector.recording.events.t_first, state.length_us
     if (window, state.selection) != (inspector.window, inspector.selection):
         inspector.open(*window, state.selection)
-    given = given_state(inspector)
-    if state.fov_deg is not None and state.fov_deg != given["fov_deg"]:
-        inspector.set_camera(state.fov_deg)
-    if state.prism_index is not None and state.prism_index != given["index"]:
-        inspector.set_index(state.prism_index)
+    set_given(inspector, state.fov_deg, state.prism_index)
     inspector.set(state.knobs)
     known = {name: source for name, source in inspector.sources.items() if name in ("camera", "prism")}
     held = {name: source for name, source in known.items() if source is Source.FILE}
     inspector.sources = dict(state.sources) | held
+
+
+def set_given(inspector: Inspector, fov_deg: float | None, index: float | None) -> None:
+    """Set the camera and the prism's index by hand where they differ from the inspector's; None keeps them."""
+    given = given_state(inspector)
+    if fov_deg is not None and fov_deg != given["fov_deg"]:
+        inspector.set_camera(fov_deg)
+    if index is not None and index != given["index"]:
+        inspector.set_index(index)
 
 
 class History:
@@ -156,15 +146,18 @@ class History:
 
 # text in the address
 
-ANGLES = ("apex", "phase", *(name for name, p in OTHERS.items() if p.unit == "rad"))
-"""Parameters that the address gives in degrees."""
 LIMITS = {
-    "apex": (0.0, 29.9), "phase": (-3600.0, 3600.0), "clock_offset": (-LARGEST_OFFSET_US, LARGEST_OFFSET_US),
-    **{name: p.limits for name, p in SLIDING.items()}, "rpm": (-LARGEST_RPM, LARGEST_RPM),
+    "apex": (0.0, 29.9), "phase": (-3600.0, 3600.0), "clock_offset": (-1e9, 1e9),
+    **{name: p.limits for name, p in SLIDING.items()}, "rpm": (-1e5, 1e5),
     **{name: p.limits for name, p in OTHERS.items()}, "focal_length": (0.1, 1e6),
 }  # fmt: skip
 """Smallest and largest value of each parameter in an address and a field: angles in degrees, others in their own units.
 """
+UNITS = {
+    **dict.fromkeys(LIMITS, 1.0),
+    **dict.fromkeys(("apex", "phase", *(name for name, p in OTHERS.items() if p.unit == "rad")), math.radians(1.0)),
+}
+"""Conversion from the units of page and address (angles in degrees) to the parameters' units (radians): factors."""
 HAND_LIMITS = {"fov_deg": (1.0, 170.0), "prism_index": (1.01, 3.5)}
 """Smallest and largest value of the properties of camera and prism that can be set by hand."""
 CHOICES: dict[str, Any] = {"image": ImageKind, "colour": Colour, "axis": Axis, "view": View}
@@ -219,15 +212,15 @@ def _knob_texts(knobs: Knobs, before: str) -> dict[str, str]:
     out = {f"{before}model": knobs.model}
     for name in LIMITS:
         if (value := knobs.value(name)) is not None:
-            out[before + name] = f"{math.degrees(value) if name in ANGLES else value:.10g}"
+            out[before + name] = f"{value / UNITS[name]:.10g}"
     return out
 
 
 def _with_value(state: ViewState, key: str, text: str, size: tuple[int, int], duration_us: int) -> ViewState:
     """Return a state with one value of an address. Raises ValueError, KeyError or OverflowError for a wrong value."""
     plain: dict[str, Callable[[], ViewState]] = {
-        "start_ms": lambda: replace(state, start_us=_time(text, 0, duration_us - 1)),
-        "length_ms": lambda: replace(state, length_us=_time(text, 1, duration_us)),
+        "start_ms": lambda: replace(state, start_us=int(_within(round(float(text) * 1e3), 0, duration_us - 1))),
+        "length_ms": lambda: replace(state, length_us=int(_within(round(float(text) * 1e3), 1, duration_us))),
         "polarity": lambda: _selected(state, polarity=POLARITIES[text]),
         "region": lambda: _selected(state, region=_region(text, size)),
         "hide_hot": lambda: _selected(state, hide_hot=FLAGS[text]),
@@ -253,8 +246,7 @@ def _with_knob(knobs: Knobs, name: str, text: str) -> Knobs:
     """Return parameters with one value of an address."""
     if name == "model" and text in MODELS:
         return replace(knobs, model=text)
-    value = _within(float(text), *LIMITS[name])
-    return knobs.with_values({name: math.radians(value) if name in ANGLES else value})
+    return knobs.with_values({name: _within(float(text), *LIMITS[name]) * UNITS[name]})
 
 
 def _selected(state: ViewState, **changes: Any) -> ViewState:
@@ -275,11 +267,6 @@ def _sources(text: str, known: tuple[tuple[str, Source], ...]) -> tuple[tuple[st
     return tuple((dict(known) | given).items())
 
 
-def _time(text: str, low: int, high: int) -> int:
-    """Return a time in us from a text in ms."""
-    return int(_within(round(float(text) * 1e3), low, high))
-
-
 def _whole(text: str, low: int, high: int) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 12):
         raise ValueError(text)
@@ -293,20 +280,13 @@ def _within(value: float, low: float, high: float) -> float:
     return value
 
 
-UNITS = {
-    "apex": math.radians(1.0), "phase": math.radians(1.0), "clock_offset": 1.0,
-    **{name: math.radians(1.0) if p.unit == "rad" else 1.0 for name, p in SLIDING.items()}, "rpm": 1.0,
-}  # fmt: skip
-"""Conversion from the page's units (angles in degrees) to the parameters' units (radians): factor per parameter."""
-NAMES = tuple(UNITS)
+NAMES = ("apex", "phase", "clock_offset", "rpm", *SLIDING)
 """Names of the prism parameters that have a slider."""
 GIVEN = {"fov_deg": ("field of view", "°", "gives_camera"), "index": ("refractive index", "", "gives_prism")}
 """Properties of camera and prism that a recording may lack: label, unit, and the condition for showing the field."""
 FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, "fov_deg": HAND_LIMITS["fov_deg"],
                 "index": HAND_LIMITS["prism_index"]}  # fmt: skip
 """Smallest and largest value of the fields of the prism and the camera, in the page's units."""
-EDITABLE = ("start_ms", "length_ms", "turns", "noise_ms", *GIVEN)
-"""State variables with a number field, next to the prism's parameters."""
 SLIDERS = {
     "apex": ("apex angle", "°", ("0", "apex_most", "0.005"), "true"),
     "phase": ("phase", "°", ("-180", "180", "0.25"), "true"),
@@ -319,14 +299,8 @@ SLIDERS = {
     },
 }  # fmt: skip
 """Sliders of the page by parameter: label, unit, (minimum, maximum, step), and the condition for showing the slider."""
-SPEEDS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1, 3, 10)
-"""Choices of the playback speed, relative to real time."""
-VIEWS = ((View.FREE.value, "corner"), (View.XY.value, "x-y"), (View.X_AXIS.value, "x-θ"), (View.Y_AXIS.value, "y-θ"))
-"""Viewpoints of the clouds, with the texts of their buttons."""
 SCOPES = ("selection", "whole recording")
 """Choices of the events that a calibration uses."""
-TOOLS = (("region", "draw region"), ("move", "move"), ("measure", "measure"))
-"""What a drag of the mouse does on the images: name and text."""
 KEYS = (
     ("ArrowRight", ("step", 1), "forward by one turn, or by the window's length"),
     ("ArrowLeft", ("step", -1), "back by one turn, or by the window's length"),
@@ -353,15 +327,14 @@ KEYS = (
 )
 """Keys of the page: name of the key, method of the panel with its arguments, and help text."""
 CALLS = (
-    "key", "released", "choose", "typed", "edge", "draw", "whole", "suggest", "look_from", "step", "move_window",
-    "resize_window", "take_from_curve", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline",
-    "undo", "redo", "reset", "restore", "answer", "keep_b", "swap_b", "compare_found", "export", "open_file",
-    "use_card", "end_film",
+    "key", "released", "choose", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
+    "resize_window", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline", "undo", "redo",
+    "reset", "restore", "answer", "keep_b", "swap_b", "export", "open_file", "use_card", "end_film",
 )  # fmt: skip
 """Methods of the panel that the page may call."""
 SETTABLE: dict[str, Check] = {
     **dict.fromkeys(NAMES, number()), "point_size": number(1.0, 20.0), "opacity": number(0.0, 1.0),
-    "speed": one_of(*SPEEDS), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
+    "speed": number(0.001, 10.0), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
     "colour": one_of(*(each.value for each in Colour)), "axis": one_of(*(each.value for each in Axis)),
     "kind": one_of(*(each.value for each in ImageKind)), "against": one_of(*AGAINST), "scope": one_of(*SCOPES),
     "message": one_of(""),
@@ -401,13 +374,17 @@ class Actions:
     def released(self) -> None:
         """End a change that lasts, such as a drag."""
 
-    def errors_shown(self, what: str) -> AbstractContextManager[None]:
-        """Show errors of the enclosed code as a message. ``what``: kind of the action."""
-        raise NotImplementedError
-
     def say(self, text: str) -> None:
         """Show a message."""
         raise NotImplementedError
+
+    @contextlib.contextmanager
+    def errors_shown(self, what: str) -> Iterator[None]:
+        """Show errors of the enclosed code as a message. ``what``: kind of the action."""
+        try:
+            yield
+        except (AmiwarpError, OSError) as error:
+            self.say(str(error))
 
     def knobs_taken(self) -> None:
         """Show parameters that the inspector has taken from elsewhere."""
@@ -460,6 +437,18 @@ class Actions:
         with self.errors_shown("knobs"):
             self.inspector.take_truth()
         self.knobs_taken()
+
+    def accept(self) -> None:
+        """Set the parameters to the result of the calibration."""
+        if self.found is not None:
+            with self.errors_shown("knobs"):
+                self.inspector.accept(self.found)
+            self.discard()
+            self.knobs_taken()
+
+    def discard(self) -> None:
+        """Forget the result of the calibration."""
+        self.found = None
 
     # Time
 
@@ -537,7 +526,8 @@ class Actions:
 def template() -> str:
     """Return the page's template with its sliders."""
     fields = "\n".join(map(_given, GIVEN))
-    return read_template().replace("@KNOBS@", "\n".join(map(_knob, SLIDERS))).replace("@GIVEN@", fields)
+    page = (FOLDER / "page.html").read_text(encoding="utf-8")
+    return page.replace("@KNOBS@", "\n".join(map(_knob, SLIDERS))).replace("@GIVEN@", fields)
 
 
 def _given(name: str) -> str:
@@ -569,7 +559,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
     recording = inspector.recording
     size = recording.events.size
     return {
-        **source_state(inspector), **knob_state(inspector), **prism_state(inspector), **given_state(inspector),
+        **source_state(inspector), **knob_state(inspector), **prism_state(inspector),
         **NO_ORBIT,
         "trame__title": f"amiwarp: {recording.name}", "trame_error_report_msg": "", "name": recording.name,
         "size": list(size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
@@ -577,14 +567,13 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "apex_most": apex_most(inspector), "truths": truths(inspector),
         "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth),
         "exports": [[name, text, name in FILMS] for name, (text, _) in EXPORTS.items()],
-        "open_shown": False, "playing": False, "speed": 0.1, "speeds": list(SPEEDS), "loop": False, "polarity": "both",
+        "help_shown": False, "open_shown": False, "playing": False, "speed": 0.1, "loop": False, "polarity": "both",
         "hide_hot": False, "noise_filter": False, "noise_ms": 2.0, "region_kind": "whole",
         "region_wanted": [0, 0, *size], "region": [0, 0, *size], "knob": "apex",
         "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
         "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
-        "views": [list(each) for each in VIEWS], "tool": "region", "tools": [list(each) for each in TOOLS],
-        "hover": "", "measured": "", "late": 0, "slice": [0.0, 1.0], "orbit_shown": True, "help_shown": False,
+        "tool": "region", "hover": "", "measured": "", "late": 0, "slice": [0.0, 1.0], "orbit_shown": True,
         "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
         "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
         "rate_on": b"", "rate_off": b"", "rate_note": "", "picked_text": "",
@@ -616,13 +605,14 @@ def source_state(inspector: Inspector) -> dict[str, Any]:
 
 def knob_values(inspector: Inspector) -> dict[str, float]:
     """Return the prism's parameters in the page's units, rounded as the page shows them."""
-    return {name: round((inspector.knobs.value(name) or 0.0) / scale, 4) for name, scale in UNITS.items()}
+    return {name: round((inspector.knobs.value(name) or 0.0) / UNITS[name], 4) for name in NAMES}
 
 
 def knob_state(inspector: Inspector) -> dict[str, Any]:
     """Return the state variables of the prism's parameters."""
     sources = {name: str(source.value) for name, source in inspector.sources.items()}
-    return {**knob_values(inspector), "model": inspector.knobs.model, "sources": sources, "notes": notes(inspector)}
+    return {**knob_values(inspector), **given_state(inspector), "model": inspector.knobs.model, "sources": sources,
+            "notes": notes(inspector)}  # fmt: skip
 
 
 def prism_state(inspector: Inspector) -> dict[str, Any]:
@@ -644,7 +634,7 @@ def given_state(inspector: Inspector) -> dict[str, Any]:
 def truths(inspector: Inspector) -> dict[str, float | None]:
     """Return the known true parameters in the page's units; None for an unknown one."""
     known = inspector.truth
-    return {n: None if known is None else round((known.value(n) or 0.0) / scale, 4) for n, scale in UNITS.items()}
+    return {n: None if known is None else round((known.value(n) or 0.0) / UNITS[n], 4) for n in NAMES}
 
 
 def notes(inspector: Inspector) -> list[str]:
@@ -654,28 +644,10 @@ def notes(inspector: Inspector) -> list[str]:
         Source.ESTIMATED: "phase estimated from the events: calibrate for an accurate one",
     }
     phase = texts.get(inspector.sources["phase"], "") if math.isfinite(inspector.turn_us) else ""
-    missing = [note for note in inspector.notes if not (note == NO_ENCODER and inspector.knobs.rpm)]
-    return [*missing, *filter(None, [phase])]
+    return [*inspector.notes, *filter(None, [phase])]
 
 
-# Texts and figures about the shown window, a live stream and a calibration.
-
-
-def statistics_state(found: Statistics) -> dict[str, Any]:
-    """Return statistics for the page: rows of name and value, and the histogram of the intervals."""
-    n, known = found.on + found.off, bool(found.intervals.any())
-    rows = [
-        ("rate", f"{found.rate:,.0f} events/s"), ("events per pixel", f"{n / found.area:.3g}"),
-        ("ON", f"{100.0 * found.on_share:.1f} %"),
-        ("pixels with events", f"{100.0 * found.pixels / found.area:.1f} %"),
-        ("median interval of a pixel", f"{found.median_us:,.0f} µs" if known else "–"),
-    ]  # fmt: skip
-    decades = np.log10(INTERVALS_US)
-    return {
-        "rows": [list(row) for row in rows], "x": (0.5 * (decades[1:] + decades[:-1])).tolist() if known else [],
-        "y": (100.0 * found.intervals / max(1, found.intervals.sum())).tolist(),
-        "median": math.log10(max(found.median_us, 1.0)) if known else None,
-    }  # fmt: skip
+# Texts and figures about a live stream and a calibration.
 
 
 def live_state(f: LiveFigures) -> dict[str, Any]:

@@ -21,19 +21,11 @@ from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
-from amiwarp.io.files import check_output, interrupts_later
 from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
-from amiwarp.viewer.drawing import ImageKind, Look, Scene
-from amiwarp.viewer.inspector import (
-    DisplayedWindow,
-    EventRates,
-    Inspector,
-    Knobs,
-    Library,
-    Selection,
-)
+from amiwarp.viewer.drawing import ImageKind, Look
+from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection
 from amiwarp.viewer.jobs import SLOW, JobCancelled, JobProgress, PageWork
 from amiwarp.viewer.serve import finite, serve, use_page
 
@@ -48,7 +40,7 @@ PLAY_S, FOLLOW_S, RATES_S = 0.05, 0.1, 1.0
 two counts of a live stream's events for the timeline [s]."""
 
 
-class Panel(layout.Actions):
+class Panel(PageWork, layout.Actions):
     """Panel that connects the page of one browser tab with its inspector. Call :meth:`close` when the tab is closed.
 
     The page may call the methods in :data:`amiwarp.viewer.layout.CALLS`. The server checks their arguments by their
@@ -57,8 +49,8 @@ class Panel(layout.Actions):
 
     def __init__(self, server: Any, inspector: Inspector, library: Library | None = None) -> None:
         """Build the page on a new trame server. ``library``: other recordings that the page may open."""
-        self.state, self.inspector, self._server, self._library = server.state, inspector, server, library
-        self.work = PageWork(server, inspector.device, self.make, self.make_slow)
+        super().__init__(server, inspector.device)
+        self.inspector, self._library = inspector, library
         self.shown: DisplayedWindow | None = None
         """Window as the page shows it; None before the first update."""
         self.plays = False
@@ -79,7 +71,7 @@ class Panel(layout.Actions):
         """Show an inspector from its first state."""
         self.inspector, self.shown, self.b, self.found, self._picked = inspector, None, None, None, -1
         self.history, self.steps = None, ()
-        self._give_points()
+        self.use_card(self._card)
         inspector.renew()  # a live stream may have gone on since the inspector was made
         files = [] if self._library is None else self._library.files()
         folder = "" if self._library is None else str(self._library.folder)
@@ -87,21 +79,21 @@ class Panel(layout.Actions):
         self._knobs_shown = {}
         self.show_knobs()
         self.time_window = inspector.window or inspector.first_window()
-        self._count_events()
+        self.start_job(self._count_events())
         self.request("window", *(["suggestion"] if self.compensates else []))
         self.released()
-        self.work.request_slow("preparation")
+        self.request_slow("preparation")
         if inspector.latest is not None:
             self.play()
         if isinstance(inspector.latest, jobs.LiveSource):
-            self.work.start_job(self._watch(inspector.latest))
+            self.start_job(self._watch(inspector.latest))
 
     def close(self) -> None:
         """Stop all work of the browser tab, and remove its downloads."""
         self._folder.cleanup()
         self.cancel()
         self.inspector.closed = True
-        self.work.close()
+        super().close()
 
     def cancel(self) -> None:
         """Stop the calibration or the film that is being made."""
@@ -117,9 +109,7 @@ class Panel(layout.Actions):
     def look(self) -> Look:
         """Style of the clouds."""
         s = self.state
-        return Look(
-            Colour(s.colour), Axis(s.axis), float(s.point_size), float(s.opacity), bool(s.dark), bool(s.overlaid)
-        )
+        return Look(s.colour, s.axis, s.point_size, s.opacity, s.dark, s.overlaid)
 
     @look.setter
     def look(self, look: Look) -> None:
@@ -149,21 +139,13 @@ class Panel(layout.Actions):
         start_us, length_us = window[0] - self.inspector.recording.events.t_first, window[1]
         self.state.update({"start_ms": round(start_us * 1e-3, 3), "length_ms": round(length_us * 1e-3, 3)})
 
-    def say(self, text: str) -> None:
-        """Show a message."""
-        self.work.show_message(text, "info")
-
-    def errors_shown(self, what: str) -> contextlib.AbstractContextManager[None]:
-        """Show errors of the enclosed code as a message, until the same kind of action succeeds."""
-        return self.work.errors_shown(what)
-
     def request(self, *what: str, change: str = "") -> None:
         """Request quick updates of the page.
 
         ``change``: name of a change that lasts, such as a drag; it is undone in one step.
         """
         self._change = f"{change} {self._drags}" if change else ""
-        self.work.request(*what)
+        super().request(*what)
 
     def _listen(self) -> None:
         """Follow the state variables that the page sets, and offer the methods that it calls."""
@@ -178,70 +160,50 @@ class Panel(layout.Actions):
         follow(("model", "against", "kind", "difference"), self.request, "knobs")
         follow(("model", "kind", "polarity", "hide_hot", "noise_filter"), self.released)
         for name in layout.CALLS:
-            self._server.trigger(name)(getattr(self, name))
+            self.server.trigger(name)(getattr(self, name))
 
     # Buttons, keys, fields and the mouse
 
     def released(self) -> None:
         """Update the slow parts of the page after a change, and end what is undone in one step."""
         self._drags += 1
-        self.work.request_slow(*SLOW)
+        self.request_slow(*SLOW)
 
     def choose(self, name: str) -> None:
         """Select the parameter over which the sharpness curve is drawn."""
         if name in layout.NAMES and name != self.state.knob:
             self.state.knob = name
-            self.work.request_slow("curve")
+            self.request_slow("curve")
 
     def typed(self, name: str, text: str) -> None:
         """Set the value that a user typed into a number field."""
-        if name not in (*layout.NAMES, *layout.EDITABLE):
+        if name not in (*layout.FIELD_LIMITS, "start_ms", "length_ms", "turns", "noise_ms"):
             return
         try:
             value = finite(text)
         except ValueError:
-            self.work.show_message(f"{text!r} is not a number; give a number such as 1.5", "error")
+            self.say(f"{text!r} is not a number; give a number such as 1.5", "error")
             return
         if name in layout.FIELD_LIMITS:
             (low, high), (label, unit, *_) = layout.FIELD_LIMITS[name], {**layout.SLIDERS, **layout.GIVEN}[name]
             if not low <= value <= high:
                 text = f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}"
-                self.work.show_message(text, "error")
+                self.say(text, "error")
                 return
         if name == "turns":
             name, value = "length_ms", value * float(self.state.turn_ms)
         self.state[name] = round(value, 4)
-        if name in layout.GIVEN:
-            self.work.start_job(self._give(name, value))
-            return
         if name in layout.NAMES:
             self.state.knob = name
-        self.request("knobs" if name in layout.NAMES else "window")
-        self.released()
-
-    async def _give(self, name: str, value: float) -> None:
-        """Set the camera or the prism's index, which the recording lacks."""
-        await self.work.until_drawn()
-        with self.work.errors_shown("knobs"), self.state as state:
-            give = self.inspector.set_camera if name == "fov_deg" else self.inspector.set_index
-            give(value)
-            state.update(layout.given_state(self.inspector))
-        self.show_knobs()
-        self.request("window")
+        self.request("knobs" if name in layout.FIELD_LIMITS else "window")
         self.released()
 
     def use_card(self, found: bool) -> None:
         """Show more points if the browser has a graphics card to draw them."""
         self._card = found
-        if self._give_points():
-            self.request("window")
-
-    def _give_points(self) -> bool:
-        """Give the inspector the number of points that a graphics card draws. Return whether it had fewer."""
-        more = self._card and self.inspector.most_points < CARD_POINTS
-        if more:
+        if found and self.inspector.most_points < CARD_POINTS:
             self.inspector.most_points = CARD_POINTS
-        return more
+            self.request("window")
 
     def answer(self) -> None:
         """Do nothing: the page asks only whether the server answers."""
@@ -264,7 +226,7 @@ class Panel(layout.Actions):
     def open_file(self, name: str) -> None:
         """Show another recording of the folder."""
         self.state.open_shown = False
-        self.work.start_job(self._open_file(name))
+        self.start_job(self._open_file(name))
 
     async def _open_file(self, name: str) -> None:
         if self._library is None:
@@ -272,37 +234,26 @@ class Panel(layout.Actions):
         if self.state.calibrating:
             self.cancel()
         self.state.playing = False
-        with self.work.errors_shown("file"):
-            inspector = await self.work.in_thread(self._library.open, name)
-            await self.work.until_drawn()
+        with self.errors_shown("file"):
+            inspector = await self.in_thread(self._library.open, name)
+            await self.until_drawn()
             self.start(inspector)
         self.state.flush()
 
     # Region of the image
 
-    def edge(self, side: int, text: str) -> None:
-        """Set one side of the region (0: left, 1: top, 2: right, 3: bottom) to a typed number [px]."""
-        with contextlib.suppress(ValueError):
-            wanted = [*self.state.region]
-            if side in (0, 1, 2, 3):
-                wanted[int(side)] = round(finite(text))
-                self.draw(*wanted)
-
     def draw(self, left: float, top: float, right: float, bottom: float) -> None:
         """Show a region of the image [px] that was drawn or typed."""
-        self._show_region([int(each) for each in (left, top, right, bottom)], "drawn")
+        sides, limits = (left, top, right, bottom), 2 * self.state.size
+        region = [min(max(round(each), 0), limit) for each, limit in zip(sides, limits, strict=True)]
+        whole = region == [0, 0, *self.state.size]
+        self.state.update({"region_wanted": region, "region_kind": "whole" if whole else "drawn"})
+        self.request("window")
+        self.released()
 
     def whole(self) -> None:
         """Show the whole image."""
-        self._show_region([0, 0, *self.state.size], "whole")
-
-    def _show_region(self, region: list[int], kind: str) -> None:
-        width, height = self.state.size
-        left, right = (min(max(x, 0), width) for x in region[::2])
-        top, bottom = (min(max(y, 0), height) for y in region[1::2])
-        self.state.update({"region_wanted": [left, top, right, bottom], "region_kind": kind})
-        self.request("window")
-        self.released()
+        self.draw(0, 0, *self.state.size)
 
     # Time: window, timeline and playback. The page counts all times from the recording's first event.
 
@@ -336,7 +287,7 @@ class Panel(layout.Actions):
             state.playing = False
             return
         self.plays = True
-        self.work.start_job(self._play())
+        self.start_job(self._play())
 
     async def _play(self) -> None:
         try:
@@ -350,26 +301,26 @@ class Panel(layout.Actions):
             start_s = loop.time()
             with state:
                 state.playing = self.advance(1e6 * elapsed_s * float(state.speed), loop=bool(state.loop))
-            await self.work.until_drawn()
+            await self.until_drawn()
             await asyncio.sleep(max(0.0, PLAY_S - (loop.time() - start_s)))
             elapsed_s = loop.time() - start_s
         self.released()
 
     async def _follow(self) -> None:
         """Show the current events of a live stream, again and again."""
-        await self.work.until_drawn()  # with the suggested region
+        await self.until_drawn()  # with the suggested region
         loop, counted_s = asyncio.get_running_loop(), -math.inf
         while self.state.playing:
             start_s = loop.time()
             with self.state:
-                with self.work.errors_shown("stream"):
+                with self.errors_shown("stream"):
                     self.inspector.renew()
                 self.state.update(layout.source_state(self.inspector))
                 if start_s >= counted_s + RATES_S:
                     counted_s = start_s
-                    self._count_events()
+                    self.start_job(self._count_events())
                 self.move(self.inspector.recording.events.t_last)
-            await self.work.until_drawn()
+            await self.until_drawn()
             await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
 
@@ -383,15 +334,12 @@ class Panel(layout.Actions):
     def _clock_us(self, time_ms: float) -> int:
         return int(self.inspector.recording.events.t_first) + round(time_ms * 1e3)
 
-    def _count_events(self) -> None:
+    async def _count_events(self) -> None:
         """Count the recording's events in the background, for the timeline."""
-        self._rates = EventRates(self.inspector.recording.events)
-        self.work.start_job(self._fill(self._rates))
-
-    async def _fill(self, rates: EventRates) -> None:
-        finished = False
+        rates, finished = EventRates(self.inspector.recording.events), False
+        self._rates = rates
         while not finished and rates is self._rates:
-            finished = await self.work.in_thread(rates.fill, STEP_S)
+            finished = await self.in_thread(rates.fill, STEP_S)
             with self.state:
                 self._show_rates()
 
@@ -404,24 +352,18 @@ class Panel(layout.Actions):
 
     # Parameters of the prism, and those to compare with
 
-    def take_from_curve(self, value: float) -> None:
-        """Set the parameter of the sharpness curve to a clicked value."""
-        self.state[self.state.knob] = round(float(value), 4)
-        self.request("knobs")
-        self.released()
-
-    def keep_b(self) -> None:
-        """Keep the current parameters as B, and show them on the left."""
-        self.show_b(self.inspector.knobs)
-
     def swap_b(self) -> None:
         """Exchange the current parameters and B."""
         if self.b is not None:
             now = self.inspector.knobs
-            with self.work.errors_shown("knobs"):
+            with self.errors_shown("knobs"):
                 self.inspector.set(self.b)
                 self.show_b(now)
             self.knobs_taken()
+
+    def keep_b(self) -> None:
+        """Keep the current parameters as B, and show them on the left."""
+        self.show_b(self.inspector.knobs)
 
     def show_b(self, knobs: Knobs | None) -> None:
         """Show parameters on the left as B; None for the recorded events."""
@@ -433,14 +375,9 @@ class Panel(layout.Actions):
         self.state.update({"has_b": knobs is not None, "b_text": text, "against": against})
         self.request("knobs")
 
-    def compare_found(self) -> None:
-        """Show the result of the calibration on the left."""
-        if self.found is not None:
-            self.state.against = "found"
-            self.request("knobs")
-
     def set_knobs(self) -> None:
         """Give the inspector the parameters that the page shows, where they differ from the inspector's."""
+        layout.set_given(self.inspector, self.state.fov_deg, self.state.index)
         known, shown = layout.knob_values(self.inspector), self.state
         values = {name: float(shown[name]) * layout.UNITS[name] for name in layout.NAMES if shown[name] != known[name]}
         self._knobs_shown = {name: shown[name] for name in self._knobs_shown}
@@ -449,7 +386,8 @@ class Panel(layout.Actions):
     def show_knobs(self) -> None:
         """Show the inspector's parameters on the page, but leave those that a user has changed since the last time."""
         state = layout.knob_state(self.inspector)
-        was, self._knobs_shown = self._knobs_shown, {name: state[name] for name in ("model", *layout.UNITS)}
+        was, names = self._knobs_shown, ("model", *layout.FIELD_LIMITS)
+        self._knobs_shown = {name: state[name] for name in names}
         self.state.update({name: value for name, value in state.items() if value != was.get(name)})
 
     def knobs_taken(self) -> None:
@@ -466,18 +404,17 @@ class Panel(layout.Actions):
     @property
     def against(self) -> Knobs | None:
         """Parameters that the left cloud and image show; None for the recorded events."""
-        return self._compared(self.state.against)
+        return self._comparable().get(self.state.against)
 
-    def _compared(self, name: str) -> Knobs | None:
-        """Return the parameters of a name in :data:`AGAINST`; None if there are none."""
-        if name == "found":
-            return None if self.found is None else self.inspector.knobs_of(self.found)
-        return {"B": self.b, "truth": self.inspector.truth}.get(name)
+    def _comparable(self) -> dict[str, Knobs | None]:
+        """Return what the left cloud can show now, by the names in :data:`amiwarp.viewer.drawing.AGAINST`."""
+        found = None if self.found is None else self.inspector.knobs_of(self.found)
+        known = {"B": self.b, "found": found, "truth": self.inspector.truth}
+        return {"recorded": None, **{name: knobs for name, knobs in known.items() if knobs is not None}}
 
     def _against_choices(self) -> list[list[str]]:
         """Return names and titles of what the left cloud can show now."""
-        known = [name for name in drawing.AGAINST if name == "recorded" or self._compared(name) is not None]
-        return [[name, drawing.against_title(self.inspector, name)] for name in known]
+        return [[name, drawing.against_title(self.inspector, name)] for name in self._comparable()]
 
     # Calibration
 
@@ -487,7 +424,7 @@ class Panel(layout.Actions):
             self.found = None
             self.state.update({"busy": "calibrating", "calibrating": True, "progress": 0, "found": "", "surface": None})
             self._progress = JobProgress(self._show_progress)
-            self.work.start_job(self._calibrate(self._progress))
+            self.start_job(self._calibrate(self._progress))
         elif self.state.calibrating:
             self.cancel()
             self.state.busy = "calibrating: cancelling"
@@ -497,15 +434,17 @@ class Panel(layout.Actions):
         inspector, state = self.inspector, self.state
         try:
             find = partial(jobs.find_calibration, whole=state.scope != layout.SCOPES[0])
-            found = await self._guarded_in_thread(find, inspector, progress)
+            async with self.device_lock:
+                found = await self.in_thread(_guarded, find, weakref.ref(inspector), progress)
             if isinstance(found, str):
                 text, severity = ("calibration cancelled", "info") if progress.cancelled else (found, "error")
-                self.work.show_message(text, severity)
+                self.say(text, severity)
                 return
             self.found = found.calibration
             with state:
                 state.update({"found": layout.found_text(found), "against_choices": self._against_choices()})
-            surface = await self._guarded_in_thread(jobs.cost_surface, inspector, progress)
+            async with self.device_lock:
+                surface = await self.in_thread(_guarded, jobs.cost_surface, weakref.ref(inspector), progress)
             if not isinstance(surface, str) and self.inspector is inspector:
                 with state:
                     state.surface = layout.surface_state(surface, inspector, self.found)
@@ -513,27 +452,14 @@ class Panel(layout.Actions):
             with state:
                 state.update({"busy": "", "calibrating": False})
 
-    async def _guarded_in_thread(self, call: Callable[..., Any], inspector: Inspector, progress: Progress) -> Any:
-        """Return the result of a call with progress, or the text of its error."""
-        async with self.work.device_lock:
-            return await self.work.in_thread(_guarded, call, weakref.ref(inspector), progress)
-
     def _show_progress(self, what: str, share: float) -> None:
         """Show the current step of a calibration or a film, and the finished share, 0 to 1."""
         with self.state:
             self.state.update({"busy": what, "progress": round(100 * min(share, 1.0))})
 
-    def accept(self) -> None:
-        """Set the prism's parameters to the result of the calibration."""
-        if self.found is not None:
-            with self.work.errors_shown("knobs"):
-                self.inspector.accept(self.found)
-            self.discard()
-            self.knobs_taken()
-
     def discard(self) -> None:
         """Forget the result of the calibration."""
-        self.found = None
+        super().discard()
         self.state.update({"found": "", "surface": None})
         if self.state.against == "found":
             self.show_b(self.b)
@@ -545,25 +471,20 @@ class Panel(layout.Actions):
         s = self.state
         if what in ("picture", "image") and self.shown is not None:
             words = drawing.caption(self.inspector, self.shown).split("; ")
-            self._server.js_call("page", what, jobs.download_name(self.inspector.recording.name, what), words)
+            self.server.js_call("page", what, jobs.download_name(self.inspector.recording.name, what), words)
         elif what in jobs.EXPORTS and what not in ("picture", "image") and not (what in jobs.FILMS and s.busy):
-            self.work.start_job(self._film(what) if what in jobs.FILMS else self._write(what))
+            self.start_job(self._film(what) if what in jobs.FILMS else self._write(what))
 
     async def _write(self, what: str) -> None:
-        inspector, kind, against = self.inspector, self.image, self.against
-        difference = bool(self.state.difference)
-
-        def write_image(path: Path) -> None:
-            images = drawing.make_images(inspector, kind, against=against)
-            jobs.write_image(drawing.with_difference(images) if difference else images, path)
-
+        inspector = self.inspector
         write: dict[str, Callable[[Path], object]] = {
-            "values": write_image, **dict.fromkeys(("csv", "npz"), partial(jobs.write_table, inspector)),
+            "values": lambda path: jobs.write_image(self._pair(), path),
+            **dict.fromkeys(("csv", "npz"), partial(jobs.write_table, inspector)),
             "events": partial(jobs.write_events, inspector, compensated=False),
             "compensated": partial(jobs.write_events, inspector, compensated=True),
             "calibration": lambda path: inspector.as_calibration().save(path),
         }  # fmt: skip
-        async with self.work.device_lock, self.work.buffers_lock:
+        async with self.device_lock, self.buffers_lock:
             await self._download(what, write[what])
 
     async def _film(self, what: str) -> None:
@@ -579,7 +500,7 @@ class Panel(layout.Actions):
             s.update({"busy": f"making the {jobs.EXPORTS[what][0]}", "progress": 0})
         try:
             with contextlib.suppress(JobCancelled):
-                async with self.work.device_lock:
+                async with self.device_lock:
                     await self._download(what, film)
         finally:
             with s:
@@ -588,14 +509,14 @@ class Panel(layout.Actions):
     async def _download(self, what: str, write: Callable[[Path], object]) -> None:
         """Write a file in a thread, and give it to the browser."""
         name = jobs.download_name(self.inspector.recording.name, what)
-        with self.work.errors_shown("export"):
+        with self.errors_shown("export"):
             path = Path(self._folder.name) / name
             path.unlink(missing_ok=True)
-            await self.work.in_thread(write, path)
+            await self.in_thread(write, path)
             self._downloads += 1  # a browser keeps what it has loaded from an address
-            self._server.js_call("page", "download", name, f"{self._server.name}/{name}?{self._downloads}")
+            self.server.js_call("page", "download", name, f"{self.server.name}/{name}?{self._downloads}")
             size = f"{path.stat().st_size / 1e3:,.0f} kB"
-            self.work.show_message(f"{name}: {size}, in the browser's downloads", "success")
+            self.say(f"{name}: {size}, in the browser's downloads", "success")
         self.state.flush()
 
     # Undo, redo, reset, and the state in the page's address
@@ -608,7 +529,7 @@ class Panel(layout.Actions):
         size = self.inspector.recording.events.size
         state, wrong = layout.decode_state(address, history.first, size=size, duration_us=self.whole_us)
         if wrong:
-            self.work.show_message("; ".join(wrong), "error")
+            self.say("; ".join(wrong), "error")
         return state
 
     def remember(self, change: str) -> layout.History:
@@ -623,13 +544,13 @@ class Panel(layout.Actions):
         wanted = self.travelled()
         if wanted is None:
             return
-        await self.work.in_thread(layout.apply_state, self.inspector, wanted)
+        await self.in_thread(layout.apply_state, self.inspector, wanted)
         s, selection = self.state, wanted.selection
         region = list(selection.region or (0, 0, *s.size))
         kind = s.region_kind if region == s.region_wanted else "whole" if selection.region is None else "drawn"
         self.time_window = self.inspector.window or self.time_window
         s.update({
-            **layout.given_state(self.inspector), "polarity": {None: "both", 1: "ON", 0: "OFF"}[selection.polarity],
+            "polarity": {None: "both", 1: "ON", 0: "OFF"}[selection.polarity],
             "hide_hot": selection.hide_hot, "noise_filter": selection.noise_us is not None, "region_wanted": region,
             "region_kind": kind, "kind": wanted.image.value,
         })  # fmt: skip
@@ -651,13 +572,15 @@ class Panel(layout.Actions):
             await self.make(todo - {"state"})
             todo = {"state"}
         if todo & {"window", "suggestion"}:
-            with self.work.errors_shown("window"):
+            with self.errors_shown("window"):
                 try:
                     await self._open(suggest="suggestion" in todo)
-                except AmiwarpError:
-                    self._return_to_open_window()
+                except AmiwarpError:  # show again what is still open; playback goes on through a time without events
+                    if self.inspector.window is not None and not state.playing:
+                        self.time_window = self.inspector.window
+                        state.region_wanted = list(self.inspector.loaded.region)
                     raise
-        with self.work.errors_shown("knobs"):
+        with self.errors_shown("knobs"):
             good = self.inspector.knobs, dict(self.inspector.sources)
             try:
                 if "knobs" in todo:
@@ -667,7 +590,7 @@ class Panel(layout.Actions):
                 if "state" in todo:
                     await self._apply_steps()
                 self.show_knobs()
-                self.shown, values = await self.work.in_thread(self._compute)
+                self.shown, values = await self.in_thread(self._compute)
             except AmiwarpError:
                 self.inspector.knobs, self.inspector.sources = good
                 self.show_knobs()
@@ -682,15 +605,20 @@ class Panel(layout.Actions):
     async def make_slow(self, name: str) -> None:
         """Make a slow update: "curve", "picture", "statistics", or "preparation" of the first picture."""
         if name == "preparation":
-            await self.work.in_thread(drawing.prepare, self.inspector)
+            await self.in_thread(drawing.prepare, self.inspector)
         elif name == "statistics":
-            self.state.statistics = layout.statistics_state(await self.work.in_thread(self.inspector.statistics))
-        else:
-            await (self._curve() if name == "curve" else self._picture())
+            self.state.statistics = (await self.in_thread(self.inspector.statistics)).state()
+        elif name == "curve":
+            await self._curve()
+        elif self.image is ImageKind.LOG_INTENSITY and self.shown is not None:
+            try:
+                self.state.update(await self.in_thread(self._images, self.shown))
+            except AmiwarpError as error:
+                self.state.update({"before": None, "after": None, "image_note": str(error)})
 
     async def _open(self, *, suggest: bool) -> None:
         """Read the window and the selection that the page shows."""
-        s, inspector, in_thread = self.state, self.inspector, self.work.in_thread
+        s, inspector, in_thread = self.state, self.inspector, self.in_thread
         if not float(s.length_ms) > 0.0:
             raise AmiwarpError(f"a window of {s.length_ms:g} ms; give a length above 0")
         start_us, length_us = self.time_window
@@ -712,19 +640,17 @@ class Panel(layout.Actions):
         return Selection({"both": None, "ON": 1, "OFF": 0}[s.polarity], None if region == whole else region,
                          bool(s.hide_hot), noise_us)  # fmt: skip
 
-    def _return_to_open_window(self) -> None:
-        """Show time and region of the window that is still shown. Playback goes on through a time without events."""
-        s, window = self.state, self.inspector.window
-        if window is not None and not s.playing:
-            self.time_window = window
-            s.region_wanted = list(self.inspector.loaded.region)
-
     def _compute(self) -> tuple[DisplayedWindow, dict[str, Any]]:
         """Return what is to be shown, and the state variables that show it."""
         s, before, against = self.state, self.shown, self.against
         shown = self.inspector.show(against=against)
         values = drawing.cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
-        values |= self._images(shown) | self._orbit(shown)
+        values |= {"image_slow": self.image is ImageKind.LOG_INTENSITY, **drawing.NO_ORBIT}
+        if not values["image_slow"]:
+            values |= self._images(shown)
+        if lines := drawing.shown_lines(self.inspector, shown, self.look.axis, against, self._picked):
+            orbit, column = map(drawing.float_bytes, lines)
+            values |= {"orbit": orbit, "column": column, "has_orbit": True} if s.orbit_shown else {}
         if before is None or shown.span is not before.span:
             values["overview"] = drawing.whole_image(shown.span.events, self.inspector.recording.events.size)
         left = "recorded" if against is None else s.against
@@ -737,33 +663,27 @@ class Panel(layout.Actions):
         }  # fmt: skip
 
     def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
-        """Return the state variables of the images of the region; of slow kinds, only that they are."""
-        kind = self.image
-        if kind is ImageKind.LOG_INTENSITY:
-            return {"image_slow": True}
-        if kind is not ImageKind.COUNT:
-            return {"image_slow": False, **self._other_images()}
-        pair = drawing.count_images(shown)
-        return {"image_slow": False, **_image_state(drawing.with_difference(pair) if self.state.difference else pair)}
+        """Return the state variables of the images of the region."""
+        pair = self._pair(shown)
+        scales = pair.scale, pair.after_scale or pair.scale
+        before, after = (
+            None if image is None else drawing.picture_state(image, scale)
+            for image, scale in zip((pair.before, pair.after), scales, strict=True)
+        )
+        first, second = map(drawing.scale_state, scales)
+        return {"before": before, "after": after, "image_scale": first, "after_scale": second, "image_note": pair.note}
 
-    def _other_images(self) -> dict[str, Any]:
-        return _image_state(drawing.make_images(self.inspector, self.image, against=self.against))
-
-    def _orbit(self, shown: DisplayedWindow) -> dict[str, Any]:
-        """Return the orbit of the scene point of the picked event, or of the middle of the region."""
-        lines = drawing.shown_lines(self.inspector, shown, self.look.axis, self.against, self._picked)
-        if not (lines and self.state.orbit_shown):
-            return drawing.NO_ORBIT
-        orbit, column = map(drawing.float_bytes, lines)
-        return {"orbit": orbit, "column": column, "has_orbit": True}
+    def _pair(self, shown: DisplayedWindow | None = None) -> drawing.ShownImages:
+        pair = drawing.make_images(self.inspector, self.image, against=self.against, shown=shown)
+        return drawing.with_difference(pair) if self.state.difference else pair
 
     async def _curve(self) -> None:
         s, name = self.state, self.state.knob
-        find = partial(jobs.scope_text, self.inspector)
-        s.calibrate_on = [await self.work.in_thread(find, whole=whole) for whole in (False, True)]
+        find = partial(jobs.calibrated_events, self.inspector)
+        s.calibrate_on = [(await self.in_thread(find, whole=whole))[1] for whole in (False, True)]
         if not self.compensates:
             return
-        values, scores = await self.work.in_thread(self.inspector.curve, name)
+        values, scores = await self.in_thread(self.inspector.curve, name)
         x: list[float] = (values / layout.UNITS[name]).tolist()
         if not x:
             return
@@ -773,27 +693,6 @@ class Panel(layout.Actions):
         s.curve = {"name": label, "title": f"{label} ({unit})", "text": f"peak {peak}, now {s[name]:.4g}", "x": x,
                    "y": scores.tolist(), "truth": layout.truths(self.inspector)[name]}  # fmt: skip
         s.curve_mark = float(s[name])
-
-    async def _picture(self) -> None:
-        """Make images of a slow kind."""
-        s = self.state
-        if s.kind != ImageKind.LOG_INTENSITY.value or self.shown is None:
-            return
-        try:
-            s.update(await self.work.in_thread(self._other_images))
-        except AmiwarpError as error:
-            s.update({"before": None, "after": None, "image_note": str(error)})
-
-
-def _image_state(pair: drawing.ShownImages) -> dict[str, Any]:
-    """Return the state variables of the images of the region."""
-    scales = pair.scale, pair.after_scale or pair.scale
-    before, after = (
-        None if image is None else drawing.picture_state(image, scale)
-        for image, scale in zip((pair.before, pair.after), scales, strict=True)
-    )
-    first, second = map(drawing.scale_state, scales)
-    return {"before": before, "after": after, "image_scale": first, "after_scale": second, "image_note": pair.note}
 
 
 def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progress: Progress) -> Any:
@@ -811,7 +710,7 @@ def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progre
         known = None
 
 
-# Ways to show the page, in a browser or in a notebook, and a picture of the clouds.
+# Ways to show the page, in a browser or in a notebook.
 
 LOCALHOST = "127.0.0.1"
 
@@ -933,20 +832,3 @@ def view(
     make_inspector()  # raises errors in the cell, before the page is served
     serving = _serve(make_inspector, None, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
     return NotebookPage(loop.create_task(serving))
-
-
-def save_screenshot(
-    inspector: Inspector, path: Path, *, view: View = View.FREE, look: Look | None = None, size: tuple[int, int]
-) -> None:
-    """Write a picture of both event clouds as PNG; ``size`` is its width and height [px]."""
-
-    check_output(path)
-    look = (look or Look()).for_clouds(drawing.cloud_titles(inspector, "recorded"))
-    clouds = inspector.show()
-    with (
-        interrupts_later(),
-        contextlib.closing(Scene(size)) as scene,
-    ):  # VTK crashes if an exception leaves it half-drawn
-        scene.show(clouds, look, caption=drawing.caption(inspector, clouds))
-        scene.look_from(view, look)
-        scene.save(path)

@@ -112,21 +112,17 @@ class HostNames:
 
 def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:
     """Return the error to raise if the server cannot listen at ``host`` and ``port``."""
+    denied = f"--port {port}: permission denied; give a port above 1023, or 0 for a free one"
+    given = f"--host {host!r} --port {port}"
+    known = {
+        errno.EADDRINUSE: f"--port {port}: is in use on {host}; give another port, or 0 for a free one",
+        errno.EADDRNOTAVAIL: f"--host {host!r} is not an address of this machine; give one, such as 127.0.0.1",
+        errno.EACCES: denied, errno.EPERM: denied,
+    }  # fmt: skip
     if isinstance(error, socket.gaierror):
-        return AmiwarpError(
-            f"--host {host!r}: unknown name or address; give an address of this machine, such as 127.0.0.1"
-        )
-    if error.errno == errno.EADDRINUSE:
-        return AmiwarpError(f"--port {port}: is in use on {host}; give another port, or 0 for a free one")
-    if error.errno == errno.EADDRNOTAVAIL:
-        return AmiwarpError(
-            f"--host {host!r} is not an address of this machine; give one of its addresses, such as 127.0.0.1"
-        )
-    if error.errno in (errno.EACCES, errno.EPERM):
-        return AmiwarpError(f"--port {port}: permission denied; give a port above 1023, or 0 for a free one")
-    return AmiwarpError(
-        f"--host {host!r} --port {port}: cannot listen: {error.strerror or error}; give another host or port"
-    )
+        return AmiwarpError(f"--host {host!r}: unknown name or address; give one of this machine, such as 127.0.0.1")
+    usual = f"{given}: cannot listen: {error.strerror or error}; give another host or port"
+    return AmiwarpError(known.get(error.errno or 0, usual))
 
 
 # Filter for messages from a page: known calls whose arguments have the expected type and size. Drops all others.
@@ -137,9 +133,9 @@ never splits them into parts."""
 HEADER_BYTES = 12
 """Size of the header of each message part [bytes]: message number, start of the part and length of the message, 32 bits
 each."""
-MOST_CHARACTERS = 2000
-"""Largest accepted length of a text that the page gives to a function of the server, such as the state in its address.
-"""
+MOST_CHARACTERS, MOST_ID = 2000, 120
+"""Largest accepted length of a text that the page gives to a function of the server, such as the state in its address,
+and of the number of a call."""
 LARGEST = 1e12
 """Largest accepted number in a message; in ms it is 30 years."""
 
@@ -156,45 +152,16 @@ def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
     return check
 
 
-def text(most: int) -> Check:
-    """Return a check that accepts strings of at most ``most`` characters."""
-    return lambda value: isinstance(value, str) and len(value) <= most
-
-
 def one_of(*known: Any) -> Check:
     """Return a check that accepts the ``known`` values, types included."""
     return lambda value: any(type(value) is type(each) and value == each for each in known)
 
 
-def list_of(*checks: Check) -> Check:
-    """Return a check that accepts lists with one item for each of ``checks``."""
-    return lambda value: (
-        isinstance(value, list)
-        and len(value) == len(checks)
-        and all(check(each) for check, each in zip(checks, value, strict=True))
-    )
-
-
-def record(required: Mapping[str, Check], optional: Mapping[str, Check] | None = None) -> Check:
-    """Return a check that accepts dictionaries with all ``required`` keys, and no others except ``optional`` ones."""
-    known = {**required, **(optional or {})}
-
-    def check(value: Any) -> bool:
-        return (
-            isinstance(value, dict)
-            and required.keys() <= value.keys() <= known.keys()
-            and all(known[name](each) for name, each in value.items())
-        )
-
-    return check
-
-
-def _integer(value: Any) -> bool:
-    return type(value) is int and abs(value) <= LARGEST
-
-
 flag = one_of(True, False)
-ARGUMENTS: Mapping[type, Check] = {str: text(MOST_CHARACTERS), float: number(), int: _integer, bool: flag}
+ARGUMENTS: Mapping[type, Check] = {
+    str: lambda value: isinstance(value, str) and len(value) <= MOST_CHARACTERS, float: number(),
+    int: lambda value: type(value) is int and abs(value) <= LARGEST, bool: flag,
+}  # fmt: skip
 """Checks of the arguments of functions that the page calls, by their annotation."""
 
 
@@ -206,21 +173,14 @@ class MessageFilter:
 
         ``settable`` maps each state variable that the page may set to the check of its values.
         """
-        self._server, self._warned = server, False
-        change = self._change(settable)
-        self._calls: dict[str, Check] = {
-            "wslink.hello": list_of(record({"secret": text(64)})),
-            "trame.state.get": list_of(),
-            "trame.lifecycle.update": list_of(one_of("client_connected", "client_exited", "client_unmounted")),
-            "trame.error.client": list_of(text(4000)),
-            "trame.state.update": list_of(lambda changes: isinstance(changes, list) and all(map(change, changes))),
-            "trame.trigger": self._is_trigger,
-        }
+        self._server, self._settable, self._warned = server, settable, False
 
     def passes(self, message: bytes) -> bool:
         """Return whether the message is allowed. Log the first message that is not."""
         try:
-            allowed = self._is_call(_unpacked(message))
+            start, length = (int.from_bytes(message[k : k + 4], "little") for k in (4, 8))
+            whole = (start, length) == (0, len(message) - HEADER_BYTES)
+            allowed = whole and self._is_call(msgpack.unpackb(message[HEADER_BYTES:]))
         except Exception:  # invalid bytes make the decoder raise errors of many types
             allowed = False
         if not allowed and not self._warned:
@@ -229,15 +189,39 @@ class MessageFilter:
         return allowed
 
     def _is_call(self, call: Any) -> bool:
-        known = {"id": text(120), "method": text(60), "args": lambda args: isinstance(args, list)}
-        more = {"wslink": text(10), "kwargs": one_of({})}
-        return record(known, more)(call) and call["method"] in self._calls and self._calls[call["method"]](call["args"])
+        """Return whether a decoded message is a call that a page makes, and nothing more."""
+        match call:
+            case {"id": str(number), "method": method, "args": list(args), **more} if len(number) <= MOST_ID:
+                plain = more.get("kwargs", {}) == {} and isinstance(more.get("wslink", ""), str)
+                return plain and more.keys() <= {"wslink", "kwargs"} and self._takes(method, args)
+        return False
 
-    def _is_trigger(self, args: list[Any]) -> bool:
+    def _takes(self, method: Any, args: list[Any]) -> bool:
+        """Return whether a page may call a method with these arguments."""
+        match method, args:
+            case "wslink.hello", [{"secret": str(), **more}]:
+                return not more
+            case "trame.state.get", []:
+                return True
+            case "trame.lifecycle.update", [event]:
+                return event in ("client_connected", "client_exited", "client_unmounted")
+            case "trame.error.client", [str(report)]:
+                return len(report) <= 2 * MOST_CHARACTERS
+            case "trame.state.update", [list(changes)]:
+                return all(map(self._is_change, changes))
+            case "trame.trigger", [str(name), list(given), {**more}]:
+                return not more and self._is_trigger(name, given)
+        return False
+
+    def _is_change(self, change: Any) -> bool:
+        """Return whether the page may give a state variable this value."""
+        match change:
+            case {"key": str(key), "value": value, **more} if key in self._settable and not more:
+                return self._settable[key](value)
+        return False
+
+    def _is_trigger(self, name: str, given: list[Any]) -> bool:
         """Return whether a function that the page may call exists and takes arguments of these types."""
-        if not list_of(text(60), lambda given: isinstance(given, list), one_of({}))(args):
-            return False
-        name, given, _ = args
         called = self._server.controller.trigger_fn(name)
         if called is None:
             return False
@@ -245,23 +229,9 @@ class MessageFilter:
         arguments = signature.bind(*given).arguments  # raises TypeError for another number of arguments
         return all(ARGUMENTS[signature.parameters[k].annotation](value) for k, value in arguments.items())
 
-    @staticmethod
-    def _change(settable: Mapping[str, Check]) -> Check:
-        shape = record({"key": text(60), "value": lambda _: True})
-        return lambda change: shape(change) and change["key"] in settable and settable[change["key"]](change["value"])
-
-
-def _unpacked(message: bytes) -> Any:
-    """Decode a message in one part. Raises :class:`ValueError` for a message in several parts."""
-    start, length = (int.from_bytes(message[k : k + 4], "little") for k in (4, 8))
-    if (start, length) != (0, len(message) - HEADER_BYTES):
-        raise ValueError("received a part of a message; expected the complete message")
-    return msgpack.unpackb(message[HEADER_BYTES:])
-
 
 def finite(given: str) -> float:
     """Return the typed text as a number, clipped to ±:data:`LARGEST`. Raises :class:`ValueError` for other text."""
-
     value = float(given or 0.0)
     if math.isnan(value):
         raise ValueError(given)
@@ -287,11 +257,6 @@ def first_page(path: Path) -> str:
     page = page.replace("<title>", f'<script src="{ROUTE}/socket.js"></script><title>')
     return re.sub(r'<div id="app"></div>\s*<script>.*?</script>', '<div id="app">opening the inspector …</div>', page,
                   flags=re.DOTALL)  # fmt: skip
-
-
-def read_template() -> str:
-    """Return the page's template."""
-    return (FOLDER / "page.html").read_text(encoding="utf-8")
 
 
 def use_page(server: Any, template: str, downloads: str) -> None:
@@ -410,7 +375,7 @@ class Tabs:
 
     async def open(self, request: web.Request) -> web.WebSocketResponse:
         """Serve a tab until it is closed. Refuse pages of other sites and clients that send no ``Origin`` header."""
-        from aiohttp import web
+        from aiohttp import WSMsgType, web
 
         if request.headers.get("Origin", "").lower() != f"{request.scheme}://{request.host}".lower():
             raise web.HTTPForbidden(text="Not allowed: the WebSocket is for this server's own pages.")
@@ -421,7 +386,12 @@ class Tabs:
         self._sockets.add(socket)
         try:
             await socket.prepare(request)
-            await self._converse(socket, build)
+            async with _connection(build, self.folders, socket) as (server, connection):
+                message_filter = MessageFilter(server, self._settable)
+                self._servers.add(server)
+                async for message in socket:
+                    if message.type is WSMsgType.BINARY and message_filter.passes(message.data):
+                        await connection.send(True, message)
         finally:
             self._sockets.discard(socket)
             self._clean_up_later(CLEANUP_S)
@@ -434,16 +404,6 @@ class Tabs:
         if self._cleanup is not None:
             self._cleanup.cancel()
         await asyncio.gather(*(socket.close(code=WSCloseCode.GOING_AWAY) for socket in [*self._sockets]))
-
-    async def _converse(self, socket: web.WebSocketResponse, build: Session) -> None:
-        from aiohttp import WSMsgType
-
-        async with _connection(build, self.folders, socket) as (server, connection):
-            message_filter = MessageFilter(server, self._settable)
-            self._servers.add(server)
-            async for message in socket:
-                if message.type is WSMsgType.BINARY and message_filter.passes(message.data):
-                    await connection.send(True, message)
 
     def _clean_up_later(self, wait_s: float) -> None:
         if self._cleanup is not None:
@@ -486,24 +446,18 @@ def _application(tabs: Tabs, token: str, names: HostNames, heard: set[Any]) -> w
             response.headers.update(HEADERS)
         return response
 
+    async def answer(request: web.Request) -> web.StreamResponse:
+        # The page asks for its files and for its WebSocket below its own path, which begins with the token. A cookie
+        # would not do: browsers withhold cookies from a frame inside a page of another site, such as a notebook's.
+        given, slash, path = request.path[1:].partition("/")
+        if not slash or not secrets.compare_digest(given.encode(errors="surrogatepass"), token.encode()):
+            raise web.HTTPForbidden(text="Not allowed: open the URL that was printed when this server was started.")
+        return await tabs.open(request) if path == "ws" else _file(tabs.folders, f"/{path}")
+
     application = web.Application(middlewares=[guard], client_max_size=MOST_BYTES)
-    application.add_routes([web.get("/{path:.*}", partial(_answer, tabs, token))])
+    application.add_routes([web.get("/{path:.*}", answer)])
     application.on_shutdown.append(tabs.close)
     return application
-
-
-async def _answer(tabs: Tabs, token: str, request: web.Request) -> web.StreamResponse:
-    """Answer a request whose path begins with the token.
-
-    The page asks for its files and for its WebSocket below its own path. A cookie would not do: browsers withhold
-    cookies from a frame inside a page of another site, such as a notebook's.
-    """
-    from aiohttp import web
-
-    given, slash, path = request.path[1:].partition("/")
-    if not slash or not secrets.compare_digest(given.encode(errors="surrogatepass"), token.encode()):
-        raise web.HTTPForbidden(text="Not allowed: open the URL that was printed when this server was started.")
-    return await tabs.open(request) if path == "ws" else _file(tabs.folders, f"/{path}")
 
 
 def _file(folders: dict[str, Path], path: str) -> web.StreamResponse:
@@ -544,7 +498,8 @@ async def _connection(
             folders[f"/{route.strip('/')}/"] = Path(source if isinstance(source, str) else source[0]).resolve()
         stack.callback(folders.pop, f"/{server.name}/", None)
         await server.ready
-        server.controller.on_error.add(_log_report)
+        # %r escapes control characters
+        server.controller.on_error.add(partial(logging.getLogger(__name__).error, "the page reports %.1000r"))
 
         async def send(_: bool, content: bytes) -> None:
             with suppress(ConnectionResetError):
@@ -554,10 +509,6 @@ async def _connection(
         connection.on_message(send)
         stack.push_async_callback(connection.close)
         yield server, connection
-
-
-def _log_report(message: str) -> None:
-    logging.getLogger(__name__).error("the page reports %.1000r", message)  # %r escapes control characters
 
 
 def _build(build: Session) -> tuple[Any, Closing]:

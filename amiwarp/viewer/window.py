@@ -16,25 +16,13 @@ from numpy.typing import NDArray
 from amiwarp.choices import Axis, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
+from amiwarp.imaging.export import save_png
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.io.files import interrupts_later
 from amiwarp.optics.models import MODELS
 from amiwarp.tasks import no_garbage_collection
-from amiwarp.viewer import jobs, layout
-from amiwarp.viewer.drawing import (
-    BACKGROUND_AND_INK,
-    ORBIT_COLOUR,
-    OWN_RENDERERS,
-    Look,
-    Scene,
-    caption,
-    cloud_titles,
-    event_text,
-    font,
-    orbit_lines,
-    shown_lines,
-    text_actor,
-)
+from amiwarp.viewer import drawing, jobs, layout
+from amiwarp.viewer.drawing import Look, Scene
 from amiwarp.viewer.inspector import SLIDING, DisplayedWindow, Inspector, colours_on_offer
 
 SIZE = (1500, 950)
@@ -55,19 +43,17 @@ IDLE_S, FOLLOW_S = 0.005, 0.25
 """Interval between two looks for input, and between two pictures of a live stream [s]."""
 COLUMN_LETTERS = 34
 """Length of the lines of text above the sliders [characters]."""
-HELP_PLACE = (0.35, 0.48, 0.72, 0.97)
-"""Left, bottom, right and top of the help, in shares of the window's size."""
+HELP_PLACE, STATISTICS_PLACE = (0.35, 0.48, 0.72, 0.97), (0.735, 0.0, 1.0, 0.25)
+"""Left, bottom, right and top of help and statistics, in shares of the window's size."""
 VTK_FONT_FILE = 4
 """Number by which VTK knows that a text has a font of a file."""
-STATISTICS_PLACE = (0.735, 0.0, 1.0, 0.25)
-"""Left, bottom, right and top of the statistics, in shares of the window's size."""
 HELP_PAPER = {False: "#f0f0ea", True: "#24282e"}
 """Background of help and statistics, for light (False) and dark (True) mode."""
 LEGEND_SHARE = 0.5
 """Height of the space for the legend above the curves of a chart, as a share of their height."""
 INTERVAL_CURVES = ((OFF_COLOUR, 2.0, "intervals"), (ON_COLOUR, 2.0, "median"))
 """Colour, width and name of the histogram of intervals, and of the line at their median."""
-MARKS = ((ORBIT_COLOUR, 5.0, "truth"), (ON_COLOUR, 2.0, "now"))
+MARKS = ((drawing.ORBIT_COLOUR, 5.0, "truth"), (ON_COLOUR, 2.0, "now"))
 """Colour, width and name of the lines that mark values on a sharpness curve."""
 ORBIT_CURVES = ((ON_COLOUR, 2.0, "in x"), (OFF_COLOUR, 2.0, "in y"))
 """Colour, width and name of the curves of a scene point's displacement."""
@@ -85,10 +71,10 @@ X_KEYS = {
 MORE_KEYS = (
     ("Up", ("nudge", 1), "the parameter moved last: up by a step"),
     ("Down", ("nudge", -1), "the parameter moved last: down by a step"),
-    ("Tab", ("choose_next",), "choose the next parameter for these keys and the curve"),
-    ("m", ("next_model",), "next optical model"),
-    ("k", ("next_colour",), "next quantity shown by colour"),
-    ("n", ("next_polarity",), "ON, OFF or both"),
+    ("Tab", ("choose_next", "knob"), "choose the next parameter for these keys and the curve"),
+    ("m", ("choose_next", "model"), "next optical model"),
+    ("k", ("choose_next", "colour"), "next quantity shown by colour"),
+    ("n", ("choose_next", "polarity"), "ON, OFF or both"),
     ("i", ("toggle", "statistics_shown"), "statistics of the selected events of the region: show or hide"),
     ("v", ("take_truth",), "take the known true parameters of a simulation"),
     ("+", ("resize_points", 1.0), "larger points"),
@@ -127,7 +113,7 @@ class Window(layout.Actions):
         self.sliders: dict[str, Any] = {}
         """Slider widgets by the name of their value."""
         self.plotter = self.scene.plotter
-        self._controls, self._charts, self._help, self._statistics = list(self.plotter.renderers)[OWN_RENDERERS:]
+        self._controls, self._charts, self._help, self._statistics = list(self.plotter.renderers)[-4:]
         self._wanted: set[str] = set()
         self.time_window = inspector.window or inspector.first_window()
         self._change, self._progress, self._film_ends = "", False, False
@@ -143,7 +129,7 @@ class Window(layout.Actions):
         self.curves: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         """Values and sharpness of the curves by parameter, in the units of the sliders."""
         self._stream: list[str] = []
-        self._texts = [text_actor("", "black", (0.05, top)) for top in (0.985, 0.97, 0.26, 0.97)]
+        self._texts = [drawing.text_actor("", "black", (0.05, top)) for top in (0.985, 0.97, 0.26, 0.97)]
         self._listen()
         self._start()
 
@@ -155,18 +141,14 @@ class Window(layout.Actions):
         """Follow the user until the window is closed or the command is interrupted."""
         with contextlib.suppress(KeyboardInterrupt), contextlib.closing(self.scene):
             while not (self.closed or self.plotter.iren.interactor.GetDone()):
-                with (
-                    interrupts_later() as self._interrupts
-                ):  # VTK ends the process if an exception leaves one of its callbacks
+                # VTK ends the process if an exception leaves one of its callbacks
+                with interrupts_later() as self._interrupts:
                     if not self.turn():
                         time.sleep(IDLE_S)
 
+    @no_garbage_collection()  # by a helper thread, which would end VTK's objects while this thread draws
     def turn(self) -> bool:
         """Handle the input so far, and draw if something has changed; return whether there was something to do."""
-        with no_garbage_collection():  # by a helper thread, which would end VTK's objects while this thread draws
-            return self._turn()
-
-    def _turn(self) -> bool:
         interactor = self.plotter.iren.interactor
         interactor.EnableRenderOff()  # VTK would draw after each of many mouse moves
         interactor.ProcessEvents()
@@ -195,7 +177,10 @@ class Window(layout.Actions):
                 if not self.plays:
                     self.remember("")  # what came before an undo can be redone
                 if (state := self.travelled()) is not None:
-                    self._apply(state)
+                    layout.apply_state(inspector, state)
+                    self.b, self.view = state.against, state.view
+                    self.look = replace(self.look, axis=state.axis, colour=state.colour, overlaid=state.overlaid)
+                    self.scene.look_from(self.view, self._look)
             if "suggestion" in wanted:
                 jobs.estimate_phase(inspector)
                 region = inspector.suggest_region().region
@@ -230,6 +215,8 @@ class Window(layout.Actions):
 
     def slide(self, name: str, value: float) -> None:
         """Set a value, in the unit of its slider."""
+        if name not in self.sliders:  # PyVista also calls this while it makes a slider
+            return
         if name in FINE:
             if name == "start_ms":
                 self.move(self.inspector.recording.events.t_first + round(value * 1e3), change=name)
@@ -243,34 +230,24 @@ class Window(layout.Actions):
             self.inspector.set(knobs)
             self.request("knobs", change=name)
 
-    def _slid(self, name: str, value: float) -> None:
-        if name in self.sliders:  # PyVista also calls this while it makes a slider
-            self.slide(name, value)
-
     def nudge(self, steps: int) -> None:
         """Move the chosen parameter by steps of its slider."""
         _, _, (_, _, step), _ = layout.SLIDERS[self.knob]
         self.slide(self.knob, layout.knob_values(self.inspector)[self.knob] + steps * float(step))
 
-    def choose_next(self) -> None:
-        """Choose the next parameter for the keys and the sharpness curve."""
-        names = [name for name in self.sliders if name not in FINE]
-        self.knob = _following(names, self.knob)
-        self.request("look")
-
-    def next_model(self) -> None:
-        """Show the next optical model."""
-        knobs = self.inspector.knobs
-        self.inspector.set(replace(knobs, model=_following(list(MODELS), knobs.model)))
-        self.request("knobs")
-
-    def next_colour(self) -> None:
-        """Show the next quantity by colour."""
-        self.restyle(colour=_following(colours_on_offer(self.inspector.recording.truth), self.look.colour))
-
-    def next_polarity(self) -> None:
-        """Show only ON events, only OFF events, or both."""
-        self._select(polarity=_following([None, 1, 0], self.inspector.selection.polarity))
+    def choose_next(self, what: str) -> None:
+        """Choose the next parameter for the keys and the curve, or the next model, colour or polarity that is shown."""
+        inspector, knobs = self.inspector, self.inspector.knobs
+        if what == "knob":
+            self.knob = _following([name for name in self.sliders if name not in FINE], self.knob)
+            self.request("look")
+        elif what == "model":
+            inspector.set(replace(knobs, model=_following(list(MODELS), knobs.model)))
+            self.request("knobs")
+        elif what == "colour":
+            self.restyle(colour=_following(colours_on_offer(inspector.recording.truth), self.look.colour))
+        else:
+            self._select(polarity=_following([None, 1, 0], inspector.selection.polarity))
 
     def resize_points(self, px: float) -> None:
         """Make the points larger."""
@@ -301,7 +278,7 @@ class Window(layout.Actions):
     def pick(self, place: tuple[int, int]) -> None:
         """Describe the event that is drawn at a place, and show its orbit. ``place``: pixels from left and bottom."""
         self._picked = self.scene.event_at(place, self.shown, self._look)
-        self.message = "" if self._picked < 0 else event_text(self.shown, self._picked)
+        self.message = "" if self._picked < 0 else drawing.event_text(self.shown, self._picked)
         self.request("look")
 
     def whole(self) -> None:
@@ -349,20 +326,12 @@ class Window(layout.Actions):
         self._progress = False
         self.request("look")
 
-    def accept(self) -> None:
-        """Set the parameters to the result of the calibration."""
-        if self.found is not None:
-            with self.errors_shown("window"):
-                self.inspector.accept(self.found)
-            self.found = None
-            self.request("knobs")
-
     def export(self, what: str) -> None:
         """Save the calibration, or a picture of the window, under a new name in the current folder."""
         path = self._new_name(what)
         with self.errors_shown("window"):
             if what == "picture":
-                self.scene.save(path)
+                save_png(path, self.scene.picture())
             else:
                 self.inspector.as_calibration().save(path)
             self.message = f"saved {path}"
@@ -378,33 +347,18 @@ class Window(layout.Actions):
     @property
     def _look(self) -> Look:
         against = "recorded" if self.b is None else "B"
-        return self.look.for_clouds(cloud_titles(self.inspector, against))
+        return self.look.for_clouds(drawing.cloud_titles(self.inspector, against))
 
     def say(self, text: str) -> None:
         """Show a message."""
         self.message = text
         self.request("look")
 
-    @contextlib.contextmanager
-    def errors_shown(self, what: str) -> Iterator[None]:
-        """Show errors of the enclosed code as a message."""
-        try:
-            yield
-        except (AmiwarpError, OSError) as error:
-            self.say(str(error))
-
     def _select(self, **changes: Any) -> None:
         inspector = self.inspector
         with self.errors_shown("window"):
             inspector.open(*self.time_window, replace(inspector.selection, **changes))
             self.request("knobs")
-
-    def _apply(self, state: layout.ViewState) -> None:
-        """Show a state of the history."""
-        layout.apply_state(self.inspector, state)
-        self.b, self.view = state.against, state.view
-        self.look = replace(self.look, axis=state.axis, colour=state.colour, overlaid=state.overlaid)
-        self.scene.look_from(self.view, self._look)
 
     def _play(self, now: float) -> None:
         """Move the window by the time since the last call, if the recording is played; or follow a live stream."""
@@ -489,10 +443,10 @@ class Window(layout.Actions):
     def _show(self) -> None:
         """Give what is to be shown to VTK."""
         shown, look = self.shown, self._look
-        lines = shown_lines(self.inspector, shown, look.axis, self.b, self._picked)
+        lines = drawing.shown_lines(self.inspector, shown, look.axis, self.b, self._picked)
         if self.compensates:
-            self._plot_orbit(*orbit_lines(self.inspector, shown, self._picked))
-        self.scene.show(shown, look, lines, caption(self.inspector, shown))
+            self._plot_orbit(*drawing.orbit_lines(self.inspector, shown, self._picked))
+        self.scene.show(shown, look, lines, drawing.caption(self.inspector, shown))
         for name in self.curves:
             self._plot_curve(name)
 
@@ -522,7 +476,7 @@ class Window(layout.Actions):
             shape.SetMaximumValue(high)
             shape.SetValue(values[name])
             shape.SetTitleText(self._slider_title(name, values[name]))
-            ink = ORBIT_COLOUR if name == self.knob else BACKGROUND_AND_INK[dark][1]
+            ink = drawing.ORBIT_COLOUR if name == self.knob else drawing.BACKGROUND_AND_INK[dark][1]
             for part in ("Title", "Slider", "Tube", "Cap"):
                 getattr(shape, f"Get{part}Property")().SetColor(pyvista.Color(ink).float_rgb)
         self._show_texts()
@@ -552,12 +506,12 @@ class Window(layout.Actions):
 
     def _make_sliders(self, names: tuple[str, ...]) -> None:
         self.plotter.clear_slider_widgets()
-        self.plotter.subplot(0, OWN_RENDERERS)
+        self.plotter.subplot(0, drawing.OWN_RENDERERS)
         self.sliders = {}
         for k, name in enumerate(names):
             y = 0.8 - 0.74 * k / max(len(names) - 1, 9)
             slider = self.plotter.add_slider_widget(
-                lambda value, name=name: self._slid(name, value), self._range(name), value=sum(self._range(name)) / 2,
+                lambda value, name=name: self.slide(name, value), self._range(name), value=sum(self._range(name)) / 2,
                 pointa=(0.05, y), pointb=(0.95, y), interaction_event="always", title_height=0.014, tube_width=0.003,
                 slider_width=0.02,
             )  # fmt: skip
@@ -566,14 +520,14 @@ class Window(layout.Actions):
             slider.GetRepresentation().SetEndCapWidth(0.01)
             title = slider.GetRepresentation().GetTitleProperty()
             title.SetFontFamily(VTK_FONT_FILE)
-            title.SetFontFile(str(font()))
+            title.SetFontFile(str(drawing.font()))
             title.BoldOff()
             title.ShadowOff()
             self.sliders[name] = slider
 
     def _make_charts(self) -> None:
         """Make the charts: sharpness over two parameters, displacement of a scene point in a turn, and intervals."""
-        ink = BACKGROUND_AND_INK[self.look.dark][1]
+        ink = drawing.BACKGROUND_AND_INK[self.look.dark][1]
         for renderer, (chart, _) in zip(self._chart_homes, self._plots.values(), strict=False):
             renderer.remove_chart(chart)
         self._charts.SetDraw(self.compensates)
@@ -592,7 +546,7 @@ class Window(layout.Actions):
         """Make the ``k``-th chart at a place (left, bottom, width, height); return it with its empty curves."""
         import pyvista
 
-        paper, ink = BACKGROUND_AND_INK[self.look.dark]
+        paper, ink = drawing.BACKGROUND_AND_INK[self.look.dark]
         paper = paper if k < 3 else HELP_PAPER[self.look.dark]
         chart = pyvista.Chart2D(size=place[2:], loc=place[:2], x_label=titles[0], y_label=titles[1], grid=False)
         chart.background_color, chart.border_color = paper, paper
@@ -651,7 +605,7 @@ class Window(layout.Actions):
 
     def _show_statistics(self) -> None:
         """Show the statistics of the selected events, as the page does."""
-        found, (chart, (line, mark)) = layout.statistics_state(self.inspector.statistics()), self._plots["intervals"]
+        found, (chart, (line, mark)) = self.inspector.statistics().state(), self._plots["intervals"]
         rows = [f"{name}:  {text}" for name, text in found["rows"]]
         self._texts[3].input = "\n".join(["Statistics of the selected events", *rows])
         x, y = found["x"] or [0.0, 6.0], found["y"] if found["x"] else [0.0, 0.0]
@@ -663,7 +617,7 @@ class Window(layout.Actions):
 
     def _show_texts(self) -> None:
         """Show what is missing, messages, and the help."""
-        paper, ink = BACKGROUND_AND_INK[self.look.dark]
+        paper, ink = drawing.BACKGROUND_AND_INK[self.look.dark]
         notes = [f"model {self.inspector.knobs.model}      h: help", "", self.message, *layout.notes(self.inspector)]
         notes, stream = ([line for text in texts for line in textwrap.wrap(text, COLUMN_LETTERS)]
                          for texts in (notes, self._stream))  # fmt: skip

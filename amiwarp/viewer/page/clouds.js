@@ -1,18 +1,18 @@
 // Component with the event clouds: draws the points in the browser, and lets the mouse and the keys turn them.
 
 import { Camera, MARGIN, VIEWS, seenPart } from './camera.js';
+import { act, drag, numbers, sizedCanvas } from './canvas.js';
 import { drawFrame } from './frame.js';
 import { GpuRaster } from './gpu.js';
 import { Raster, nearest } from './raster.js';
 
-const { onBeforeUnmount, onMounted, ref, watch } = window.Vue;
+const { computed, onMounted, watch } = window.Vue;
 const MOST_PIXELS = 3e6; // of the picture; a finer screen gets a coarser picture
 const HEIGHT = 0.75; // length of the third axis as a share of the width of the region
 const CLICK_PX = 3;
 const REACH_PX = 8;
 const GREY = 0xff909090;
 const ORBIT = '#009e73';
-const KEYS = { ArrowLeft: [-12, 0], ArrowRight: [12, 0], ArrowUp: [0, -12], ArrowDown: [0, 12] };
 
 // Return a function that returns what it made last, until something that it is made of changes.
 function memory() {
@@ -23,24 +23,6 @@ function memory() {
   };
 }
 
-// Return what draws points: a graphics card if there is one.
-function newRaster() {
-  try {
-    return new GpuRaster();
-  } catch {
-    return new Raster();
-  }
-}
-
-export function floats(bytes) {
-  if (!bytes || !bytes.byteLength) return new Float32Array(0);
-  return new Float32Array(bytes.slice().buffer);
-}
-
-function words(bytes) {
-  return bytes && bytes.byteLength ? new Uint32Array(bytes.slice().buffer) : new Uint32Array(0);
-}
-
 export const EventClouds = {
   props: {
     before: null, after: null, third: null, thirdBefore: null, coloursBefore: null, coloursAfter: null, orbit: null, column: null,
@@ -48,20 +30,26 @@ export const EventClouds = {
     dark: Boolean, picked: Number, slice: Array, beside: Boolean,
   },
   emits: ['pick', 'card'],
-  template: `<div class="clouds"><canvas ref="canvas" tabindex="0" role="img" :aria-label="label"></canvas></div>`,
+  template: `<div class="clouds"><canvas ref="canvas" tabindex="0" role="img" :aria-label="label" @pointerdown="pressed"
+    @contextmenu.prevent @keydown="typed" @wheel.prevent="wheeled"></canvas></div>`,
   setup(props, { emit }) {
-    const canvas = ref(null);
+    const canvas = sizedCanvas(() => (props.titles.length === 1 ? build() : draw()));
     const camera = new Camera();
-    const rasters = [newRaster(), newRaster()];
+    const rasters = [0, 1].map(() => { // a graphics card draws the points if there is one
+      try {
+        return new GpuRaster();
+      } catch {
+        return new Raster();
+      }
+    });
     const [pictures, places, colours] = [0, 1, 2].map(() => [memory(), memory()]);
     const scene = { places: [new Float32Array(0), new Float32Array(0)], colours: [], half: [1, 1, 1] };
-    const label = window.Vue.computed(() => {
+    const label = computed(() => {
       const names = props.titles.map(([, title]) => title).join(' and ');
       return `Event cloud${props.titles.length > 1 ? 's' : ''}, ${names}, over x, y and ${props.axis.title}. `
         + 'Drag or shift and arrow keys to turn, wheel or plus and minus to zoom.';
     });
     let waiting = false;
-    let observer;
 
     function build() {
       const [W, H] = [canvas.value.clientWidth, canvas.value.clientHeight];
@@ -69,15 +57,14 @@ export const EventClouds = {
       const frame = frameOf(props.box, props.axis, alone);
       const key = JSON.stringify([props.box, props.axis, frame.half]);
       scene.half = frame.half;
-      scene.places = [props.before, props.after].map(
-        (cloud, k) => {
-          const third = k ? props.third : props.thirdBefore;
-          return places[k](() => place(frame, floats(cloud), floats(third)), cloud, third, key);
-        },
+      scene.places = [[props.before, props.thirdBefore], [props.after, props.third]].map(
+        ([cloud, third], k) => places[k](() => place(frame, numbers(cloud), numbers(third)), cloud, third, key),
       );
-      scene.colours = [props.coloursBefore, props.coloursAfter].map((bytes, k) => colours[k](() => words(bytes), bytes));
-      const turns = floats(props.orbit).filter((_, k) => k % 3 === 2);
-      const xy = (bytes) => floats(bytes).filter((_, k) => k % 3 !== 2);
+      scene.colours = [props.coloursBefore, props.coloursAfter].map(
+        (bytes, k) => colours[k](() => numbers(bytes, Uint32Array), bytes),
+      );
+      const turns = numbers(props.orbit).filter((_, k) => k % 3 === 2);
+      const xy = (bytes) => numbers(bytes).filter((_, k) => k % 3 !== 2);
       scene.lines = [props.orbit, props.column].map((bytes) => place(frame, xy(bytes), turns));
       ask();
     }
@@ -171,10 +158,19 @@ export const EventClouds = {
       const [x0, y0, x1, y1] = clipOf(projection, pane);
       context.rect(x0, y0, x1 - x0, y1 - y0);
       context.clip();
-      for (const k of pane.clouds) line(context, scene.lines[k], projection);
+      const at = (places, k) => projection.at(places.subarray(3 * k, 3 * k + 3)).slice(0, 2);
+      for (const places of pane.clouds.map((k) => scene.lines[k])) {
+        context.beginPath();
+        for (let k = 0; k < places.length / 3; k++) context.lineTo(...at(places, k));
+        context.stroke();
+      }
       context.restore();
-      if (props.picked >= 0) {
-        for (const k of pane.clouds.filter((cloud) => cloud || !props.beside)) ring(context, scene.places[k], projection, ink);
+      context.strokeStyle = ink;
+      context.lineWidth = 2;
+      for (const k of props.picked >= 0 ? pane.clouds.filter((cloud) => cloud || !props.beside) : []) {
+        context.beginPath();
+        context.arc(...at(scene.places[k], props.picked), 7, 0, 2 * Math.PI);
+        context.stroke();
       }
       context.fillStyle = ink;
       context.font = `600 ${size + 1}px system-ui, sans-serif`;
@@ -191,40 +187,21 @@ export const EventClouds = {
       return [xs[0] - 2, ys[0] - 2, xs[1] + 3, ys[1] + 3];
     }
 
-    function line(context, places, projection) {
-      context.beginPath();
-      for (let i = 0; i < places.length; i += 3) context.lineTo(...projection.at(places.subarray(i, i + 3)).slice(0, 2));
-      context.stroke();
-    }
-
-    function ring(context, places, projection, ink) {
-      const [x, y] = projection.at(places.subarray(3 * props.picked, 3 * props.picked + 3));
-      context.strokeStyle = ink;
-      context.lineWidth = 2;
-      context.beginPath();
-      context.arc(x, y, 7, 0, 2 * Math.PI);
-      context.stroke();
-    }
-
-    function pick(x, y) {
-      const pane = paneAt(x, y);
-      const cloud = pane.clouds[pane.clouds.length - 1];
-      if (!cloud && props.beside) return; // events of another recording
-      const projection = projected(pane);
-      emit('pick', nearest(scene.places[cloud], projection, x - pane.left, y - pane.top, REACH_PX));
-    }
-
     function paneAt(x, y) {
       const all = panes();
       return all.find((each) => x < each.left + each.width && y < each.top + each.height) || all[0];
+    }
+
+    function placeOf(event) {
+      const box = canvas.value.getBoundingClientRect();
+      return [event.clientX - box.left, event.clientY - box.top];
     }
 
     function pressed(event) {
       const start = [event.clientX, event.clientY];
       let last = start;
       let moved = false;
-      canvas.value.setPointerCapture(event.pointerId);
-      canvas.value.onpointermove = (now) => {
+      drag(event, (now) => {
         const by = [now.clientX - last[0], now.clientY - last[1]];
         moved = moved || Math.hypot(now.clientX - start[0], now.clientY - start[1]) > CLICK_PX;
         if (!moved) return;
@@ -232,55 +209,45 @@ export const EventClouds = {
         if (event.button > 0 || event.shiftKey) camera.move(...by);
         else camera.turn(...by);
         ask();
-      };
-      canvas.value.onpointerup = canvas.value.onpointercancel = (end) => {
-        canvas.value.onpointermove = canvas.value.onpointerup = canvas.value.onpointercancel = null;
-        const box = canvas.value.getBoundingClientRect();
-        if (!moved && end.type === 'pointerup') pick(end.clientX - box.left, end.clientY - box.top);
-      };
+      }, (end) => {
+        const [x, y] = placeOf(end);
+        const pane = paneAt(x, y);
+        const cloud = pane.clouds.at(-1);
+        if (moved || end.type !== 'pointerup' || (!cloud && props.beside)) return; // events of another recording
+        emit('pick', nearest(scene.places[cloud], projected(pane), x - pane.left, y - pane.top, REACH_PX));
+      });
     }
 
     function wheeled(event) {
-      event.preventDefault();
-      const box = canvas.value.getBoundingClientRect();
-      const pane = paneAt(event.clientX - box.left, event.clientY - box.top);
-      const place = [
-        event.clientX - box.left - pane.left - pane.width / 2, event.clientY - box.top - pane.top - pane.height / 2,
-      ];
-      camera.scale(Math.exp(-0.0015 * event.deltaY), ...place);
+      const [x, y] = placeOf(event);
+      const pane = paneAt(x, y);
+      camera.scale(Math.exp(-0.0015 * event.deltaY), x - pane.left - pane.width / 2, y - pane.top - pane.height / 2);
       ask();
     }
 
     function typed(event) {
-      if (event.shiftKey && KEYS[event.key]) camera.turn(...KEYS[event.key]);
-      else if (event.key === '+') camera.scale(1.25);
-      else if (event.key === '-') camera.scale(0.8);
-      else return;
-      event.preventDefault();
-      event.stopPropagation();
+      const turn = (x, y) => () => camera.turn(12 * x, 12 * y);
+      act(event, {
+        '+': () => camera.scale(1.25), '-': () => camera.scale(0.8),
+        ...(event.shiftKey && { ArrowLeft: turn(-1, 0), ArrowRight: turn(1, 0), ArrowUp: turn(0, -1), ArrowDown: turn(0, 1) }),
+      });
       ask();
     }
 
     onMounted(() => {
-      observer = new window.ResizeObserver(() => (props.titles.length === 1 ? build() : ask()));
-      observer.observe(canvas.value);
-      canvas.value.addEventListener('pointerdown', pressed);
-      canvas.value.addEventListener('wheel', wheeled, { passive: false });
-      canvas.value.addEventListener('keydown', typed);
-      canvas.value.addEventListener('contextmenu', (event) => event.preventDefault());
       camera.look(props.view[0]);
       emit('card', rasters[0] instanceof GpuRaster);
       build();
     });
-    onBeforeUnmount(() => observer.disconnect());
-    const content = ['before', 'after', 'third', 'thirdBefore', 'coloursBefore', 'coloursAfter', 'box', 'axis', 'orbit', 'column', 'titles'];
+    const look = ['dot', 'opacity', 'overlaid', 'dark', 'picked', 'slice'];
+    const content = Object.keys(props).filter((name) => ![...look, 'view', 'beside'].includes(name));
     watch(content.map((name) => () => props[name]), build);
-    watch(['dot', 'opacity', 'overlaid', 'dark', 'picked', 'slice'].map((name) => () => props[name]), () => setTimeout(ask));
+    watch(look.map((name) => () => props[name]), () => setTimeout(ask));
     watch(() => props.view, ([view]) => {
       camera.look(view);
       ask();
     });
-    return { canvas, label };
+    return { canvas, label, pressed, typed, wheeled };
   },
 };
 

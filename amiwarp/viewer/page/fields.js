@@ -11,7 +11,7 @@ export const NumberField = {
   props: { value: [Number, String], low: { type: Number, default: -Infinity }, high: { type: Number, default: Infinity }, unit: { type: String, default: '' } },
   emits: ['typed'],
   template: `<span class="number"><input ref="box" type="number" step="any" v-bind="$attrs" :aria-invalid="!!wrong"
-    @input="typed" @change="done" @blur="left" @keydown.enter="box.blur()" @keydown.esc="forget"/>
+    @input="typed" @change="done" @blur="left" @keydown.enter="box.blur()" @keydown.esc="show(), box.blur()"/>
     <span v-if="wrong" class="wrong" role="alert">{{ wrong }}</span></span>`,
   setup(props, { emit }) {
     const box = ref(null);
@@ -43,17 +43,13 @@ export const NumberField = {
     function left() {
       if (state !== 'sent') show();
     }
-    function forget() {
-      show();
-      box.value.blur();
-    }
     onMounted(show);
     watch(() => props.value, () => {
       if (state === 'typing') return;
       wrong.value = '';
       show();
     });
-    return { box, wrong, typed, done, left, forget };
+    return { box, wrong, show, typed, done, left };
   },
 };
 

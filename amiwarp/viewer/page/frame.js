@@ -1,7 +1,7 @@
 // Box, ticks and titles around a cloud, drawn so that texts never cover each other.
 
 import { corners } from './camera.js';
-import { text, ticks } from './ticks.js';
+import { text, ticks } from './canvas.js';
 
 const TICK_PX = [40, 32]; // least distance between two ticks along a flat and an upright axis
 

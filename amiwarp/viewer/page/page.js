@@ -7,7 +7,7 @@ import { ColourBar, CostSurface, CurvePlot } from './plots.js';
 import { saveImages, savePicture } from './snapshot.js';
 import { RateTimeline } from './timeline.js';
 
-const { inject, nextTick, onBeforeUnmount, onMounted, ref, watch } = window.Vue;
+const { inject, onBeforeUnmount, onMounted, watch } = window.Vue;
 const FIELDS = 'input:not([type=range]):not([type=checkbox]):not([type=radio]), textarea, select';
 const LOOK = 'amiwarp-look';
 const RETRY_MS = 1500;
@@ -28,14 +28,13 @@ function download(name, content) {
 const PageFrame = {
   props: { address: String, lost: String, look: Object },
   emits: ['late'],
-  template: '<div ref="root"><slot/></div>',
+  template: `<div @click="released($event, 'button, summary, input[type=checkbox], input[type=radio]')"
+    @change="released($event, 'select')"><slot/></div>`,
   setup(props, { emit }) {
     const trame = inject('trame');
-    const root = ref(null);
-    let timer = 0;
-    let changed = 0;
+    const gone = new AbortController(); // ends the page's own listeners
+    let [retrying, changed, asking] = [0, 0, 0];
     let asked = 0; // time of the question that is not answered yet
-    let asking = 0;
 
     // Calls are answered in their order: an answer tells that the server has taken all changes before the question.
     function ask() {
@@ -68,28 +67,18 @@ const PageFrame = {
     }
 
     // The browser keeps how the page looks, where a frame of another site lets it.
-    function recall() {
+    function kept(look = null) {
       try {
-        for (const [name, value] of Object.entries(JSON.parse(window.localStorage.getItem(LOOK) || '{}'))) {
-          if (name in props.look && value !== props.look[name]) trame.state.set(name, value);
-        }
+        if (look) window.localStorage.setItem(LOOK, JSON.stringify(look));
+        return JSON.parse(window.localStorage.getItem(LOOK)) || {};
       } catch {
-        // no storage
+        return {}; // no storage
       }
     }
 
-    function keep(look) {
-      try {
-        window.localStorage.setItem(LOOK, JSON.stringify(look));
-      } catch {
-        // no storage
-      }
-    }
-
-    // After a click, the keys belong to the page again and not to the control that was clicked.
-    function released(event) {
-      const control = event.target.closest('button, select, summary, input[type=checkbox], input[type=radio]');
-      if (control && event.detail > 0 && !control.matches('select')) control.blur();
+    // After a click or a choice, the keys belong to the page again and not to the control.
+    function released(event, controls) {
+      if (event.type === 'change' || event.detail > 0) event.target.closest(controls)?.blur();
     }
 
     function restore() {
@@ -115,60 +104,38 @@ const PageFrame = {
       if (address) changed = window.setTimeout(() => window.history.replaceState(null, '', `#${address}`), ADDRESS_MS);
     });
     watch(() => props.lost, (lost) => {
-      window.clearInterval(timer);
-      if (lost) timer = window.setInterval(retry, RETRY_MS);
+      window.clearInterval(retrying);
+      if (lost) retrying = window.setInterval(retry, RETRY_MS);
     }, { immediate: true });
     onMounted(() => {
       asking = window.setInterval(ask, ASK_MS);
-      window.addEventListener('keydown', pressed);
-      window.addEventListener('hashchange', restore);
-      root.value.addEventListener('click', released);
-      root.value.addEventListener('change', (event) => event.target.matches('select') && event.target.blur());
+      window.addEventListener('keydown', pressed, gone);
+      window.addEventListener('hashchange', restore, gone);
       restore();
-      recall();
-      watch(() => JSON.stringify(props.look), () => keep(props.look));
+      for (const [name, value] of Object.entries(kept())) {
+        if (name in props.look && value !== props.look[name]) trame.state.set(name, value);
+      }
+      watch(() => JSON.stringify(props.look), () => kept(props.look));
     });
     onBeforeUnmount(() => {
-      window.removeEventListener('keydown', pressed);
-      window.removeEventListener('hashchange', restore);
-      window.clearInterval(timer);
-      window.clearInterval(asking);
-      window.clearTimeout(changed);
+      gone.abort();
+      [retrying, asking, changed].forEach((timer) => window.clearTimeout(timer));
     });
-    return { root };
+    return { released };
   },
 };
 
-// Dialog that takes the focus, and closes by its button, by Escape, or by the page's state.
+// Dialog that has the focus while it exists. It closes by its button, by Escape, or by a click outside.
 const PageDialog = {
-  props: { open: Boolean, title: String, name: String },
+  props: { title: String, name: String },
   emits: ['close'],
-  template: `<dialog ref="box" :id="name" :aria-label="title" @close="$emit('close')" @click.self="$emit('close')">
+  template: `<dialog @vue:mounted="({ el }) => el.showModal()" @vue:before-unmount="({ el }) => el.close()" :id="name"
+    :aria-label="title" @close="$emit('close')" @click.self="$emit('close')">
     <header><h2>{{ title }}</h2><button type="button" :id="name + '-close'" @click="$emit('close')">close</button></header>
     <slot/></dialog>`,
-  setup(props) {
-    const box = ref(null);
-    const follow = () => nextTick(() => {
-      if (props.open && !box.value.open) box.value.showModal();
-      else if (!props.open && box.value.open) box.value.close();
-    });
-    onMounted(follow);
-    watch(() => props.open, follow);
-    return { box };
-  },
 };
 
-window.amiwarp_page = {
-  install(app) {
-    app.component('EventClouds', EventClouds);
-    app.component('EventPicture', EventPicture);
-    app.component('RateTimeline', RateTimeline);
-    app.component('CurvePlot', CurvePlot);
-    app.component('CostSurface', CostSurface);
-    app.component('ColourBar', ColourBar);
-    app.component('KnobField', KnobField);
-    app.component('NumberField', NumberField);
-    app.component('PageFrame', PageFrame);
-    app.component('PageDialog', PageDialog);
-  },
+const COMPONENTS = {
+  EventClouds, EventPicture, RateTimeline, CurvePlot, CostSurface, ColourBar, KnobField, NumberField, PageFrame, PageDialog,
 };
+window.amiwarp_page = { install: (app) => Object.entries(COMPONENTS).forEach((each) => app.component(...each)) };

@@ -8,20 +8,16 @@ const BAR = 10;
 const LEAST_PX = 320; // width from which an image is not enlarged
 const FONT = '13px system-ui, sans-serif';
 
-function colours() {
-  const style = window.getComputedStyle(document.querySelector('.clouds canvas'));
-  return { ink: style.getPropertyValue('--ink').trim(), paper: style.getPropertyValue('--paper').trim() };
-}
-
 // Return a context of a new picture, filled with the background.
 function sheet(width, height, ratio = 1) {
+  const style = window.getComputedStyle(document.querySelector('.clouds canvas'));
   const canvas = Object.assign(document.createElement('canvas'), { width: Math.round(width * ratio), height: Math.round(height * ratio) });
   const context = canvas.getContext('2d');
-  context.fillStyle = colours().paper;
+  context.fillStyle = style.getPropertyValue('--paper');
   context.fillRect(0, 0, canvas.width, canvas.height);
   context.scale(ratio, ratio);
   context.font = FONT;
-  context.fillStyle = colours().ink;
+  context.fillStyle = style.getPropertyValue('--ink');
   return context;
 }
 
@@ -30,26 +26,19 @@ function bar(context, css, x, y, width) {
   const stops = css.match(/rgb\([^)]*\)/g) || [];
   const fill = context.createLinearGradient(x, 0, x + width, 0);
   stops.forEach((colour, k) => fill.addColorStop(k / (stops.length - 1), colour));
-  const before = context.fillStyle;
+  context.save();
   context.fillStyle = fill;
   context.fillRect(x, y, width, BAR);
-  context.fillStyle = before;
+  context.restore();
 }
 
 // Return the lines of texts that are at most as wide as the picture.
 function wrapped(context, texts, width) {
-  const lines = [];
-  for (const text of texts) {
-    let line = '';
-    for (const word of text.split(' ')) {
-      if (line && context.measureText(`${line} ${word}`).width > width) {
-        lines.push(line);
-        line = word;
-      } else line = line ? `${line} ${word}` : word;
-    }
-    lines.push(line);
-  }
-  return lines;
+  const add = (lines, word) => {
+    const longer = `${lines.at(-1)} ${word}`;
+    return context.measureText(longer).width > width ? [...lines, word] : [...lines.slice(0, -1), longer];
+  };
+  return texts.map((text) => text.split(' ')).flatMap(([first, ...words]) => words.reduce(add, [first]));
 }
 
 function save(context, name, download) {
