@@ -336,6 +336,13 @@ def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraR
     return CameraRotation((x, y, z), (a, b, c), middle_us)
 
 
+def given_lens(camera: Camera) -> dict[str, float]:
+    """Return the values of a camera's lens parameters (:data:`LENS`)."""
+    lens = camera.distortion
+    values = (camera.fx, camera.cx, camera.cy, lens.k1 if lens else 0.0, camera.fy / camera.fx)
+    return dict(zip(LENS, values, strict=True))
+
+
 def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
     """Return the camera with those of its lens parameters (:data:`LENS`) that ``values`` contain."""
     if values.keys().isdisjoint(LENS):
@@ -444,9 +451,8 @@ def widened(space: ParameterSpace, names: tuple[str, ...]) -> ParameterSpace:
 
     They start at their present values. Raises :class:`AmiwarpError` if one of them moves no event.
     """
-    camera, lens = space.camera, space.camera.distortion
-    given = {"focal_length": camera.fx, "center_x": camera.cx, "center_y": camera.cy, "k1": lens.k1 if lens else 0.0}
-    given["fy_over_fx"] = camera.fy / camera.fx
+    camera = space.camera
+    given = given_lens(camera)
     values = {**{n: given.get(n, 0.0) for n in names}, **space.start}
     half = {"focal_length": 0.6 * values.get("focal_length", 0.0), "k1": 0.5, "fy_over_fx": 0.3}
     half |= dict.fromkeys(("center_x", "center_y"), 0.2 * camera.width)

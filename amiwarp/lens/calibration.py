@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.calibration import prepare
 from amiwarp.calib.parameters import ParameterSpace, like_size, nominal
+from amiwarp.calib.photometric.consistency import COLUMNS, ROWS, TURN, displacements
 from amiwarp.calib.photometric.cost import Cost, Slopes
 from amiwarp.calib.photometric.stage import LARGEST_COST, Equations
 from amiwarp.calib.result import Calibration
@@ -476,10 +477,6 @@ INDEX_STEP, INDEX_STEPS, INDEX_ROUNDS = 0.1, 4, 2
 the comparison is repeated about its answer: the maps are biased to the index of their fit."""
 
 
-ROWS, COLUMNS, TURN = 7, 9, 12
-"""Numbers of rows and columns of pixels, and of angles of a turn, on which displacements are compared."""
-
-
 class JointPrism:
     """Photometric fit of one prism to the events of all poses."""
 
@@ -646,17 +643,9 @@ def _systematic(space: ParameterSpace, v: Vector, fit: Fit) -> Vector:
 
 
 def _displacements(space: ParameterSpace, camera: Camera, v: Vector) -> Vector:
-    """Return the displacements of a grid of pixels over a turn [px], without their means, flattened.
-
-    The mean of a pixel moves its picture, not its events against each other.
-    """
+    """Return :func:`displacements` by the prism at a search vector."""
     space = replace(space, camera=camera)
-    x, y = np.meshgrid(np.linspace(0, camera.width - 1, COLUMNS), np.linspace(0, camera.height - 1, ROWS))
-    xy, theta = np.stack([x.ravel(), y.ravel()], axis=1), np.linspace(0.0, math.tau, TURN, endpoint=False)
-    points, angles = np.repeat(xy, TURN, axis=0).astype(np.float32), np.tile(theta, len(xy)).astype(np.float32)
-    moved = space.build(space.to_values(v)).compensate_points(points, angles)
-    away = (np.asarray(moved, np.float64) - points).reshape(len(xy), TURN, 2)
-    return np.asarray((away - away.mean(axis=1, keepdims=True)).ravel())
+    return np.asarray(displacements([space.build(space.to_values(v))])[0])
 
 
 def _total(each: Sequence[Slopes]) -> Slopes:
