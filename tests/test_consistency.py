@@ -29,6 +29,7 @@ from amiwarp import (
     simulate,
     truth_model,
 )
+from amiwarp.calib import calibration
 from amiwarp.calib.parameters import ParameterSpace, make_space
 from amiwarp.calib.photometric import consistency, stage
 from amiwarp.calib.photometric.consistency import CAUSES, Consistency, Finding, LinearFit
@@ -116,6 +117,13 @@ def test_an_encoder_that_is_off_centre_is_corrected(wide: Recording, model: str,
     assert error_px(wide, found) < 0.02
     found.save(tmp_path / "calibration.json")
     assert Calibration.load(tmp_path / "calibration.json").harmonics == found.harmonics
+
+
+def test_an_accepted_answer_confirms_a_corrected_encoder(wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its cost may be that of other pairs: the last turn may no longer be whole at the corrected speed."""
+    assert wide.encoder is not None
+    monkeypatch.setattr(calibration, "LARGEST_STRAIGHT_COST_RATIO", 0.0)
+    assert calibrated(replace(wide, encoder=bent(wide.encoder))).harmonics is not None
 
 
 def test_an_error_that_cannot_be_corrected_is_refused(wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
