@@ -23,14 +23,18 @@ from amiwarp import (
     PrismMotion,
     RadialTangential,
     Recording,
+    SensorModel,
     calibrate,
     model_error,
     simulate,
     truth_model,
 )
-from amiwarp.calib.photometric import stage
+from amiwarp.calib import calibration
+from amiwarp.calib.parameters import ParameterSpace, make_space
+from amiwarp.calib.photometric import consistency, stage
 from amiwarp.calib.photometric.consistency import CAUSES, Consistency, Finding, LinearFit
 from amiwarp.calib.photometric.stage import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
+from amiwarp.studies.stability.cells import polygons
 
 CAMERA = Camera.from_fov(160, 120, math.radians(90.0))
 PRISM = Prism(math.radians(2.0))
@@ -113,6 +117,13 @@ def test_an_encoder_that_is_off_centre_is_corrected(wide: Recording, model: str,
     assert error_px(wide, found) < 0.02
     found.save(tmp_path / "calibration.json")
     assert Calibration.load(tmp_path / "calibration.json").harmonics == found.harmonics
+
+
+def test_an_accepted_answer_confirms_a_corrected_encoder(wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its cost may be that of other pairs: the last turn may no longer be whole at the corrected speed."""
+    assert wide.encoder is not None
+    monkeypatch.setattr(calibration, "LARGEST_STRAIGHT_COST_RATIO", 0.0)
+    assert calibrated(replace(wide, encoder=bent(wide.encoder))).harmonics is not None
 
 
 def test_an_error_that_cannot_be_corrected_is_refused(wide: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,6 +237,46 @@ def test_linear_fit() -> None:
     assert fit.fit(("size",)).gain < whole.gain
     half = fit.fit(("size", "phase", "other"), fit.xy[:, 0] < 50.0)
     assert half.covariance[0, 0] == pytest.approx(2.0 * whole.covariance[0, 0], rel=0.4)
+
+
+def seen(curvatures: dict[str, float]) -> tuple[ParameterSpace, np.ndarray, LinearFit]:
+    """Return a space, an answer, and a fit of independent columns with these curvatures at the answer."""
+    space = make_space(
+        "exact", CAMERA, PRISM, free=("apex", "phase"), start={}, bounds={}, rad_per_us=1e-4, duration_us=2e5
+    )
+    hessian = np.diag([*curvatures.values()])[None]
+    fit = LinearFit((*curvatures,), hessian, np.zeros((1, len(hessian[0]))), np.zeros((1, 2)), squares_sum=1.0)
+    return space, space.to_vector({"apex": PRISM.apex, "phase": 0.4}), fit
+
+
+def test_a_lens_that_the_events_do_not_tell_is_a_part_of_the_apex() -> None:
+    space, v, fit = seen({"apex": 1.0, "phase": 1.0, "focal_length": 1e-6})
+    std = space.deviations(v, consistency.lens_errors(space, v, fit, consistency.LEAST_GAIN))
+    assert 0.01 < std["apex"] / PRISM.apex < 0.03
+    assert std["phase"] < 0.002
+    space, v, fit = seen({"apex": 1.0, "phase": 1.0, "focal_length": 1e6})
+    told = space.deviations(v, consistency.lens_errors(space, v, fit, consistency.LEAST_GAIN))
+    assert told["apex"] < 0.01 * std["apex"]
+
+
+def test_errors_of_the_map_are_shared_by_all_pairs() -> None:
+    space, v, fit = seen({"apex": 400.0, "phase": 400.0})
+    coarse, fine = (space.deviations(v, consistency.map_errors(space, v, fit, 40_000, d)) for d in (1.0, 2.0))
+    px_per_rad = float(np.linalg.norm(v))
+    assert coarse["phase"] * px_per_rad == pytest.approx(consistency.MAP_ERROR["phase"] * 10.0, rel=1e-3)
+    assert coarse["phase"] == pytest.approx(4.0 * fine["phase"])
+    assert coarse["apex"] / PRISM.apex == pytest.approx(coarse["phase"] * 0.008 / 0.03, rel=1e-3)
+
+
+def test_the_phase_from_few_sharp_edges_is_as_good_as_stated() -> None:
+    """A map with one node per pixel makes it about one degree too large."""
+    picture = polygons(np.random.default_rng(0), 480, 360)
+    sensor = SensorModel(contrast_on=0.33, contrast_off=0.33, latency_us=0.0, refractory_us=0.0)
+    camera = Camera.from_fov(160, 120, math.radians(60.0))
+    recording = simulate(picture, camera, PRISM, duration_s=0.34, seed=0, sensor=sensor)
+    found = calibrated(recording)
+    assert abs(found.parameters["phase"]) < 2.0 * found.uncertainty["phase"]
+    assert found.uncertainty["phase"] < math.radians(1.5)
 
 
 def outcome(**values: Any) -> Consistency:

@@ -107,8 +107,9 @@ def calibrate(
 LEAST_BAD_SHARE = 0.01
 """Share of the events on hot or flickering pixels above which these pixels are masked."""
 LARGEST_STRAIGHT_COST_RATIO = 1.05
-"""Largest ratio of the photometric cost with a corrected encoder to that without. A small error of the encoder changes
-the cost by less than two maps of the same scene differ."""
+"""Largest ratio of the photometric cost with a corrected encoder to that without, if the corrected answer is not
+accepted with a low cost. A small error of the encoder changes the cost by less than two maps of the same scene differ,
+and than one turn of four does that is no longer whole at the corrected speed."""
 LEAST_LONGER = 1.5
 """Length of a recording from which on its ends can confirm the answer of its middle, as a multiple of the length of a
 calm span: they are half a turn apart then."""
@@ -267,7 +268,8 @@ class Calibrator:
         straight = replace(self.recording, encoder=encoder.with_harmonics(harmonics))
         calibrator = replace(self, recording=straight, harmonics=harmonics)
         again = calibrator.attempt()
-        if again.calibration is None or again.cost > LARGEST_STRAIGHT_COST_RATIO * tried.cost:
+        holds = again.accepted and again.cost <= stage.LARGEST_STILL_COST
+        if again.calibration is None or not (holds or again.cost <= LARGEST_STRAIGHT_COST_RATIO * tried.cost):
             return self, tried
         assert found is not None
         assert again.photometric is not None

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.camera import LENS, Camera, CameraRotation
+from amiwarp.optics.camera import LENS, Camera, CameraRotation, given_lens
 from amiwarp.optics.models import (
     MODELS,
     PHASE,
@@ -423,9 +423,8 @@ def widened(space: ParameterSpace, names: tuple[str, ...]) -> ParameterSpace:
 
     They start at their present values. Raises :class:`AmiwarpError` if one of them moves no event.
     """
-    camera, lens = space.camera, space.camera.distortion
-    given = {"focal_length": camera.fx, "center_x": camera.cx, "center_y": camera.cy, "k1": lens.k1 if lens else 0.0}
-    given["fy_over_fx"] = camera.fy / camera.fx
+    camera = space.camera
+    given = given_lens(camera)
     values = {**{n: given.get(n, 0.0) for n in names}, **space.start}
     half = {"focal_length": 0.6 * values.get("focal_length", 0.0), "k1": 0.5, "fy_over_fx": 0.3}
     half |= dict.fromkeys(("center_x", "center_y"), 0.2 * camera.width)

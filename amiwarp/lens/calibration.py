@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.calibration import prepare
 from amiwarp.calib.parameters import ParameterSpace, like_size, nominal
+from amiwarp.calib.photometric.consistency import displacements, over_a_turn
 from amiwarp.calib.photometric.cost import Cost, Slopes
 from amiwarp.calib.photometric.stage import LARGEST_COST, Equations
 from amiwarp.calib.result import Calibration
@@ -30,7 +31,7 @@ from amiwarp.lens.board import Board, Corners, opencv
 from amiwarp.lens.corner_fit import Fit, fit_lens, lens_values, match_corners, tilt_of, with_lens_values
 from amiwarp.lens.poses import Pose, still_poses
 from amiwarp.optics.camera import Camera, Fisheye
-from amiwarp.optics.models import ExactModel, Model, rms
+from amiwarp.optics.models import ExactModel, rms
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.tasks import Progress, silent
@@ -444,8 +445,8 @@ class LensWork:
 
     def _change(self, old: ExactModel, new: ExactModel) -> float:
         """Return the change of the compensation from one model to another [px rms]."""
-        xy = _places(self.inside)
-        return rms((_moved(new, xy) - _moved(old, xy)).reshape(-1, 2))
+        before, after = over_a_turn((old, new), _places(self.inside))
+        return rms((after - before).reshape(-1, 2))
 
     def _drop_unexplained(self, joint: JointPrism) -> list[str]:
         """Leave out the poses whose events the prism of all poses does not explain, and return their names."""
@@ -526,8 +527,8 @@ INDEX_STEP, INDEX_STEPS, INDEX_ROUNDS = 0.1, 4, 2
 the comparison is repeated about its answer: the maps are biased to the index of their fit."""
 
 
-PLACES, TURN = 63, 12
-"""Numbers of pixels, and of angles of a turn, on which displacements are compared."""
+PLACES = 63
+"""Number of pixels at which displacements are compared."""
 
 
 class JointPrism:
@@ -740,21 +741,9 @@ def _places(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
     return yx[np.linspace(0, len(yx) - 1, PLACES).astype(np.int64), ::-1]
 
 
-def _moved(model: Model, xy: NDArray[Any]) -> Vector:
-    """Return how a model moves pixels, shape (n, 2), over a turn [px], shape (n, TURN, 2)."""
-    theta = np.linspace(0.0, math.tau, TURN, endpoint=False)
-    points, angles = np.repeat(xy, TURN, axis=0).astype(np.float32), np.tile(theta, len(xy)).astype(np.float32)
-    moved = np.asarray(model.compensate_points(points, angles), np.float64) - points
-    return np.asarray(moved.reshape(len(xy), TURN, 2))
-
-
 def _displacements(space: ParameterSpace, camera: Camera, v: Vector, xy: NDArray[Any]) -> Vector:
-    """Return the displacements of pixels over a turn [px] without their means, flattened.
-
-    The mean of a pixel moves its picture, not its events against each other.
-    """
-    away = _moved(replace(space, camera=camera).build(space.to_values(v)), xy)
-    return np.asarray((away - away.mean(axis=1, keepdims=True)).ravel())
+    """Return :func:`displacements` of pixels by the prism at a search vector."""
+    return np.asarray(displacements([replace(space, camera=camera).build(space.to_values(v))], xy)[0])
 
 
 def _total(each: Sequence[Slopes]) -> Slopes:

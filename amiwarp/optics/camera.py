@@ -465,6 +465,13 @@ LENS = ("focal_length", "center_x", "center_y", "k1", "fy_over_fx")
 first radial coefficient of distortion, and fy / fx."""
 
 
+def given_lens(camera: Camera) -> dict[str, float]:
+    """Return the values of a camera's lens parameters (:data:`LENS`)."""
+    lens = camera.distortion
+    values = (camera.fx, camera.cx, camera.cy, lens.k1 if lens else 0.0, camera.fy / camera.fx)
+    return dict(zip(LENS, values, strict=True))
+
+
 def with_lens(camera: Camera, values: Mapping[str, float]) -> Camera:
     """Return the camera with those of its lens parameters (:data:`LENS`) that ``values`` contain."""
     if values.keys().isdisjoint(LENS):

@@ -8,7 +8,7 @@ residual each of a few likely causes would remove, were it free.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -22,8 +22,8 @@ from amiwarp.calib.photometric.cost import place_arguments, size_and_phase_direc
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.equations import by_shift, multiply
 from amiwarp.kernels.launch import launch
-from amiwarp.optics.camera import LENS, Camera, CameraRotation
-from amiwarp.optics.models import Model, predicted_error
+from amiwarp.optics.camera import LENS, Camera, CameraRotation, given_lens
+from amiwarp.optics.models import Model, compensate_by_each, predicted_error, rms
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 
 if TYPE_CHECKING:
@@ -310,11 +310,20 @@ NOTABLE_PX = 0.025
 GAP_SHARE, LEAST_STD_PX = 0.5, 0.002
 """Systematic standard deviation of the answer: a share of the difference between the answers of pairs with long and
 with short gaps, and a least value [px]. Measured on recordings with known truth."""
-COARSE_STD_PX = 0.01
-"""The least value for a map with one node per pixel, where bilinear look-ups do not follow the scene within an orbit of
-one or two pixels [px]."""
+MAP_ERROR = {"size": 0.008, "phase": 0.03}
+"""Standard deviation of the errors of brightness that all pairs share because the map is interpolated linearly between
+nodes [thresholds], as far as they change size and phase. It holds for nodes 1 px apart, and grows with the square of
+their distance. Edges in a map are too soft, so that an ON event and the OFF event after it seem further apart: 68 of 73
+phases came out too large, by 0.017 thresholds in the median for nodes 1 px apart, and by 0.036 at most in 95 %."""
+LENS_DOUBT = 0.01
+"""Standard deviation of a given lens: what moves points at the border of the image by this share of their distance from
+its middle. Focusing from far to 100 focal lengths changes a focal length by as much."""
 DOUBT = 2.0
 """Factor of the standard deviation that a doubtful lens adds: a linearised fit finds too small changes."""
+ROWS, COLUMNS, TURN = 7, 9, 12
+"""Numbers of rows and columns of pixels, and of angles of a turn, on which displacements are compared."""
+FOLLOW_PX = 0.05
+"""Step of the parameters for that comparison [px]."""
 REGIONS = (3, 2)
 """Number of columns and rows of the parts of the image whose answers are compared."""
 FEWEST_SQUARES = 4
@@ -437,9 +446,9 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         fit = linear_fit(cost, columns)
         findings = _findings(cost, best, fit, causes, LEAST_GAIN)
         shake_px = _shake(space, fit)
-    systematic = _systematic(space, fit, COARSE_STD_PX if cost.brightness.tiles.density <= 1.0 else LEAST_STD_PX)
-    if doubtful:
-        systematic = systematic + _doubt(space, fit, causes)
+    brightness = cost.brightness
+    systematic = _systematic(space, fit) + map_errors(space, best, fit, brightness.count, brightness.tiles.density)
+    systematic += lens_errors(space, best, fit, least_gain) + (_doubt(space, fit, causes) if doubtful else 0.0)
     return Consistency(
         step=fit.fit(space.names).change, systematic=systematic, findings=tuple(findings),
         drift=_drift(space, best, fit), spread=_spread(space, best, fit),
@@ -468,15 +477,82 @@ def _orbit(space: ParameterSpace) -> list[str]:
     return [n for n in space.names if n in (space.size_name, "phase")]
 
 
-def _systematic(space: ParameterSpace, fit: LinearFit, least_px: float) -> Vector:
+def _systematic(space: ParameterSpace, fit: LinearFit) -> Vector:
     """Return the covariance of errors that pairs with long and with short gaps do not share [px²]."""
     names = _orbit(space)
     which = [space.names.index(n) for n in names]
     change = np.zeros(len(space.names))
     change[which] = fit.fit((*space.names, *(f"long {n}" for n in names))).change[len(space.names) :]
     least = np.zeros(len(change))
-    least[which] = least_px**2
+    least[which] = LEAST_STD_PX**2
     return np.asarray(GAP_SHARE**2 * np.outer(change, change) + np.diag(least))
+
+
+def map_errors(space: ParameterSpace, best: Vector, fit: LinearFit, pairs: int, density: float) -> Vector:
+    """Return the covariance of errors that the map's interpolation between nodes causes [px²].
+
+    An error of brightness that all pairs share moves the answer by at most its size times the root of their number, in
+    standard deviations for independent errors of one threshold.
+    """
+    along = np.array(size_and_phase_directions(space, best)).reshape(-1, len(best))
+    error = np.array([MAP_ERROR["phase" if n == "phase" else "size"] / density**2 for n in _orbit(space)])
+    variances = error**2 * pairs * np.einsum("ki,ij,kj->k", along, fit.fit(space.names).inverse, along)
+    return np.asarray(along.T * variances @ along)
+
+
+def lens_errors(space: ParameterSpace, best: Vector, fit: LinearFit, least_gain: float) -> Vector:
+    """Return the covariance of size and phase [px²] by errors of the given lens that the check cannot see.
+
+    The events tell the displacements. Which apex these mean depends on the lens. Its errors are those of
+    :data:`LENS_DOUBT`, up to the size that would be found.
+    """
+    n, camera, values = len(best), space.camera, space.to_values(best)
+    covariance, names = np.zeros((n, n)), [name for name in LENS if name not in space.names]
+    if space.model != "exact" or not space.cartesian or not names:
+        return covariance
+    scale = {"focal_length": camera.fx, "k1": (2.0 * camera.fx / camera.width) ** 2, "fy_over_fx": 1.0}
+    given = {**given_lens(camera), **values}
+    doubts = [{**values, n: given[n] + LENS_DOUBT * scale.get(n, 0.5 * camera.width)} for n in names]
+    steps = [space.to_values(best + FOLLOW_PX * unit) for unit in np.eye(n)]
+    at, *ends = displacements([space.build(each) for each in (values, *steps, *doubts)])
+    moved = np.stack(ends, axis=1) - at[:, None]
+    moved = moved[np.isfinite(moved).all(axis=1)]
+    told = np.full(len(names), math.inf)
+    for k, name in enumerate(names):
+        if name in fit.names:
+            found = least_gain * fit.squares_sum * float(fit.fit((*space.names, name)).inverse[-1, -1])
+            told[k] = DOUBT * math.sqrt(found) / max(rms(moved[:, n + k].reshape(-1, 2)), 1e-9)
+    # a lens parameter that was not tested looks like a wrong scale
+    told = np.where(np.isinf(told) & (names[0] == "focal_length"), told[0], told)
+    lens = moved[:, n:] * np.minimum(told, 1.0)
+    follows = FOLLOW_PX * np.linalg.lstsq(moved[:, :n], lens, rcond=None)[0]
+    which = [space.names.index(name) for name in _orbit(space)]
+    covariance[np.ix_(which, which)] = follows[which] @ follows[which].T
+    return covariance
+
+
+def over_a_turn(models: Sequence[Model], xy: NDArray[Any]) -> Vector:
+    """Return where each of several models of one image moves pixels, shape (n, 2), over a turn [px].
+
+    The result has the shape (models, n, TURN, 2).
+    """
+    theta = np.linspace(0.0, math.tau, TURN, endpoint=False)
+    points, angles = np.repeat(xy, TURN, axis=0).astype(np.float32), np.tile(theta, len(xy))
+    return np.asarray(compensate_by_each(models, points, angles).reshape(len(models), len(xy), TURN, 2))
+
+
+def displacements(models: Sequence[Model], xy: NDArray[Any] | None = None) -> Vector:
+    """Return the displacements of pixels over a turn by each of several models of one image [px].
+
+    The pixels ``xy`` have the shape (n, 2); without them a grid is used. The result has one row per model, without the
+    mean of each pixel: this moves the pixel's picture, not its events against each other.
+    """
+    if xy is None:
+        camera = models[0].camera
+        x, y = np.meshgrid(np.linspace(0, camera.width - 1, COLUMNS), np.linspace(0, camera.height - 1, ROWS))
+        xy = np.stack([x.ravel(), y.ravel()], axis=1)
+    away = over_a_turn(models, xy) - xy[:, None]
+    return np.asarray((away - away.mean(axis=2, keepdims=True)).reshape(len(models), -1))
 
 
 def _doubt(space: ParameterSpace, fit: LinearFit, causes: list[Cause]) -> Vector:
