@@ -83,11 +83,10 @@ CERTAIN, DOUBTFUL = 4.0, 1.5
 the index from which on a third of the poses let all of them be asked."""
 LARGEST_DEVIATION = {"index": 0.02, "tilt": math.radians(0.5)}
 """Standard deviation above which an index or a tilt [rad] counts as not determined."""
-SIZE_ERROR, SHAPE_ERROR = 0.08, 0.35
+SIZE_ERROR, SHAPE_ERROR = 0.08, 0.2
 """Standard deviations of errors of the orbits' size and of their shape that all poses share [px], times the cube of the
 orbits' radius at the centre of the image [px]. Maps are looked up bilinearly, which follows the picture less within a
-small orbit: indices came out too large, by 0.003 px of shape in orbits of 4.7 px, 0.012 to 0.018 px in 3 px, and less
-than 0.001 px in 6 px."""
+small orbit: orbits of 3 px came out 0.003 px too large; in orbits of 5.4 px, indices of 1.6 came out 0.01 too large."""
 REGIONS = (("upper", "middle", "lower"), ("left", "centre", "right"))
 """Names of the nine regions of the image in which corners are counted."""
 STEEP = math.radians(15.0)
