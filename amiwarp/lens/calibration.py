@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.calibration import prepare
 from amiwarp.calib.parameters import ParameterSpace, like_size, nominal
-from amiwarp.calib.photometric.consistency import displacements, over_a_turn
+from amiwarp.calib.photometric.consistency import FOLLOW_PX, displacements, over_a_turn
 from amiwarp.calib.photometric.cost import Cost, Slopes
 from amiwarp.calib.photometric.stage import LARGEST_COST, Equations
 from amiwarp.calib.result import Calibration
@@ -276,9 +276,10 @@ class LensWork:
         self._check_count(len(self.poses), "given")
         values = self._first_prism()
         everyone = [pose.name for pose in self.poses]
-        equations = self._equations(_some(everyone), values, 0)
+        first = _some(everyone)
+        equations = self._equations(first, values, 0)
         if len(equations) < LEAST_POSES:
-            equations |= self._equations([name for name in everyone if name not in _some(everyone)], values, 0)
+            equations |= self._equations([name for name in everyone if name not in first], values, 0)
         self._check_count(len(equations), "with enough events")
         joint = JointPrism(equations, self.full, values)
         shown, fit, seen = joint.model(self.camera, values), None, dict[str, Corners]()
@@ -685,23 +686,19 @@ class JointPrism:
         size = (fit.camera.height, fit.camera.width)
         xy = _places(np.ones(size, bool) if self.inside is None else self.inside)
 
-        def with_prism(k: int) -> Vector:
-            step = np.zeros(len(v))
-            step[k] = 0.05
-            return (_displacements(space, fit.camera, v + step, xy) - at) / 0.05
-
-        def with_lens(name: str) -> Vector:
-            step = max(fit.deviations[name], 1e-9)
-            moved = {name: lens_values(fit.camera, [name])[name] + step}
-            return (_displacements(space, with_lens_values(fit.camera, moved), v, xy) - at) / step
-
-        at = _displacements(space, fit.camera, v, xy)
-        prism = np.stack([with_prism(k) for k in range(len(v))], axis=1)
-        lens = np.stack([with_lens(name) for name in fit.names], axis=1)
+        values, given = space.to_values(v), lens_values(fit.camera, fit.names)
+        steps = {name: max(fit.deviations[name], 1e-9) for name in fit.names}
+        models = [space.build(space.to_values(v + FOLLOW_PX * unit)) for unit in np.eye(len(v))]
+        for name, step in steps.items():
+            lens_moved = with_lens_values(fit.camera, {name: given[name] + step})
+            models.append(replace(space, camera=lens_moved).build(values))
+        at, *ends = displacements([space.build(values), *models], xy)
+        prism = (np.stack(ends[: len(v)], axis=1) - at[:, None]) / FOLLOW_PX
+        lens = (np.stack(ends[len(v) :], axis=1) - at[:, None]) / np.array([*steps.values()])
         seen = np.isfinite(prism).all(axis=1) & np.isfinite(lens).all(axis=1)
         prism, follows = prism[seen], -np.linalg.lstsq(prism[seen], lens[seen], rcond=None)[0]
         middle = np.array([[fit.camera.cx, fit.camera.cy]])
-        cube = rms(_displacements(space, fit.camera, v, middle).reshape(-1, 2)) ** 3
+        cube = rms(displacements([space.build(values)], middle).reshape(-1, 2)) ** 3
         larger = np.zeros(len(v))
         larger[:2] = v[:2] / np.linalg.norm(v[:2]) if space.cartesian else (1.0, 0.0)
         by_size = SIZE_ERROR / cube / math.sqrt(2.0 * float(np.mean((prism @ larger) ** 2))) * larger
@@ -738,11 +735,6 @@ def _places(inside: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return :data:`PLACES` of the pixels that are marked in an image, evenly chosen, as x and y."""
     yx = np.argwhere(inside)
     return yx[np.linspace(0, len(yx) - 1, PLACES).astype(np.int64), ::-1]
-
-
-def _displacements(space: ParameterSpace, camera: Camera, v: Vector, xy: NDArray[Any]) -> Vector:
-    """Return :func:`displacements` of pixels by the prism at a search vector."""
-    return np.asarray(displacements([replace(space, camera=camera).build(space.to_values(v))], xy)[0])
 
 
 def _total(each: Sequence[Slopes]) -> Slopes:

@@ -512,19 +512,20 @@ def lens_errors(space: ParameterSpace, best: Vector, fit: LinearFit, least_gain:
         return covariance
     scale = {"focal_length": camera.fx, "k1": (2.0 * camera.fx / camera.width) ** 2, "fy_over_fx": 1.0}
     given = {**given_lens(camera), **values}
-    doubts = [{**values, n: given[n] + LENS_DOUBT * scale.get(n, 0.5 * camera.width)} for n in names]
+    doubts = [{**values, name: given[name] + LENS_DOUBT * scale.get(name, 0.5 * camera.width)} for name in names]
     steps = [space.to_values(best + FOLLOW_PX * unit) for unit in np.eye(n)]
     at, *ends = displacements([space.build(each) for each in (values, *steps, *doubts)])
     moved = np.stack(ends, axis=1) - at[:, None]
     moved = moved[np.isfinite(moved).all(axis=1)]
-    told = np.full(len(names), math.inf)
+    unseen = np.full(len(names), math.inf)  # largest error that the check would not find, in those of the lens
     for k, name in enumerate(names):
         if name in fit.names:
             found = least_gain * fit.squares_sum * float(fit.fit((*space.names, name)).inverse[-1, -1])
-            told[k] = DOUBT * math.sqrt(found) / max(rms(moved[:, n + k].reshape(-1, 2)), 1e-9)
+            unseen[k] = DOUBT * math.sqrt(found) / max(rms(moved[:, n + k].reshape(-1, 2)), 1e-9)
     # a lens parameter that was not tested looks like a wrong scale
-    told = np.where(np.isinf(told) & (names[0] == "focal_length"), told[0], told)
-    lens = moved[:, n:] * np.minimum(told, 1.0)
+    if names[0] == "focal_length":
+        unseen[np.isinf(unseen)] = unseen[0]
+    lens = moved[:, n:] * np.minimum(unseen, 1.0)
     follows = FOLLOW_PX * np.linalg.lstsq(moved[:, :n], lens, rcond=None)[0]
     which = [space.names.index(name) for name in _orbit(space)]
     covariance[np.ix_(which, which)] = follows[which] @ follows[which].T
