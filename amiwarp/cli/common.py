@@ -39,22 +39,23 @@ Topic = Annotated[
 ]
 """Option that chooses among several streams of events."""
 
+# Options in a panel of the help.
 _in_common = partial(typer.Option, rich_help_panel="Common")
-_in_camera = partial(typer.Option, rich_help_panel="Camera")
-_in_prism = partial(typer.Option, rich_help_panel="Prism")
-_in_log = partial(typer.Option, rich_help_panel="Encoder")
+in_camera = partial(typer.Option, rich_help_panel="Camera")
+in_prism = partial(typer.Option, rich_help_panel="Prism")
+in_encoder = partial(typer.Option, rich_help_panel="Encoder")
 
 
 @dataclass(frozen=True)
 class CameraOptions:
     """Options for the camera. They override the camera in the recording."""
 
-    fov_deg: Annotated[float | None, _in_camera(help="Horizontal field of view of an ideal pinhole camera (deg).")] = (
+    fov_deg: Annotated[float | None, in_camera(help="Horizontal field of view of an ideal pinhole camera (deg).")] = (
         None
     )
     camera: Annotated[
         Path | None,
-        _in_camera(
+        in_camera(
             help="Camera intrinsics: JSON (width, height, fx, fy, cx, cy, distortion), a calibration file, YAML of ROS "
             "or Kalibr, or calib.txt (fx fy cx cy k1 k2 p1 p2 k3)."
         ),
@@ -83,9 +84,9 @@ class CameraOptions:
 class NominalPrismOptions:
     """Options for the prism as its data sheet describes it."""
 
-    nominal_apex_deg: Annotated[float | None, _in_prism(help="Apex angle from the prism's data sheet (deg).")] = None
-    index: Annotated[float | None, _in_prism(help="Refractive index of the prism.")] = None
-    flat_side: Annotated[FlatSide | None, _in_prism(help="Direction that the prism's flat face points to.")] = None
+    nominal_apex_deg: Annotated[float | None, in_prism(help="Apex angle from the prism's data sheet (deg).")] = None
+    index: Annotated[float | None, in_prism(help="Refractive index of the prism.")] = None
+    flat_side: Annotated[FlatSide | None, in_prism(help="Direction that the prism's flat face points to.")] = None
 
     def build(self, known: NominalPrism | None) -> NominalPrism | None:
         """Return the nominal prism ``known`` with the values that options give; None if neither exists.
@@ -117,27 +118,29 @@ class EncoderOptions:
 
     encoder: Annotated[
         Path | None,
-        _in_log(help="Encoder log: CSV with the header t_us,angle_deg or t_us,count, and optionally index (0 or 1)."),
+        in_encoder(
+            help="Encoder log: CSV with the header t_us,angle_deg or t_us,count, and optionally index (0 or 1)."
+        ),
     ] = None
     encoder_from: Annotated[
         str | None,
-        _in_log(
+        in_encoder(
             help="Take the encoder from the trigger edges in the recording: triggers:CHANNEL. Each rising edge is one "
             "count; by default it is the index pulse, one per turn.",
             metavar="triggers:CHANNEL",
         ),
     ] = None
-    counts_per_turn: Annotated[int | None, _in_log(min=1, help="Encoder counts per turn.")] = None
+    counts_per_turn: Annotated[int | None, in_encoder(min=1, help="Encoder counts per turn.")] = None
     counter_bits: Annotated[
         int | None,
-        _in_log(
+        in_encoder(
             min=0,
             max=64,
             help="Width of the encoder's counter (bits); 0: the counter restarts at every turn. "
             "Default: inferred from the counts.",
         ),
     ] = None
-    direction: Annotated[Literal["1", "-1"], _in_log(help="Counting direction; -1: backwards.")] = "1"
+    direction: Annotated[Literal["1", "-1"], in_encoder(help="Counting direction; -1: backwards.")] = "1"
 
     def build(self, source: Path, topic: str | None) -> Encoder | None:
         """Return the encoder of the log or of the recording's triggers, or None if neither is given."""

@@ -12,7 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from amiwarp.choices import Seeing
-from amiwarp.cli.common import OUTPUT, Common, choose_device, numbers, parse_size, progress, report
+from amiwarp.cli.common import (
+    OUTPUT,
+    Common,
+    choose_device,
+    in_camera,
+    in_encoder,
+    in_prism,
+    numbers,
+    parse_size,
+    progress,
+    report,
+)
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
 from amiwarp.io.camera_files import load_camera
@@ -30,10 +41,7 @@ if TYPE_CHECKING:
 
 # Options for simulated recordings: camera, prism, motion of the prism, encoder and sensor.
 
-_in_camera = partial(typer.Option, rich_help_panel="Camera")
-_in_prism = partial(typer.Option, rich_help_panel="Prism")
 _in_sensor = partial(typer.Option, rich_help_panel="Sensor")
-_in_encoder = partial(typer.Option, rich_help_panel="Encoder")
 
 MOST_SPEEDS = 1_000_000
 """Largest number of rows of a table of speeds."""
@@ -45,34 +53,34 @@ class RigOptions:
 
     size: Annotated[
         str | None,
-        _in_camera(
+        in_camera(
             help="Size of the camera's image (px). Default: 640x480; for 'amiwarp translate', its pictures' size.",
             metavar="WIDTHxHEIGHT",
         ),
     ] = None
     fov_deg: Annotated[
-        float | None, _in_camera(help="Horizontal field of view (deg). Default: 60 if --camera is not given.")
+        float | None, in_camera(help="Horizontal field of view (deg). Default: 60 if --camera is not given.")
     ] = None
     camera: Annotated[
-        Path | None, _in_camera(help="Camera intrinsics: JSON or YAML (including the size), or calib.txt.")
+        Path | None, in_camera(help="Camera intrinsics: JSON or YAML (including the size), or calib.txt.")
     ] = None
-    apex_deg: Annotated[float, _in_prism(help="True apex angle of the prism (deg).")] = 1.0
+    apex_deg: Annotated[float, in_prism(help="True apex angle of the prism (deg).")] = 1.0
     nominal_apex_deg: Annotated[
-        float | None, _in_prism(help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.")
+        float | None, in_prism(help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.")
     ] = None
-    index: Annotated[float, _in_prism(help="Refractive index of the prism.")] = 1.5168
-    flat_side: Annotated[FlatSide, _in_prism(help="Side that the prism's flat face is on.")] = FlatSide.SCENE
-    rpm: Annotated[float, _in_prism(help="Speed of the prism (turns/min); negative: backwards.")] = 720.0
+    index: Annotated[float, in_prism(help="Refractive index of the prism.")] = 1.5168
+    flat_side: Annotated[FlatSide, in_prism(help="Side that the prism's flat face is on.")] = FlatSide.SCENE
+    rpm: Annotated[float, in_prism(help="Speed of the prism (turns/min); negative: backwards.")] = 720.0
     speed: Annotated[
-        Path | None, _in_prism(help="Speed over time, instead of --rpm: CSV with 'seconds,rpm' on each line.")
+        Path | None, in_prism(help="Speed over time, instead of --rpm: CSV with 'seconds,rpm' on each line.")
     ] = None
-    phase_deg: Annotated[float, _in_prism(help="Azimuth of the prism at encoder angle 0 (deg).")] = 0.0
+    phase_deg: Annotated[float, in_prism(help="Azimuth of the prism at encoder angle 0 (deg).")] = 0.0
     tilt_deg: Annotated[
-        str, _in_prism(help="Tilt of the prism's rotation axis about the camera's x and y axes (deg).", metavar="X,Y")
+        str, in_prism(help="Tilt of the prism's rotation axis about the camera's x and y axes (deg).", metavar="X,Y")
     ] = "0,0"
     cylinder_deg: Annotated[
         str,
-        _in_prism(
+        in_prism(
             help="Cylinder power of the prism's tilted face, along the wedge and at 45 deg to it (deg per unit of the "
             "ray's tangent).",
             metavar="X,Y",
@@ -80,7 +88,7 @@ class RigOptions:
     ] = "0,0"
     wobble_deg: Annotated[
         str,
-        _in_prism(
+        in_prism(
             help="Wobble of the prism about the rotation axis, along the wedge and across it (deg).", metavar="X,Y"
         ),
     ] = "0,0"
@@ -189,19 +197,19 @@ class SensorOptions:
 class EncoderModelOptions:
     """Options for the encoder's imperfections. Defaults are those of ``amiwarp.EncoderModel``."""
 
-    counts_per_turn: Annotated[int | None, _in_encoder(help="Counts per turn; 0: no rounding to counts.")] = None
-    rate_hz: Annotated[float | None, _in_encoder(help="Sample rate (Hz).")] = None
-    jitter_us: Annotated[float | None, _in_encoder(help="Standard deviation of the sample times (us).")] = None
+    counts_per_turn: Annotated[int | None, in_encoder(help="Counts per turn; 0: no rounding to counts.")] = None
+    rate_hz: Annotated[float | None, in_encoder(help="Sample rate (Hz).")] = None
+    jitter_us: Annotated[float | None, in_encoder(help="Standard deviation of the sample times (us).")] = None
     clock_offset_us: Annotated[
-        float | None, _in_encoder(help="Encoder clock minus camera clock (us); stored in the ground truth only.")
+        float | None, in_encoder(help="Encoder clock minus camera clock (us); stored in the ground truth only.")
     ] = None
-    dropouts_hz: Annotated[float | None, _in_encoder(help="Rate of drop-outs (1/s).")] = None
+    dropouts_hz: Annotated[float | None, in_encoder(help="Rate of drop-outs (1/s).")] = None
     dropout_us: Annotated[
-        float | None, _in_encoder(help="Length of a drop-out, during which all samples are lost (us).")
+        float | None, in_encoder(help="Length of a drop-out, during which all samples are lost (us).")
     ] = None
     encoder_error_deg: Annotated[
         str,
-        _in_encoder(
+        in_encoder(
             help="Error of the angle that repeats every turn: factors of its cosine and sine, and of those of twice "
             "the angle (deg). An eccentric disc causes the first two.",
             metavar="C1,S1,C2,S2",

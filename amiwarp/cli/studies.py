@@ -22,6 +22,8 @@ from amiwarp.cli.common import (
     CameraOptions,
     Common,
     choose_device,
+    in_camera,
+    in_prism,
     made_again,
     numbers,
     parse_size,
@@ -321,20 +323,18 @@ def _setting_speed(row: Row) -> tuple[str, str]:
 
 FOV_DEG = 60.0
 """Horizontal field of view that is assumed if no option describes the camera [deg]."""
-_in_camera = partial(typer.Option, rich_help_panel="Camera")
 _in_limits = partial(typer.Option, rich_help_panel="Limits")
 _in_faults = partial(typer.Option, rich_help_panel="Faults")
-_in_prism = partial(typer.Option, rich_help_panel="Prism")
 
 
 @dataclass(frozen=True)
 class GridOptions:
     """Options for the prisms and speeds to compare."""
 
-    apex_deg: Annotated[str, _in_prism(help="Apex angles to compare (deg).", metavar="A,B,...")] = "0.25,0.5,1,2,4"
-    rpm: Annotated[str, _in_prism(help="Speeds to compare (turns/min).", metavar="A,B,...")] = "180,360,720,1440,2880"
-    index: Annotated[float, _in_prism(help="Refractive index of the prism.")] = 1.5168
-    flat_side: Annotated[FlatSide, _in_prism(help="Direction that the prism's flat face points to.")] = FlatSide.SCENE
+    apex_deg: Annotated[str, in_prism(help="Apex angles to compare (deg).", metavar="A,B,...")] = "0.25,0.5,1,2,4"
+    rpm: Annotated[str, in_prism(help="Speeds to compare (turns/min).", metavar="A,B,...")] = "180,360,720,1440,2880"
+    index: Annotated[float, in_prism(help="Refractive index of the prism.")] = 1.5168
+    flat_side: Annotated[FlatSide, in_prism(help="Direction that the prism's flat face points to.")] = FlatSide.SCENE
 
     @property
     def apexes(self) -> list[float]:
@@ -398,7 +398,7 @@ def run_design(
     ),
     size: Annotated[
         str | None,
-        _in_camera(
+        in_camera(
             help="Size of the camera's image (px). Default: 640x480, or the size in --camera.", metavar="WIDTHxHEIGHT"
         ),
     ] = None,
