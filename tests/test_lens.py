@@ -32,6 +32,7 @@ from amiwarp.lens.corner_fit import first_pose, fit_lens, match_corners
 from amiwarp.lens.live import StillSpans
 from amiwarp.lens.poses import Pose, still_poses
 from amiwarp.live.stream import session
+from amiwarp.reconstruction.picture import Reconstruction
 from tests.test_stream_returning import LONG_S
 
 BOARD = amiwarp.Board(6, 5, 0.03)
@@ -321,6 +322,39 @@ def test_recordings_of_a_still_board_give_lens_and_prism(recordings: list[amiwar
     assert sum(map(sum, data["coverage"])) == 30 * len(recordings)
     assert any("record more poses" in text for text in data["advice"])
     assert cv2.imread(str(figure)).std() > 10.0
+
+
+@pytest.mark.parametrize("rpm", [720.0, -720.0])
+def test_pictures_start_at_evenly_spread_angles(rpm: float) -> None:
+    turn_us = 60e6 / 720.0
+    at = amiwarp.Events.from_arrays([1, 1], [1, 1], [0, round(3 * turn_us) - 1], [0, 1])
+    encoder = amiwarp.Encoder.constant_speed(abs(rpm), -1000, 300_000, direction=1 if rpm > 0.0 else -1)
+    recording = amiwarp.Recording(amiwarp.MemoryEvents(at, 8, 8), None, encoder)
+    for angle in (0.1, 2.0, 4.0, 6.0):
+        start = calibration.window_start(recording, 1.25, turn_us, angle)
+        assert math.cos(float(encoder.angle_at(np.array([start]))[0]) - angle) == pytest.approx(1.0, abs=1e-6)
+        assert 0.75 * turn_us - 1.0 <= start <= 1.75 * turn_us + 1.0
+    assert calibration.window_start(recording, 2.9, turn_us, 2.0) == 0  # too short to start at that angle
+
+
+def test_corners_hardly_depend_on_the_start_of_a_picture(recordings: list[amiwarp.Recording]) -> None:
+    """The positions of a picture's corners at starts half a turn apart, by the length of the picture's events."""
+    (rotation, middle), turn_us = placed(np.random.default_rng(1), CAMERA, 5, (20, 35))[0], 60e6 / 720.0
+    true = corners_of(CAMERA, rotation, middle - rotation.apply(BOARD.points.max(axis=0) / 2.0))
+    pose = first_pose(CAMERA, BOARD, true)
+    work = Reconstruction(recordings[0], model=amiwarp.ExactModel(CAMERA, PRISM, PHASE), device="cpu")
+    work.smoothness, work.with_silence = calibration.SMOOTHNESS, False
+    moved = []
+    for turns in (1.0, calibration.PICTURE_TURNS):
+        xy = []
+        for start in (0.2, 0.7):
+            log = work.window(round(start * turn_us), round(turns * turn_us)).log
+            low, high = np.percentile(log, (1.0, 99.0))
+            picture = np.clip((log - low) / (high - low) * 255.0, 0.0, 255.0).astype(np.uint8)
+            xy.append(match_corners(picture, BOARD, true, CAMERA, pose).xy)
+        moved.append(float(np.linalg.norm(np.median(xy[1] - xy[0], axis=0))))
+    assert moved[1] < 0.6 * moved[0]
+    assert moved[1] < 0.03
 
 
 def test_too_few_poses_and_still_prisms_are_refused(recordings: list[amiwarp.Recording]) -> None:
