@@ -207,7 +207,7 @@ def test_the_index_is_where_the_cost_of_the_poses_is_least(
     least = 1.57 + scatter * np.random.default_rng(2).standard_normal(12)
     maps = SimpleNamespace(copy_unknowns=lambda: None)
     cost = SimpleNamespace(brightness=maps, replace_map=lambda unknowns: None, space="fit")
-    equations = {str(k): SimpleNamespace(answers=SimpleNamespace(cost=cost)) for k in range(12)}
+    equations = {str(k): SimpleNamespace(cost=cost) for k in range(12)}
     joint = JointPrism(equations, SimpleNamespace(start={}), {"apex": 0.0175, "index": 1.5168})
     joint.costs = {"0": 0.15}
     sizes = []

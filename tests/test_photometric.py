@@ -353,6 +353,24 @@ def test_damping_follows_the_contrast_of_the_seen_nodes(recording: Recording, de
     assert solver._prior.damping.numpy()[0] == pytest.approx(DAMPING * CONTRAST / square, rel=1e-6)
 
 
+@pytest.mark.parametrize("density", [1.0, 3.0, 4.0])
+def test_a_map_starts_from_one_of_another_density(recording: Recording, device: str, density: float) -> None:
+    width, height = recording.events.size
+    table = EventTable([recording.events.slice(0, 3000)], np.zeros((height, width), np.int32), device)
+    assert recording.encoder is not None
+    pairs = table.pairs(recording.encoder, longest_gap_us=20_000)
+    tiles = Tiles(np.zeros((2, 2), np.float32), 21, 33)
+    given = BrightnessMap(pairs, tiles)
+    given.unknowns = np.random.default_rng(0).normal(size=2 * 21 * 33 + 2).astype(np.float32)
+    another = BrightnessMap(pairs, tiles.at_density(density))
+    another.start_from(given)
+    np.testing.assert_array_equal(another.extra, given.extra)
+    y, x = np.indices(another.maps().shape[1:]) * (tiles.density / density)
+    for found, of in zip(another.maps(), given.maps(), strict=True):
+        expected = ndimage.map_coordinates(of.astype(np.float64), [y, x], order=1, mode="nearest")
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+
+
 def test_no_pair_is_an_error() -> None:
     one = Events.from_arrays([1], [1], [5], [1])
     tile_of = np.zeros((4, 4), dtype=np.int32)

@@ -1145,6 +1145,17 @@ class BrightnessMap:
         """Return a copy of the unknowns on the device."""
         return wp.clone(self._image)
 
+    def start_from(self, other: BrightnessMap) -> None:
+        """Set map, leak and OFF threshold to those of ``other``, whose tiles are the same but for their density."""
+        maps, closer = other.maps(), other.tiles.density / self.tiles.density
+        for axis, count in ((1, self.tiles.rows), (2, self.tiles.columns)):
+            most = maps.shape[axis] - 1
+            at = np.minimum(np.arange(count, dtype=np.float32) * np.float32(closer), most)
+            low = np.minimum(at.astype(np.int64), most - 1)
+            share = (at - low).reshape([-1 if k == axis else 1 for k in range(3)])
+            maps = maps.take(low, axis) * (1.0 - share) + maps.take(low + 1, axis) * share
+        self.unknowns = np.concatenate([maps.ravel(), other.extra])
+
     def maps(self) -> NDArray[np.float32]:
         """Return the map [ON thresholds], shape (tiles, rows, columns)."""
         shape = (len(self.tiles.origin), self.tiles.rows, self.tiles.columns)

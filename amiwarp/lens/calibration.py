@@ -62,7 +62,11 @@ SEARCHED = 3
 """Number of poses in which the prism is searched by sharpness. Each answer is tried on the others."""
 PAIRS, FINE_PAIRS = 600_000, 1_200_000
 """Number of pairs of events of all poses together, and at most a sixth of it in one pose: at first, and with the last
-lens, when maps have several nodes per pixel. Maps with one make small orbits too large, a radius of 3 px by 0.4 %."""
+lens, when maps have several nodes per pixel."""
+FINE, FINEST, FINEST_STEPS = 2.0, 3.0, 2
+"""Map nodes per pixel with the last lens, and those with which the last steps correct the orbits' size; number of these
+steps. Maps are looked up bilinearly and so make small orbits too large: a radius of 3 px with one node per pixel by 0.4
+%, one of 2.4 px with two, three and four nodes by 0.16, 0.028 and 0.003 %."""
 BOARD_DAMPING = 0.00125
 """Damping of the fine maps. Most of a board is flat, so it gets no smaller damping for its contrast; the usual one, of
 0.02, made orbits of 2.4 px too large by 0.1 %."""
@@ -359,7 +363,7 @@ class LensWork:
         recording = replace(pose.recording, camera=self.camera, events=MemoryEvents(events, *size))
         prism = recording.prism
         bounds = {"apex": (SIZES[0] * prism.apex, SIZES[1] * prism.apex)} if isinstance(prism, Prism) else {}
-        pairs, density = (FINE_PAIRS, 2.0) if fine else (PAIRS, 1.0)
+        pairs, density = (FINE_PAIRS, FINE) if fine else (PAIRS, 1.0)
         pairs = min(pairs // 6, pairs // len(self.poses))
         photometric = PhotometricSettings(pairs=pairs, density=density)
         settings = Settings(model="exact", free=free, start=start, bounds=bounds, photometric=photometric)
@@ -492,6 +496,7 @@ class LensWork:
             values = joint.refine(self.camera, TILTED)
             joint.linearise(self.camera, TILTED)
             deviations = joint.deviations(TILTED, fit)
+        values = joint.correct_size(self.camera)
         if index_off:
             by_index = values["apex"] / (values["index"] - 1.0) * index_off
             deviations = {**deviations, "apex": math.hypot(deviations["apex"], by_index), "index": index_off}
@@ -565,7 +570,7 @@ class JointPrism:
     def use(self, equations: Mapping[str, Equations], inside: NDArray[np.bool_]) -> None:
         """Go on with the equations of the events ``inside``, weighted alike in all poses, and with little damping."""
         self.equations, self.inside = dict(equations), inside
-        costs = [each.answers.cost for each in self.equations.values()]
+        costs = [each.cost for each in self.equations.values()]
         usual = float(np.median([cost.scale for cost in costs]))
         for cost in costs:
             cost.scale = usual
@@ -596,6 +601,17 @@ class JointPrism:
         self.values = {**self.values, **space.to_values(v)}
         return dict(self.values)
 
+    def correct_size(self, camera: Camera) -> dict[str, float]:
+        """Correct the orbits' size, and the phase, with :data:`FINEST` maps. Return all values.
+
+        Poses whose events do not determine a fine map keep their coarse one.
+        """
+        for each in self.equations.values():
+            if each.cost.brightness.tiles.density == FINE:
+                each.use_density(FINEST)
+                each.cost.brightness.set_damping(BOARD_DAMPING)
+        return self.refine(camera, ("apex", "phase"), FINEST_STEPS, 0.0)
+
     def set_index(self, index: float) -> None:
         """Change the prism's index, and its apex with it, so that the orbit stays as large."""
         thinner = (self.values["index"] - 1.0) / (index - 1.0)
@@ -609,7 +625,7 @@ class JointPrism:
         parabola is the index, and its jackknife over the poses the deviation. The fit stays as it was.
         """
         fit, values, rows = dict(vars(self)), self.values, []
-        costs = [self.equations[name].answers.cost for name in names]
+        costs = [self.equations[name].cost for name in names]
         maps, spaces = [cost.brightness.copy_unknowns() for cost in costs], [cost.space for cost in costs]
         middle = values["index"]
         for index in (middle - INDEX_STEP, middle, middle + INDEX_STEP):
@@ -635,7 +651,7 @@ class JointPrism:
     def _costs(self, camera: Camera, names: tuple[str, ...], poses: Iterable[str] = ()) -> dict[str, Cost]:
         """Return the costs of some poses, or of all, by name, as functions of the parameters ``names``."""
         self.space = replace(self.full, camera=camera, names=names).holding(self.values)
-        costs = {name: self.equations[name].answers.cost for name in poses or self.equations}
+        costs = {name: self.equations[name].cost for name in poses or self.equations}
         for cost in costs.values():
             cost.space = self.space
         return costs

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import warp as wp
@@ -129,19 +130,33 @@ class Equations:
             cost = self.cost_on(tiles.at_density(1.0), space)
             cost.warm_up(v)
             coverage = cost.brightness.coverage(cost.scale)
-        left = check_pairs(recording.name, coverage, len(self.pairs))
-        keep = determined(cost.slopes(v, with_parts=True), space, left)
+        self.cost = cost
+        """Cost on the first map, at the result of the sharpness stage."""
+        self._left = check_pairs(recording.name, coverage, len(self.pairs))
         self.rotation: dict[str, float] = {}
         """Standard deviations of the camera's rotation, if it was found before the paths of the tiles."""
-        self.held = tuple(n for n in space.names if n not in keep)
-        """Free parameters that the events do not determine."""
-        # undetermined parameters stay at the answer of sharpness, because the others were found together with them
-        cost.space = space = space.without(self.held).holding({n: x for n, x in best.items() if n in self.held})
-        self.start = space.to_vector({**space.start, **best})
-        """Search vector of the sharpness stage's result."""
+        self.held: tuple[str, ...] = ()
+        """Free parameters that the events do not determine, known from :attr:`answers` on."""
+
+    @cached_property
+    def answers(self) -> AnswerSearch:
+        """Search for the free parameters that the events determine.
+
+        The others stay at the answer of sharpness, because the first were found together with them.
+        """
+        cost, best = self.cost, self.search.best
+        keep = determined(cost.slopes(self.start, with_parts=True), cost.space, self._left)
+        self.held = tuple(n for n in cost.space.names if n not in keep)
+        cost.space = cost.space.without(self.held).holding({n: x for n, x in best.items() if n in self.held})
         if self.held:
             cost.warm_up(self.start)
-        self.answers = AnswerSearch(cost, dict(best), left, self._settings, self._report, search.most_cost)
+        return AnswerSearch(cost, dict(best), self._left, self._settings, self._report, self.search.most_cost)
+
+    @property
+    def start(self) -> Vector:
+        """Search vector of the sharpness stage's result."""
+        space = self.cost.space
+        return space.to_vector({**space.start, **self.search.best})
 
     def _report(self, share: float) -> None:
         self.search.report("photometric", share)
@@ -160,6 +175,13 @@ class Equations:
         cost = self.cost_on(tiles, space)
         cost.warm_up(space.to_vector({**space.start, **self.search.best}))
         return cost
+
+    def use_density(self, density: float) -> None:
+        """Go on with a map of another density, which starts from the present one."""
+        present = self.cost
+        self.cost = self.cost_on(present.brightness.tiles.at_density(density), present.space)
+        self.cost.scale = present.scale
+        self.cost.brightness.start_from(present.brightness)
 
     def coarse(self) -> AnswerSearch:
         """Return the search on a new map with one node per pixel."""
