@@ -324,6 +324,44 @@ def test_recordings_of_a_still_board_give_lens_and_prism(recordings: list[amiwar
     assert cv2.imread(str(figure)).std() > 10.0
 
 
+@pytest.mark.parametrize(
+    ("seen_index", "systematic", "said"),
+    [
+        (1.6, (0.021, 0.01), None),  # pictures of the wrong index bent the lens
+        (1.6, (0.021, 0.021), "the events prefer an index of 1.600 ± 0.022, but not with certainty: the given one"),
+        (1.52, (0.01, 0.01), ""),
+        (1.6, (0.04, 0.01), "the index of the prism is not determined, and stays as given, 1.5168"),
+    ],
+)
+def test_an_index_far_off_is_asked_for_with_the_lens_that_is_seen_through_it(
+    monkeypatch: pytest.MonkeyPatch, seen_index: float, systematic: tuple[float, float], said: str | None
+) -> None:
+    """``systematic``: deviation of the index that the lens causes, with the given index and with the one seen."""
+    sights = [
+        calibration.Sight({}, {"0": Corners(np.arange(0), np.zeros((0, 2)))}, SimpleNamespace(off=off, camera=camera))
+        for off, camera in zip(systematic, (ROUGH, replace(ROUGH, fx=1.01 * ROUGH.fx)), strict=True)
+    ]
+    work = calibration.LensWork(BOARD, ROUGH, [], "cpu", lambda *_: None)
+    joint = JointPrism({str(k): None for k in range(12)}, SimpleNamespace(start={}), {"apex": 0.0175, "index": 1.5168})
+    monkeypatch.setattr(work, "pictures", lambda *_, **__: {})
+    monkeypatch.setattr(work, "_lens", lambda *_, **__: sights[1])
+    monkeypatch.setattr(joint, "model", lambda *_: None)
+    monkeypatch.setattr(joint, "refine", lambda *_: None)
+    monkeypatch.setattr(joint, "index", lambda *_: (seen_index, 0.007))
+    monkeypatch.setattr(joint, "systematic_of_index", lambda fit: fit.off)
+    notes = list[str]()
+    off, sight = work._free_index(joint, sights[0], notes)
+    if said is None:
+        assert (off, sight, work.camera, notes) == (math.hypot(0.007, 0.01), sights[1], sights[1].fit.camera, [])
+        assert joint.values["index"] == 1.6
+        assert joint.values["apex"] == pytest.approx(0.0175 * 0.5168 / 0.6 / 1.01)  # in pixels, the orbit is as large
+        return
+    assert (off, sight, work.camera) == (0.0, sights[0], ROUGH)
+    assert joint.values == {"apex": 0.0175, "index": 1.5168}
+    assert "".join(notes).startswith(said)
+    assert len(notes) == bool(said)
+
+
 @pytest.mark.parametrize("rpm", [720.0, -720.0])
 def test_pictures_start_at_evenly_spread_angles(rpm: float) -> None:
     turn_us = 60e6 / 720.0

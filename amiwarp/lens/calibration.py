@@ -260,6 +260,18 @@ def first_camera(size: tuple[int, int], known: Camera | None, fov: float | None,
     return Camera(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0, Fisheye())
 
 
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What is seen with a prism and a lens, and the lens that it determines."""
+
+    pictures: dict[str, NDArray[np.uint8]]
+    """Pictures by name of the pose, each of shape (height, width)."""
+    corners: dict[str, Corners]
+    """Corners by name of each pose of the fit."""
+    fit: Fit
+    """Lens and poses."""
+
+
 @dataclass
 class LensWork:
     """Steps of a lens calibration, to be read from top to bottom."""
@@ -290,11 +302,11 @@ class LensWork:
             equations |= self._equations([name for name in everyone if name not in first], values, 0)
         self._check_count(len(equations), "with enough events")
         joint = JointPrism(equations, self.full, values)
-        shown, fit, seen = joint.model(self.camera, values), None, dict[str, Corners]()
+        shown, sight = joint.model(self.camera, values), None
         for k in range(MOST_PASSES + 1):
             self.progress("prism", (k + 0.1) / (MOST_PASSES + 1))
-            if k == 2:  # the first lens was that of some of the poses
-                self.inside = self._between(seen)
+            if sight is not None and k == 2:  # the first lens was that of some of the poses
+                self.inside = self._between(sight.corners)
                 equations = self._equations(everyone, joint.values, k, fine=True)
                 self._check_count(len(equations), "with enough events")
                 joint.use(equations, self.inside)
@@ -310,22 +322,23 @@ class LensWork:
             first = names if k else _some(names)
             pictures = self.pictures(model, first, k, turns=PICTURE_TURNS if k else 0.5)
             try:
-                fit, seen = self._lens(pictures, matched=k > 0)
+                sight = self._lens(pictures, matched=k > 0)
             except AmiwarpError:  # the first poses alone do not suffice
                 rest = [name for name in names if name not in first]
                 if not rest:
                     raise
-                fit, seen = self._lens(pictures | self.pictures(model, rest, k, turns=0.5), matched=k > 0)
-            joint.values["apex"] *= self.camera.fx / fit.camera.fx  # the orbit stays as large
-            self.camera = fit.camera
-        assert fit is not None
-        values, uncertainty, notes = self._whole_prism(joint, fit)
-        for name, corners in seen.items():
-            if self.board.has_another(pictures[name], corners):
+                pictures |= self.pictures(model, rest, k, turns=0.5)
+                sight = self._lens(pictures, matched=k > 0)
+            self._use_lens(joint, sight)
+        assert sight is not None
+        sight, values, uncertainty, notes = self._whole_prism(joint, sight)
+        fit = sight.fit
+        for name, corners in sight.corners.items():
+            if self.board.has_another(sight.pictures[name], corners):
                 raise AmiwarpError(f"{name}: {TWO_BOARDS}")
         used = [
-            BoardPose(n, c, r, v[:3], v[3:], pictures[n])
-            for (n, c), r, v in zip(seen.items(), fit.residuals, fit.poses, strict=True)
+            BoardPose(n, c, r, v[:3], v[3:], sight.pictures[n])
+            for (n, c), r, v in zip(sight.corners.items(), fit.residuals, fit.poses, strict=True)
         ]
         if fit.left_out:
             notes = (f"the corners do not determine {', '.join(fit.left_out)}, which stay 0", *notes)
@@ -410,8 +423,13 @@ class LensWork:
             out[name] = np.clip((log - low) / max(high - low, 1e-6) * 255.0, 0.0, 255.0).astype(np.uint8)
         return out
 
-    def _lens(self, pictures: dict[str, NDArray[np.uint8]], *, matched: bool) -> tuple[Fit, dict[str, Corners]]:
-        """Return the lens that the corners of the pictures determine, and the corners by name of the pose.
+    def _use_lens(self, joint: JointPrism, sight: Sight) -> None:
+        """Go on with the lens that was seen; the prism's orbits stay as large."""
+        joint.values["apex"] *= self.camera.fx / sight.fit.camera.fx
+        self.camera = sight.fit.camera
+
+    def _lens(self, pictures: dict[str, NDArray[np.uint8]], *, matched: bool) -> Sight:
+        """Return the lens that the corners of the pictures determine, with the corners.
 
         The rough lens smears the first pictures, each in its way: corners that were ``matched`` in them would agree too
         well, and free coefficients that mean nothing.
@@ -441,7 +459,7 @@ class LensWork:
             )
             del seen[worst]
             self._check_count(len(seen), "that fit together")
-        return fit, seen
+        return Sight(pictures, seen, fit)
 
     def _before_the_lens(self) -> NDArray[np.bool_]:
         """Return the pixels whose events are used with the rough lens, shape (height, width)."""
@@ -480,58 +498,77 @@ class LensWork:
         self._check_count(len(joint.equations), "that agree on the prism")
         return bad
 
-    def _whole_prism(self, joint: JointPrism, fit: Fit) -> tuple[dict[str, float], dict[str, float], tuple[str, ...]]:
-        """Return all parameters of the prism, their standard deviations, and what the events do not determine.
+    def _whole_prism(
+        self, joint: JointPrism, sight: Sight
+    ) -> tuple[Sight, dict[str, float], dict[str, float], tuple[str, ...]]:
+        """Return what is seen, all parameters of the prism, their standard deviations, and what is not determined.
 
         Index and tilt are only freed if they differ from their nominal values with certainty.
         """
         notes = list[str]()
-        index_off = self._free_index(joint, fit, notes)
+        index_off, sight = self._free_index(joint, sight, notes)
+        fit = sight.fit
         joint.linearise(self.camera, TILTED)
         values, deviations, off = dict(joint.values), joint.deviations(TILTED[:2], fit), joint.deviations(TILTED, fit)
         better = joint.step()
         if max(off[n] for n in TILTED[2:]) > LARGEST_DEVIATION["tilt"]:
             notes.append("the tilt of the prism is not determined, and stays as given")
         elif any(abs(better[n] - values[n]) > CERTAIN * off[n] for n in TILTED[2:]):
-            values = joint.refine(self.camera, TILTED)
+            joint.refine(self.camera, TILTED)
             joint.linearise(self.camera, TILTED)
             deviations = joint.deviations(TILTED, fit)
         values = joint.correct_size(self.camera)
         if index_off:
             by_index = values["apex"] / (values["index"] - 1.0) * index_off
             deviations = {**deviations, "apex": math.hypot(deviations["apex"], by_index), "index": index_off}
-        return values, deviations, tuple(notes)
+        return sight, values, deviations, tuple(notes)
 
-    def _free_index(self, joint: JointPrism, fit: Fit, notes: list[str]) -> float:
-        """Set the prism's index if it differs from the given one with certainty; return its deviation, or 0 if held."""
-        given, names = dict(joint.values), [*joint.equations]
+    def _free_index(self, joint: JointPrism, sight: Sight, notes: list[str]) -> tuple[float, Sight]:
+        """Set the prism's index if it differs from the given one with certainty.
+
+        Return its deviation, or 0 if it is held, and what is seen with it. Pictures that were made with a wrong index
+        bend the lens, so they are made again once another index is likely.
+        """
+        given, before, names = dict(joint.values), (self.camera, sight), [*joint.equations]
         index, off = given["index"], math.inf
-        systematic = joint.systematic_of_index(fit)
 
         def ask(names: Sequence[str]) -> tuple[float, float]:
             index, off = joint.index(self.camera, names)
-            return index, math.hypot(off, systematic)
+            return index, math.hypot(off, joint.systematic_of_index(sight.fit))
 
         def differs(enough: float) -> bool:
             return abs(index - given["index"]) > enough * off
 
-        if len(names) >= GOOD_POSES and systematic < LARGEST_DEVIATION["index"]:
+        enough = len(names) >= GOOD_POSES
+        if enough and joint.systematic_of_index(sight.fit) < DOUBTFUL * LARGEST_DEVIATION["index"]:
             index, off = ask(names[::PROBED])  # a few tell whether it is worth while
-            for _ in range(INDEX_ROUNDS):
+            for k in range(INDEX_ROUNDS):
                 if not differs(DOUBTFUL):
                     break
                 joint.set_index(index)
+                if not k:
+                    model = joint.model(self.camera, joint.values)
+                    pictures = self.pictures(model, [*sight.corners], MOST_PASSES, turns=PICTURE_TURNS)
+                    sight = self._lens(pictures, matched=True)
+                    self._use_lens(joint, sight)
                 joint.refine(self.camera, ("apex", "phase"))
                 index, off = ask(names)
         sure = off < LARGEST_DEVIATION["index"]
         another = sure and differs(CERTAIN)
         if joint.values != given:
-            joint.values = given
-            joint.set_index(index if another else given["index"])
+            if another:
+                joint.set_index(index)
+            else:
+                joint.values, (self.camera, sight) = given, before
             joint.refine(self.camera, ("apex", "phase"))
-        if not sure:
+        if not another and off < math.inf and differs(DOUBTFUL):
+            notes.append(
+                f"the events prefer an index of {index:.3f} ± {off:.3f}, but not with certainty: the given one, "
+                f"{given['index']:g}, is used"
+            )
+        elif not sure:
             notes.append(f"the index of the prism is not determined, and stays as given, {given['index']:g}")
-        return off if another else 0.0
+        return (off if another else 0.0), sight
 
 
 ALL_FREE = ("apex", "phase", "tilt_x", "tilt_y", "index")
