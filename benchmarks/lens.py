@@ -2,8 +2,9 @@
 
 ``python -m benchmarks.lens --seeds 10 --out lens.json`` simulates 12 poses a seed: 640x480 px, default sensor with
 noise, 0.25 s each. Each calibration starts 10 % off in focal length and apex. A row gives the relative errors of focal
-length and apex, the error of the principal point [px], the reprojection error on held-out true corners [px rms], and
-the same for OpenCV on frames without noise and with the noise of a usual camera.
+length and apex, the error of the principal point [px], the reprojection error on held-out true corners [px rms], the
+signed relative error of the orbits (apex times focal length, with the index held), and the same for OpenCV on frames
+without noise and with the noise of a usual camera.
 """
 
 from __future__ import annotations
@@ -103,6 +104,7 @@ def one(lens: str, seed: int, count: int, device: str, index: float) -> dict[str
     row |= errors(found.camera, true, xy[count:])
     row |= {
         "apex": abs(apex / prism.apex - 1.0), "seconds": time.perf_counter() - began, "poses": len(found.poses),
+        "orbit": apex * found.camera.fx / (prism.apex * true.fx) - 1.0, "apex_std": std / prism.apex,
         "z_apex": (apex - prism.apex) / std, "notes": found.notes,
         **{f"z_{n}": (getattr(found.camera, n) - getattr(true, n)) / found.uncertainty[n] for n in ("fx", "cx", "cy")},
     }  # fmt: skip

@@ -75,7 +75,7 @@ STEEPEST = math.radians(45.0)
 so fast with the angle that a wrong focal length gives a wrong prism."""
 FIRST_TOLERANCE_PX = 0.01
 """Length of a step that ends the search for the prism with a lens that is not the last one [px]."""
-MOST_STEPS, TOLERANCE_PX, LARGEST_GAIN = 10, 0.001, 5.0
+MOST_STEPS, TOLERANCE_PX, LARGEST_GAIN = 10, 0.004, 5.0
 """Largest number of steps towards the prism; length of a step that ends them [px]; and the largest factor by which a
 step is lengthened, because the weights of outliers make Gauss-Newton steps too short."""
 PROBED, PROBE_PX = 3, 0.05
@@ -406,8 +406,9 @@ class LensWork:
     ) -> dict[str, NDArray[np.uint8]]:
         """Return pictures of some poses, each from some turns of the prism, by name. ``done`` passes are over.
 
-        They start at prism angles that are evenly spread over the poses. An error that depends on the start would
-        otherwise be common to all poses: the principal point would follow it, and the scatter of the poses not show it.
+        Those of more than a turn start at prism angles that are evenly spread over the poses. An error that depends on
+        the start would otherwise be common to all poses: the principal point would follow it, and the scatter of the
+        poses not show it.
         """
         out = {}
         recordings = {pose.name: pose.recording for pose in self.poses}
@@ -417,7 +418,8 @@ class LensWork:
             work = Reconstruction(recordings[name], model=model, device=self.device)
             work.smoothness, work.with_silence = SMOOTHNESS, False
             assert work.turn_us is not None  # a still span has turns
-            start = window_start(recordings[name], turns, work.turn_us, math.tau * k / len(names))
+            angle = math.tau * k / len(names)
+            start = window_start(recordings[name], turns, work.turn_us, angle) if turns > 1.0 else None
             log = work.window(*work.span(start, turns=turns)).to_host().log
             low, high = np.percentile(log, (1.0, 99.0))
             out[name] = np.clip((log - low) / max(high - low, 1e-6) * 255.0, 0.0, 255.0).astype(np.uint8)
