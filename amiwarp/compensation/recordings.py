@@ -48,8 +48,9 @@ class LaunchPlan:
         name = str(device)
         self.size = model.camera.width, model.camera.height
         """Sensor width and height [px]."""
-        self.kernel = kernels.compensate_blocks if device.is_cpu else kernels.compensate_events
-        self.block = int(kernels.BLOCK) if device.is_cpu else 1
+        in_blocks = device.is_cpu and model.ANGLES == 1
+        self.kernel = kernels.compensate_blocks if in_blocks else kernels.compensate_events
+        self.block = int(kernels.BLOCK) if in_blocks else 1
         """Number of events per thread of the kernel; columns are padded to a multiple of this number."""
         self._camera = camera_params(model.camera, name)
         self._pinhole = pinhole_params(model.camera) or self._camera

@@ -205,7 +205,8 @@ class UploadedEvents:
             return _put(part, values.dtype, values.device)
 
         turn = cut(a.turn if base is None else base)
-        few = self._with(x=cut(a.x), y=cut(a.y), layer=cut(a.layer), turn=turn, time=cut(a.time))
+        columns = {name: cut(getattr(a, name)) for name in ("x", "y", "layer", "second", "time")}
+        few = self._with(turn=turn, **columns)
         n, base = -(-self.count // step), None if base is None else wp.clone(turn)
         return replace(few, count=n, total=n, base=base, slope=cut(self.slope))
 
@@ -216,7 +217,7 @@ class UploadedEvents:
     def _with(self, **columns: wp.array) -> UploadedEvents:
         """Return the same events with other columns."""
         e = event_kernels.EventArrays()
-        for name in ("x", "y", "turn", "azimuths", "time", "weight", "layer"):
+        for name in ("x", "y", "turn", "second", "azimuths", "time", "weight", "layer"):
             setattr(e, name, columns.get(name, getattr(self.arrays, name)))
         return replace(self, arrays=e)
 
@@ -270,7 +271,7 @@ def upload_events(
     e.x, e.y = put(events.x, wp.uint16), put(events.y, wp.uint16)
     e.layer = put(events.p, wp.uint8)
     e.azimuths, e.time = azimuths(str(device)), wp.empty(0, dtype=float, device=device)
-    e.weight = wp.empty(0, dtype=wp.uint8, device=device)
+    e.weight, e.second = wp.empty(0, dtype=wp.uint8, device=device), wp.empty(0, dtype=wp.uint16, device=device)
     if not isinstance(angles, np.ndarray) or middle_us is not None:
         t = _times(events, device)
     if isinstance(angles, np.ndarray):
@@ -280,6 +281,9 @@ def upload_events(
         if n:
             encoder = device_events.encoder_params(angles, *device_events.time_span(events), device)
             launch(event_kernels.turn_events, n, [encoder, t], [e.turn], device=device)
+            if angles.second is not None:
+                e.second = wp.zeros(padded, dtype=wp.uint16, device=device)
+                launch(event_kernels.turn_second, n, [encoder, t], [e.second], device=device)
     if middle_us is not None:
         e.time = wp.empty(n, dtype=float, device=device)
         launch(event_kernels.time_events, n, [t, middle_us], [e.time], device=device)
@@ -348,7 +352,7 @@ def _folded(key: NDArray[np.int64], weight: NDArray[np.uint8], n: int, bins: int
     out.x, out.y, out.turn = (wp.zeros(_padded(m, device), dtype=wp.uint16, device=device) for _ in range(3))
     out.layer = wp.zeros(_padded(m, device), dtype=wp.uint8, device=device)
     out.weight, out.azimuths = _put(weight, wp.uint8, device), azimuths(str(device))
-    out.time = wp.empty(0, dtype=float, device=device)
+    out.time, out.second = wp.empty(0, dtype=float, device=device), wp.empty(0, dtype=wp.uint16, device=device)
     launch(
         event_kernels.unfold_keys,
         m,
