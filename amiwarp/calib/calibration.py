@@ -32,7 +32,7 @@ from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, 
 from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, Settings
 from amiwarp.calib.sharpness import Search
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.optics.camera import LENS, Camera, with_lens
 from amiwarp.optics.models import MODELS, RisleyModel, predicted_error, size_names
@@ -515,6 +515,7 @@ def prepare(
         checks.check_unmasked_events(len(events), recording.events.mask, name)
     searches = []
     for encoder in encoders:
+        check_prisms(encoder, MODELS[settings.model].ANGLES)
         checks.check_coverage(encoder, int(events.t[0]), int(events.t[-1]), name)
         checks.check_pulses(encoder, name)
         space = _space(recording, camera, encoder, events, settings, free)

@@ -333,8 +333,10 @@ class Calibration:
         AmiwarpError
             If the recording has no encoder and the calibration no rpm, or a path that does not cover the events.
         """
-        if self.parameters.get(MODELS[self.model_name].SIZE) == 0.0:
-            return constant_speed(0.0, t_first, t_last, t_first)
+        kind = MODELS[self.model_name]
+        if all(self.parameters.get(size) == 0.0 for size, _ in kind.ORBITS):
+            rest = constant_speed(0.0, t_first, t_last, t_first)
+            return rest if kind.ANGLES == 1 else rest.with_second(1.0)
         if encoder is not None:
             encoder = encoder.with_clock_offset(self.parameters.get("clock_offset", encoder.clock_offset_us))
             return encoder if self.harmonics is None else encoder.with_harmonics(self.harmonics)

@@ -20,7 +20,7 @@ from amiwarp.calib.result import Calibration
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
 from amiwarp.events.device_events import DeviceEvents, azimuths, device_for, limits, wait
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, EventSource, MetadataValue, Recording
 from amiwarp.io import RecordingWriter
 from amiwarp.io.export import bag_of, export, left_out
@@ -226,6 +226,7 @@ class BlockCompensator:
 
         Raises :class:`AmiwarpError` if the encoder does not cover the times ``t_first`` .. ``t_last`` [us].
         """
+        check_prisms(encoder, model.ANGLES)
         self._device = wp.get_device(device)
         self._plan = LaunchPlan(model, self._device)
         self._encoder = device_events.encoder_params(encoder, t_first, t_last, str(self._device))

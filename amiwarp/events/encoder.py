@@ -808,6 +808,17 @@ def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(angle - TWO_PI * np.round(angle / TWO_PI))
 
 
+def check_prisms(encoder: Encoder, angles: int) -> None:
+    """Raise :class:`AmiwarpError` if an encoder is not that of a model with this number of prisms."""
+    if angles == 1 and encoder.second is not None:
+        raise AmiwarpError("the encoder is that of a pair of prisms, the model has one prism; use the model 'risley'")
+    if angles == 2 and encoder.second is None:
+        raise AmiwarpError(
+            "the model has two prisms, the encoder measures one; add the other one's encoder, or its speed relative to "
+            "the first (Encoder.with_second, --second-encoder or --second-ratio of 'amiwarp convert')"
+        )
+
+
 # Speed of the prism during the events. It differs from the mean of all samples if the motor starts or stops.
 
 LEAST_RPM = 1e-3

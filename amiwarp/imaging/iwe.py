@@ -16,7 +16,7 @@ from amiwarp.choices import Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
 from amiwarp.events.device_events import DeviceEvents, azimuths, cast, device_for, wait
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events
 from amiwarp.kernels import launch as launches
 from amiwarp.kernels import pixel_votes
@@ -175,16 +175,18 @@ class UploadedEvents:
     slope: Any
     """Change of each prism angle per unit of the drifting parameter [1/65536 turn]; None if there is no such parameter.
     """
+    second_base: Any = None
+    """Angles of the second prism at drift 0 [1/65536 turn]; None for one prism."""
+    ratio: float = 0.0
+    """Mean speed of the second prism relative to the first."""
 
     def drift(self, value: float) -> None:
         """Set the prism angles for the value ``value`` of the drifting parameter."""
-        launch(
-            event_kernels.drift_turns,
-            self.count,
-            [self.base, self.slope, value],
-            [self.arrays.turn],
-            device=self.base.device,
-        )
+        moved = [(self.base, value, self.arrays.turn)]
+        if self.second_base is not None:
+            moved.append((self.second_base, self.ratio * value, self.arrays.second))
+        for base, change, out in moved:
+            launch(event_kernels.drift_turns, self.count, [base, self.slope, change], [out], device=base.device)
 
     def in_parts(self, parts: int, *, per_polarity: bool) -> UploadedEvents:
         """Return the same events split over ``parts`` images, or over ``parts`` pairs (OFF, ON) of images."""
@@ -205,10 +207,12 @@ class UploadedEvents:
             return _put(part, values.dtype, values.device)
 
         turn = cut(a.turn if base is None else base)
-        columns = {name: cut(getattr(a, name)) for name in ("x", "y", "layer", "second", "time")}
+        columns = {name: cut(getattr(a, name)) for name in ("x", "y", "layer", "time")}
+        columns["second"] = cut(a.second if self.second_base is None else self.second_base)
         few = self._with(turn=turn, **columns)
         n, base = -(-self.count // step), None if base is None else wp.clone(turn)
-        return replace(few, count=n, total=n, base=base, slope=cut(self.slope))
+        second = None if self.second_base is None else wp.clone(columns["second"])
+        return replace(few, count=n, total=n, base=base, slope=cut(self.slope), second_base=second)
 
     def at_angles(self, angles: NDArray[np.float64]) -> UploadedEvents:
         """Return the same events at other prism angles [rad], shape ``(n,)``. The other columns are not copied."""
@@ -295,7 +299,10 @@ def upload_events(
         return _folded(*points, n, fold, device)
     if slope is None:
         return UploadedEvents(e, n, n, None, None)
-    return UploadedEvents(e, n, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
+    slopes = put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float)
+    found = UploadedEvents(e, n, n, wp.clone(e.turn), slopes)
+    ratio = None if isinstance(angles, np.ndarray) else angles.ratio
+    return found if ratio is None else replace(found, second_base=wp.clone(e.second), ratio=ratio)
 
 
 def _padded(n: int, device: Any) -> int:
@@ -864,6 +871,8 @@ def iwe(
     """
     if (model is None) != (encoder is None):
         raise AmiwarpError("only one of model and encoder is given; give both a model and an encoder, or neither")
+    if model is not None and encoder is not None:
+        check_prisms(encoder, model.ANGLES)
     device = device_for(events, device)
     device_events.check_order(events)
     votes = Votes(CanvasShape(width, height, pad, 1.0, per_polarity, vote), device)

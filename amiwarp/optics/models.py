@@ -985,6 +985,12 @@ def rungs(name: str = ExactModel.NAME) -> dict[str, type[Model]]:
     return {other: model for other, model in MODELS.items() if approximates(other)}
 
 
+def alternatives(name: str) -> dict[str, type[Model]]:
+    """Return all models of the same optic as a model, by name: the best one and its approximations."""
+    better = MODELS[name].SIMPLIFIES
+    return rungs(name) if better is None else alternatives(better)
+
+
 # Distance between two optical models over the image and one turn of the prism.
 
 
