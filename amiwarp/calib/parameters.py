@@ -67,6 +67,16 @@ def units() -> dict[str, str]:
     return {name: parameter.unit for name, parameter in optical_parameters().items()} | _UNITS
 
 
+def of_orbit(space: ParameterSpace, k: int, at: Mapping[str, float]) -> ParameterSpace:
+    """Return the space of the ``k``-th prism's size and phase.
+
+    Prisms before it have the values ``at``, later ones the size 0.
+    """
+    orbits = MODELS[space.model].ORBITS
+    others = tuple({*space.names} - {*orbits[k]})
+    return space.holding({**at, **{size: 0.0 for size, _ in orbits[k + 1 :]}}).without(others)
+
+
 def phase_names() -> set[str]:
     """Return the names of the parameters that are the phase of a prism."""
     return {phase for model in MODELS.values() for _, phase in model.ORBITS}
@@ -132,31 +142,12 @@ class ParameterSpace:
     @cached_property
     def orbits(self) -> tuple[int, ...]:
         """Indices of the vector's entries that are (size·cos phase, size·sin phase), with the next entry."""
-        found = []
-        for size, phase in MODELS[self.model].ORBITS:
+        found, orbits = [], MODELS[one_of(self.model, MODELS, "model")].ORBITS
+        for size, phase in orbits:
             full = self.high.get(phase, 0.0) - self.low.get(phase, 0.0) >= 2.0 * math.pi - 1e-9
             if full and size in self.names and phase in self.names:
                 found.append(self.names.index(size))
-        return tuple(k for k in found if self.names[k : k + 2] in MODELS[self.model].ORBITS)
-
-    def of_orbit(self, k: int, at: Mapping[str, float]) -> ParameterSpace:
-        """Return the space of the ``k``-th orbit alone: the prisms before it have the values ``at``, later ones size 0.
-
-        Parameters
-        ----------
-        k : int
-            Number of the orbit, in the order of the model.
-        at : mapping of str to float
-            Values of the parameters, in their units.
-
-        Returns
-        -------
-        ParameterSpace
-            The space, with size and phase of this orbit.
-        """
-        orbits = MODELS[self.model].ORBITS
-        names = {*self.names} - {*orbits[k]}
-        return self.holding({**at, **{size: 0.0 for size, _ in orbits[k + 1 :]}}).without(tuple(names))
+        return tuple(k for k in found if self.names[k : k + 2] in orbits)
 
     @property
     def sized(self) -> bool:

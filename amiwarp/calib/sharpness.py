@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from amiwarp.calib import checks
 from amiwarp.calib.calibration_events import CalibrationEvents, EventsAhead
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import MOTION, ParameterSpace, like_size, phase_names, units
+from amiwarp.calib.parameters import MOTION, ParameterSpace, like_size, of_orbit, phase_names, units
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.settings import Settings, stage_share
 from amiwarp.choices import Sharpness
@@ -422,7 +422,7 @@ class Search:
         The prisms of a pair are searched one after the other: each removes its part of the blur.
         """
         count = len(MODELS[space.model].ORBITS)
-        return [lambda _: space] if count == 1 else [partial(space.of_orbit, k) for k in range(count)]
+        return [lambda _: space] if count == 1 else [partial(of_orbit, space, k) for k in range(count)]
 
     def _coarse_objective(self, events: CalibrationEvents, space: ParameterSpace) -> Objective:
         step = max(1, len(events.events) // (self.settings.events // 3 + 1))

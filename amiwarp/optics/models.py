@@ -720,7 +720,7 @@ class RisleyModel(Model):
     >>> camera = amiwarp.Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
     >>> pair = amiwarp.Prism(apex=0.03, second=amiwarp.Prism(apex=0.03))
     >>> model = amiwarp.RisleyModel(camera, pair)
-    >>> model.compensate_points(np.array([[100.0, 200.0]]), np.array([[0.4, 0.4 + np.pi]])).round(1)  # they cancel
+    >>> model.compensate_points(np.array([[100.0, 200.0]]), np.array([[0.4, 0.4 + np.pi]])).round()  # they cancel
     array([[100., 200.]])
     """
 
@@ -765,10 +765,13 @@ class RisleyModel(Model):
         pair = Prism(values["apex"], prism.index, prism.flat_side, other)
         return cls(camera, pair, values["phase"], values.get("second_phase", 0.0), values.get("ratio", 0.0))
 
+    def kernel_values(self) -> tuple[Any, ...]:
+        prisms = (each.kernel_values() for each in self.singles())
+        return (*prisms, self.phase, self.second_phase, self.ratio)
+
     def params(self, device: Any) -> Any:
-        first, second = self.singles()
-        values = (first.params(device), second.params(device), self.phase, self.second_phase, self.ratio)
-        return struct_of(kernels.PairParams, values)
+        prisms = (each.params(device) for each in self.singles())
+        return struct_of(kernels.PairParams, [*prisms, *self.kernel_values()[2:]])
 
     def singles(self) -> tuple[ExactModel, ExactModel]:
         first = ExactModel(self.camera, replace(self.prism, second=None), self.phase)

@@ -83,7 +83,7 @@ class UnsizedPrism:
     Examples
     --------
     >>> amiwarp.UnsizedPrism(index=1.5).with_apex(0.03)
-    Prism(apex=0.03, index=1.5, flat_side=<FlatSide.SCENE: 'scene'>)
+    Prism(apex=0.03, index=1.5, flat_side=<FlatSide.SCENE: 'scene'>, second=None)
     """
 
     index: float = 1.5168
