@@ -90,6 +90,7 @@ from .optics.models import Model as Model
 from .optics.models import ModelError as ModelError
 from .optics.models import Parameter as Parameter
 from .optics.models import RadialCircleModel as RadialCircleModel
+from .optics.models import RisleyModel as RisleyModel
 from .optics.models import predicted_error as predicted_error
 from .optics.prism import FlatSide as FlatSide
 from .optics.prism import NominalPrism as NominalPrism

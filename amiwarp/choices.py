@@ -2,7 +2,7 @@
 
 import enum
 
-OPTICAL_MODELS = ("circle", "exact", "radial", "ellipse")
+OPTICAL_MODELS = ("circle", "exact", "radial", "ellipse", "risley")
 """Names of the optical models, for programs that do not load them."""
 
 # Choices for images of warped events: how to vote, what to do with polarity, which sharpness to measure.

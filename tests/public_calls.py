@@ -40,6 +40,7 @@ SOURCE = aw.MemoryEvents(EVENTS, 4, 3)
 ENCODER = aw.Encoder(np.array([0, 1000], np.int64), np.array([0.0, 0.1]))
 PRISM = aw.Prism(0.02)
 MODEL = aw.ExactModel(CAMERA, PRISM)
+PAIR = aw.Prism(0.02, second=aw.Prism(0.01))
 RECORDING = aw.Recording(SOURCE, CAMERA, ENCODER, PRISM)
 STILL = aw.Trajectory.still((0, 0, 0))
 MESH = aw.Mesh([[0, 0, 2], [1, 0, 2], [0, 1, 2]], [[0, 1, 2]])
@@ -234,6 +235,7 @@ OWN: dict[str, dict[str, Any]] = {
     "Encoder.gaps": {"max_interval_us": 100.0},
     "Encoder.with_clock_offset": {"clock_offset_us": 1.0},
     "Encoder.with_harmonics": {"harmonics": [0.1, 0.0, 0.0, 0.0]},
+    "Encoder.with_second": {"second": -0.5},
     "Encoder.with_index": {"index_t_us": [500]},
     "EncoderStream.append": {"t_us": [2000, 3000]},
     "EncoderStream.guessed": {"t": np.array([0, 5])},
@@ -299,13 +301,14 @@ OWN: dict[str, dict[str, Any]] = {
     "CameraRotation.rotation": {"tau": np.zeros(2)},
     **{
         f"{name}.{method}": given
-        for name in ("CircleModel", "EllipseModel", "ExactModel", "RadialCircleModel")
+        for name in ("CircleModel", "EllipseModel", "ExactModel", "RadialCircleModel", "RisleyModel")
         for method, given in (("apex_from_size", {"size": 0.02}), ("size_from_apex", {"apex": 0.02}))
     },
     "CircleModel": {"deflection": 0.01},
     "CircleModel.from_values": {"values": {"deflection": 0.01, "phase": 0.0}},
     "RadialCircleModel.from_values": {"values": {"deflection": 0.01, "phase": 0.0}},
     "RadialCircleModel": {"deflection": 0.01},
+    "RisleyModel": {"prism": PAIR},
     "EllipseModel": {"offset": TABLE, "cosine": TABLE, "sine": TABLE},
     "EllipseModel.fit": {"xy": XY, "theta": np.linspace(0, 6, 200), "compensated": XY, "degree": 1},
     "ModelError": {"rms": 0.1, "worst": 0.1, "lag": 0.0},
@@ -400,6 +403,7 @@ OBJECTS: dict[str, Any] = {
     "RadialCircleModel": aw.RadialCircleModel(CAMERA, 0.01),
     "EllipseModel": aw.EllipseModel(CAMERA, *[TABLE] * 3),
     "ExactModel": MODEL,
+    "RisleyModel": aw.RisleyModel(CAMERA, PAIR),
     "UnsizedPrism": aw.UnsizedPrism(),
     "Picture": PICTURE,
     "PixelMap": PIXELS,

@@ -45,7 +45,8 @@ from amiwarp.calib.model_choice import (
     trial_for,
 )
 from amiwarp.calib.sharpness import split_turns
-from amiwarp.optics.models import MODELS, compensate_by_each, rms
+from amiwarp.optics.models import compensate_by_each, rms
+from amiwarp.optics.models import rungs as wedge_models
 from tests.conftest import COARSE
 
 BOTH = Settings(events=120_000, photometric=COARSE)
@@ -109,7 +110,7 @@ def test_a_wide_lens_does_not(found: Calibration, wide: Recording) -> None:
     assert found.ladder is not None
     truth, places = true_exact(wide), places_of(wide, 50_000)
     rungs = {r.model: r for r in found.ladder.rungs}
-    assert list(rungs) == list(MODELS)
+    assert list(rungs) == list(wedge_models())
     assert [r.model for r in rungs.values() if r.chosen] == ["exact"]
     exact = replace(found.exact, parameters={"apex": truth.prism.apex, "phase": truth.phase})
     for name in ("circle", "radial"):
@@ -176,7 +177,7 @@ def test_held_out_turns_see_the_circle_s_error_in_pixels(as_circle: Calibration)
 
 def test_held_out_turns_are_not_measured_if_they_cannot_change_the_choice(found: Calibration) -> None:
     assert found.ladder is not None
-    assert [r.seen_px for r in found.ladder.rungs] == [None] * len(MODELS)
+    assert [r.seen_px for r in found.ladder.rungs] == [None] * len(wedge_models())
     assert found.ladder.agreed
     assert found.warnings == ()
 
@@ -255,7 +256,7 @@ def test_the_command_shows_the_table(found: Calibration, capsys: pytest.CaptureF
     for line in calibration_lines(found, calibration_summary(found) | {"file": "c.json", "device": "cpu"}):
         console.print(line, markup=False)
     out = capsys.readouterr().out
-    assert all(f"\n{name} " in out for name in MODELS)
+    assert all(f"\n{name} " in out for name in wedge_models())
     assert "chosen: the smallest that keeps the budget" in out
     assert "record at two speeds" in out
 

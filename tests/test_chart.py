@@ -35,7 +35,7 @@ from amiwarp import (
 )
 from amiwarp.calib.presets import Preset, check, settings_from, settings_to, simplified
 from amiwarp.cli.app import app
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import rungs
 from amiwarp.plotting import figures
 from amiwarp.studies.chart import Charts, measurement
 from amiwarp.studies.chart.measurement import (
@@ -372,7 +372,7 @@ def test_presets_are_taken(charted: tuple[Path, dict[str, Any]], tmp_path: Path)
     assert found["stages"][0]["name"] == "global"
     assert found["stages"][0]["evaluations"] == 30  # an option takes precedence over the preset
     assert "photometric" not in [stage["name"] for stage in found["stages"]]
-    for model in MODELS:
+    for model in rungs():
         preset = tmp_path / f"{model}.json"
         Preset("compensation", {"model": model}, {}).save(preset)
         words = ("compensate", folder / "recording.h5", tmp_path / f"{model}.h5", "--calibration", tmp_path / "c.json")
@@ -380,7 +380,7 @@ def test_presets_are_taken(charted: tuple[Path, dict[str, Any]], tmp_path: Path)
         assert result.exit_code == 0, result.output
         assert f"by the {model} model" in result.stdout
         assert open_recording(tmp_path / f"{model}.h5").metadata["compensated_with"] == model
-    first = {m: open_recording(tmp_path / f"{m}.h5").events.slice(0, 10_000) for m in MODELS}
+    first = {m: open_recording(tmp_path / f"{m}.h5").events.slice(0, 10_000) for m in rungs()}
     away = {m: rms(np.stack([e.x - first["exact"].x, e.y - first["exact"].y], axis=1)) for m, e in first.items()}
     assert away["exact"] == 0.0 < away["ellipse"] < away["radial"] < away["circle"] < 0.5
 

@@ -23,7 +23,7 @@ from amiwarp import (
     iwe,
 )
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, rungs
 
 WIDTH, HEIGHT = 64, 48
 CAMERA = Camera.from_fov(WIDTH, HEIGHT, math.radians(60))
@@ -47,7 +47,7 @@ def joined(packets: list[Compensated]) -> tuple[Events, np.ndarray]:
     return Events.concatenate([p.events for p in packets]), np.concatenate([p.flags for p in packets])
 
 
-@pytest.mark.parametrize("name", list(MODELS))
+@pytest.mark.parametrize("name", list(rungs()))
 @pytest.mark.parametrize("distorted", [False, True])
 def test_a_stream_comes_out_as_its_recording_does(name: str, distorted: bool, device: str) -> None:
     """Equal bit for bit, for packets of any size, some longer than a batch, with a clock offset."""

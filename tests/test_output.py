@@ -97,7 +97,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     exact_calibration(CAMERA, Prism(math.radians(2.0)), values).save(folder / "cal.json")
     camera = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     (folder / "cam.json").write_text(json.dumps(camera))
-    (folder / "enc.csv").write_text("t_us,angle_deg\n-1000,0\n100000,436.3\n201000,872.6\n")
+    for name in ("enc.csv", "enc2.csv"):
+        (folder / name).write_text("t_us,angle_deg\n-1000,0\n100000,436.3\n201000,872.6\n")
     Image.fromarray(np.tile(np.arange(64, dtype=np.uint8) * 4, (48, 1))).save(folder / "pic.png")
     pictures = folder / "pictures"
     pictures.mkdir()
@@ -144,6 +145,7 @@ OVER_INPUTS = (
     ("compensate a.h5 out.h5 --calibration cal.json --iwe {}", "cal.json"),
     ("compensate a.h5 {} --calibration cal.json --preset tr.tum", "tr.tum"),
     ("compensate a.h5 {} --calibration cal.json --encoder enc.csv", "enc.csv"),
+    ("compensate a.h5 {} --calibration cal.json --encoder enc.csv --second-encoder enc2.csv", "enc2.csv"),
     ("reconstruct a.h5 {} --calibration cal.json", "a.h5"),
     ("reconstruct a.h5 out.png --calibration cal.json --mask {}", "cal.json"),
     ("pixels a.h5 cal.json {}", "a.h5"),
@@ -165,6 +167,7 @@ OVER_INPUTS = (
     ("translate pictures {} --fps 100 --events a.h5", "a.h5"),
     ("convert a.h5 {}", "a.h5"),
     ("convert a.h5 {} --encoder enc.csv", "enc.csv"),
+    ("convert a.h5 {} --encoder enc.csv --second-encoder enc2.csv", "enc2.csv"),
     ("convert a.h5 {} --camera cam.json", "cam.json"),
     ("convert text/events.txt {}", "text/calib.txt"),
     ("record a.h5 {} --fast", "a.h5"),
@@ -518,6 +521,7 @@ ENDLESS = (
     "info {}",
     "convert {} out.h5",
     "convert a.h5 out.h5 --encoder {}",
+    "convert a.h5 out.h5 --encoder enc.csv --second-encoder {}",
     "convert a.h5 out.h5 --camera {}.json",
     "convert a.h5 out.h5 --camera {}.txt",
     "convert a.h5 out.h5 --camera {}.yaml",
@@ -529,6 +533,7 @@ ENDLESS = (
     "compensate a.h5 out.h5 --calibration {}",
     "compensate a.h5 out.h5 --calibration cal.json --preset {}",
     "compensate a.h5 out.h5 --calibration cal.json --encoder {}",
+    "compensate a.h5 out.h5 --calibration cal.json --encoder enc.csv --second-encoder {}",
     "reconstruct {} out.png --calibration cal.json",
     "reconstruct a.h5 out.png --calibration {}",
     "simulate out.h5 --picture {}",

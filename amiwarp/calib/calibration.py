@@ -24,7 +24,7 @@ from amiwarp.calib import checks, first_guess
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
 from amiwarp.calib.model_choice import ModelChooser
-from amiwarp.calib.parameters import MOTION, RATES, ParameterSpace, make_space, nominal
+from amiwarp.calib.parameters import MOTION, RATES, ParameterSpace, default_free, make_space, nominal
 from amiwarp.calib.photometric import stage
 from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
@@ -32,10 +32,10 @@ from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, 
 from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, Settings
 from amiwarp.calib.sharpness import Search
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.optics.camera import LENS, Camera, with_lens
-from amiwarp.optics.models import MODELS, predicted_error, size_names
+from amiwarp.optics.models import MODELS, RisleyModel, predicted_error, size_names
 from amiwarp.optics.prism import Prism
 from amiwarp.tasks import Progress
 from amiwarp.validation import check_names, guarded
@@ -97,6 +97,8 @@ def calibrate(
     check_names(changes, [entry.name for entry in fields(Settings)], "calibrate: setting ")
     settings = replace(settings or Settings(), **changes)
     settings.check()
+    if settings.model == AUTO and recording.encoder is not None and recording.encoder.second is not None:
+        settings = replace(settings, model=RisleyModel.NAME)
     if settings.model != AUTO:
         return Calibrator(recording, settings, device, progress).run()
     chooser = ModelChooser(recording, settings, device)
@@ -442,7 +444,7 @@ def _sharpest(
 ) -> Calibration:
     """Return the calibration by the sharpness stage that ``search`` ran. Its time is not set."""
     settings, space, best = search.settings, search.space, search.best
-    still = {n: 0.0 for n in (space.size_name, *MOTION) if n in best}
+    still = {**MODELS[space.model].still_values(best), **{n: 0.0 for n in MOTION if n in best}}
     return Calibration(
         model_name=settings.model,
         camera=space.camera,
@@ -451,7 +453,7 @@ def _sharpest(
         uncertainty=uncertainty,
         free=space.names,
         sharpness_name=settings.sharpness.value,
-        sharpness_before=search.fine.values({**best, **still}),
+        sharpness_before=search.fine.values(still),
         sharpness_after=search.score,
         stages=tuple(search.stages),
         # without an encoder, the prism angle is 0 at this time
@@ -513,6 +515,7 @@ def prepare(
         checks.check_unmasked_events(len(events), recording.events.mask, name)
     searches = []
     for encoder in encoders:
+        check_prisms(encoder, MODELS[settings.model].ANGLES)
         checks.check_coverage(encoder, int(events.t[0]), int(events.t[-1]), name)
         checks.check_pulses(encoder, name)
         space = _space(recording, camera, encoder, events, settings, free)
@@ -585,7 +588,7 @@ def _encoders(recording: Recording, settings: Settings, path: Encoder | None) ->
     either sign. If the events show that the speed varies much, they are paths with either sense of rotation.
     """
     kind = MODELS[settings.model]
-    free = kind.FREE[:2] if settings.free is None else settings.free
+    free = default_free(kind) if settings.free is None else settings.free
     free = tuple(n for n in free if n not in LINEAR_UNKNOWNS)
     if not {*size_names(), "phase"} & set(free) and settings.start.get(kind.SIZE) == 0.0:
         return [constant_speed(0.0, recording.events.t_first, recording.events.t_last, middle_time(recording))], free
@@ -627,6 +630,8 @@ def _space(
         start["rpm"] = encoder.rpm
     if "clock_offset" in free:
         start.setdefault("clock_offset", encoder.clock_offset_us)
+    if encoder.ratio is not None:
+        start["ratio"] = encoder.ratio
     if ("motion" in free or set(RATES) & set(free)) and turned > 0.0 and not set(RATES) & set(start):
         found = dict(zip(RATES, first_guess.estimate_rates(events, encoder, camera), strict=True))
         start |= {n: rate for n, rate in found.items() if "motion" in free or n in free}

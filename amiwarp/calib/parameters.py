@@ -67,6 +67,26 @@ def units() -> dict[str, str]:
     return {name: parameter.unit for name, parameter in optical_parameters().items()} | _UNITS
 
 
+def of_orbit(space: ParameterSpace, k: int, at: Mapping[str, float]) -> ParameterSpace:
+    """Return the space of the ``k``-th prism's size and phase.
+
+    Prisms before it have the values ``at``, later ones the size 0.
+    """
+    orbits = MODELS[space.model].ORBITS
+    others = tuple({*space.names} - {*orbits[k]})
+    return space.holding({**at, **{size: 0.0 for size, _ in orbits[k + 1 :]}}).without(others)
+
+
+def phase_names() -> set[str]:
+    """Return the names of the parameters that are the phase of a prism."""
+    return {phase for model in MODELS.values() for _, phase in model.ORBITS}
+
+
+def default_free(kind: type[Model]) -> tuple[str, ...]:
+    """Return the names of the parameters that are free by default: size and phase of each prism."""
+    return tuple(name for orbit in kind.ORBITS for name in orbit)
+
+
 def like_size(names: Iterable[str]) -> tuple[str, ...]:
     """Return those parameters that in sharpness are nearly degenerate with the size: of the lens, and some of a model.
 
@@ -114,11 +134,20 @@ class ParameterSpace:
         """Name of the parameter that sets the size of the orbit: ``apex`` or ``deflection``."""
         return MODELS[one_of(self.model, MODELS, "model")].SIZE
 
-    @cached_property
+    @property
     def cartesian(self) -> bool:
         """Whether the vector's first two entries are (size·cos phase, size·sin phase)."""
-        full = self.high.get("phase", 0.0) - self.low.get("phase", 0.0) >= 2.0 * math.pi - 1e-9
-        return self.names[:2] == (self.size_name, "phase") and full
+        return 0 in self.orbits
+
+    @cached_property
+    def orbits(self) -> tuple[int, ...]:
+        """Indices of the vector's entries that are (size·cos phase, size·sin phase), with the next entry."""
+        found, orbits = [], MODELS[one_of(self.model, MODELS, "model")].ORBITS
+        for size, phase in orbits:
+            full = self.high.get(phase, 0.0) - self.low.get(phase, 0.0) >= 2.0 * math.pi - 1e-9
+            if full and size in self.names and phase in self.names:
+                found.append(self.names.index(size))
+        return tuple(k for k in found if self.names[k : k + 2] in orbits)
 
     @property
     def sized(self) -> bool:
@@ -172,9 +201,9 @@ class ParameterSpace:
         """
         low = np.array([self.low[n] * self.pixels[n] for n in self.names])
         high = np.array([self.high[n] * self.pixels[n] for n in self.names])
-        if self.cartesian:
-            high[1] = high[0]
-            low[:2] = -high[:2]
+        for k in self.orbits:
+            high[k + 1] = high[k]
+            low[k : k + 2] = -high[k : k + 2]
         return low, high
 
     def to_vector(self, values: Mapping[str, float]) -> NDArray[np.float64]:
@@ -192,8 +221,9 @@ class ParameterSpace:
         """
         check_given(values, self.names)
         v = np.array([values[n] * self.pixels[n] for n in self.names])
-        if self.cartesian:
-            v[:2] = v[0] * math.cos(values["phase"]), v[0] * math.sin(values["phase"])
+        for k in self.orbits:
+            phase = values[self.names[k + 1]]
+            v[k : k + 2] = v[k] * math.cos(phase), v[k] * math.sin(phase)
         return v
 
     def to_values(self, v: NDArray[np.float64]) -> dict[str, float]:
@@ -215,9 +245,9 @@ class ParameterSpace:
         values, entries = dict(self.start), v.tolist()
         for name, entry in zip(self.names, entries, strict=True):
             values[name] = entry / self.pixels[name]
-        if self.cartesian:
-            x, y, size = entries[0], entries[1], self.names[0]
-            values[size], values["phase"] = math.hypot(x, y) / self.pixels[size], math.atan2(y, x)
+        for k in self.orbits:
+            x, y, (size, phase) = entries[k], entries[k + 1], self.names[k : k + 2]
+            values[size], values[phase] = math.hypot(x, y) / self.pixels[size], math.atan2(y, x)
         for name in self.names:
             values[name] = min(max(values[name], self.low[name]), self.high[name])
         return values
@@ -321,7 +351,7 @@ def nominal(prism: NominalPrism | None) -> Prism:
 
 
 def _difference(name: str, a: float, b: float) -> float:
-    return math.remainder(a - b, 2.0 * math.pi) if name == "phase" else a - b
+    return math.remainder(a - b, 2.0 * math.pi) if name in phase_names() else a - b
 
 
 def rotation_from_values(values: Mapping[str, float], middle_us: int) -> CameraRotation:
@@ -395,10 +425,10 @@ def make_space(
         order, or if a free parameter moves no event.
     """
     kind = MODELS[model]
-    names = _ordered_names(kind, kind.FREE[:2] if free is None else free)
+    names = _ordered_names(kind, default_free(kind) if free is None else free)
     _check_given(kind, names, start, bounds)
     nominal = {**kind.start_values(prism), "focal_length": camera.fx}
-    values = {n: start.get(n, nominal.get(n, 0.0)) for n in (*kind.FREE[:2], *names, *start)}
+    values = {n: start.get(n, nominal.get(n, 0.0)) for n in (*default_free(kind), *names, *start)}
     low, high = {}, {}
     for name in names:
         low[name], high[name] = bounds.get(name) or _default_bounds(kind, name, values[name], prism)
@@ -484,8 +514,10 @@ def _check_given(
 def _default_bounds(kind: type[Model], name: str, value: float, prism: Prism) -> tuple[float, float]:
     if name == kind.SIZE:
         return 0.0, kind.size_from_apex(2.0 * prism.apex, prism)
-    if name == PHASE.name:
+    if name in phase_names():
         return -PHASE.half_range, PHASE.half_range
+    if name in dict(kind.ORBITS):  # the size of another prism
+        return 0.0, 2.0 * value
     share = {"rpm": 0.02, "focal_length": 0.2}
     ranges = _HALF_RANGE | {parameter.name: parameter.half_range for parameter in kind.PARAMETERS}
     half = share[name] * abs(value) if name in share else ranges[name]
@@ -508,10 +540,11 @@ def _pixels_per_unit(
     size.
     """
     kind = MODELS[model].closed_form()
-    nominal = {**values, kind.SIZE: kind.size_from_apex(prism.apex, prism)}
+    nominal = {**values, **{size: kind.start_values(prism)[size] for size, _ in kind.ORBITS}}
     lens = {"center_x": 1.0, "center_y": 1.0, "k1": 0.01, "fy_over_fx": 0.01}
     steps = {**dict.fromkeys((kind.SIZE, *optical_parameters()), 0.02), **lens}
-    steps |= {kind.SIZE: 0.25 * nominal[kind.SIZE], "phase": 0.05}
+    for size, phase in kind.ORBITS:
+        steps |= {size: 0.25 * nominal[size], phase: 0.05}
     steps = {n: h for n, h in steps.items() if n in names or (n == "phase" and set(DRIFTS) & set(names))}
     if "focal_length" in names:
         steps["focal_length"] = 0.01 * camera.fx

@@ -333,8 +333,10 @@ class Calibration:
         AmiwarpError
             If the recording has no encoder and the calibration no rpm, or a path that does not cover the events.
         """
-        if self.parameters.get(MODELS[self.model_name].SIZE) == 0.0:
-            return constant_speed(0.0, t_first, t_last, t_first)
+        kind = MODELS[self.model_name]
+        if all(self.parameters.get(size) == 0.0 for size, _ in kind.ORBITS):
+            rest = constant_speed(0.0, t_first, t_last, t_first)
+            return rest if kind.ANGLES == 1 else rest.with_second(1.0)
         if encoder is not None:
             encoder = encoder.with_clock_offset(self.parameters.get("clock_offset", encoder.clock_offset_us))
             return encoder if self.harmonics is None else encoder.with_harmonics(self.harmonics)
@@ -365,7 +367,7 @@ class Calibration:
             "version": VERSION,
             "model": self.model_name,
             "camera": camera_to_json(self.camera),
-            "prism": {"apex_rad": self.prism.apex, "index": self.prism.index, "flat_side": self.prism.flat_side.value},
+            "prism": prism_to_json(self.prism),
             "parameters": {name: self._parameter(name) for name in self.parameters},
             "sharpness": {
                 "kind": self.sharpness_name,
@@ -446,7 +448,6 @@ class Calibration:
         model = one_of(data["model"], MODELS, "field model")
         given = fields_of(data["parameters"], "parameters", *MODELS[model].FREE[:2], optional=tuple(units()))
         entries = {name: _entry(name, entry) for name, entry in given.items()}
-        prism = fields_of(data["prism"], "prism", "apex_rad", "index", "flat_side")
         sharpness = build(_Sharpness, data["sharpness"], "sharpness")
         path = None if data.get("path") is None else build(_Path, data["path"], "path")
         names = [f.name for f in fields(_PlainFields)]
@@ -454,7 +455,7 @@ class Calibration:
         result = cls(
             model_name=model,
             camera=camera_from_json(data["camera"], "camera"),
-            prism=Prism(prism["apex_rad"], prism["index"], prism["flat_side"]),
+            prism=prism_from_json(data["prism"], "prism"),
             parameters={name: entry.value for name, entry in entries.items()},
             uncertainty={name: entry.std for name, entry in entries.items() if entry.std is not None},
             free=tuple(name for name, entry in entries.items() if entry.free),
@@ -466,6 +467,20 @@ class Calibration:
         )
         _ = replace(result, model_name=MODELS[model].closed_form().NAME).model
         return result
+
+
+def prism_to_json(prism: Prism) -> dict[str, Any]:
+    """Return a prism, with the second one of a pair, in types that JSON knows."""
+    found = {"apex_rad": prism.apex, "index": prism.index, "flat_side": prism.flat_side.value}
+    return found if prism.second is None else {**found, "second": prism_to_json(prism.second)}
+
+
+def prism_from_json(data: Any, name: str) -> Prism:
+    """Return the prism of :func:`prism_to_json`."""
+    given = fields_of(data, name, "apex_rad", "index", "flat_side", optional=("second",))
+    second = given.get("second")
+    behind = None if second is None else prism_from_json(second, f"{name}.second")
+    return Prism(given["apex_rad"], given["index"], given["flat_side"], behind)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from amiwarp.calib import checks
 from amiwarp.calib.calibration_events import CalibrationEvents, EventsAhead
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import MOTION, ParameterSpace, like_size, units
+from amiwarp.calib.parameters import MOTION, ParameterSpace, like_size, of_orbit, phase_names, units
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.settings import Settings, stage_share
 from amiwarp.choices import Sharpness
@@ -88,8 +88,8 @@ class Objective:
         self._meter = SharpnessMeter(canvas, kind, smoothing=smoothing * scale, device=device)
         self._graph: Any = None
         self._votes: Votes | TileVotes
-        # tiles are prepared for one camera, so a free focal length excludes them
-        if self._meter.device.is_cuda and "focal_length" not in space.names:
+        # tiles are prepared for one camera, so a free focal length excludes them, and for one prism
+        if self._meter.device.is_cuda and "focal_length" not in space.names and MODELS[space.model].ANGLES == 1:
             self._votes = TileVotes(self._meter.image, canvas, events, self._model(space.start))
         else:
             self._votes, self._events = Votes(canvas, self._meter.device), events
@@ -149,7 +149,8 @@ def padding(space: ParameterSpace) -> int:
     For the camera's rotation it allows twice the start's rates and :data:`ROTATION_MARGIN_PX`; faster answers are
     wrong anyway. It is never larger than the image.
     """
-    largest = {n: space.high[n] for n in space.names if n == space.size_name}
+    sizes = dict(MODELS[space.model].ORBITS)
+    largest = {n: space.high[n] for n in space.names if n in sizes}
     faster = {n: 2.0 * abs(space.start.get(n, 0.0)) for n in MOTION if n in space.start}
     margin = ROTATION_MARGIN_PX if space.moving else 0.0
     most = max(space.camera.width, space.camera.height)
@@ -161,10 +162,12 @@ def reach(space: ParameterSpace, values: Mapping[str, float]) -> float:
     camera = space.camera
     kind = MODELS[space.model].closed_form()
     xy, *points = _border_points(camera)
-    moved = build_model(kind.NAME, camera, space.prism, values).compensate_points(*points).numpy() - xy
-    radius = np.linalg.norm(moved[np.isfinite(moved).all(axis=1)], axis=1)
+    model, radius = build_model(kind.NAME, camera, space.prism, values), 0.0
+    for each in model.singles():
+        moved = each.compensate_points(*points).numpy() - xy
+        radius += float(np.linalg.norm(moved[np.isfinite(moved).all(axis=1)], axis=1).max(initial=0.0))
     turned = space.camera_rotation(values).reach(camera, space.duration_us * 0.5e-6)
-    return float(radius.max(initial=0.0)) + float(np.linalg.norm(turned))
+    return radius + float(np.linalg.norm(turned))
 
 
 @lru_cache(maxsize=16)
@@ -397,9 +400,13 @@ class Search:
         starts = [space.to_vector(space.start if start is None else start)]
         still = space.without(MOTION) if space.moving else space  # the global search keeps a rotation's start values
         if start is None and s.global_algorithm is not None and still.names:
-            objective, first = self._coarse_objective(self.calibration_events, still), still.to_vector(still.start)
-            stage = self._maximise(objective, s.global_algorithm, first, s.global_evaluations, step=1.0)
-            starts = [space.to_vector(still.to_values(v)) for v in distinct_optima(stage, CANDIDATES)]
+            found = [dict(still.start)]
+            for part in self._global_parts(still):
+                one = part(found[0])
+                objective, first = self._coarse_objective(self.calibration_events, one), one.to_vector(one.start)
+                stage = self._maximise(objective, s.global_algorithm, first, s.global_evaluations, step=1.0)
+                found = [one.to_values(v) for v in distinct_optima(stage, CANDIDATES)]
+            starts = [space.to_vector(values) for values in found]
         if space.moving:
             starts = [self._track_rotation(each) for each in starts]
         runs: list[SearchStage] = []
@@ -408,6 +415,14 @@ class Search:
             runs.append(self._maximise(self.fine, s.local_algorithm, each, s.local_evaluations, step=0.7, known=known))
         best = max(runs, key=lambda run: run.score)
         self.best, self.score = space.to_values(best.x), best.score
+
+    def _global_parts(self, space: ParameterSpace) -> list[Callable[[Mapping[str, float]], ParameterSpace]]:
+        """Return for each step of the global search how its space follows from the values of the step before.
+
+        The prisms of a pair are searched one after the other: each removes its part of the blur.
+        """
+        count = len(MODELS[space.model].ORBITS)
+        return [lambda _: space] if count == 1 else [partial(of_orbit, space, k) for k in range(count)]
 
     def _coarse_objective(self, events: CalibrationEvents, space: ParameterSpace) -> Objective:
         step = max(1, len(events.events) // (self.settings.events // 3 + 1))
@@ -483,7 +498,8 @@ class Search:
             plain = self.settings.sharpness is Sharpness.VARIANCE
             variance = parts if plain else self._objective_by_parts(Sharpness.VARIANCE)
             unmoved = MODELS[space.model].still_values(best)
-            points = (best, {**best, "phase": best["phase"] + math.pi}, unmoved)
+            away = {phase: best[phase] + math.pi for _, phase in MODELS[space.model].ORBITS}
+            points = (best, {**best, **away}, unmoved)
             sharp, opposite, still = (variance.each(values) for values in points)
             if "photometric" in self.settings.stages:
                 size, most = space.size_name, space.high[space.size_name]
@@ -495,8 +511,8 @@ class Search:
         v = space.to_vector(best)
         covariance, warnings = estimate_covariance(parts, v)
         at_bound = [
-            n for n in space.names
-            if n != "phase" and min(best[n] - space.low[n], space.high[n] - best[n]) * space.pixels[n] < LEAST_INSIDE_PX
+            n for n in (each for each in space.names if each not in phase_names())
+            if min(best[n] - space.low[n], space.high[n] - best[n]) * space.pixels[n] < LEAST_INSIDE_PX
         ]  # fmt: skip
         unit = units()
         bounds = (f"{n} = {best[n]:.6g} {unit[n]} lies on its bound; widen the bounds of {n}" for n in at_bound)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal, cast, get_type_hints
 
 import rich.progress
 import typer
@@ -29,7 +29,7 @@ from amiwarp.io.camera_files import load_camera
 from amiwarp.io.files import check_regular
 from amiwarp.io.formats import LIMITS, Codec, OutputFormat, Rounding
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import FlatSide, NominalPrism, UnsizedPrism
+from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
 from amiwarp.tasks import Progress
 
 # Options that several commands use. A group of options is a dataclass.
@@ -87,6 +87,9 @@ class NominalPrismOptions:
     nominal_apex_deg: Annotated[float | None, in_prism(help="Apex angle from the prism's data sheet (deg).")] = None
     index: Annotated[float | None, in_prism(help="Refractive index of the prism.")] = None
     flat_side: Annotated[FlatSide | None, in_prism(help="Direction that the prism's flat face points to.")] = None
+    second_apex_deg: Annotated[
+        float | None, in_prism(help="Apex angle of a second prism behind the first, a Risley pair (deg).")
+    ] = None
 
     def build(self, known: NominalPrism | None) -> NominalPrism | None:
         """Return the nominal prism ``known`` with the values that options give; None if neither exists.
@@ -97,7 +100,14 @@ class NominalPrismOptions:
         changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         prism = replace(known or UnsizedPrism(), **changes)
         if self.nominal_apex_deg is not None:
-            return UnsizedPrism(prism.index, prism.flat_side).with_apex(math.radians(self.nominal_apex_deg))
+            sized = UnsizedPrism(prism.index, prism.flat_side).with_apex(math.radians(self.nominal_apex_deg))
+            prism = replace(sized, second=prism.second) if isinstance(prism, Prism) else sized
+            changes["apex"] = sized.apex
+        if self.second_apex_deg is not None:
+            if not isinstance(prism, Prism):
+                raise AmiwarpError("--second-apex-deg needs the apex of the first prism; give --nominal-apex-deg")
+            second = Prism(math.radians(self.second_apex_deg), prism.index, prism.flat_side)
+            return replace(prism, second=second)
         return prism if changes else known
 
 
@@ -141,9 +151,28 @@ class EncoderOptions:
         ),
     ] = None
     direction: Annotated[Literal["1", "-1"], in_encoder(help="Counting direction; -1: backwards.")] = "1"
+    second_encoder: Annotated[
+        Path | None, in_encoder(help="Encoder log of the second prism of a Risley pair, in the form of --encoder.")
+    ] = None
+    second_ratio: Annotated[
+        float | None,
+        in_encoder(help="Speed of the second prism of a Risley pair relative to the first, if both are geared."),
+    ] = None
 
     def build(self, source: Path, topic: str | None) -> Encoder | None:
         """Return the encoder of the log or of the recording's triggers, or None if neither is given."""
+        if self.second_encoder is not None and self.second_ratio is not None:
+            raise AmiwarpError("--second-encoder and --second-ratio both describe the second prism; give one of them")
+        first = replace(self, second_encoder=None, second_ratio=None)._first(source, topic)
+        if self.second_encoder is None and self.second_ratio is None:
+            return first
+        if first is None:
+            raise AmiwarpError("--second-encoder and --second-ratio need the first prism's encoder; give --encoder too")
+        if self.second_ratio is not None:
+            return first.with_second(self.second_ratio)
+        return first.with_second(cast("Encoder", replace(self, encoder=self.second_encoder)._first(source, topic)))
+
+    def _first(self, source: Path, topic: str | None) -> Encoder | None:
         if self.encoder_from is not None:
             return self._from_triggers(self.encoder_from, source, topic)
         if self.encoder is None:

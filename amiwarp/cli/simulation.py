@@ -92,6 +92,15 @@ class RigOptions:
             help="Wobble of the prism about the rotation axis, along the wedge and across it (deg).", metavar="X,Y"
         ),
     ] = "0,0"
+    second_apex_deg: Annotated[
+        float | None, in_prism(help="Apex angle of a second prism behind the first, a Risley pair (deg).")
+    ] = None
+    second_rpm: Annotated[
+        float | None, in_prism(help="Speed of the second prism (turns/min). Default: that of the first, backwards.")
+    ] = None
+    second_phase_deg: Annotated[
+        float | None, in_prism(help="Azimuth of the second prism at encoder angle 0 (deg). Default: 0.")
+    ] = None
 
     def build_camera(self, default: tuple[int, int] = (640, 480)) -> Camera:
         """Return the camera. ``default`` is the size of its image [px] if no option gives one."""
@@ -104,7 +113,14 @@ class RigOptions:
 
     def build_prism(self) -> Prism:
         """Return the prism with its true parameters."""
-        return Prism(math.radians(self.apex_deg), self.index, self.flat_side)
+        if self.second_apex_deg is None:
+            if (self.second_rpm, self.second_phase_deg) != (None, None):
+                raise AmiwarpError(
+                    "--second-rpm and --second-phase-deg describe a second prism; give --second-apex-deg"
+                )
+            return Prism(math.radians(self.apex_deg), self.index, self.flat_side)
+        second = Prism(math.radians(self.second_apex_deg), self.index, self.flat_side)
+        return Prism(math.radians(self.apex_deg), self.index, self.flat_side, second)
 
     def build_nominal(self) -> Prism:
         """Return the nominal prism that is stored with the recording."""
@@ -122,7 +138,11 @@ class RigOptions:
             )
         )
         rpm: Any = self.rpm if self.speed is None else _read_speed(self.speed)
-        return PrismMotion(rpm, math.radians(self.phase_deg), tilt, cylinder, wobble)
+        second = None
+        if self.second_apex_deg is not None:
+            backwards = -self.rpm if self.second_rpm is None else self.second_rpm
+            second = PrismMotion(backwards, math.radians(self.second_phase_deg or 0.0))
+        return PrismMotion(rpm, math.radians(self.phase_deg), tilt, cylinder, wobble, second)
 
 
 def _read_speed(path: Path) -> list[tuple[float, ...]]:

@@ -20,7 +20,7 @@ from amiwarp.calib.result import Calibration
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
 from amiwarp.events.device_events import DeviceEvents, azimuths, device_for, limits, wait
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, EventSource, MetadataValue, Recording
 from amiwarp.io import RecordingWriter
 from amiwarp.io.export import bag_of, export, left_out
@@ -48,8 +48,9 @@ class LaunchPlan:
         name = str(device)
         self.size = model.camera.width, model.camera.height
         """Sensor width and height [px]."""
-        self.kernel = kernels.compensate_blocks if device.is_cpu else kernels.compensate_events
-        self.block = int(kernels.BLOCK) if device.is_cpu else 1
+        in_blocks = device.is_cpu and model.ANGLES == 1
+        self.kernel = kernels.compensate_blocks if in_blocks else kernels.compensate_events
+        self.block = int(kernels.BLOCK) if in_blocks else 1
         """Number of events per thread of the kernel; columns are padded to a multiple of this number."""
         self._camera = camera_params(model.camera, name)
         self._pinhole = pinhole_params(model.camera) or self._camera
@@ -225,6 +226,7 @@ class BlockCompensator:
 
         Raises :class:`AmiwarpError` if the encoder does not cover the times ``t_first`` .. ``t_last`` [us].
         """
+        check_prisms(encoder, model.ANGLES)
         self._device = wp.get_device(device)
         self._plan = LaunchPlan(model, self._device)
         self._encoder = device_events.encoder_params(encoder, t_first, t_last, str(self._device))

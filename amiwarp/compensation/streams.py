@@ -552,6 +552,8 @@ class Compensator:
         self.start_us = whole(start_us, "start_us", 0, TIME_LIMIT, " us")
         self.most_waiting = whole(most_waiting, "most_waiting", 0, TIME_LIMIT, " events")
         self.most_bytes = whole(most_bytes, "most_bytes", 0, TIME_LIMIT, " bytes")
+        if model.ANGLES > 1:
+            raise AmiwarpError("a stream carries the angle of one prism; record it, and compensate the recording")
         self._device = wp.get_device(device)
         batch = (1 << 16 if self._device.is_cpu else 1 << 20) if batch is None else batch
         self.batch = whole(batch, "batch", 1, 1 << 28, " events")

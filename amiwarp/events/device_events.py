@@ -155,15 +155,29 @@ def encoder_params(encoder: Encoder, t_first: int, t_last: int, device: Any) -> 
     origin, start, angle, slope = encoder_pieces(encoder, t_first, t_last)
     # a bucket of samples lasts 2**shift us, at most the mean interval between samples
     shift = max(int(start[-1]) // start.size, 1).bit_length() - 1
-    edges = np.arange((int(start[-1]) >> shift) + 1, dtype=np.int64) << shift
-    first = np.append(np.searchsorted(start, edges, side="right") - 1, start.size - 1)
     p = EncoderParams()
     p.origin, p.shift = origin, shift
-    p.first = wp.array(first.astype(np.int32), dtype=int, device=device)
+    p.first, p.start, p.angle, p.slope = _on_device(start, angle, slope, shift, device)
+    if encoder.second is None:
+        return p
+    origin, start, angle, slope = encoder_pieces(encoder.second, t_first, t_last)
+    start, behind = start + (origin - p.origin), int(origin - p.origin)
+    if behind > 0:  # the first piece reaches back to the origin
+        start[:1], angle[:1] = 0, angle[:1] - slope[:1] * np.uint64(behind)
+    p.second_first, p.second_start, p.second_angle, p.second_slope = _on_device(start, angle, slope, shift, device)
+    return p
+
+
+def _on_device(
+    start: NDArray[np.int64], angle: NDArray[np.uint64], slope: NDArray[np.uint64], shift: int, device: Any
+) -> tuple[wp.array, ...]:
+    """Return the arrays of :class:`EncoderParams` for pieces whose times are relative to its origin."""
+    edges = np.arange((max(int(start[-1]), 0) >> shift) + 1, dtype=np.int64) << shift
+    first = np.append(np.maximum(np.searchsorted(start, edges, side="right") - 1, 0), start.size - 1)
     pieces = np.stack([start, angle.view(np.int64), slope.view(np.int64)])
     rows = wp.array(pieces, dtype=wp.int64, device=device)  # one copy to the device instead of three
-    p.start, p.angle, p.slope = rows[0], rows[1].view(wp.uint64), rows[2].view(wp.uint64)
-    return p
+    buckets = wp.array(first.astype(np.int32), dtype=int, device=device)
+    return buckets, rows[0], rows[1].view(wp.uint64), rows[2].view(wp.uint64)
 
 
 def encoder_pieces(encoder: Encoder, t_first: int, t_last: int) -> tuple[int, Any, Any, Any]:

@@ -362,6 +362,8 @@ class Encoder:
     """Encoder time minus event time [us]."""
     index_t: NDArray[np.int64] | None = None
     """Times of the index pulses on the encoder's clock [us], shape ``(k,)``; None if the encoder has none."""
+    second: Encoder | None = None
+    """Encoder of the second prism of a pair, on the same clock; None for one prism."""
 
     def __post_init__(self) -> None:
         if self.t.ndim != 1 or self.t.shape != self.angle.shape or self.t.size < 2:
@@ -385,6 +387,12 @@ class Encoder:
         object.__setattr__(self, "clock_offset_us", offset)
         if self.index_t is not None:
             self._check_index(self.index_t)
+        if self.second is not None:
+            instance(self.second, Encoder, "encoder second")
+            if self.second.second is not None:
+                raise AmiwarpError("the second encoder has a second one itself; a pair has two prisms")
+            if self.second.clock_offset_us != self.clock_offset_us:
+                object.__setattr__(self, "second", self.second.with_clock_offset(self.clock_offset_us))
 
     def _check_index(self, index_t: NDArray[np.int64]) -> None:
         if instance(index_t, np.ndarray, "encoder index_t").ndim != 1 or index_t.dtype != np.int64:
@@ -530,6 +538,30 @@ class Encoder:
         """
         return dataclasses.replace(self, clock_offset_us=clock_offset_us)
 
+    def with_second(self, second: Encoder | float) -> Encoder:
+        """Return an encoder of a pair of prisms: this one is that of the first prism, next to the camera.
+
+        Parameters
+        ----------
+        second : Encoder or float
+            Encoder of the second prism, on the same clock. Or the speed of the second prism relative to the first, if
+            both are geared; their angles are then 0 together.
+
+        Returns
+        -------
+        Encoder
+            The encoder. Its clock offset holds for both.
+
+        Examples
+        --------
+        >>> encoder = amiwarp.Encoder.from_angles([0, 1000], [0.0, 1.5]).with_second(-0.5)
+        >>> encoder.angles_at([1000])
+        array([[ 1.5 , -0.75]])
+        """
+        if not isinstance(second, Encoder):
+            second = Encoder(self.t, self.angle * real(second, "speed of the second prism relative to the first"))
+        return dataclasses.replace(self, second=second)
+
     def with_harmonics(self, harmonics: ArrayLike) -> Encoder:
         """Return an encoder whose angles are corrected by an error that repeats every turn.
 
@@ -642,6 +674,32 @@ class Encoder:
                 result = np.where(outside, angle[end] + slope * (elapsed - sampled[end]), result)
         return np.asarray(result, np.float64)
 
+    def angles_at(self, t: ArrayLike) -> NDArray[np.float64]:
+        """Return the angles of all prisms at event times, as the methods of optical models take them.
+
+        Parameters
+        ----------
+        t : array_like
+            Event times [us], shape (n,).
+
+        Returns
+        -------
+        numpy.ndarray
+            Unwrapped angles [rad]: shape (n,) for one prism, (n, 2) for a pair.
+
+        Raises
+        ------
+        AmiwarpError
+            If a time is outside :attr:`coverage`, or not a whole number.
+        """
+        first = self.angle_at(t)
+        return first if self.second is None else np.stack([first, self.second.angle_at(t)], axis=-1)
+
+    @property
+    def ratio(self) -> float | None:
+        """Mean speed of the second prism relative to the first; None for one prism."""
+        return None if self.second is None else self.second.rpm / (self.rpm or math.inf)
+
     def speed_at(self, t: ArrayLike) -> NDArray[np.float64]:
         """Return the prism's speed at event times: the slope of the interpolation of :meth:`angle_at`.
 
@@ -683,12 +741,18 @@ class Encoder:
 
     @property
     def coverage(self) -> tuple[int, int]:
-        """First and last event time with an angle [us]: the samples, and one sample interval before and after."""
+        """First and last event time with an angle [us]: the samples, and one sample interval before and after.
+
+        For a pair of prisms, both have an angle.
+        """
         # If the first or last interval is a gap, extrapolate by the mean interval only.
         before = min(float(self.t[1] - self.t[0]), self.interval_us)
         after = min(float(self.t[-1] - self.t[-2]), self.interval_us)
         first, last = int(self.t[0]), int(self.t[-1])
-        return math.ceil(first - before - self.clock_offset_us), math.floor(last + after - self.clock_offset_us)
+        start, end = math.ceil(first - before - self.clock_offset_us), math.floor(last + after - self.clock_offset_us)
+        if self.second is None:
+            return start, end
+        return max(start, self.second.coverage[0]), min(end, self.second.coverage[1])
 
     @property
     def interval_us(self) -> float:
@@ -742,6 +806,17 @@ class Encoder:
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Wrap angles [rad] to -pi .. pi."""
     return np.asarray(angle - TWO_PI * np.round(angle / TWO_PI))
+
+
+def check_prisms(encoder: Encoder, angles: int) -> None:
+    """Raise :class:`AmiwarpError` if an encoder is not that of a model with this number of prisms."""
+    if angles == 1 and encoder.second is not None:
+        raise AmiwarpError("the encoder is that of a pair of prisms, the model has one prism; use the model 'risley'")
+    if angles == 2 and encoder.second is None:
+        raise AmiwarpError(
+            "the model has two prisms, the encoder measures one; add the other one's encoder, or its speed relative to "
+            "the first (Encoder.with_second, --second-encoder or --second-ratio of 'amiwarp convert')"
+        )
 
 
 # Speed of the prism during the events. It differs from the mean of all samples if the motor starts or stops.

@@ -16,7 +16,7 @@ from amiwarp.choices import Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
 from amiwarp.events.device_events import DeviceEvents, azimuths, cast, device_for, wait
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events
 from amiwarp.kernels import launch as launches
 from amiwarp.kernels import pixel_votes
@@ -175,16 +175,18 @@ class UploadedEvents:
     slope: Any
     """Change of each prism angle per unit of the drifting parameter [1/65536 turn]; None if there is no such parameter.
     """
+    second_base: Any = None
+    """Angles of the second prism at drift 0 [1/65536 turn]; None for one prism."""
+    ratio: float = 0.0
+    """Mean speed of the second prism relative to the first."""
 
     def drift(self, value: float) -> None:
         """Set the prism angles for the value ``value`` of the drifting parameter."""
-        launch(
-            event_kernels.drift_turns,
-            self.count,
-            [self.base, self.slope, value],
-            [self.arrays.turn],
-            device=self.base.device,
-        )
+        moved = [(self.base, value, self.arrays.turn)]
+        if self.second_base is not None:
+            moved.append((self.second_base, self.ratio * value, self.arrays.second))
+        for base, change, out in moved:
+            launch(event_kernels.drift_turns, self.count, [base, self.slope, change], [out], device=base.device)
 
     def in_parts(self, parts: int, *, per_polarity: bool) -> UploadedEvents:
         """Return the same events split over ``parts`` images, or over ``parts`` pairs (OFF, ON) of images."""
@@ -205,9 +207,12 @@ class UploadedEvents:
             return _put(part, values.dtype, values.device)
 
         turn = cut(a.turn if base is None else base)
-        few = self._with(x=cut(a.x), y=cut(a.y), layer=cut(a.layer), turn=turn, time=cut(a.time))
+        columns = {name: cut(getattr(a, name)) for name in ("x", "y", "layer", "time")}
+        columns["second"] = cut(a.second if self.second_base is None else self.second_base)
+        few = self._with(turn=turn, **columns)
         n, base = -(-self.count // step), None if base is None else wp.clone(turn)
-        return replace(few, count=n, total=n, base=base, slope=cut(self.slope))
+        second = None if self.second_base is None else wp.clone(columns["second"])
+        return replace(few, count=n, total=n, base=base, slope=cut(self.slope), second_base=second)
 
     def at_angles(self, angles: NDArray[np.float64]) -> UploadedEvents:
         """Return the same events at other prism angles [rad], shape ``(n,)``. The other columns are not copied."""
@@ -216,7 +221,7 @@ class UploadedEvents:
     def _with(self, **columns: wp.array) -> UploadedEvents:
         """Return the same events with other columns."""
         e = event_kernels.EventArrays()
-        for name in ("x", "y", "turn", "azimuths", "time", "weight", "layer"):
+        for name in ("x", "y", "turn", "second", "azimuths", "time", "weight", "layer"):
             setattr(e, name, columns.get(name, getattr(self.arrays, name)))
         return replace(self, arrays=e)
 
@@ -270,7 +275,7 @@ def upload_events(
     e.x, e.y = put(events.x, wp.uint16), put(events.y, wp.uint16)
     e.layer = put(events.p, wp.uint8)
     e.azimuths, e.time = azimuths(str(device)), wp.empty(0, dtype=float, device=device)
-    e.weight = wp.empty(0, dtype=wp.uint8, device=device)
+    e.weight, e.second = wp.empty(0, dtype=wp.uint8, device=device), wp.empty(0, dtype=wp.uint16, device=device)
     if not isinstance(angles, np.ndarray) or middle_us is not None:
         t = _times(events, device)
     if isinstance(angles, np.ndarray):
@@ -280,6 +285,9 @@ def upload_events(
         if n:
             encoder = device_events.encoder_params(angles, *device_events.time_span(events), device)
             launch(event_kernels.turn_events, n, [encoder, t], [e.turn], device=device)
+            if angles.second is not None:
+                e.second = wp.zeros(padded, dtype=wp.uint16, device=device)
+                launch(event_kernels.turn_second, n, [encoder, t], [e.second], device=device)
     if middle_us is not None:
         e.time = wp.empty(n, dtype=float, device=device)
         launch(event_kernels.time_events, n, [t, middle_us], [e.time], device=device)
@@ -291,7 +299,10 @@ def upload_events(
         return _folded(*points, n, fold, device)
     if slope is None:
         return UploadedEvents(e, n, n, None, None)
-    return UploadedEvents(e, n, n, wp.clone(e.turn), put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float))
+    slopes = put((slope * (TURNS / (2.0 * np.pi))).astype(np.float32), float)
+    found = UploadedEvents(e, n, n, wp.clone(e.turn), slopes)
+    ratio = None if isinstance(angles, np.ndarray) else angles.ratio
+    return found if ratio is None else replace(found, second_base=wp.clone(e.second), ratio=ratio)
 
 
 def _padded(n: int, device: Any) -> int:
@@ -348,7 +359,7 @@ def _folded(key: NDArray[np.int64], weight: NDArray[np.uint8], n: int, bins: int
     out.x, out.y, out.turn = (wp.zeros(_padded(m, device), dtype=wp.uint16, device=device) for _ in range(3))
     out.layer = wp.zeros(_padded(m, device), dtype=wp.uint8, device=device)
     out.weight, out.azimuths = _put(weight, wp.uint8, device), azimuths(str(device))
-    out.time = wp.empty(0, dtype=float, device=device)
+    out.time, out.second = wp.empty(0, dtype=float, device=device), wp.empty(0, dtype=wp.uint16, device=device)
     launch(
         event_kernels.unfold_keys,
         m,
@@ -860,6 +871,8 @@ def iwe(
     """
     if (model is None) != (encoder is None):
         raise AmiwarpError("only one of model and encoder is given; give both a model and an encoder, or neither")
+    if model is not None and encoder is not None:
+        check_prisms(encoder, model.ANGLES)
     device = device_for(events, device)
     device_events.check_order(events)
     votes = Votes(CanvasShape(width, height, pad, 1.0, per_polarity, vote), device)

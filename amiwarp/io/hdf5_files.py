@@ -13,6 +13,7 @@ import threading
 import weakref
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -723,6 +724,7 @@ def _needed(file: Hdf5File, name: str) -> Column:
 
 
 def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
+    second = _read_second_encoder(file)
     columns = {name: _needed(file, f"encoder/{name}") for name in ("t", "angle")}
     t, angle = (column.read(0, len(column)) for column in columns.values())
     t, angle = rounded_times(t), angle.astype(np.float64)
@@ -736,7 +738,15 @@ def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
     if t.size < 2 and (file.unfinished or t.size == angle.size == 0):
         return None
     offset = attribute(_attributes(file, "encoder"), f"{path}: /encoder", "clock_offset_us", float, 0.0)
-    return Encoder(t, angle, offset, index_t)
+    return Encoder(t, angle, offset, index_t, second)
+
+
+def _read_second_encoder(file: Hdf5File) -> Encoder | None:
+    """Return the encoder of the second prism of a pair; None for one prism."""
+    if "encoder/second_t" not in file.columns:
+        return None
+    t, angle = (_needed(file, f"encoder/second_{name}") for name in ("t", "angle"))
+    return Encoder(rounded_times(t.read(0, len(t))), angle.read(0, len(angle)).astype(np.float64))
 
 
 # Camera and prism as attributes of an HDF5 group, or of a JSON object in a stream.
@@ -794,14 +804,24 @@ def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
 def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
     """Return the attributes of a nominal prism, without ``apex`` if that is unknown."""
     known: dict[str, float | str] = {"apex": prism.apex} if isinstance(prism, Prism) else {}
-    return {**known, "index": prism.index, "flat_side": prism.flat_side.value}
+    known |= {"index": prism.index, "flat_side": prism.flat_side.value}
+    if isinstance(prism, Prism) and prism.second is not None:
+        known |= {f"second_{name}": value for name, value in prism_attributes(prism.second).items()}
+    return known
 
 
 def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
     """Return the nominal prism stored in attributes. The apex angle is unknown if ``apex`` is missing."""
     side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
     prism = UnsizedPrism(attribute(attributes, where, "index", float), side)
-    return prism.with_apex(attribute(attributes, where, "apex", float)) if "apex" in attributes else prism
+    if "apex" not in attributes:
+        return prism
+    second = {name: attributes[f"second_{name}"] for name in ("apex", "index", "flat_side")
+              if f"second_{name}" in attributes}  # fmt: skip
+    behind = read_prism(second, f"{where} second prism") if second else None
+    if isinstance(behind, UnsizedPrism):
+        raise AmiwarpError(f"{where} has a second prism without 'second_apex'; add this attribute")
+    return replace(prism.with_apex(attribute(attributes, where, "apex", float)), second=behind)
 
 
 # Events of native recordings and of files of DSEC and M3ED, whose layouts are alike.

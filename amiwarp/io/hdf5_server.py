@@ -75,7 +75,7 @@ ATTRIBUTES = {
     "/": ("format", "format_version", "width", "height"),
     "encoder": ("clock_offset_us",),
     "camera": ("width", "height", "fx", "fy", "cx", "cy", "distortion_model", "distortion"),
-    "prism": ("apex", "index", "flat_side"),
+    "prism": ("apex", "index", "flat_side", "second_apex", "second_index", "second_flat_side"),
     "truth": (),
     "truth/world": ("name",),
     "metadata": (),
@@ -90,6 +90,8 @@ COLUMNS = {
     "encoder/t": "iu",
     "encoder/angle": "f",
     "encoder/index_t": "iu",
+    "encoder/second_t": "iu",
+    "encoder/second_angle": "f",
     "truth/x": "f",
     "truth/y": "f",
     **{f"truth/events/{name}": "iu" for name in ("cause", "instance")},
@@ -122,7 +124,8 @@ DIMENSIONS = {
 """Numbers of dimensions of the datasets that do not have exactly one dimension."""
 
 READ_AT_ONCE = (
-    "t_offset", "encoder/t", "encoder/angle", "encoder/index_t", "truth/frames/t", "truth/known/t",
+    "t_offset", "encoder/t", "encoder/angle", "encoder/index_t", "encoder/second_t", "encoder/second_angle",
+    "truth/frames/t", "truth/known/t",
     "truth/world/instances", "truth/world/categories", "truth/poses/body_names", "truth/joints/names",
     "imu/t", "imu/angular_velocity", "imu/acceleration", "frames/t",
 )  # fmt: skip

@@ -666,6 +666,9 @@ class RecordingWriter:
                 values = getattr(self._encoder, name)
                 if values is not None:
                     self._extend(f"encoder/{name}", values)
+            if self._encoder.second is not None:
+                for name in ("t", "angle"):
+                    self._extend(f"encoder/second_{name}", getattr(self._encoder.second, name))
 
     def _close(self) -> None:
         if self._chunks is not None:

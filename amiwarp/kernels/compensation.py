@@ -13,8 +13,16 @@ from amiwarp.kernels.native_code import (
     store_uint8,
     store_uint32,
 )
-from amiwarp.kernels.prism_angle import THETA_U32_RAD, EncoderParams, piece_at, theta_u32_at, theta_u32_on
-from amiwarp.kernels.refraction import displace, even, is_even
+from amiwarp.kernels.prism_angle import (
+    THETA_U32_RAD,
+    EncoderParams,
+    of_second,
+    piece_at,
+    radians,
+    theta_u32_at,
+    theta_u32_on,
+)
+from amiwarp.kernels.refraction import PairParams, displace, even, is_even, state_of
 
 # Fused multiply-add is off because CPUs and GPUs apply it at different places: results are then bit-identical.
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
@@ -47,8 +55,8 @@ def shared_piece(encoder: EncoderParams, t: wp.array(dtype=wp.int64), first: int
 
 
 @wp.func
-def azimuth(model: Any, azimuths: wp.array(dtype=float), turn: wp.uint32):
-    """Return cosine and sine of the tilt azimuth for theta_u32 ``turn``.
+def state_at_turn(model: Any, azimuths: wp.array(dtype=float), turn: wp.uint32):
+    """Return the optic's state for theta_u32 ``turn``.
 
     The table gives the values at the next coarser angle; a first-order rotation adds the remainder. The remainder is
     below 1e-4 rad; neglecting its square moves an event on an orbit of 100 px by 5e-7 px.
@@ -57,15 +65,28 @@ def azimuth(model: Any, azimuths: wp.array(dtype=float), turn: wp.uint32):
     rest = float(int(turn & wp.uint32(0xFFFF))) * THETA_U32_RAD
     c = load_float(azimuths, coarse)
     s = load_float(azimuths, coarse + 1)
-    a = c - s * rest
-    b = s + c * rest
-    return a * model.phase_cos - b * model.phase_sin, b * model.phase_cos + a * model.phase_sin
+    w0, w1 = state_of(model, c - s * rest, s + c * rest)
+    return w0, w1
 
 
 @wp.func
-def displace_event(model: Any, camera: Any, azimuths: wp.array(dtype=float), columns: Columns, turn: wp.uint32, i: int):
+def state_at_time(model: Any, encoder: EncoderParams, azimuths: wp.array(dtype=float), t: wp.int64):
+    """Return the optic's state at event time ``t`` [us]."""
+    w0, w1 = state_at_turn(model, azimuths, theta_u32_at(encoder, t))
+    return w0, w1
+
+
+@wp.func
+def state_at_time(model: PairParams, encoder: EncoderParams, azimuths: wp.array(dtype=float), t: wp.int64):
+    """Return the state of both prisms at event time ``t`` [us]."""
+    second = radians(theta_u32_at(of_second(encoder), t))
+    w0, w1 = state_of(model, radians(theta_u32_at(encoder, t)), second)
+    return w0, w1
+
+
+@wp.func
+def displace_event(model: Any, camera: Any, columns: Columns, w0: float, w1: float, i: int):
     """Return the compensated position [px] of event ``i``."""
-    w0, w1 = azimuth(model, azimuths, turn)
     x, y = displace(model, camera, float(load_uint16(columns.x, i)), float(load_uint16(columns.y, i)), w0, w1)
     return x, y
 
@@ -77,7 +98,8 @@ def displace_block(
 ):  # fmt: skip
     """Compute the compensated positions [px] of a block of events."""
     for k in range(BLOCK):
-        x, y = displace_event(model, camera, azimuths, columns, load_uint32(turns, k), first + k)
+        w0, w1 = state_at_turn(model, azimuths, load_uint32(turns, k))
+        x, y = displace_event(model, camera, columns, w0, w1, first + k)
         store_float(xs, k, x)
         store_float(ys, k, y)
 
@@ -132,7 +154,8 @@ def compensate_events(
     columns: Columns,
     start: int,
 ):
-    """Compensate one event per thread. For CUDA."""
+    """Compensate one event per thread. For CUDA, and for a pair of prisms."""
     i = start + wp.tid()
-    x, y = displace_event(model, camera, azimuths, columns, theta_u32_at(encoder, columns.t[i]), i)
+    w0, w1 = state_at_time(model, encoder, azimuths, columns.t[i])
+    x, y = displace_event(model, camera, columns, w0, w1, i)
     store_position(size, columns, i, x, y)

@@ -25,10 +25,11 @@ class Pairs:
     """Pairs of consecutive events of a pixel: the first sets the reference level, the second is triggered by it.
 
     All arrays are flat. ``azimuth`` holds four parts: the cosines of the encoder's angle at the first events, the
-    sines, and both at the second events. ``time`` [s] counts from the middle of the window; ``slope`` is the derivative
-    of the angle by the drifting parameter, or empty. Both hold the first events, then the second events. ``lag`` and
-    ``offset`` describe slow pixels (:mod:`amiwarp.kernels.slow_pixels`), or are empty. ``path`` tells how the scene of
-    each tile moves in the image, or is empty.
+    sines, and both at the second events. For two prisms it holds the angles of the first prism, and of the second
+    [rad]. ``time`` [s] counts from the middle of the window; ``slope`` is the derivative of the angle by the
+    drifting parameter, or empty. Both hold the first events, then the second events. ``lag`` and ``offset``
+    describe slow pixels (:mod:`amiwarp.kernels.slow_pixels`), or are empty. ``path`` tells how the scene of each
+    tile moves in the image, or is empty.
     """
 
     count: int

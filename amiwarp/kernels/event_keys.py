@@ -7,8 +7,7 @@ import warp as wp
 
 from amiwarp.kernels.camera import pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.pixels import LAG_ZERO, LARGEST_LAG, LOW_BITS, LOW_MASK, TICKS, Sink
-from amiwarp.kernels.prism_view import Steps, View
-from amiwarp.kernels.refraction import ray_without_prism
+from amiwarp.kernels.prism_view import Steps, View, ray_without_prisms
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,9 +45,10 @@ def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.
     block.ticks[i] = at
     k = wp.clamp(at / steps.ticks, 0, steps.margin + steps.count)
     angle = steps.angle[k] + steps.turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
+    second = steps.second_angle[k] + steps.second_turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
     ray = pixel_to_ray(view.camera, wp.vec2(float(col), float(row)))
-    w = wp.vec2(wp.cos(angle), wp.sin(angle))
-    block.points[i] = ray_to_pixel(view.camera, ray_without_prism(view.prism, ray, w))
+    w, w2 = wp.vec2(wp.cos(angle), wp.sin(angle)), wp.vec2(wp.cos(second), wp.sin(second))
+    block.points[i] = ray_to_pixel(view.camera, ray_without_prisms(view.prism, view.second, ray, w, w2))
 
 
 @wp.kernel

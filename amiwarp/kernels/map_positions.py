@@ -8,7 +8,7 @@ from amiwarp.kernels.camera import NAN, CameraParams, CameraRotationParams, Pinh
 from amiwarp.kernels.equations import Atlas, Geometry, Pairs
 from amiwarp.kernels.equations_cpu import BLOCK, interpolate
 from amiwarp.kernels.native_code import load_float, load_int, load_uint16, store_float, store_int
-from amiwarp.kernels.refraction import compensate, displace, even, is_even, is_plain, plain
+from amiwarp.kernels.refraction import advanced, compensate, displace, even, is_even, is_plain, plain, state_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,11 +38,12 @@ def node_at(atlas: Atlas, tile: int, x: float, y: float):
 
 
 @wp.func
-def event_azimuth(model: Any, pairs: Pairs, k: int, i: int):
-    """Return (cos, sin) of the prism's tilt azimuth at the first (k = 0) or second event of pair ``i``."""
-    c = load_float(pairs.azimuth, 2 * k * pairs.stride + i)
-    s = load_float(pairs.azimuth, (2 * k + 1) * pairs.stride + i)
-    return c * model.phase_cos - s * model.phase_sin, s * model.phase_cos + c * model.phase_sin
+def event_state(model: Any, pairs: Pairs, k: int, i: int):
+    """Return the optic's state at the first (k = 0) or second event of pair ``i``."""
+    a = load_float(pairs.azimuth, 2 * k * pairs.stride + i)
+    b = load_float(pairs.azimuth, (2 * k + 1) * pairs.stride + i)
+    w0, w1 = state_of(model, a, b)
+    return w0, w1
 
 
 @wp.func
@@ -52,13 +53,12 @@ def turned(w0: float, w1: float, c: float, s: float) -> wp.vec2:
 
 
 @wp.func
-def drifted_azimuth(model: Any, pairs: Pairs, drift: float, k: int, i: int) -> wp.vec2:
-    """Return (cos, sin) of the tilt azimuth at the first (k = 0) or second event of a pair, at the given drift."""
-    w0, w1 = event_azimuth(model, pairs, k, i)
+def drifted_state(model: Any, pairs: Pairs, drift: float, k: int, i: int) -> wp.vec2:
+    """Return the optic's state at the first (k = 0) or second event of a pair, at the given drift."""
+    w0, w1 = event_state(model, pairs, k, i)
     if pairs.slope.shape[0] == 0:
         return wp.vec2(w0, w1)
-    angle = pairs.slope[k * pairs.stride + i] * drift
-    return turned(w0, w1, wp.cos(angle), wp.sin(angle))
+    return advanced(model, w0, w1, pairs.slope[k * pairs.stride + i] * drift)
 
 
 @wp.func
@@ -83,7 +83,7 @@ def compensated_position(
     model: Any, camera: CameraParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
 ) -> wp.vec2:
     """Return the compensated position [px] of the first (k = 0) or second event of a pair, at the given drift."""
-    w = drifted_azimuth(model, pairs, drift, k, i)
+    w = drifted_state(model, pairs, drift, k, i)
     pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
     if pairs.lag.shape[0] > 0:
         return contracted_position(model, camera, pixel, w[0], w[1], lag_of(pairs, k, i))
@@ -97,7 +97,7 @@ def compensated_position(
     model: Any, camera: PinholeParams, camera_rotation: CameraRotationParams, pairs: Pairs, drift: float, i: int, k: int
 ) -> wp.vec2:
     """Return the compensated position for a camera without distortion, and pixels that are not slow."""
-    w = drifted_azimuth(model, pairs, drift, k, i)
+    w = drifted_state(model, pairs, drift, k, i)
     u, v = displace(model, camera, float(pairs.x[i]), float(pairs.y[i]), w[0], w[1])
     xy = undo_camera_rotation(camera, wp.vec2(u, v), camera_rotation, pairs.time[k * pairs.stride + i])
     return without_path(pairs, k, i, xy)
@@ -176,7 +176,7 @@ def event_node(model: Any, camera: PinholeParams, pairs: Pairs, atlas: Atlas, k:
 
     This function is for a camera without distortion and rotation, and without drift.
     """
-    w0, w1 = event_azimuth(model, pairs, k, i)
+    w0, w1 = event_state(model, pairs, k, i)
     u, v = displace(model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1)
     cell, x, y = node_at(atlas, load_int(pairs.tile, i), u, v)
     return cell, x, y
@@ -198,11 +198,11 @@ def displace_block(
 ):  # fmt: skip
     """Compute the compensated positions [px] of the first (k = 0) or second events of a block of pairs.
 
-    If ``drifts`` is 1, ``x`` and ``y`` hold their azimuths (cos, sin) before.
+    If ``drifts`` is 1, ``x`` and ``y`` hold the states at these events before.
     """
     for j in range(BLOCK):
         i = first + j
-        w0, w1 = event_azimuth(model, pairs, k, i)
+        w0, w1 = event_state(model, pairs, k, i)
         w0 = wp.where(drifts == 1, load_float(x, j), w0)
         w1 = wp.where(drifts == 1, load_float(y, j), w1)
         u, v = displace(model, camera, float(load_uint16(pairs.x, i)), float(load_uint16(pairs.y, i)), w0, w1)
@@ -214,9 +214,9 @@ def displace_block(
 def drift_block(
     model: Any, pairs: Pairs, drift: float, k: int, first: int, x: wp.array(dtype=float), y: wp.array(dtype=float)
 ):
-    """Compute the azimuths (cos, sin) of the first (k = 0) or second events of a block of pairs, at the given drift."""
+    """Compute the states at the first (k = 0) or second events of a block of pairs, at the given drift."""
     for j in range(BLOCK):
-        w = drifted_azimuth(model, pairs, drift, k, first + j)
+        w = drifted_state(model, pairs, drift, k, first + j)
         x[j] = w[0]
         y[j] = w[1]
 

@@ -8,7 +8,7 @@ counted and written.
 import warp as wp
 
 from amiwarp.kernels.equations import HELD, QUIET, Pairs
-from amiwarp.kernels.prism_angle import THETA_U32_RAD, EncoderParams, piece_at
+from amiwarp.kernels.prism_angle import EncoderParams, of_second, piece_at, radians
 
 wp.set_module_options({"enable_backward": False})
 
@@ -182,25 +182,37 @@ def mark_quiet(
 
 
 @wp.func
-def store_time(encoder: EncoderParams, window: Window, pairs: Pairs, k: int, i: int, t: wp.int64, late: wp.float64):
-    """Store time and azimuth of an event, ``late`` [us] after its time stamp.
-
-    The angle is extrapolated on the encoder's piece at the time stamp.
-    """
+def angle_after(encoder: EncoderParams, t: wp.int64, late: wp.float64) -> float:
+    """Return the prism angle [rad] ``late`` [us] after a time stamp, extrapolated on the encoder's piece there."""
     elapsed = t - encoder.origin
     piece = piece_at(encoder, elapsed)
     slope = encoder.slope[piece]
     angle = encoder.angle[piece] + wp.uint64(elapsed - encoder.start[piece]) * slope
     angle += wp.uint64(wp.int64(wp.float64(wp.int64(slope)) * late))
-    theta = float(wp.float64(wp.int32(wp.uint32(angle >> wp.uint64(32)))) * wp.float64(THETA_U32_RAD))
-    pairs.azimuth[2 * k * pairs.stride + i] = wp.cos(theta)
-    pairs.azimuth[(2 * k + 1) * pairs.stride + i] = wp.sin(theta)
+    return radians(wp.uint32(angle >> wp.uint64(32)))
+
+
+@wp.func
+def store_time(encoder: EncoderParams, window: Window, pairs: Pairs, k: int, i: int, t: wp.int64, late: wp.float64):
+    """Store time and angle of an event, ``late`` [us] after its time stamp.
+
+    The angle is cosine and sine of one prism's angle, or the angles of both prisms of a pair.
+    """
+    a = angle_after(encoder, t, late)
+    b = float(0.0)
+    if encoder.second_start.shape[0] > 0:
+        b = angle_after(of_second(encoder), t, late)
+    else:
+        b = wp.sin(a)
+        a = wp.cos(a)
+    pairs.azimuth[2 * k * pairs.stride + i] = a
+    pairs.azimuth[(2 * k + 1) * pairs.stride + i] = b
     pairs.time[k * pairs.stride + i] = float(wp.float64(t - window.middle) * wp.float64(1.0e-6))
 
 
 @wp.func
 def store_pair(encoder: EncoderParams, window: Window, pairs: Pairs, i: int, first: wp.int64, second: wp.int64):
-    """Store the times and azimuths of both events of a pair."""
+    """Store the times and angles of both events of a pair."""
     store_time(encoder, window, pairs, 0, i, first, window.late_first)
     store_time(encoder, window, pairs, 1, i, second, window.late_second)
 
@@ -235,7 +247,7 @@ def write_pairs(
 
 @wp.kernel
 def write_spans(edges: wp.array(dtype=wp.int64), window: Window, encoder: EncoderParams, start: int, pairs: Pairs):
-    """Write times and azimuths of a pair from the beginning to the end of each time span between ``edges`` [us]."""
+    """Write times and angles of a pair from the beginning to the end of each time span between ``edges`` [us]."""
     span = start + wp.tid()
     store_pair(encoder, window, pairs, span, edges[span], edges[span + 1])
 

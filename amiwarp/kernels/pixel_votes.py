@@ -19,14 +19,13 @@ from amiwarp.kernels.native_code import (
     copy_floats,
     load_float,
     load_int,
-    load_pairs,
     load_uint8,
     load_uint16,
     store_float,
     store_int,
 )
-from amiwarp.kernels.refraction import displace, even, is_even, is_plain, plain
-from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, rotate_azimuth
+from amiwarp.kernels.refraction import displace, even, is_even, is_plain, plain, state_of
+from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, load_states
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -39,10 +38,10 @@ def displace_block(
     model: Any, camera: Any, events: EventArrays, first: int, x: wp.array(dtype=float), y: wp.array(dtype=float)
 ):
     """Compute the compensated positions of a block of events."""
-    azimuths = wp.zeros(shape=(128,), dtype=float)
-    load_pairs(azimuths, events.azimuths, events.turn, first)
+    states = wp.zeros(shape=(128,), dtype=float)
+    load_states(model, events, first, states)
     for k in range(BLOCK):
-        w0, w1 = rotate_azimuth(model, load_float(azimuths, 2 * k), load_float(azimuths, 2 * k + 1))
+        w0, w1 = state_of(model, load_float(states, 2 * k), load_float(states, 2 * k + 1))
         i = first + k
         u, v = displace(model, camera, float(load_uint16(events.x, i)), float(load_uint16(events.y, i)), w0, w1)
         store_float(x, k, u)

@@ -374,7 +374,7 @@ def run_pixels_ahead(
     t0 = wp.int64(0)
     for block in range(steps.ahead.shape[0]):
         n = wp.min(AHEAD, steps.count - block * AHEAD)
-        at = locate_texels(view, texels_ahead(view.prism, steps.ahead[block], ray))
+        at = locate_texels(view, texels_ahead(view.prism, view.second, steps.ahead[block], ray))
         levels = levels_ahead(view, steps, block, n, at)
         j = int(0)
         while j < n:
@@ -533,7 +533,7 @@ def run_filtered_pixels_ahead(
     t0 = wp.int64(0)
     for block in range(steps.ahead.shape[0]):
         n = wp.min(AHEAD, steps.count - block * AHEAD)
-        at = locate_texels(view, texels_ahead(view.prism, steps.ahead[block], ray))
+        at = locate_texels(view, texels_ahead(view.prism, view.second, steps.ahead[block], ray))
         levels = levels_ahead(view, steps, block, n, at)
         j = int(0)
         while j < n:

@@ -26,6 +26,10 @@ class EncoderParams:
     start: wp.array(dtype=wp.int64)  # first event time of each piece, relative to the origin [us]
     angle: wp.array(dtype=wp.uint64)  # prism angle at the start of each piece [2**-64 turn]
     slope: wp.array(dtype=wp.uint64)  # speed on each piece [2**-64 turn per us]
+    second_first: wp.array(dtype=int)  # the same four arrays for the second prism of a pair; empty for one prism
+    second_start: wp.array(dtype=wp.int64)
+    second_angle: wp.array(dtype=wp.uint64)
+    second_slope: wp.array(dtype=wp.uint64)
 
 
 @wp.func
@@ -56,3 +60,22 @@ def theta_u32_at(encoder: EncoderParams, t: wp.int64) -> wp.uint32:
     """Return theta_u32, the prism angle [2**-32 turn], at event time ``t`` [us]."""
     elapsed = t - encoder.origin
     return theta_u32_on(encoder, piece_at(encoder, elapsed), elapsed)
+
+
+@wp.func
+def of_second(encoder: EncoderParams) -> EncoderParams:
+    """Return the path of the second prism of a pair. Times are relative to the same origin."""
+    e = EncoderParams()
+    e.origin = encoder.origin
+    e.shift = encoder.shift
+    e.first = encoder.second_first
+    e.start = encoder.second_start
+    e.angle = encoder.second_angle
+    e.slope = encoder.second_slope
+    return e
+
+
+@wp.func
+def radians(theta: wp.uint32) -> float:
+    """Return theta_u32 as an angle from -pi to pi [rad]."""
+    return float(wp.float64(wp.int32(theta)) * wp.float64(THETA_U32_RAD))

@@ -3,12 +3,18 @@
 import warp as wp
 
 from amiwarp.kernels.camera import NAN, CameraParams, pixel_to_ray
-from amiwarp.kernels.refraction import ExactParams, compensate_uneven, ray_without_prism
+from amiwarp.kernels.refraction import (
+    ExactParams,
+    compensate_about_axis,
+    compensate_uneven,
+    ray_without_prism,
+    refract_in_prism_frame,
+)
 
 wp.set_module_options({"enable_backward": False})
 
 AHEAD = wp.constant(16)  # number of instants that a CPU computes together: columns of the next four types
-Instants = wp.types.matrix(shape=(11, 16), dtype=float)  # rows: cos and sin of the azimuth, then to_texel
+Instants = wp.types.matrix(shape=(13, 16), dtype=float)  # rows: azimuth (cos, sin), to_texel, azimuth of the second
 TexelCoordinates = wp.types.matrix(shape=(2, 16), dtype=float)  # rows: x and y, texel coordinates
 TexelPieces = wp.types.matrix(shape=(3, 16), dtype=float)  # rows: texel index (bits of an int), x and y in it
 Levels = wp.types.vector(length=16, dtype=float)  # log intensity at each instant
@@ -21,6 +27,7 @@ class View:
 
     camera: CameraParams
     prism: ExactParams
+    second: ExactParams  # second prism of a pair, about the same axis; without one, its apex angle is 0
     maps: wp.array(dtype=wp.vec4)  # coefficients of bilinear interpolation of log intensity at each texel, slot by slot
     width: int  # width of a map [texels]
     height: int  # height of a map [texels]
@@ -31,6 +38,7 @@ class Step:
     """Instant: the end of one step and the start of the next."""
 
     azimuth: wp.vec2  # cosine and sine of the true azimuth of the prism
+    second: wp.vec2  # the same for the second prism
     to_texel: wp.mat33  # matrix from the prism's frame to homogeneous texel coordinates
     before: int  # slot of the map before this time
     after: int  # slot of the map after this time
@@ -45,6 +53,8 @@ class Steps:
     ahead: wp.array(dtype=Instants)  # ends of the steps in blocks of 16, for CPUs; the last end is repeated
     angle: wp.array(dtype=float)  # true azimuth of the prism [rad]
     turn: wp.array(dtype=float)  # change of the azimuth until the next instant [rad]
+    second_angle: wp.array(dtype=float)  # the same two arrays for the second prism
+    second_turn: wp.array(dtype=float)
     margin: int  # number of instants before the start of the chunk
     count: int  # number of steps in the chunk
     ticks: int  # length of a step [ticks]
@@ -113,6 +123,23 @@ def prism_shift(m: ExactParams, along: float, z: float) -> float:
 
 
 @wp.func
+def behind_second(m: ExactParams, x: float, y: float, z: float, w0: float, w1: float):
+    """Return a direction behind the second prism of a pair, in the prism's frame; the same one if there is none."""
+    a, b, c = x, y, z
+    if m.sin_apex != 0.0:
+        a, b, c = refract_in_prism_frame(m.sin_apex, m.cos_apex, m.index2, x, y, z, w0, w1, m.flat_to_scene)
+    return a, b, c
+
+
+@wp.func
+def ray_without_prisms(prism: ExactParams, second: ExactParams, ray: wp.vec3, w: wp.vec2, w2: wp.vec2) -> wp.vec3:
+    """Return the direction of the scene point that a camera's ray sees through the prism, or both prisms of a pair."""
+    seen = ray_without_prism(prism, ray, w)
+    x, y, z = behind_second(second, seen[0], seen[1], seen[2], w2[0], w2[1])
+    return wp.vec3(x, y, z)
+
+
+@wp.func
 def depth_or_nan(depth: float) -> float:
     """Return a depth, or NaN for a depth that is not in front of the camera."""
     return wp.where(depth > SMALLEST_DEPTH, depth, NAN)
@@ -130,13 +157,14 @@ def see_level(view: View, step: Step, ray: wp.vec3) -> float:
         shift = prism_shift(view.prism, along, ray[2])
         x, y = ray[0] + shift * w[0], ray[1] + shift * w[1]
         z = wp.sqrt(ray[2] * ray[2] - shift * (2.0 * along + shift))
+    x, y, z = behind_second(view.second, x, y, z, step.second[0], step.second[1])
     h = step.to_texel * wp.vec3(x, y, z)
     depth = depth_or_nan(h[2])
     return level_at(view, step, h[0] / depth, h[1] / depth)
 
 
 @wp.func
-def texels_ahead(prism: ExactParams, m: Instants, ray: wp.vec3) -> TexelCoordinates:
+def texels_ahead(prism: ExactParams, second: ExactParams, m: Instants, ray: wp.vec3) -> TexelCoordinates:
     """Return the texel coordinates, rows x and y, that a bearing sees at several instants; see :func:`see_level`.
 
     LLVM vectorises this loop because it has no branches, no vector types and only contiguous loads. It is a ``while``
@@ -144,8 +172,9 @@ def texels_ahead(prism: ExactParams, m: Instants, ray: wp.vec3) -> TexelCoordina
     """
     met = TexelCoordinates()
     j = int(0)
-    while j < AHEAD and prism.uneven == 1:
-        x, y, z = compensate_uneven(prism, ray[0], ray[1], ray[2], m[0, j], m[1, j])
+    while j < AHEAD and (prism.uneven == 1 or second.sin_apex != 0.0):
+        x, y, z = compensate_about_axis(prism, ray[0], ray[1], ray[2], m[0, j], m[1, j])
+        x, y, z = behind_second(second, x, y, z, m[11, j], m[12, j])
         depth = depth_or_nan(m[8, j] * x + m[9, j] * y + m[10, j] * z)
         met[0, j] = (m[2, j] * x + m[3, j] * y + m[4, j] * z) / depth
         met[1, j] = (m[5, j] * x + m[6, j] * y + m[7, j] * z) / depth
@@ -203,17 +232,17 @@ def ray_in_prism_frame(view: View, index: int) -> wp.vec3:
 
 @wp.kernel
 def scene_bearings(
-    camera: CameraParams,
-    prism: ExactParams,
+    view: View,
     xy: wp.array(dtype=wp.vec2),
-    theta: wp.array(dtype=float),
+    theta: wp.array(dtype=wp.vec2),
     start: int,
     out: wp.array(dtype=wp.vec3),
 ):
-    """Compute the bearing, in the camera's frame, of the scene point that a pixel sees at tilt azimuth ``theta``."""
+    """Compute the bearing, in the camera's frame, of the scene point that a pixel sees at the azimuths ``theta``."""
     i = start + wp.tid()
-    w = wp.vec2(wp.cos(theta[i]), wp.sin(theta[i]))
-    out[i] = ray_without_prism(prism, pixel_to_ray(camera, xy[i]), w)
+    w = wp.vec2(wp.cos(theta[i][0]), wp.sin(theta[i][0]))
+    w2 = wp.vec2(wp.cos(theta[i][1]), wp.sin(theta[i][1]))
+    out[i] = ray_without_prisms(view.prism, view.second, pixel_to_ray(view.camera, xy[i]), w, w2)
 
 
 @wp.kernel

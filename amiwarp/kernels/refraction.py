@@ -1,8 +1,9 @@
 """Refraction models: observed pixel to the pixel without the prism (compensate), and back (deflect).
 
 Every model struct has ``compensate(model, camera, xy, w)`` and ``deflect(model, camera, xy, w)``, where ``w`` is the
-(cos, sin) of the tilt azimuth that ``azimuth(model, theta)`` returns. ``displace`` is ``compensate`` for an event's
-pixel, with plain floats. ``compensate_direction`` compensates a direction.
+state of the optic: two floats, for one prism the (cos, sin) of its tilt azimuth, for a pair the azimuths of both.
+``state_of`` computes it from what is stored for an event, and ``advanced`` turns it on. ``displace`` is ``compensate``
+for an event's pixel, with plain floats. ``compensate_direction`` compensates a direction.
 """
 
 from typing import Any
@@ -81,11 +82,58 @@ class EllipseParams:
     table: wp.array3d(dtype=float)  # per pixel [px]: offset (x, y), factor of cos (x, y), factor of sin (x, y)
 
 
+@wp.struct
+class PairParams:
+    """Two prisms behind each other, with refraction at all four faces."""
+
+    first: ExactParams  # prism next to the camera
+    second: ExactParams  # prism behind it
+    phase: float  # phase of the first prism's angle [rad]
+    second_phase: float  # phase of the second prism's angle [rad]
+    ratio: float  # mean speed of the second prism relative to the first
+
+
+# -- state of an optic at an event
+
+
 @wp.func
-def azimuth(model: Any, theta: float) -> wp.vec2:
-    """Return (cos, sin) of the tilt azimuth at prism angle ``theta`` [rad]."""
-    phi = theta + model.phase
+def state_of(model: Any, c: float, s: float):
+    """Return the state from what is stored for an event: cosine and sine of the prism angle."""
+    return c * model.phase_cos - s * model.phase_sin, s * model.phase_cos + c * model.phase_sin
+
+
+@wp.func
+def state_of(model: PairParams, first: float, second: float):
+    """Return the state from what is stored for an event: the angles of both prisms [rad]."""
+    return first + model.phase, second + model.second_phase
+
+
+@wp.func
+def advanced(model: Any, w0: float, w1: float, angle: float) -> wp.vec2:
+    """Return the state after the prism has turned by ``angle`` [rad]."""
+    c = wp.cos(angle)
+    s = wp.sin(angle)
+    return wp.vec2(w0 * c - w1 * s, w1 * c + w0 * s)
+
+
+@wp.func
+def advanced(model: PairParams, w0: float, w1: float, angle: float) -> wp.vec2:
+    """Return the state after the first prism has turned by ``angle`` [rad], and the second one by its share."""
+    return wp.vec2(w0 + angle, w1 + model.ratio * angle)
+
+
+@wp.func
+def state_at(model: Any, theta: wp.array(dtype=float), i: int) -> wp.vec2:
+    """Return the state at the prism angle ``theta[i]`` [rad]."""
+    phi = theta[i] + model.phase
     return wp.vec2(wp.cos(phi), wp.sin(phi))
+
+
+@wp.func
+def state_at(model: PairParams, theta: wp.array(dtype=float), i: int) -> wp.vec2:
+    """Return the state at the angles of both prisms, ``theta[2 i]`` and ``theta[2 i + 1]`` [rad]."""
+    w0, w1 = state_of(model, theta[2 * i], theta[2 * i + 1])
+    return wp.vec2(w0, w1)
 
 
 # Directions are three floats, not a vec3, in code that CPUs vectorise over eight events: LLVM does not vectorise calls
@@ -307,6 +355,25 @@ def deflect(model: ExactParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -
     return ray_to_pixel(camera, wp.vec3(x, y, z))
 
 
+# -- pair: refraction at both faces of both prisms
+
+
+@wp.func
+def compensate_direction(model: PairParams, x: float, y: float, z: float, w0: float, w1: float):
+    """Return the direction without the prisms: behind the first prism, then behind the second."""
+    a, b, c = compensate_direction(model.first, x, y, z, wp.cos(w0), wp.sin(w0))
+    return compensate_direction(model.second, a, b, c, wp.cos(w1), wp.sin(w1))
+
+
+@wp.func
+def deflect(model: PairParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    """Return the observed pixel: the ray meets the second prism first."""
+    ray = pixel_to_ray(camera, xy)
+    x, y, z = deflect_direction(model.second, ray[0], ray[1], ray[2], wp.cos(w[1]), wp.sin(w[1]))
+    x, y, z = deflect_direction(model.first, x, y, z, wp.cos(w[0]), wp.sin(w[0]))
+    return ray_to_pixel(camera, wp.vec3(x, y, z))
+
+
 # -- ellipse: offset and first harmonic of the displacement of each observed pixel
 
 
@@ -410,7 +477,7 @@ def compensate_points(
 ):
     """Compensate one pixel per thread at its prism angle [rad]."""
     i = start + wp.tid()
-    out[i] = compensate(model, camera, xy[i], azimuth(model, theta[i]))
+    out[i] = compensate(model, camera, xy[i], state_at(model, theta, i))
 
 
 @wp.kernel
@@ -424,7 +491,7 @@ def deflect_points(
 ):
     """Deflect one pixel per thread at its prism angle [rad]."""
     i = start + wp.tid()
-    out[i] = deflect(model, camera, xy[i], azimuth(model, theta[i]))
+    out[i] = deflect(model, camera, xy[i], state_at(model, theta, i))
 
 
 @wp.kernel

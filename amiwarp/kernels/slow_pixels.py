@@ -10,9 +10,9 @@ import warp as wp
 
 from amiwarp.kernels.camera import NAN, CameraParams
 from amiwarp.kernels.equations import Atlas, Pairs, interpolated
-from amiwarp.kernels.map_positions import contracted_position, event_azimuth, lag_of, node_at, turned
+from amiwarp.kernels.map_positions import contracted_position, event_state, lag_of, node_at
 from amiwarp.kernels.pixels import filter_level
-from amiwarp.kernels.refraction import compensate
+from amiwarp.kernels.refraction import advanced, compensate
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,9 +46,9 @@ def brightness_before(
     angle: float,
 ) -> float:  # fmt: skip
     """Return the brightness at the pixel of an event when the prism's angle was smaller by ``angle`` [rad]."""
-    w0, w1 = event_azimuth(model, pairs, k, i)
-    azimuth = turned(w0, w1, wp.cos(angle), -wp.sin(angle))
-    xy = compensate(model, camera, wp.vec2(float(pairs.x[i]), float(pairs.y[i])), azimuth)
+    w0, w1 = event_state(model, pairs, k, i)
+    w = advanced(model, w0, w1, -angle)
+    xy = compensate(model, camera, wp.vec2(float(pairs.x[i]), float(pairs.y[i])), w)
     return brightness_at_position(image, atlas, pairs.tile[i], xy)
 
 
@@ -82,10 +82,10 @@ def filtered(
     width = MEMORY / float(STEPS)  # step [time constants at median light]
     turn = filter.turn[pairs.tile[i]]
     before = float(brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * turn - filter.ahead))
-    w0, w1 = event_azimuth(model, pairs, k, i)
-    past_azimuth = turned(w0, w1, wp.cos(MEMORY * turn), -wp.sin(MEMORY * turn))
+    w0, w1 = event_state(model, pairs, k, i)
+    past = advanced(model, w0, w1, -MEMORY * turn)
     pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
-    xy = contracted_position(model, camera, pixel, past_azimuth[0], past_azimuth[1], lag_of(pairs, k, i))
+    xy = contracted_position(model, camera, pixel, past[0], past[1], lag_of(pairs, k, i))
     level = float(brightness_at_position(image, atlas, pairs.tile[i], xy))
     if wp.isnan(level):
         level = before
@@ -111,7 +111,7 @@ def find_offsets(
     total = float(0.0)
     sign = float(-1.0)
     for k in range(2):
-        w0, w1 = event_azimuth(model, pairs, k, i)
+        w0, w1 = event_state(model, pairs, k, i)
         pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
         xy = contracted_position(model, camera, pixel, w0, w1, lag_of(pairs, k, i))
         there = brightness_at_position(image, atlas, pairs.tile[i], xy)

@@ -12,7 +12,7 @@ import warp as wp
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, undo_camera_rotation
 from amiwarp.kernels.native_code import add_to_word, get_word, load_uint32, set_word, wait_for_block, window
 from amiwarp.kernels.prism_angle import THETA_U16_RAD
-from amiwarp.kernels.refraction import displace
+from amiwarp.kernels.refraction import displace, state_of
 from amiwarp.kernels.votes import Canvas, dither_offset, events_of
 
 # Fast math is on: these sums need not equal those of a CPU bit for bit.
@@ -184,8 +184,8 @@ def displace_event(
     angle = float(drifted_theta(motion, events, candidate, i, event.turn)) * THETA_U16_RAD
     c = wp.cos(angle)
     s = wp.sin(angle)
-    w0 = c * model.phase_cos - s * model.phase_sin
-    x, y = displace(model, camera, event.x, event.y, w0, s * model.phase_cos + c * model.phase_sin)
+    w0, w1 = state_of(model, c, s)
+    x, y = displace(model, camera, event.x, event.y, w0, w1)
     x, y = without_camera_rotation(motion, camera, x, y, events, candidate, i)
     return x * event.scale + event.corner_x, y * event.scale + event.corner_y
 

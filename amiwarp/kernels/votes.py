@@ -10,7 +10,9 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.prism_angle import EncoderParams, theta_u32_at
+from amiwarp.kernels.native_code import load_float, load_pairs, load_uint16, store_float
+from amiwarp.kernels.prism_angle import THETA_U16_RAD, EncoderParams, of_second, theta_u32_at
+from amiwarp.kernels.refraction import PairParams
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -22,15 +24,17 @@ MIX_2 = wp.constant(wp.uint32(0xC2B2AE35))
 class EventArrays:
     """Events on a device, padded to whole blocks.
 
-    ``layer`` is the image that an event goes to, by its polarity. ``turn`` is theta_u16, the encoder's angle [1/65536
-    turn], and ``azimuths`` holds cosine and sine of each such angle. ``time`` [s] counts from the middle of the window;
-    it is empty if the camera does not rotate. ``weight`` is the number of events that an entry stands for, or empty.
+    ``layer`` is the image that an event goes to, by its polarity. ``turn`` is theta_u16, the encoder's angle
+    [1/65536 turn], and ``azimuths`` holds cosine and sine of each such angle. ``second`` is theta_u16 of the second
+    prism, or empty. ``time`` [s] counts from the middle of the window; it is empty if the camera does not rotate.
+    ``weight`` is the number of events that an entry stands for, or empty.
     """
 
     x: wp.array(dtype=wp.uint16)
     y: wp.array(dtype=wp.uint16)
     layer: wp.array(dtype=wp.uint8)
     turn: wp.array(dtype=wp.uint16)
+    second: wp.array(dtype=wp.uint16)
     azimuths: wp.array(dtype=float)
     time: wp.array(dtype=float)
     weight: wp.array(dtype=wp.uint8)
@@ -90,9 +94,32 @@ def cell_at(canvas: Canvas, x: float, y: float, layer: int):
 
 
 @wp.func
-def rotate_azimuth(model: Any, c: float, s: float):
-    """Return (cos, sin) of the tilt azimuth from those of the prism angle."""
-    return c * model.phase_cos - s * model.phase_sin, s * model.phase_cos + c * model.phase_sin
+def stored_state(model: Any, events: EventArrays, i: int):
+    """Return cosine and sine of the encoder's angle at event ``i``."""
+    turn = 2 * int(load_uint16(events.turn, i))
+    return load_float(events.azimuths, turn), load_float(events.azimuths, turn + 1)
+
+
+@wp.func
+def stored_state(model: PairParams, events: EventArrays, i: int):
+    """Return the angles of both encoders at event ``i`` [rad]."""
+    first = float(int(load_uint16(events.turn, i)))
+    return first * THETA_U16_RAD, float(int(load_uint16(events.second, i))) * THETA_U16_RAD
+
+
+@wp.func
+def load_states(model: Any, events: EventArrays, first: int, states: wp.array(dtype=float)):
+    """Load what :func:`stored_state` returns for a block of 64 events, in a form that CPUs vectorise."""
+    load_pairs(states, events.azimuths, events.turn, first)
+
+
+@wp.func
+def load_states(model: PairParams, events: EventArrays, first: int, states: wp.array(dtype=float)):
+    """Load what :func:`stored_state` returns for a block of 64 events."""
+    for k in range(64):
+        a, b = stored_state(model, events, first + k)
+        store_float(states, 2 * k, a)
+        store_float(states, 2 * k + 1, b)
 
 
 @wp.kernel
@@ -100,6 +127,13 @@ def turn_events(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int,
     """Compute theta_u16 of each event: the prism angle at its time, rounded to 1/65536 turn."""
     i = start + wp.tid()
     turn[i] = wp.uint16((theta_u32_at(encoder, t[i]) + wp.uint32(32768)) >> wp.uint32(16))
+
+
+@wp.kernel
+def turn_second(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, turn: wp.array(dtype=wp.uint16)):
+    """Compute theta_u16 of the second prism at each event."""
+    i = start + wp.tid()
+    turn[i] = wp.uint16((theta_u32_at(of_second(encoder), t[i]) + wp.uint32(32768)) >> wp.uint32(16))
 
 
 @wp.kernel

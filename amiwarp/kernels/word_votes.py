@@ -14,9 +14,9 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, CameraRotationParams, undo_camera_rotation
-from amiwarp.kernels.native_code import load_float, load_uint8, load_uint16
-from amiwarp.kernels.refraction import displace
-from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, rotate_azimuth
+from amiwarp.kernels.native_code import load_uint8, load_uint16
+from amiwarp.kernels.refraction import displace, state_of
+from amiwarp.kernels.votes import Canvas, EventArrays, cell_at, dither_offset, stored_state
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -81,10 +81,10 @@ def vote_at(canvas: Canvas, x: float, y: float, layer: int):
 
 
 @wp.func
-def azimuth_at(model: Any, events: EventArrays, i: int):
-    """Return (cos, sin) of the tilt azimuth of event ``i``."""
-    turn = 2 * int(load_uint16(events.turn, i))
-    w0, w1 = rotate_azimuth(model, load_float(events.azimuths, turn), load_float(events.azimuths, turn + 1))
+def event_state(model: Any, events: EventArrays, i: int):
+    """Return the optic's state at event ``i``."""
+    a, b = stored_state(model, events, i)
+    w0, w1 = state_of(model, a, b)
     return w0, w1
 
 
@@ -99,7 +99,7 @@ def repeat_vote(events: EventArrays, i: int, word: wp.uint64) -> wp.uint64:
 @wp.func
 def event_vote(model: Any, camera: Any, events: EventArrays, canvas: Canvas, i: int):
     """Compute prism angle, displacement and vote of one event."""
-    w0, w1 = azimuth_at(model, events, i)
+    w0, w1 = event_state(model, events, i)
     x, y = displace(model, camera, float(load_uint16(events.x, i)), float(load_uint16(events.y, i)), w0, w1)
     dx, dy = dither_offset(i)
     layer = int(load_uint8(events.layer, i)) * canvas.layer
@@ -127,7 +127,7 @@ def vote_rotating_camera(
 ):
     """Vote one event per thread, exactly, with the camera's rotation removed."""
     i = start + wp.tid()
-    w0, w1 = azimuth_at(model, events, i)
+    w0, w1 = event_state(model, events, i)
     x, y = displace(model, camera, float(events.x[i]), float(events.y[i]), w0, w1)
     xy = undo_camera_rotation(camera, wp.vec2(x, y), camera_rotation, events.time[i])
     dx, dy = dither_offset(i)

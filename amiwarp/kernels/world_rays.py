@@ -3,8 +3,8 @@
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray
-from amiwarp.kernels.prism_view import Steps, View
-from amiwarp.kernels.refraction import ExactParams, ray_without_prism
+from amiwarp.kernels.prism_view import Steps, View, ray_without_prisms
+from amiwarp.kernels.refraction import ExactParams
 from amiwarp.kernels.world import (
     FAR,
     NAN,
@@ -32,6 +32,7 @@ class RayView:
 
     camera: CameraParams  # camera model
     prism: ExactParams  # prism model
+    second: ExactParams  # second prism of a pair; without one, its apex angle is 0
     poses: wp.array(dtype=Pose)  # pose of the camera at each instant
     aperture: wp.array(dtype=wp.vec3)  # rays of a pixel: x and y relative to the pixel's centre [px], and weight
     reach: int  # largest distance of these rays from the pixel's centre, rounded up [px]
@@ -41,7 +42,8 @@ class RayView:
 @wp.func
 def look_through(view: RayView, steps: Steps, k: int, x: float, y: float) -> wp.vec3:
     """Return the unit vector in the world's frame along which a point of the image looks at instant ``k``."""
-    ray = ray_without_prism(view.prism, pixel_to_ray(view.camera, wp.vec2(x, y)), steps.at[k].azimuth)
+    ray = pixel_to_ray(view.camera, wp.vec2(x, y))
+    ray = ray_without_prisms(view.prism, view.second, ray, steps.at[k].azimuth, steps.at[k].second)
     return view.poses[k].rotation * wp.normalize(ray)
 
 

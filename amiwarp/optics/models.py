@@ -99,6 +99,10 @@ class Model:
     """Names of the parameters that a calibration can find."""
     SIZE: ClassVar[str]
     """Name of the parameter that sets the size of the orbit."""
+    ANGLES: ClassVar[int] = 1
+    """Number of angles of its state: one prism has one, a pair has two."""
+    ORBITS: ClassVar[tuple[tuple[str, str], ...]]
+    """Names of size and phase of each prism, which a calibration finds by default."""
 
     camera: Camera
     """Camera intrinsics."""
@@ -109,6 +113,8 @@ class Model:
         super().__init_subclass__(**options)
         cls.FREE = tuple(parameter.name for parameter in cls.PARAMETERS)
         cls.SIZE = cls.FREE[0]
+        if "ORBITS" not in vars(cls):
+            cls.ORBITS = ((cls.SIZE, cls.FREE[1]),)
 
     @classmethod
     def closed_form(cls) -> type[Model]:
@@ -236,9 +242,9 @@ class Model:
         Returns
         -------
         dict
-            The values, with a size of 0.
+            The values, with all sizes of 0.
         """
-        return {**values, cls.SIZE: 0.0}
+        return {**values, **{size: 0.0 for size, _ in cls.ORBITS}}
 
     def kernel_values(self) -> tuple[Any, ...]:
         """Return the values of the parameters for kernels, in the order of the fields of :attr:`STRUCT`.
@@ -265,6 +271,31 @@ class Model:
         """
         return struct_of(self.STRUCT, self.kernel_values())
 
+    def singles(self) -> tuple[Model, ...]:
+        """Return a model of each prism on its own.
+
+        Returns
+        -------
+        tuple of Model
+            The model itself, for one prism.
+        """
+        return (self,)
+
+    def all_angles(self, theta: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the angles of all prisms for angles of the first one [rad], shape (..., :attr:`ANGLES`).
+
+        Parameters
+        ----------
+        theta : numpy.ndarray
+            Angles of the first prism [rad].
+
+        Returns
+        -------
+        numpy.ndarray
+            The angles [rad], with one more axis.
+        """
+        return np.asarray(theta, np.float64)[..., None]
+
     def compensate_points(self, xy: Points, theta: Points) -> Points:
         """Return the pixel that the same scene ray would hit without the prism.
 
@@ -274,6 +305,7 @@ class Model:
             Observed pixels [px], shape (n, 2), or a Warp array of vec2 of shape (n,).
         theta : numpy.ndarray or warp.array
             Prism angle of the encoder [rad], shape (n,). A float32 Warp array on the same device if ``xy`` is one.
+            For a pair of prisms both angles, shape (n, 2); with one, the second prism follows by the speeds' ratio.
 
         Returns
         -------
@@ -298,7 +330,7 @@ class Model:
         xy : numpy.ndarray or warp.array
             Pixels without the prism [px], shape (n, 2), or a Warp array of vec2 of shape (n,).
         theta : numpy.ndarray or warp.array
-            Prism angle of the encoder [rad], shape (n,). A float32 Warp array on the same device if ``xy`` is one.
+            As for :meth:`compensate_points`.
 
         Returns
         -------
@@ -314,24 +346,37 @@ class Model:
 
 
 def _run(kernel_name: str, model: Model, xy: Any, theta: Any) -> Any:
-    kernel = getattr(kernels, kernel_name)
+    kernel, per_point = getattr(kernels, kernel_name), model.ANGLES
     if isinstance(xy, wp.array):
         if not isinstance(theta, wp.array) or theta.device != xy.device or theta.dtype is not wp.float32:
             raise AmiwarpError(
                 f"xy is a Warp array on {xy.device}; give theta as a float32 Warp array on the same device"
             )
-        if xy.dtype is not wp.vec2 or xy.ndim != 1 or xy.shape != theta.shape:
+        if xy.dtype is not wp.vec2 or xy.ndim != 1 or theta.shape not in _shapes(len(xy), per_point):
             given = f"xy has type {xy.dtype} and shape {xy.shape}, theta has shape {theta.shape}"
-            raise AmiwarpError(f"{given}; give vec2 for xy, and shape (n,) for both")
+            raise AmiwarpError(f"{given}; give vec2 of shape (n,) for xy, and shape {_wanted(per_point)} for theta")
+        if theta.ndim < per_point:
+            theta = wp.array(model.all_angles(theta.numpy()), dtype=float, device=xy.device)
+        theta = theta.flatten()
         out = wp.empty_like(xy)
         launch(kernel, len(xy), [model.params(xy.device), model_camera(model, xy.device), xy, theta], [out],
                device=xy.device)  # fmt: skip
         return out
     xy, theta = array(xy, "xy"), array(theta, "theta")
-    if xy.ndim != 2 or xy.shape[1] != 2 or theta.shape != xy.shape[:1]:
-        raise AmiwarpError(f"xy has shape {xy.shape} and theta {theta.shape}; give (n, 2) and (n,)")
-    result = _run(kernel_name, model, *points_on_host(xy, theta))
+    if xy.ndim != 2 or xy.shape[1] != 2 or theta.shape not in _shapes(len(xy), per_point):
+        raise AmiwarpError(f"xy has shape {xy.shape} and theta {theta.shape}; give (n, 2) and {_wanted(per_point)}")
+    angles = theta if theta.ndim == per_point else model.all_angles(theta)
+    result = _run(kernel_name, model, *points_on_host(xy, angles))
     return result.numpy().astype(xy.dtype if np.issubdtype(xy.dtype, np.floating) else np.float32, copy=False)
+
+
+def _shapes(n: int, angles: int) -> tuple[tuple[int, ...], ...]:
+    """Return the shapes that angles of ``n`` points may have, for a model with this number of angles."""
+    return ((n,),) if angles == 1 else ((n,), (n, angles))
+
+
+def _wanted(angles: int) -> str:
+    return "(n,)" if angles == 1 else f"(n, {angles})"
 
 
 Made = TypeVar("Made", bound=Model)
@@ -358,14 +403,16 @@ def check_given(values: Mapping[str, float], names: Iterable[str]) -> None:
 def compensate_by_each(models: Sequence[Model], xy: NDArray[Any], theta: NDArray[Any]) -> NDArray[np.float64]:
     """Return the same pixels compensated by each of several models, on the CPU [px], shape (models, n, 2).
 
-    ``xy`` holds the pixels, shape (n, 2). ``theta`` holds the prism angles, wrapped to a turn [rad], shape (n,), or
-    (models, n) if each model has its own. One call takes a fraction of the time of a call for each model. Successive
-    places of one model share a launch.
+    ``xy`` holds the pixels, shape (n, 2). ``theta`` holds the angles of the first prism, wrapped to a turn [rad], shape
+    (n,), or (models, n) if each model has its own. One call takes a fraction of the time of a call for each model.
+    Successive places of one model share a launch.
     """
     n = len(xy)
     pixels = wp.array(np.tile(xy.astype(np.float32), (len(models), 1)), dtype=wp.vec2, device="cpu", copy=False)
     angles = np.empty((len(models), n), np.float32)
     angles[:] = theta
+    if models[0].ANGLES > 1:  # a pair is compared with pairs only
+        angles = np.stack([model.all_angles(own) for model, own in zip(models, angles, strict=True)]).astype(np.float32)
     points = [pixels, wp.array(angles.ravel(), dtype=float, device="cpu", copy=False)]
     out = wp.empty_like(pixels)
     launches: dict[type, RecordedLaunch] = {}
@@ -390,7 +437,7 @@ def rms(moved: NDArray[np.float64]) -> float:
 
 
 def points_on_host(xy: NDArray[Any], theta: NDArray[Any]) -> tuple[Any, Any]:
-    """Return pixels, shape (n, 2), and prism angles [rad], shape (n,), as Warp arrays on the CPU."""
+    """Return pixels, shape (n, 2), and prism angles [rad], shape (n,) or (n, angles), as Warp arrays on the CPU."""
     wrapped = wrap_angle(theta).astype(np.float32)
     return wp.array(xy.astype(np.float32), dtype=wp.vec2, device="cpu"), wp.array(wrapped, dtype=float, device="cpu")
 
@@ -649,6 +696,92 @@ class ExactModel(Model):
         )  # fmt: skip
 
 
+# Pair of prisms: exact refraction at the four faces of two prisms that turn independently.
+
+
+@guarded
+@dataclass(frozen=True)
+class RisleyModel(Model):
+    """Risley pair: refracts each ray at the four faces of two prisms, each with its own angle.
+
+    Raises
+    ------
+    AmiwarpError
+        If the prism has no second one, or a field has an unusable value.
+
+    Notes
+    -----
+    A ray of the camera meets the first prism, then the second one. Each refracts it as in :class:`ExactModel`; both
+    turn about the optical axis.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> camera = amiwarp.Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    >>> pair = amiwarp.Prism(apex=0.03, second=amiwarp.Prism(apex=0.03))
+    >>> model = amiwarp.RisleyModel(camera, pair)
+    >>> model.compensate_points(np.array([[100.0, 200.0]]), np.array([[0.4, 0.4 + np.pi]])).round()  # they cancel
+    array([[100., 200.]])
+    """
+
+    NAME, TEXT, NUMBERS, STRUCT, ANGLES = "risley", "pair of prisms", "4, indices given", kernels.PairParams, 2
+    PARAMETERS = (
+        Parameter("apex", "rad"),
+        PHASE,
+        Parameter("second_apex", "rad", 0.02, limits=(0.0, 30.0), label="second apex", slider=(0.0, 10.0, 0.05)),
+        Parameter("second_phase", "rad", limits=(-180.0, 180.0), label="second phase", slider=(-180.0, 180.0, 0.5)),
+        Parameter("ratio", "1", 0.01),
+    )  # fmt: skip
+    ORBITS = (("apex", "phase"), ("second_apex", "second_phase"))
+
+    camera: Camera
+    """Camera intrinsics."""
+    prism: Prism
+    """The prism next to the camera, with the second one."""
+    phase: float = 0.0
+    """Phase θ_b of the first prism, added to its encoder's angle [rad]."""
+    second_phase: float = 0.0
+    """Phase of the second prism, added to its encoder's angle [rad]."""
+    ratio: float = 0.0
+    """Mean speed of the second prism relative to the first, which tells the second angle where only one is given."""
+
+    def __post_init__(self) -> None:
+        instance(self.camera, Camera, "camera")
+        if instance(self.prism, Prism, "prism").second is None:
+            raise AmiwarpError("the prism has no second one; give Prism(apex, second=Prism(apex))")
+        for name in ("phase", "second_phase"):
+            object.__setattr__(self, name, check_phase(getattr(self, name), name))
+        object.__setattr__(self, "ratio", real(self.ratio, "ratio", -1e6, 1e6))
+
+    @classmethod
+    def start_values(cls, prism: Prism) -> dict[str, float]:
+        second = prism if prism.second is None else prism.second
+        return {**super().start_values(prism), "second_apex": second.apex}
+
+    @classmethod
+    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        second = prism if prism.second is None else prism.second
+        other = Prism(values.get("second_apex", second.apex), second.index, second.flat_side)
+        pair = Prism(values["apex"], prism.index, prism.flat_side, other)
+        return cls(camera, pair, values["phase"], values.get("second_phase", 0.0), values.get("ratio", 0.0))
+
+    def kernel_values(self) -> tuple[Any, ...]:
+        prisms = (each.kernel_values() for each in self.singles())
+        return (*prisms, self.phase, self.second_phase, self.ratio)
+
+    def params(self, device: Any) -> Any:
+        prisms = (each.params(device) for each in self.singles())
+        return struct_of(kernels.PairParams, [*prisms, *self.kernel_values()[2:]])
+
+    def singles(self) -> tuple[ExactModel, ExactModel]:
+        first = ExactModel(self.camera, replace(self.prism, second=None), self.phase)
+        return first, ExactModel(self.camera, cast("Prism", self.prism.second), self.second_phase)
+
+    def all_angles(self, theta: NDArray[Any]) -> NDArray[np.float64]:
+        first = np.asarray(theta, np.float64)
+        return np.stack([first, self.ratio * first], axis=-1)
+
+
 def axis_rotation(tilt_x: float, tilt_y: float) -> NDArray[np.float64]:
     """Return the rotation matrix (3, 3) of a tilted axis: about x by ``tilt_x``, then about y by ``tilt_y`` [rad]."""
     cx, sx, cy, sy = math.cos(tilt_x), math.sin(tilt_x), math.cos(tilt_y), math.sin(tilt_y)
@@ -836,7 +969,7 @@ def _triangle(degree: int) -> NDArray[np.bool_]:
 # The models by name.
 
 MODELS: dict[str, type[Model]] = {
-    model.NAME: model for model in (CircleModel, ExactModel, RadialCircleModel, EllipseModel)
+    model.NAME: model for model in (CircleModel, ExactModel, RadialCircleModel, EllipseModel, RisleyModel)
 }
 """Optical models by name, ordered by their number of calibrated parameters, then by their measured cost per event."""
 
@@ -853,6 +986,12 @@ def rungs(name: str = ExactModel.NAME) -> dict[str, type[Model]]:
         return other is not None and (other == name or approximates(MODELS[other].SIMPLIFIES))
 
     return {other: model for other, model in MODELS.items() if approximates(other)}
+
+
+def alternatives(name: str) -> dict[str, type[Model]]:
+    """Return all models of the same optic as a model, by name: the best one and its approximations."""
+    better = MODELS[name].SIMPLIFIES
+    return rungs(name) if better is None else alternatives(better)
 
 
 # Distance between two optical models over the image and one turn of the prism.

@@ -1,4 +1,4 @@
-"""The wedge prism: apex angle, refractive index, the side of its flat face, and its deflection.
+"""The wedge prism: apex angle, refractive index, the side of its flat face, its deflection, and a second prism.
 
 This is the glass only. Its motion is that of the encoder, :mod:`amiwarp.events.encoder`.
 """
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import choice, guarded, real, vector
+from amiwarp.validation import choice, guarded, instance, real, vector
 
 LARGEST_APEX = math.radians(30.0)
 """Upper limit of the apex angle [rad]. Larger values are mistakes, such as angles in degrees."""
@@ -58,8 +58,12 @@ class Prism:
     """Refractive index. The default is that of N-BK7 at the d line, 587.6 nm."""
     flat_side: FlatSide = FlatSide.SCENE
     """Side that the flat face points to."""
+    second: Prism | None = None
+    """Second prism of a pair (Risley pair), behind this one as seen from the camera; None for one prism."""
 
     def __post_init__(self) -> None:
+        if self.second is not None and instance(self.second, Prism, "prism second").second is not None:
+            raise AmiwarpError("the second prism has a second one itself; a pair has two prisms")
         hint = " rad, 0 .. 30 deg; is it given in degrees?"
         object.__setattr__(self, "apex", real(self.apex, "prism apex", 0.0, _BELOW_LARGEST_APEX, hint))
         object.__setattr__(self, "index", check_index(self.index, "prism index"))
@@ -67,7 +71,7 @@ class Prism:
 
     @property
     def deflection(self) -> float:
-        """Deflection of the ray on the camera's optical axis [rad]."""
+        """Deflection of the ray on the camera's optical axis by this prism [rad]."""
         return deflection_from_apex(self.apex, self.index, self.flat_side)
 
 
@@ -79,7 +83,7 @@ class UnsizedPrism:
     Examples
     --------
     >>> amiwarp.UnsizedPrism(index=1.5).with_apex(0.03)
-    Prism(apex=0.03, index=1.5, flat_side=<FlatSide.SCENE: 'scene'>)
+    Prism(apex=0.03, index=1.5, flat_side=<FlatSide.SCENE: 'scene'>, second=None)
     """
 
     index: float = 1.5168

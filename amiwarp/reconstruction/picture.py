@@ -26,7 +26,7 @@ from amiwarp.choices import CONTRAST, Fill, Tone
 from amiwarp.compensation.recordings import check_size
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceMemoryEvents, device_of, read_between, wait
-from amiwarp.events.encoder import TWO_PI, Encoder, turn_between
+from amiwarp.events.encoder import TWO_PI, Encoder, check_prisms, turn_between
 from amiwarp.events.recording import EventSource, Recording
 from amiwarp.imaging.export import encode_image
 from amiwarp.io.files import NewFile, check_output
@@ -416,6 +416,7 @@ class Reconstruction:
         if model is None or encoder is None:
             raise AmiwarpError(f"{recording.name}: give a calibration, or a model and an encoder")
         check_size(model, recording.events.size, recording.name, what="model")
+        check_prisms(encoder, model.ANGLES)
         self.recording, self.model, self.encoder = recording, model, encoder
         if camera_rotation is None and calibration is not None:
             camera_rotation = calibration.camera_rotation

@@ -17,7 +17,7 @@ from amiwarp.events.encoder import TWO_PI, Encoder, periodic
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.models import ExactModel, RisleyModel
 from amiwarp.optics.prism import Prism, check_angles, check_phase
 from amiwarp.simulation.pictures import linear_luminance, read_picture
 from amiwarp.simulation.worlds.world import WorldScene
@@ -61,9 +61,17 @@ class PrismMotion:
     """Cylinder power of the tilted face, which turns with the prism [rad], as in :class:`amiwarp.ExactModel`."""
     wobble: tuple[float, float] = (0.0, 0.0)
     """Wobble of the prism about the axis of rotation [rad], as in :class:`amiwarp.ExactModel`."""
+    second: PrismMotion | None = None
+    """Motion of the second prism of a pair; None for one prism."""
 
     def __post_init__(self) -> None:
         _check_table("prism speed", self._table())
+        if self.second is not None:
+            instance(self.second, PrismMotion, "motion of the second prism")
+            if self.second.second is not None or any((*self.second.tilt, *self.second.cylinder, *self.second.wobble)):
+                raise AmiwarpError("the motion of the second prism has more than speed and phase; leave the rest out")
+            if any((*self.tilt, *self.cylinder, *self.wobble)):
+                raise AmiwarpError("a pair of prisms has tilt, cylinder power or wobble; simulate one prism with them")
         object.__setattr__(self, "phase", check_phase(self.phase, "prism phase"))
         for name in ("tilt", "cylinder", "wobble"):
             object.__setattr__(self, name, check_angles(getattr(self, name), name))
@@ -137,6 +145,22 @@ class PrismMotion:
             return before[i] + mean * (inside - at[i]) + np.interp(t, at, speed) * (t - inside)
 
         return np.asarray(integral(np.asarray(t_us, np.float64) * 1e-6) - integral(np.zeros(1)))
+
+    def angles(self, t_us: ArrayLike) -> NDArray[np.float64]:
+        """Return the unwrapped angles of all prisms.
+
+        Parameters
+        ----------
+        t_us : array_like
+            Times [us], shape ``(n,)``.
+
+        Returns
+        -------
+        ndarray
+            Angles [rad], shape ``(n,)`` for one prism, ``(n, 2)`` for a pair.
+        """
+        first = self.angle(t_us)
+        return first if self.second is None else np.stack([first, self.second.angle(t_us)], axis=1)
 
     @property
     def largest_speed(self) -> float:
@@ -313,7 +337,8 @@ class EncoderModel:
         kept[[0, -1]] = True
         stamp, angle = stamp[kept], angle[kept]
         rising = np.concatenate([[True], stamp[1:] > np.maximum.accumulate(stamp)[:-1]])
-        return Encoder(stamp[rising], angle[rising])
+        second = None if motion.second is None else self.sample(motion.second, duration_us, seed + 1)
+        return Encoder(stamp[rising], angle[rising], second=second)
 
 
 # Model of the sensor.
@@ -677,6 +702,9 @@ class SimulationValues:
             given, expected = (f"{width}x{height}" for width, height in (self.pixels.size, size))
             raise AmiwarpError(f"the pixel map has {given} pixels, the camera {expected}; give the map of this camera")
         whole(self.seed, "seed", 0, (1 << 31) - 1)
+        if (self.prism.second is None) != (self.motion.second is None):
+            has, lacks = ("prism", "motion") if self.motion.second is None else ("motion", "prism")
+            raise AmiwarpError(f"the {has} has a second prism, the {lacks} has none; give both or neither")
 
     @property
     def duration_us(self) -> int:
@@ -684,7 +712,10 @@ class SimulationValues:
         return round(self.duration_s * 1e6)
 
     @property
-    def true_model(self) -> ExactModel:
-        """True optical model of the prism."""
-        motion = self.motion
-        return ExactModel(self.camera, self.prism, motion.phase, motion.tilt, motion.cylinder, motion.wobble)
+    def true_model(self) -> ExactModel | RisleyModel:
+        """True optical model of the prism, or of both prisms."""
+        motion, second = self.motion, self.motion.second
+        if second is None:
+            return ExactModel(self.camera, self.prism, motion.phase, motion.tilt, motion.cylinder, motion.wobble)
+        turned, by = second.angle([1e6 * self.duration_s])[0], motion.angle([1e6 * self.duration_s])[0]
+        return RisleyModel(self.camera, self.prism, motion.phase, second.phase, turned / by if by else 0.0)

@@ -15,6 +15,7 @@ from amiwarp.kernels import prism_view, world_rays
 from amiwarp.kernels import world as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import Camera, camera_params
+from amiwarp.optics.models import ExactModel
 from amiwarp.simulation.description import Scene, SimulationValues
 from amiwarp.simulation.pictures import DARK, Placement, log_map, place_picture
 from amiwarp.simulation.worlds.world import Body, Material, Trajectory, World, WorldScene
@@ -59,6 +60,9 @@ LARGEST_BEND = 0.002
 """Largest distance of the orbit from its chord in a time step [px]. Brightness is interpolated along the chord, so that
 orbits come out too small by up to two thirds of it."""
 
+PAIR_MARGIN = 1.1
+"""Margin of the image's motion by a pair of prisms over the sum of both, as each deflects what the other deflected."""
+
 LONGEST_STEP = 2000
 """Longest time step of the simulation, even if nothing moves [us]."""
 
@@ -78,8 +82,8 @@ The picture lies on a plane in front of the camera, so no picture exists beside 
 class ImageMotion:
     """Largest motion of the image that a turn of the prism or of the camera by a unit angle causes."""
 
-    prism: float
-    """Largest motion of the image per rotation angle of the prism [px/rad]."""
+    prisms: NDArray[np.float64]
+    """Largest motion of the image per rotation angle of each prism [px/rad], shape (1,) or (2,)."""
     camera: NDArray[np.float64]
     """Largest motion of the image per rotation angle of the camera about each of its axes [px/rad], shape (3,)."""
 
@@ -91,9 +95,9 @@ def step_us(simulation: SimulationValues, *, world_speed: float = 0.0, longest: 
     """
     motion = image_motion(simulation)
     rates = simulation.camera_motion.largest_rates
-    turning = simulation.motion.largest_speed
-    speed = motion.prism * turning + float(motion.camera @ rates) + world_speed
-    bend = motion.prism * turning**2 / 8.0  # [px/s²]: the distance from the chord, per squared duration of a step
+    turning = np.array([each.largest_speed for each in (simulation.motion, simulation.motion.second) if each])
+    speed = float(motion.prisms @ turning) + float(motion.camera @ rates) + world_speed
+    bend = float(motion.prisms @ turning**2) / 8.0  # [px/s²]: the distance from the chord, per squared step
     step = 1e6 * min(LARGEST_MOTION / max(speed, 1e-9), math.sqrt(LARGEST_BEND / max(bend, 1e-9)))
     step = min(float(LONGEST_STEP), longest, step)
     frames = getattr(simulation.scene, "frames", None)
@@ -114,14 +118,31 @@ def image_motion(simulation: SimulationValues) -> ImageMotion:
     )
     turns = 72
     theta = np.linspace(0.0, 2.0 * np.pi, turns + 1)
-    model = replace(simulation.true_model, phase=0.0)
     xy = wp.array(np.repeat(grid, turns + 1, axis=0).astype(np.float32), dtype=wp.vec2, device=device)
     angles = wp.array(np.tile(theta, len(grid)).astype(np.float32), dtype=float, device=device)
-    path = model.compensate_points(xy, angles).numpy().reshape(len(grid), turns + 1, 2)
     arc = (theta[1] / 2.0) / math.sin(theta[1] / 2.0)  # a step along a circle is longer than its chord
-    along = np.linalg.norm(np.diff(path, axis=1), axis=2)
-    prism = float(np.max(along, initial=0.0, where=np.isfinite(along))) * arc / theta[1]
-    return ImageMotion(prism, _camera_image_motion(simulation, grid))
+    prisms = []
+    for model in single_models(simulation):
+        path = replace(model, phase=0.0).compensate_points(xy, angles).numpy().reshape(len(grid), turns + 1, 2)
+        along = np.linalg.norm(np.diff(path, axis=1), axis=2)
+        prisms.append(float(np.max(along, initial=0.0, where=np.isfinite(along))) * arc / theta[1])
+    shares = np.array(prisms) * (1.0 if len(prisms) == 1 else PAIR_MARGIN)
+    return ImageMotion(shares, _camera_image_motion(simulation, grid))
+
+
+def single_models(simulation: SimulationValues) -> list[ExactModel]:
+    """Return the exact model of the prism, or of each prism of a pair on its own."""
+    model = simulation.true_model
+    return [model] if isinstance(model, ExactModel) else list(model.singles())
+
+
+def prism_view_of(simulation: SimulationValues, device: Any) -> Any:
+    """Return the kernels' :class:`amiwarp.kernels.prism_view.View` with camera and prisms, without maps."""
+    view, (prism, *second) = prism_view.View(), single_models(simulation)
+    view.camera, view.prism = camera_params(simulation.camera, str(device)), prism.params(device)
+    if second:
+        view.second = second[0].params(device)
+    return view
 
 
 def _camera_image_motion(simulation: SimulationValues, grid: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -153,12 +174,13 @@ def seen_bearings(simulation: SimulationValues) -> NDArray[np.float64]:
         [np.stack([x * right, y * bottom], 1) for x, y in ((along, zero), (along, one), (zero, along), (one, along))]
     )
     border = np.round(border)
-    theta = np.arange(24) * (2.0 * np.pi / 24)
-    xy = wp.array(np.repeat(border, 24, axis=0).astype(np.float32), dtype=wp.vec2, device=device)
-    angles = wp.array(np.tile(theta, len(border)).astype(np.float32), dtype=float, device=device)
+    turn = np.arange(24) * (2.0 * np.pi / 24)
+    others = turn if simulation.motion.second is not None else np.zeros(1)
+    theta = np.stack([m.ravel() for m in np.meshgrid(turn, others)], axis=1)
+    xy = wp.array(np.repeat(border, len(theta), axis=0).astype(np.float32), dtype=wp.vec2, device=device)
+    angles = wp.array(np.tile(theta.astype(np.float32), (len(border), 1)), dtype=wp.vec2, device=device)
     out = wp.empty(len(xy), dtype=wp.vec3, device=device)
-    prism = simulation.true_model.params(device)
-    inputs = [camera_params(camera, str(wp.get_device(device))), prism, xy, angles]
+    inputs = [prism_view_of(simulation, wp.get_device(device)), xy, angles]
     launch(prism_view.scene_bearings, len(xy), inputs, [out], device=device)
     bearings = out.numpy().astype(np.float64)
     return np.asarray(bearings[np.isfinite(bearings).all(axis=1)])
@@ -1082,7 +1104,7 @@ class WorldSight:
         poses: NDArray[Any] = np.zeros(len(t), cast("Any", kernels.Pose).numpy_dtype())
         poses["rotation"], poses["position"] = self._scene.trajectory.poses(t)
         self._view.poses = wp.array(poses, dtype=kernels.Pose, device=self._world.device)
-        self._view.prism = view.prism
+        self._view.prism, self._view.second = view.prism, view.second
 
     def light(self, steps: Any, first: int, count: int) -> wp.array:
         """Return the luminance that each pixel sees at ``count`` instants, the first of which has the index ``first``.

@@ -23,8 +23,8 @@ from amiwarp.events.truth import EventTruth, EventValues, FrameTruth, Poses, Tru
 from amiwarp.io import RecordingWriter
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.kernels import event_keys, launch, pixels, prism_view
-from amiwarp.optics.camera import Camera, camera_params
-from amiwarp.optics.models import ExactModel, axis_rotation, wrap_angle
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import ExactModel, Model, axis_rotation, wrap_angle
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation import scenery
 from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel, SimulationValues
@@ -94,7 +94,7 @@ class TruthRenderer:
         (rotation,), (position,) = scene.trajectory.poses([t])
         self._world.set_instants(np.array([t]))
         pixels = camera.rays_to_pixels(self._rays)
-        theta = np.full(len(pixels), wrap_angle(self._simulation.motion.angle([t_us]))[0])
+        theta = np.repeat(wrap_angle(self._simulation.motion.angles([t_us])), len(pixels), axis=0)
         bare = scenery.surfaces_at(self._world, self._rays, rotation, position)
         places = model.compensate_points(pixels, theta)
         through = scenery.surfaces_at(self._world, camera.pixels_to_rays(places), rotation, position)
@@ -150,7 +150,7 @@ class TruthRenderer:
 
     def _prism_flow(
         self,
-        model: ExactModel,
+        model: Model,
         places: NDArray[np.float64],
         speed: NDArray[np.float64],
         theta: NDArray[np.float64],
@@ -164,23 +164,24 @@ class TruthRenderer:
         size = np.linalg.norm(speed, axis=1, keepdims=True)
         aside = speed / np.maximum(size, 1e-9)
         along = [model.deflect_points(places + sign * aside, theta) for sign in (-1.0, 1.0)]
-        turned = [model.deflect_points(places, theta + sign * ANGLE) for sign in (-10.0, 10.0)]
-        (before, after) = self._simulation.motion.angle([t_us - 50.0, t_us + 50.0])
-        rate = (after - before) / 1e-4
-        return np.asarray((along[1] - along[0]) / 2.0 * size + (turned[1] - turned[0]) / (20.0 * ANGLE) * rate)
+        before, after = self._simulation.motion.angles([t_us - 50.0, t_us + 50.0])
+        rates = np.atleast_1d((after - before) / 1e-4)
+        flow = (along[1] - along[0]) / 2.0 * size
+        for rate, alone in zip(rates, np.eye(len(rates)), strict=True):
+            step = ANGLE * (alone if len(rates) > 1 else 1.0)
+            turned = [model.deflect_points(places, theta + sign * step) for sign in (-10.0, 10.0)]
+            flow = flow + (turned[1] - turned[0]) / (20.0 * ANGLE) * rate
+        return np.asarray(flow)
 
     def _intensity(self, t_us: int, *, prism: bool) -> NDArray[np.float32]:
         """Return the luminance of all pixels at a time, through the prism or without the prism, shape (n,)."""
-        simulation, device = self._simulation, self._world.device
-        model = simulation.true_model
+        device, simulation = self._world.device, self._simulation
         if not prism:
-            model = replace(model, prism=replace(model.prism, apex=0.0), cylinder=(0.0, 0.0))
-        view = prism_view.View()
-        view.prism = model.params(device)
-        self._sight.set_instants(np.array([float(t_us)]), view)
-        angle = simulation.motion.phase + float(simulation.motion.angle([t_us])[0])
+            simulation = cast("Simulation", simulation).without_prism()
+        self._sight.set_instants(np.array([float(t_us)]), scenery.prism_view_of(simulation, device))
         table: NDArray[Any] = np.zeros(1, cast("Any", prism_view.Step).numpy_dtype())
-        table["azimuth"] = (math.cos(angle), math.sin(angle))
+        first, second = true_angles(simulation.motion, np.array([float(t_us)]))
+        table["azimuth"], table["second"] = azimuths_of(first), azimuths_of(second)
         steps = prism_view.Steps()
         steps.at = wp.array(table, dtype=prism_view.Step, device=device)
         return np.array(self._sight.light(steps, 0, 1).numpy()[0])
@@ -573,9 +574,7 @@ class Engine:
         self._margin = int(pixels.LARGEST_LAG) // (int(pixels.TICKS) * self._step) + 2
         self._axis = axis_rotation(*simulation.motion.tilt)
         self._sensor = sensor_params(simulation.sensor, self._step)
-        self._view = prism_view.View()
-        self._view.camera = camera_params(simulation.camera, str(self._device))
-        self._view.prism = simulation.true_model.params(self._device)
+        self._view = scenery.prism_view_of(simulation, self._device)
         if self._maps is not None:
             self._view.width, self._view.height = self._maps.placement.width, self._maps.placement.height
         sensor = simulation.sensor
@@ -622,10 +621,10 @@ class Engine:
         """
         simulation, margin = self._simulation, self._margin
         t = np.arange(first - margin, first + count + 1, dtype=np.float64) * self._step
-        angle = simulation.motion.phase + simulation.motion.angle(t)
+        angle, second = true_angles(simulation.motion, t)
         steps = prism_view.Steps()
         table: NDArray[Any] = np.zeros(len(t), cast("Any", prism_view.Step).numpy_dtype())
-        table["azimuth"] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        table["azimuth"], table["second"] = azimuths_of(angle), azimuths_of(second)
         if self._maps is not None:
             self._fill_maps(self._maps, table, t, first, count)
         if self._sight is not None:
@@ -635,12 +634,16 @@ class Engine:
             steps.ahead = wp.array(
                 instants_in_blocks(table[margin + 1 :]), dtype=prism_view.Instants, device=self._device
             )
-        steps.angle = self._upload(wrap_angle(angle))
-        steps.turn = self._upload(np.diff(angle, append=2.0 * angle[-1] - angle[-2]))
+        steps.angle, steps.turn = self._angles(angle)
+        steps.second_angle, steps.second_turn = self._angles(second)
         steps.per_tick = 1.0 / (self._step * int(pixels.TICKS))
         steps.shift = int(pixels.LOW_BITS) + (self._pixels - 1).bit_length()
         steps.margin, steps.count, steps.ticks = margin, count, self._step * int(pixels.TICKS)
         return steps
+
+    def _angles(self, angle: NDArray[np.float64]) -> tuple[wp.array, wp.array]:
+        """Return angles [rad] and their changes until the next instant on the device."""
+        return self._upload(wrap_angle(angle)), self._upload(np.diff(angle, append=2.0 * angle[-1] - angle[-2]))
 
     def _fill_maps(
         self, maps: MapRing | WorldMapRing, table: NDArray[Any], t: NDArray[np.float64], first: int, count: int
@@ -757,15 +760,26 @@ class Engine:
         return DeviceBlock(block, partial(self._sight.look, self._view, steps, block, n, faces))
 
 
+def true_angles(motion: PrismMotion, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the true azimuths of the prism and of the second prism [rad]; without a second prism, zeros."""
+    first, second = motion.phase + motion.angle(t_us), motion.second
+    return first, np.zeros(len(t_us)) if second is None else second.phase + second.angle(t_us)
+
+
+def azimuths_of(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return cosine and sine of angles [rad], shape (n, 2)."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
 def instants_in_blocks(table: NDArray[Any]) -> NDArray[np.float32]:
-    """Return the prism azimuths and matrices of a table of instants in blocks of 16, shape (n, 11, 16).
+    """Return the prism azimuths and matrices of a table of instants in blocks of 16, shape (n, 13, 16).
 
     The last block is padded with copies of the last instant.
     """
     ahead = int(prism_view.AHEAD)
-    columns = np.concatenate([table["azimuth"], table["to_texel"].reshape(-1, 9)], axis=1)
+    columns = np.concatenate([table["azimuth"], table["to_texel"].reshape(-1, 9), table["second"]], axis=1)
     filled = np.concatenate([columns, np.repeat(columns[-1:], -len(columns) % ahead, axis=0)])
-    return np.ascontiguousarray(filled.reshape(-1, ahead, 11).swapaxes(1, 2))
+    return np.ascontiguousarray(filled.reshape(-1, ahead, 13).swapaxes(1, 2))
 
 
 def sensor_params(sensor: SensorModel, step: int) -> Any:
@@ -801,6 +815,7 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
         "apex": simulation.prism.apex,
         "index": simulation.prism.index,
         "phase": simulation.motion.phase,
+        **of_second_prism(simulation),
         **clock,
         **{
             f"{name}_{axis}": angle
@@ -810,6 +825,16 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
         **{name: value for name, value in omega.items() if math.isfinite(value)},
         **asdict(simulation.sensor),
     }
+
+
+def of_second_prism(simulation: SimulationValues) -> dict[str, float]:
+    """Return the true values of the second prism of a pair; none for one prism."""
+    model = simulation.true_model
+    if isinstance(model, ExactModel):
+        return {}
+    second = cast("Prism", model.prism.second)
+    return {"second_apex": second.apex, "second_index": second.index, "second_phase": model.second_phase,
+            "ratio": model.ratio}  # fmt: skip
 
 
 # Events of a simulation and their ground truth, collected in the memory of the host or of the device.
@@ -870,7 +895,8 @@ class Simulation(SimulationValues):
         Simulation
             The same scene, sensor and seed with an apex angle of 0. Its recording has neither encoder nor prism.
         """
-        prism, motion = replace(self.prism, apex=0.0), replace(self.motion, cylinder=(0.0, 0.0))
+        prism = replace(self.prism, apex=0.0, second=None)
+        motion = replace(self.motion, cylinder=(0.0, 0.0), second=None)
         return replace(self, prism=prism, motion=motion, nominal_prism=None, encoder_model=None)
 
     def encoder(self) -> Encoder | None:

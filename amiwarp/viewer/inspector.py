@@ -31,7 +31,7 @@ from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, upload_event
 from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_variance
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, PHASE, Model, build_model, size_names
+from amiwarp.optics.models import MODELS, PHASE, ExactModel, Model, RisleyModel, build_model, size_names
 from amiwarp.optics.prism import NominalPrism
 from amiwarp.reconstruction.picture import Picture, border_displacements
 
@@ -750,7 +750,9 @@ class Inspector:
         """Nominal prism of the recording, with an assumed apex if it is unknown."""
         self.zero_us = (source.t_first + source.t_last) // 2
         """Time at which the prism angle is 0 if there is no encoder [us]."""
-        self.knobs = Knobs(apex=self.prism.apex, clock_offset=self._recorded_offset_us)
+        self.knobs = Knobs.given(
+            self._second_prism, model=self._best_model, apex=self.prism.apex, clock_offset=self._recorded_offset_us
+        )
         self.window: tuple[int, int] | None = None
         """Start and length of the time window [us]; None: that of :meth:`first_window`."""
         self.selection = Selection()
@@ -849,6 +851,18 @@ class Inspector:
         return encoder if encoder is None or harmonics is None else encoder.with_harmonics(harmonics)
 
     @property
+    def _best_model(self) -> str:
+        """Name of the best model of the recording's optic: one prism, or a pair."""
+        encoder = self.recording.encoder
+        return ExactModel.NAME if encoder is None or encoder.second is None else RisleyModel.NAME
+
+    @property
+    def _second_prism(self) -> dict[str, float]:
+        """Values of the second prism of a pair as the recording gives them; none for one prism."""
+        ratio = None if self.recording.encoder is None else self.recording.encoder.ratio
+        return {} if ratio is None else {"second_apex": (self.prism.second or self.prism).apex, "ratio": ratio}
+
+    @property
     def adjusted_encoder(self) -> Encoder:
         """Encoder with the clock offset set on the page."""
         return self.encoder_of(self.knobs)
@@ -942,7 +956,9 @@ class Inspector:
         if not {"apex", "phase"} <= set(p):
             return None
         offset = p.get("clock_offset_us", self._recorded_offset_us)
-        return Knobs.given(p, apex=p["apex"], phase=p["phase"], clock_offset=offset, rpm=self.knobs.rpm)
+        return Knobs.given(
+            p, model=self._best_model, apex=p["apex"], phase=p["phase"], clock_offset=offset, rpm=self.knobs.rpm
+        )
 
     def take_truth(self) -> None:
         """Set the parameters to the known truth. Raises :class:`AmiwarpError` if the recording has none."""
@@ -1146,7 +1162,7 @@ class Inspector:
     @property
     def _unprismed(self) -> Knobs:
         """Parameters that leave all events where they were recorded."""
-        return replace(self.knobs, model="exact", apex=0.0, others=())
+        return replace(self.knobs, model=self._best_model, apex=0.0, others=())
 
     def warped(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
         """Return the model, the events on the device and their drift [us], to vote the events of a window.
@@ -1159,7 +1175,7 @@ class Inspector:
     def positions(self, events: Events, knobs: Knobs) -> NDArray[np.float32]:
         """Return the compensated positions of events [px], shape ``(n, 2)``."""
         xy = np.stack([events.x, events.y], axis=1).astype(np.float32)
-        theta = self.encoder_of(knobs).angle_at(events.t).astype(np.float32)
+        theta = self.encoder_of(knobs).angles_at(events.t).astype(np.float32)
         return np.asarray(self.model_of(knobs).compensate_points(xy, theta), np.float32)
 
     def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:

@@ -10,7 +10,7 @@ from urllib.parse import parse_qsl, urlencode
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, alternatives
 from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look, Scale, picture_state
 from amiwarp.viewer.inspector import OTHERS, SLIDING, Inspector, Knobs, Selection, Source, colours_on_offer, truth_text
 from amiwarp.viewer.jobs import EXPORTS, FILMS, CostSurface, FoundCalibration, LiveFigures
@@ -563,7 +563,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         **NO_ORBIT,
         "trame__title": f"amiwarp: {recording.name}", "trame_error_report_msg": "", "name": recording.name,
         "size": list(size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
-        "has_encoder": inspector.has_encoder, "models": list(MODELS),
+        "has_encoder": inspector.has_encoder, "models": list(alternatives(inspector.knobs.model)),
         "apex_most": apex_most(inspector), "truths": truths(inspector),
         "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth),
         "exports": [[name, text, name in FILMS] for name, (text, _) in EXPORTS.items()],

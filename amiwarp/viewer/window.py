@@ -19,7 +19,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.io.files import interrupts_later
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, alternatives
 from amiwarp.tasks import no_garbage_collection
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import Look, Scene
@@ -242,7 +242,7 @@ class Window(layout.Actions):
             self.knob = _following([name for name in self.sliders if name not in FINE], self.knob)
             self.request("look")
         elif what == "model":
-            inspector.set(replace(knobs, model=_following(list(MODELS), knobs.model)))
+            inspector.set(replace(knobs, model=_following(list(alternatives(knobs.model)), knobs.model)))
             self.request("knobs")
         elif what == "colour":
             self.restyle(colour=_following(colours_on_offer(inspector.recording.truth), self.look.colour))

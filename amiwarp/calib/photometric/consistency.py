@@ -17,13 +17,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.calib.parameters import DRIFTS, RATES, ParameterSpace, widened
+from amiwarp.calib.parameters import DRIFTS, RATES, ParameterSpace, default_free, phase_names, widened
 from amiwarp.calib.photometric.cost import place_arguments, size_and_phase_directions
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.equations import by_shift, multiply
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LENS, Camera, CameraRotation, given_lens
-from amiwarp.optics.models import Model, compensate_by_each, predicted_error, rms
+from amiwarp.optics.models import MODELS, Model, compensate_by_each, predicted_error, rms
 from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
 
 if TYPE_CHECKING:
@@ -473,8 +473,8 @@ def _columns(cost: Cost, best: Vector) -> dict[str, Any]:
 
 
 def _orbit(space: ParameterSpace) -> list[str]:
-    """Return the names of the free ones of size and phase."""
-    return [n for n in space.names if n in (space.size_name, "phase")]
+    """Return the names of the free ones of size and phase, of each prism."""
+    return [n for n in space.names if n in default_free(MODELS[space.model])]
 
 
 def _systematic(space: ParameterSpace, fit: LinearFit) -> Vector:
@@ -495,7 +495,7 @@ def map_errors(space: ParameterSpace, best: Vector, fit: LinearFit, pairs: int, 
     standard deviations for independent errors of one threshold.
     """
     along = np.array(size_and_phase_directions(space, best)).reshape(-1, len(best))
-    error = np.array([MAP_ERROR["phase" if n == "phase" else "size"] / density**2 for n in _orbit(space)])
+    error = np.array([MAP_ERROR["phase" if n in phase_names() else "size"] / density**2 for n in _orbit(space)])
     variances = error**2 * pairs * np.einsum("ki,ij,kj->k", along, fit.fit(space.names).inverse, along)
     return np.asarray(along.T * variances @ along)
 
@@ -569,8 +569,8 @@ def _spread(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float,
 
     The estimate of DerSimonian and Laird (Controlled Clinical Trials 1986) for the variance between groups.
     """
-    names = tuple(_orbit(space))
-    along = np.array(size_and_phase_directions(space, best))[:, [space.names.index(n) for n in names]]
+    names = tuple(_orbit(space)[:2])
+    along = np.array(size_and_phase_directions(space, best)[:2])[:, [space.names.index(n) for n in names]]
     places = np.minimum(fit.xy * REGIONS / (space.camera.width, space.camera.height), np.array(REGIONS) - 0.5)
     region = places.astype(int) @ (1, REGIONS[0])
     found = [fit.fit(names, region == k) for k in np.unique(region) if np.count_nonzero(region == k) >= FEWEST_SQUARES]
@@ -648,7 +648,7 @@ def _shake_columns(cost: Cost, best: Vector) -> dict[str, Any]:
     They are rotations about x and about y by the cosine and by the sine of the encoder's angle [px at the centre].
     """
     pairs, camera, at = cost.brightness.pairs, cost.space.camera, cost.at(best)
-    if cost.space.moving or not _orbit(cost.space):
+    if cost.space.moving or not _orbit(cost.space) or MODELS[cost.space.model].ANGLES > 1:
         return {}
     rows, times, columns = pairs.angle_patterns((0.0, 0.0)), pairs.arrays.time, {}
     for k, name in enumerate(SHAKE):
@@ -664,7 +664,8 @@ def _shake_columns(cost: Cost, best: Vector) -> dict[str, Any]:
 def _angle_columns(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by patterns of the prism's angle, for a still camera."""
     pairs, camera = cost.brightness.pairs, cost.space.camera
-    if cost.space.moving or pairs.arrays.slope.shape[0] or not _orbit(cost.space):
+    one = MODELS[cost.space.model].ANGLES == 1
+    if cost.space.moving or pairs.arrays.slope.shape[0] or not (one and _orbit(cost.space)):
         return {}
     rows = pairs.angle_patterns((0.5 * camera.width, 0.5 * camera.height))
     return {name: shifted(cost, best, rows[k]) for k, name in enumerate(PATTERNS)}
@@ -823,5 +824,6 @@ def _drift(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, 
                       for d in size_and_phase_directions(space, best)])  # fmt: skip
     change = along @ estimate.change[n:]
     std = np.sqrt(np.diag(along @ estimate.covariance[n:, n:] @ along.T))
-    size, phase = np.where(np.abs(change) > SIGNIFICANT * std, change, 0.0).tolist()
+    told = np.where(np.abs(change) > SIGNIFICANT * std, change, 0.0)
+    size, phase = (max(told[k::2].tolist(), key=abs) for k in (0, 1))  # of the prism for which it changes most
     return size, phase

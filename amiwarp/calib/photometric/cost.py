@@ -27,6 +27,7 @@ from amiwarp.imaging.iwe import Image
 from amiwarp.kernels.iwe import sum_segments
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.map_positions import PATH_TERMS as POWERS
+from amiwarp.optics.models import MODELS
 
 if TYPE_CHECKING:
     from amiwarp.calib.sharpness import Search
@@ -338,13 +339,16 @@ class Cost:
 
 
 def size_and_phase_directions(space: ParameterSpace, best: Vector) -> list[Vector]:
-    """Return unit vectors of the search space along the prism's size and phase, if these are free."""
-    if space.cartesian:
-        x, y = best[:2] / max(float(np.linalg.norm(best[:2])), 1e-9)
-        rest = np.zeros(len(best) - 2)
-        return [np.array([x, y, *rest]), np.array([-y, x, *rest])]
-    unit = np.eye(len(best))
-    return [unit[k] for k, name in enumerate(space.names) if name in (space.size_name, "phase")]
+    """Return unit vectors of the search space along size and phase of each prism, if these are free."""
+    unit, found = np.eye(len(best)), []
+    for size, phase in MODELS[space.model].ORBITS:
+        free = [k for k, name in enumerate(space.names) if name in (size, phase)]
+        if free and free[0] in space.orbits:
+            x, y = best[free] / max(float(np.linalg.norm(best[free])), 1e-9)
+            found += [x * unit[free[0]] + y * unit[free[1]], x * unit[free[1]] - y * unit[free[0]]]
+        else:
+            found += [unit[k] for k in free]
+    return found
 
 
 # Choice of the parts of the scene that the photometric stage maps.

@@ -38,6 +38,7 @@ from amiwarp.calib.settings import GAUSS_NEWTON, LINEAR_UNKNOWNS, PhotometricSet
 from amiwarp.calib.sharpness import LEAST_INSIDE_PX, Search
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import LENS, Camera
+from amiwarp.optics.models import MODELS
 
 Vector = NDArray[np.float64]
 
@@ -843,7 +844,8 @@ def can_be_examined(answer: Answer, cost: Cost) -> bool:
     """Return whether the angles of the events can be examined: for a still camera, if a map explains most events."""
     space = cost.space
     drifts = cost.brightness.pairs.arrays.slope.shape[0]
-    return space.sized and not space.moving and not drifts and answer.result.cost <= LARGEST_EXAMINED_COST
+    one = MODELS[space.model].ANGLES == 1
+    return one and space.sized and not space.moving and not drifts and answer.result.cost <= LARGEST_EXAMINED_COST
 
 
 def timing_steps(cost: Cost, v: Vector, direction: float) -> tuple[float, float]:

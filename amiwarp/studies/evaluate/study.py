@@ -30,7 +30,7 @@ from amiwarp.events.truth import EventTruth, FrameTruth
 from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.metrics import TRUTH_PERCENTILES, picture_quality
 from amiwarp.optics.camera import Camera, CameraRotation
-from amiwarp.optics.models import ExactModel, Model
+from amiwarp.optics.models import Model
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.simulator import Simulation, TruthRenderer
@@ -367,7 +367,7 @@ class Streams(RecordedStreams):
         return tuple(s for s in Stream if s is not Stream.CALIBRATED or self.calibration is not None)
 
     @cached_property
-    def true_model(self) -> ExactModel:
+    def true_model(self) -> Model:
         """True model of the prism."""
         return self.simulation.true_model
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache, partial
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -469,7 +469,8 @@ def make(condition: Condition, seed: int, device: str = "cpu") -> SimulatedSampl
     )
     stated_phase = motion.phase + math.radians(HARDWARE_DEG) * rng.standard_normal()
     known = {"phase": stated_phase + (math.pi / 2 if condition.start == "wrong" else 0.0)}
-    return SimulatedSample(stated, known, simulation.true_model, motion, plain)
+    truth = cast("ExactModel", simulation.true_model)
+    return SimulatedSample(stated, known, truth, motion, plain)
 
 
 def skewed(events: Events, c: Condition) -> Events:
@@ -537,7 +538,7 @@ def _scene(c: Condition, seed: int) -> Scene:
 def _prism_motion(c: Condition, phase: float, rng: np.random.Generator) -> PrismMotion:
     """Return the prism's motion under a condition."""
     # the apex varies over the image by twice the cylinder power: along the wedge and across it, with opposite signs
-    shape = {"cylinder": _at_random(c.cylinder_deg / 2.0, rng), "wobble": _at_random(c.wobble_deg, rng)}
+    shape: dict[str, Any] = {"cylinder": _at_random(c.cylinder_deg / 2.0, rng), "wobble": _at_random(c.wobble_deg, rng)}
     if not (c.ripple or c.turn_ripple or c.ramp):
         return PrismMotion(c.rpm, phase, **shape)
     begin = rng.uniform(0.0, TWO_PI) if c.turn_ripple else 0.0
