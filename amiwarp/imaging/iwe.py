@@ -631,6 +631,10 @@ class Votes:
 
         ``drift``: value of the drifting parameter. ``camera_rotation`` is compensated if the events have times.
         """
+        if (model.ANGLES == 2) != (events.arrays.second.shape[0] > 0) and events.count:
+            raise AmiwarpError(
+                f"the events have the angles of {1 + (model.ANGLES == 1)} prisms, the model {model.ANGLES}"
+            )
         if events.slope is not None:
             events.drift(drift)
         kernel, rotation, camera = self._buffers.EVENTS, [], pinhole_params(model.camera)

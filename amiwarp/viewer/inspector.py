@@ -22,7 +22,7 @@ from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.choices import Colour, Sharpness, Vote
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder, turn_between
+from amiwarp.events.encoder import Encoder, check_prisms, turn_between
 from amiwarp.events.recording import Events, EventSource, Recording
 from amiwarp.events.truth import Cause, EventValues, Truth
 from amiwarp.imaging.corners import find_background_activity
@@ -987,7 +987,11 @@ class Inspector:
         )  # fmt: skip
 
     def set(self, knobs: Knobs) -> None:
-        """Set the parameters of the prism. Parameters that change count as set by hand."""
+        """Set the parameters of the prism. Parameters that change count as set by hand.
+
+        Raises :class:`AmiwarpError` for a model of another number of prisms than the recording has.
+        """
+        check_prisms(self._encoder(0.0), MODELS[knobs.model].ANGLES)
         shown = self.sources.keys() - {"camera", "prism"}
         changed = {name for name in shown if knobs.value(name) != self.knobs.value(name)}
         self.sources |= dict.fromkeys(changed, Source.HAND)
