@@ -4,6 +4,8 @@ import dataclasses
 import importlib.util
 import json
 import math
+import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -281,3 +283,16 @@ def test_the_results_of_data_sets_have_equal_files() -> None:
     assert len(results) == 2
     for result in results:
         assert {row["equal_to_one_worker"] for row in result["rows"]} == ({True} if result["measured"] else {None})
+
+
+def test_mutants_know_which_tests_read_files_with_a_module(tmp_path: Path) -> None:
+    """Coverage does not run in the reading process."""
+    test = "tests/test_io_formats.py::test_arrays_of_ros[True-dvs_msgs]"
+    subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "benchmarks.mutants_plugin", test],
+        cwd=report.ROOT, env=os.environ | {"MUTANTS_DURATIONS": str(tmp_path / "tests.json")}, check=True,
+        stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    found = json.loads((tmp_path / "tests.json").read_text())
+    assert "amiwarp.io.ros" in found["called"][test]
+    assert found["seconds"][test] > 0
