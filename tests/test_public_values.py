@@ -199,7 +199,7 @@ def test_common_mistakes(wrong: Callable[[], Any], message: str) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda t: amiwarp.Poses(t, np.zeros((3, 7))), r"pose 2 \(5 us\) is not later than the one before; sort by time"),
+        (lambda t: amiwarp.Poses(t, np.zeros((3, 7))), r"pose 2 \(5 us\) is not later than the one before"),
         (lambda t: amiwarp.Encoder(t, np.zeros(3)), r"encoder sample 2 \(5 us\) is not later than the one before"),
         (lambda t: amiwarp.PictureFolder((Path("a.png"),) * 3, t, (4, 3)), r"picture 2 \(5 us\) is not later than"),
         (lambda t: amiwarp.Poses(t[:2], np.zeros((3, 7))), r"'camera' have shape \(3, 7\) for 2 times; .* \(2, 7\)"),
