@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -296,3 +297,16 @@ def test_mutants_know_which_tests_read_files_with_a_module(tmp_path: Path) -> No
     found = json.loads((tmp_path / "tests.json").read_text())
     assert "amiwarp.io.ros" in found["called"][test]
     assert found["seconds"][test] > 0
+
+
+def test_explained_mutants_and_their_modules_are_in_the_code() -> None:
+    config = tomllib.loads((report.ROOT / "benchmarks" / "mutants.toml").read_text())
+    for area in config["area"]:
+        assert len(set(area["modules"])) == len(area["modules"])
+        assert all(list(report.ROOT.glob(module)) for module in area["modules"])
+        assert all((report.ROOT / "tests" / f"test_{name}.py").exists() for name in area["tests"])
+    lines = {
+        one["module"]: set(map(str.strip, (report.ROOT / one["module"]).read_text().splitlines()))
+        for one in config["equivalent"]
+    }
+    assert [one["before"] for one in config["equivalent"] if one["before"] not in lines[one["module"]]] == []
