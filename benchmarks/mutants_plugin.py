@@ -134,8 +134,10 @@ def _replace(path: str, name: str, source: str) -> bool:
                 yield from codes(constant)
 
     new = {code.co_firstlineno: code for code in codes(compile(source, path, "exec")) if code.co_qualname == name}
-    loaded = [f for f in gc.get_objects() if isinstance(f, FunctionType) and f.__code__.co_filename == path]
-    changed = [f for f in loaded if f.__code__.co_qualname == name]
+    gc.unfreeze()  # conftest.py hides all that exists from the collector, and so from the next line
+    functions = [one for one in gc.get_objects() if isinstance(one, FunctionType) and one.__code__.co_filename == path]
+    changed = [function for function in functions if function.__code__.co_qualname == name]
     for function in changed:
         function.__code__ = new[function.__code__.co_firstlineno]
+    loaded = any(getattr(module, "__file__", None) == path for module in list(sys.modules.values()))
     return bool(changed) or not loaded  # a module that is not loaded yet will be imported with the change

@@ -1,6 +1,7 @@
 """The benchmark runner on small scenes: right results pass, wrong ones are named, and the page shows the files."""
 
 import dataclasses
+import gc
 import importlib.util
 import json
 import math
@@ -18,7 +19,7 @@ from PIL import Image
 from amiwarp import Events, Vote
 from amiwarp.compensation.recordings import PIECE
 from benchmarks import __main__ as runner
-from benchmarks import cases, compensate, dataset, ours, report, scenes, truth
+from benchmarks import cases, compensate, dataset, mutants_plugin, ours, report, scenes, truth
 from benchmarks.job import Job
 from benchmarks.libraries import Missing
 from benchmarks.scenes import SECONDS, TURNS_PER_S, EventScene, RecordingScene, event_scene
@@ -310,3 +311,21 @@ def test_explained_mutants_and_their_modules_are_in_the_code() -> None:
         for one in config["equivalent"]
     }
     assert [one["before"] for one in config["equivalent"] if one["before"] not in lines[one["module"]]] == []
+
+
+def test_mutants_replace_functions_that_are_hidden_from_the_collector(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a_mutated_module.py"
+    path.write_text("class A:\n    def f(self):\n        return 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module(path.stem)
+    gc.freeze()
+    try:
+        assert mutants_plugin._replace(str(path), "A.f", path.read_text().replace("1", "2"))
+        assert module.A().f() == 2
+        assert not mutants_plugin._replace(str(path), "A.g", path.read_text())
+        assert mutants_plugin._replace(str(tmp_path / "b.py"), "A.f", "")
+    finally:
+        gc.freeze()
+        del sys.modules[path.stem]
