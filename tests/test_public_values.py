@@ -140,7 +140,7 @@ def test_public_calls_return_or_say_what_is_wrong(call: PublicCall) -> None:
                 np.testing.assert_array_equal(junk, before)
 
 
-FRACTIONS = {"PrismMotion.angle", "Trajectory", "Trajectory.poses"}
+FRACTIONS = {"PrismMotion.angle", "PrismMotion.angles", "Trajectory", "Trajectory.poses"}
 """Calls whose times may have fractions: motions are functions of the time."""
 
 
@@ -207,6 +207,7 @@ def test_common_mistakes(wrong: Callable[[], Any], message: str) -> None:
         (lambda t: amiwarp.Poses(t[:2], np.zeros((2, 7)), {}, {"j": np.zeros((2, 7))}), r"'j' have shape \(2, 7\)"),
         (lambda t: amiwarp.PictureFolder((Path("a.png"),) * 2, t[1:], (4, 3)), "int64 times from 5 on; give .* at 0"),
         (lambda t: amiwarp.PictureFolder((Path("a.png"),) * 2, t[:2], (4, 3), 0.5), "start_us = 0.5 is not a whole"),
+        (lambda t: amiwarp.MemoryImages(t[1::-1], np.zeros((2, 3, 4), np.uint8)), "give ordered int64 times"),
         (lambda t: amiwarp.VideoFile(Path("v.mp4"), (4, 3), 30.0, math.nan), "duration_us = nan is not"),
         (lambda t: amiwarp.VideoFile(Path("v.mp4"), (4, 0), 30.0, 1.0), "size of the frames = 0 is not"),
     ],
