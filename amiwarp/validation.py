@@ -198,6 +198,14 @@ def rounded_times(values: ArrayLike, what: str = "times") -> NDArray[np.int64]:
     return np.asarray(np.rint(given) if given.dtype.kind == "f" else given, np.int64)
 
 
+def check_ascending(t: NDArray[np.int64], what: str) -> None:
+    """Raise :class:`AmiwarpError` if a time is not later than the one before. ``what`` is at each time."""
+    later = t[1:] > t[:-1]
+    if not later.all():
+        at = int(np.argmin(later)) + 1
+        raise AmiwarpError(f"{what} {at} ({t[at]} us) is not later than the one before; sort by time")
+
+
 def on_gpu(value: Any) -> bool:
     """Return whether an array of any library is outside the host's memory, by DLPack's ``__dlpack_device__``."""
     if isinstance(value, np.ndarray):

@@ -11,12 +11,12 @@ import json
 import os
 import select
 import signal
+import sys
 import time
 from collections.abc import Generator
 from pathlib import Path
 from types import CodeType, FunctionType
 
-import coverage
 import pytest
 
 PIPES = os.environ.pop("MUTANTS_PIPES", "")
@@ -34,7 +34,8 @@ _failures: list[str] = []
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Measure the duration of a test with its fixtures [s]. Coverage, if it runs, gets the test's name."""
-    recording = coverage.Coverage.current()
+    coverage = sys.modules.get("coverage")
+    recording = coverage and coverage.Coverage.current()
     if recording is not None:
         recording.switch_context(item.nodeid)
     began = time.perf_counter()
@@ -57,12 +58,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def pytest_sessionstart() -> None:
     """Note calls to the reading process, in which coverage does not run."""
     if DURATIONS:
-        from amiwarp.io.reading_process import ReadingProcess
+        from amiwarp.io.reading_process import Function, ReadingProcess, name_of
 
         send = ReadingProcess.send
 
-        def noted(process: ReadingProcess, function: str, *arguments: object) -> None:
-            _modules.add(function.partition(":")[0])
+        def noted(process: ReadingProcess, function: Function, *arguments: object) -> None:
+            named = [name_of(function), *(text for text in arguments if isinstance(text, str))]
+            _modules.update(text.partition(":")[0] for text in named if text.startswith("amiwarp."))
             send(process, function, *arguments)
 
         ReadingProcess.send = noted  # type: ignore[method-assign]
@@ -132,8 +134,10 @@ def _replace(path: str, name: str, source: str) -> bool:
                 yield from codes(constant)
 
     new = {code.co_firstlineno: code for code in codes(compile(source, path, "exec")) if code.co_qualname == name}
-    loaded = [f for f in gc.get_objects() if isinstance(f, FunctionType) and f.__code__.co_filename == path]
-    changed = [f for f in loaded if f.__code__.co_qualname == name]
+    gc.unfreeze()  # conftest.py hides all that exists from the collector, and so from the next line
+    functions = [one for one in gc.get_objects() if isinstance(one, FunctionType) and one.__code__.co_filename == path]
+    changed = [function for function in functions if function.__code__.co_qualname == name]
     for function in changed:
         function.__code__ = new[function.__code__.co_firstlineno]
+    loaded = any(getattr(module, "__file__", None) == path for module in list(sys.modules.values()))
     return bool(changed) or not loaded  # a module that is not loaded yet will be imported with the change

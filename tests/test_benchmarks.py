@@ -1,10 +1,14 @@
 """The benchmark runner on small scenes: right results pass, wrong ones are named, and the page shows the files."""
 
 import dataclasses
+import gc
 import importlib.util
 import json
 import math
+import os
+import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +19,7 @@ from PIL import Image
 from amiwarp import Events, Vote
 from amiwarp.compensation.recordings import PIECE
 from benchmarks import __main__ as runner
-from benchmarks import cases, compensate, dataset, ours, report, scenes, truth
+from benchmarks import cases, compensate, dataset, mutants_plugin, ours, report, scenes, truth
 from benchmarks.job import Job
 from benchmarks.libraries import Missing
 from benchmarks.scenes import SECONDS, TURNS_PER_S, EventScene, RecordingScene, event_scene
@@ -281,3 +285,47 @@ def test_the_results_of_data_sets_have_equal_files() -> None:
     assert len(results) == 2
     for result in results:
         assert {row["equal_to_one_worker"] for row in result["rows"]} == ({True} if result["measured"] else {None})
+
+
+def test_mutants_know_which_tests_read_files_with_a_module(tmp_path: Path) -> None:
+    """Coverage does not run in the reading process."""
+    test = "tests/test_io_formats.py::test_arrays_of_ros[True-dvs_msgs]"
+    subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "benchmarks.mutants_plugin", test],
+        cwd=report.ROOT, env=os.environ | {"MUTANTS_DURATIONS": str(tmp_path / "tests.json")}, check=True,
+        stdout=subprocess.DEVNULL,
+    )  # fmt: skip
+    found = json.loads((tmp_path / "tests.json").read_text())
+    assert "amiwarp.io.ros" in found["called"][test]
+    assert found["seconds"][test] > 0
+
+
+def test_explained_mutants_and_their_modules_are_in_the_code() -> None:
+    config = tomllib.loads((report.ROOT / "benchmarks" / "mutants.toml").read_text())
+    for area in config["area"]:
+        assert len(set(area["modules"])) == len(area["modules"])
+        assert all(list(report.ROOT.glob(module)) for module in area["modules"])
+        assert all((report.ROOT / "tests" / f"test_{name}.py").exists() for name in area["tests"])
+    lines = {
+        one["module"]: set(map(str.strip, (report.ROOT / one["module"]).read_text().splitlines()))
+        for one in config["equivalent"]
+    }
+    assert [one["before"] for one in config["equivalent"] if one["before"] not in lines[one["module"]]] == []
+
+
+def test_mutants_replace_functions_that_are_hidden_from_the_collector(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a_mutated_module.py"
+    path.write_text("class A:\n    def f(self):\n        return 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module(path.stem)
+    gc.freeze()
+    try:
+        assert mutants_plugin._replace(str(path), "A.f", path.read_text().replace("1", "2"))
+        assert module.A().f() == 2
+        assert not mutants_plugin._replace(str(path), "A.g", path.read_text())
+        assert mutants_plugin._replace(str(tmp_path / "b.py"), "A.f", "")
+    finally:
+        gc.freeze()
+        del sys.modules[path.stem]

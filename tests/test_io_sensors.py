@@ -20,6 +20,7 @@ from amiwarp import (
     save_recording,
 )
 from amiwarp.cli.recordings import _rows, describe
+from amiwarp.io import aedat
 from amiwarp.io.file_scan import head_only
 from reference.io_samples import SIZE, make_events, refusal
 from reference.io_samples_extra import arrays, packets, typestore, write_aedat2, write_mvsec, write_ros1, write_ros2
@@ -321,3 +322,8 @@ def test_info_shows_both(tmp_path: Path) -> None:
     assert rows["IMU"] == "2,001 samples, 2000 Hz"
     assert rows["frames"] == "5 of 9 x 7 px, 25 Hz"
     assert refusal(open_recording, tmp_path / "missing.h5") is not None
+
+
+def test_samples_of_jaer_start_where_seven_records_follow() -> None:
+    for numbers, starts in ((range(7), [0]), (range(6), []), ([3, *range(7), 0, 1], [1]), ([0, *range(7)] * 2, [1, 9])):
+        assert aedat._starts(np.array(numbers)).tolist() == starts

@@ -140,6 +140,27 @@ def test_public_calls_return_or_say_what_is_wrong(call: PublicCall) -> None:
                 np.testing.assert_array_equal(junk, before)
 
 
+FRACTIONS = {"PrismMotion.angle", "PrismMotion.angles", "Trajectory", "Trajectory.poses"}
+"""Calls whose times may have fractions: motions are functions of the time."""
+
+
+@pytest.mark.parametrize("call", CALLS, ids=lambda call: call.label)
+@pytest.mark.usefixtures("folder")
+def test_masked_values_and_times_in_seconds_are_refused(call: PublicCall) -> None:
+    thing, function = call.target()
+    given = call.arguments(function)
+    if isinstance(thing, RecordingWriter):
+        thing.__exit__(ValueError, None, None)
+    for name, annotation in call.parameters().items():
+        if "Array" not in annotation or name not in given:
+            continue
+        values = np.asarray(given[name])
+        masked = np.ma.masked_array(values, np.arange(values.size).reshape(values.shape) == values.size - 1)
+        assert "masked" in outcome(call, **{name: masked}), name
+        if re.fullmatch("t|t_us|times_us|index_t_us", name) and call.label not in FRACTIONS:
+            assert re.search("whole|int64", outcome(call, **{name: values * 1e-6 + 0.1})), name
+
+
 @pytest.mark.parametrize("call", CALLS, ids=lambda call: call.label)
 @pytest.mark.usefixtures("folder")
 def test_unknown_keywords_and_too_many_arguments(call: PublicCall) -> None:
@@ -173,6 +194,27 @@ def test_unknown_keywords_and_too_many_arguments(call: PublicCall) -> None:
 def test_common_mistakes(wrong: Callable[[], Any], message: str) -> None:
     with pytest.raises((AmiwarpError, TypeError), match=message):
         wrong()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda t: amiwarp.Poses(t, np.zeros((3, 7))), r"pose 2 \(5 us\) is not later than the one before"),
+        (lambda t: amiwarp.Encoder(t, np.zeros(3)), r"encoder sample 2 \(5 us\) is not later than the one before"),
+        (lambda t: amiwarp.PictureFolder((Path("a.png"),) * 3, t, (4, 3)), r"picture 2 \(5 us\) is not later than"),
+        (lambda t: amiwarp.Poses(t[:2], np.zeros((3, 7))), r"'camera' have shape \(3, 7\) for 2 times; .* \(2, 7\)"),
+        (lambda t: amiwarp.Poses(t[:2], np.zeros((2, 7)), {"b": np.zeros((2, 3))}), r"'b' have shape \(2, 3\)"),
+        (lambda t: amiwarp.Poses(t[:2], np.zeros((2, 7)), {}, {"j": np.zeros((2, 7))}), r"'j' have shape \(2, 7\)"),
+        (lambda t: amiwarp.PictureFolder((Path("a.png"),) * 2, t[1:], (4, 3)), "int64 times from 5 on; give .* at 0"),
+        (lambda t: amiwarp.PictureFolder((Path("a.png"),) * 2, t[:2], (4, 3), 0.5), "start_us = 0.5 is not a whole"),
+        (lambda t: amiwarp.MemoryImages(t[1::-1], np.zeros((2, 3, 4), np.uint8)), "give ordered int64 times"),
+        (lambda t: amiwarp.VideoFile(Path("v.mp4"), (4, 3), 30.0, math.nan), "duration_us = nan is not"),
+        (lambda t: amiwarp.VideoFile(Path("v.mp4"), (4, 0), 30.0, 1.0), "size of the frames = 0 is not"),
+    ],
+)
+def test_times_and_shapes_of_records(make: Callable[[Any], Any], message: str) -> None:
+    with pytest.raises(AmiwarpError, match=message):
+        make(np.array([0, 5, 5]))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,9 @@
 
 import itertools
 import math
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -500,3 +503,34 @@ def test_a_picture_is_cut_to_the_view() -> None:
 def test_bad_input_is_told(make: object, message: str) -> None:
     with pytest.raises(AmiwarpError, match=message):
         make()  # type: ignore[operator]
+
+
+FORKED = """
+import os, signal, sys
+import numpy as np
+import amiwarp
+camera, prism = amiwarp.Camera.from_fov(64, 48, 1.0), amiwarp.Prism(0.02)
+scene = amiwarp.Scene.from_picture(np.random.default_rng(0).random((40, 60)).astype(np.float32))
+def use():
+    recording = amiwarp.simulate(scene, camera, prism, duration_s=0.02, device="cpu")
+    events = amiwarp.Events.concatenate(list(recording.events.blocks()))
+    stream = amiwarp.EncoderStream()
+    stream.append(recording.encoder.t, recording.encoder.angle)
+    compensator = amiwarp.Compensator(amiwarp.ExactModel(camera, prism), stream, device="cpu")
+    compensator.put(events, 0)
+    compensator.flush()
+    return len(events), float(compensator.image().sum())
+known = use()
+child = os.fork()
+if child == 0:
+    signal.alarm(60)
+    os._exit(int(use() != known))
+sys.exit(os.waitpid(child, 0)[1])
+"""
+"""Program that works in a fork of a process that has worked: Python's processes on Linux, and loaders of data sets."""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_fork_works_on() -> None:
+    done = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr

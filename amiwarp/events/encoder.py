@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import TIME_LIMIT, array, as_times, guarded, instance, real, vector, whole
+from amiwarp.validation import TIME_LIMIT, array, as_times, check_ascending, guarded, instance, real, vector, whole
 
 # Unwrap an encoder's counts and angles: find the period at which they wrap, and reject ambiguous samples.
 #
@@ -371,10 +371,7 @@ class Encoder:
             raise AmiwarpError(f"encoder samples have shapes {shapes}; expected two equal lengths of at least 2")
         if self.t.dtype != np.int64 or self.angle.dtype != np.float64:
             raise AmiwarpError(f"encoder t is {self.t.dtype}, angle is {self.angle.dtype}; expected int64 and float64")
-        late = self.t[1:] <= self.t[:-1]
-        if late.any():
-            at = int(np.argmax(late)) + 1
-            raise AmiwarpError(f"encoder sample {at} ({self.t[at]} us) is not later than the one before; sort by time")
+        check_ascending(self.t, "encoder sample")
         if not (self.t[0] > -TIME_LIMIT and self.t[-1] < TIME_LIMIT):
             span = f"{self.t[0]} .. {self.t[-1]} us"
             raise AmiwarpError(f"encoder samples span {span}, beyond {TIME_LIMIT} us from 0; times are damaged")
@@ -786,7 +783,7 @@ class Encoder:
         All times are relative to the first of these samples. Only samples near ``t`` are used, so the cost does not
         depend on the recording's length.
         """
-        times = t if isinstance(t, np.ndarray) and t.dtype == np.int64 else as_times(t)
+        times = _event_times(t)
         low, high = (int(times.min()), int(times.max())) if times.size else self.coverage
         if not self.covers(low, high):
             first, last = self.coverage
@@ -801,6 +798,11 @@ class Encoder:
         elapsed += self.clock_offset_us
         sampled = (self.t[start:stop] - self.t[start]).astype(np.float64)
         return elapsed, sampled, self.angle[start:stop]
+
+
+def _event_times(t: ArrayLike) -> NDArray[np.int64]:
+    """Return event times as int64 [us]. Times of :class:`Events` were checked before; others are checked here."""
+    return t if type(t) is np.ndarray and t.dtype == np.int64 else as_times(t)
 
 
 def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -1069,6 +1071,7 @@ class EncoderStream:
         numpy.ndarray
             True for times in a gap, before the first sample or after the last, shape (n,).
         """
+        t = _event_times(t)
         if t.ndim != 1:
             raise AmiwarpError(f"t has shape {t.shape}; give shape (n,)")
         out = np.zeros(t.size, np.bool_)

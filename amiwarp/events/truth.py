@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import array, as_times, guarded, shown
+from amiwarp.validation import array, as_times, check_ascending, guarded, shown
 
 Item = TypeVar("Item", covariant=True)
 """What a store returns: an array, or a record."""
@@ -244,8 +244,18 @@ class Poses:
     """Positions of named points in the world, such as joints [m], shape ``(k, 3)`` each."""
 
     def __post_init__(self) -> None:
-        if self.t.ndim != 1:
-            raise AmiwarpError(f"poses have times of shape {self.t.shape}; give shape (k,)")
+        if self.t.ndim != 1 or self.t.dtype != np.int64:
+            raise AmiwarpError(
+                f"poses have {self.t.dtype} times of shape {self.t.shape}; give int64 times [us] of shape (k,)"
+            )
+        check_ascending(self.t, "pose")
+        tables = [("camera", self.camera, 7), *((name, rows, 7) for name, rows in self.bodies.items())]
+        for name, rows, columns in (*tables, *((name, rows, 3) for name, rows in self.joints.items())):
+            if rows.shape != (self.t.size, columns):
+                raise AmiwarpError(
+                    f"poses of {shown(name)} have shape {rows.shape} for {self.t.size} times; give shape "
+                    f"({self.t.size}, {columns})"
+                )
 
     @classmethod
     def concatenate(cls, blocks: Sequence[Poses]) -> Poses:

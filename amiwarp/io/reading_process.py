@@ -104,7 +104,7 @@ class ReadingProcess:
             self.receive()
         arguments = tuple(_absolute(value) if isinstance(value, Path) else value for value in arguments)
         limits = {"cpu_s": CPU_SECONDS, "memory_bytes": MEMORY_BYTES}
-        request = json.dumps({"function": _name_of(function), "arguments": arguments, **limits}).encode()
+        request = json.dumps({"function": name_of(function), "arguments": arguments, **limits}).encode()
         try:
             self._requests.write(request + b"\n")
             self._requests.flush()
@@ -146,7 +146,8 @@ class ReadingProcess:
         return AmiwarpError(f"the reading process ended with code {code}; {remedy}")
 
 
-def _name_of(function: Function) -> str:
+def name_of(function: Function) -> str:
+    """Return the name by which the process finds a function: ``module:function``."""
     return function if isinstance(function, str) else f"{function.__module__}:{function.__name__}"
 
 
@@ -223,7 +224,7 @@ def packets(function: Function, *arguments: Any) -> Iterator[Any]:
     *given, notes = arguments
     process = borrow()
     try:
-        process.call(begin, _name_of(function), *given)
+        process.call(begin, name_of(function), *given)
         process.send(advance)
         waiting = True
         try:

@@ -46,8 +46,8 @@ def pool() -> ThreadPoolExecutor:
 class _Helpers:
     """Threads that run jobs for other threads. A hand-over takes a third of that to a ``ThreadPoolExecutor``."""
 
-    def __init__(self, process: int) -> None:
-        """Start without threads. ``process`` is the id of this process: a forked one has no threads."""
+    def __init__(self) -> None:
+        """Start without threads."""
         self._jobs: SimpleQueue[_Job] = SimpleQueue()
         self._threads = 0
         self._starting = Lock()
@@ -83,7 +83,7 @@ def run_together(jobs: Sequence[Callable[[], object]]) -> None:
     """
     done: SimpleQueue[BaseException | None] = SimpleQueue()
     if len(jobs) > 1:
-        _helpers(os.getpid()).put([(job, done) for job in jobs[1:]])
+        _helpers().put([(job, done) for job in jobs[1:]])
     try:
         jobs[0]()
     finally:
@@ -97,6 +97,11 @@ def run_together(jobs: Sequence[Callable[[], object]]) -> None:
 def background_worker() -> ThreadPoolExecutor:
     """Return the shared background worker: a pool of one thread, which keeps the order of its jobs."""
     return ThreadPoolExecutor(1, thread_name_prefix="amiwarp-background-worker")
+
+
+if hasattr(os, "register_at_fork"):  # a fork has none of the threads
+    for _started in (pool, _helpers, background_worker):
+        os.register_at_fork(after_in_child=_started.cache_clear)
 
 
 def specialised(kernel: Any, inputs: Sequence[Any]) -> Any:

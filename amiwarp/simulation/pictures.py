@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name, input_path, open_input, register_reader
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.validation import TIME_LIMIT, guarded, real, shown, vector, whole
+from amiwarp.validation import TIME_LIMIT, check_ascending, guarded, real, shown, vector, whole
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear red, green and blue in the luminance (ITU-R BT.709)."""
@@ -222,6 +222,12 @@ class PictureFolder:
         if len(self.files) < 2 or self.times_us.shape != (len(self.files),):
             given = f"{len(self.files)} files and times of shape {self.times_us.shape}"
             raise AmiwarpError(f"pictures have {given}; give at least two files and a time for each")
+        if self.times_us.dtype != np.int64 or self.times_us[0] != 0:
+            given = f"{self.times_us.dtype} times from {self.times_us[0]} on"
+            raise AmiwarpError(f"pictures have {given}; give int64 times [us] that start at 0")
+        check_ascending(self.times_us, "picture")
+        if self.start_us is not None:
+            whole(self.start_us, "start_us", -TIME_LIMIT, TIME_LIMIT, " us")
         vector(self.size, 2, "size of the pictures", lambda size, what: whole(size, what, 1, LARGEST_SIZE))
 
     @property
@@ -351,6 +357,8 @@ class VideoFile:
     def __post_init__(self) -> None:
         real(self.fps, "fps", 1e-6, 1e6, " pictures per second")
         real(self.stretch, "stretch", 0.0, 1e9)
+        real(self.duration_us, "duration_us", 0.0, TIME_LIMIT, " us")
+        vector(self.size, 2, "size of the frames", lambda size, what: whole(size, what, 1, LARGEST_SIZE))
 
     @property
     def interval_us(self) -> float:
@@ -436,14 +444,10 @@ def _open_folder(folder: Path, fps: float | None) -> PictureFolder:
         times = np.rint(np.arange(len(files)) * (1e6 / fps)).astype(np.int64)
     if len(files) < 2:
         raise AmiwarpError(f"{folder} contains {len(files)} pictures; give at least 2")
-    if not (np.diff(times) > 0).all():
-        at = int(np.argmin(np.diff(times) > 0)) + 1
-        raise AmiwarpError(
-            f"{table}: t_us of picture {at} ({times[at]}) is not later than the one before; sort the rows"
-        )
     height, width = read_picture(files[0]).shape
     start_us = None if fps is not None else int(times[0])
-    return PictureFolder(tuple(files), times - times[0], (width, height), start_us)
+    with errors_name(table, lambda: "times"):
+        return PictureFolder(tuple(files), times - times[0], (width, height), start_us)
 
 
 def _natural(file: Path) -> list[tuple[int, int, str]]:
@@ -510,4 +514,5 @@ def _open_video(path: Path, fps: float | None) -> VideoFile:
     if native_fps <= 0.0 or min(size) < 2:
         raise AmiwarpError(f"{path} has no frame rate or no picture size; convert it to a common format")
     stretch = native_fps / fps if fps else 1.0
-    return VideoFile(path, size, native_fps, length * 1e6 * stretch, stretch)
+    with errors_name(path, lambda: "video header"):
+        return VideoFile(path, size, native_fps, length * 1e6 * stretch, stretch)
