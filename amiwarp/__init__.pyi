@@ -59,6 +59,7 @@ from .imaging.metrics import sharpness as sharpness
 from .imaging.metrics import truth_model as truth_model
 from .io.camera_files import load_camera as load_camera
 from .io.camera_files import save_camera as save_camera
+from .io.depth_map import DepthMap as DepthMap
 from .io.export import ConversionSummary as ConversionSummary
 from .io.export import convert as convert
 from .io.export import save_flow_dsec as save_flow_dsec
@@ -89,15 +90,18 @@ from .optics.models import ExactModel as ExactModel
 from .optics.models import Model as Model
 from .optics.models import ModelError as ModelError
 from .optics.models import Parameter as Parameter
+from .optics.models import PlateModel as PlateModel
 from .optics.models import RadialCircleModel as RadialCircleModel
 from .optics.models import RisleyModel as RisleyModel
 from .optics.models import predicted_error as predicted_error
 from .optics.prism import FlatSide as FlatSide
 from .optics.prism import NominalPrism as NominalPrism
+from .optics.prism import Plate as Plate
 from .optics.prism import Prism as Prism
 from .optics.prism import UnsizedPrism as UnsizedPrism
 from .optics.prism import apex_from_deflection as apex_from_deflection
 from .optics.prism import deflection_from_apex as deflection_from_apex
+from .reconstruction.depth_at_rest import depth as depth
 from .reconstruction.picture import Picture as Picture
 from .reconstruction.picture import Reconstruction as Reconstruction
 from .reconstruction.picture import reconstruct as reconstruct

@@ -2,8 +2,24 @@
 
 import enum
 
-OPTICAL_MODELS = ("circle", "exact", "radial", "ellipse", "risley")
+OPTICAL_MODELS = ("circle", "exact", "radial", "ellipse", "risley", "plate")
 """Names of the optical models, for programs that do not load them."""
+
+
+class Optic(enum.StrEnum):
+    """Moving glass in front of a simulated camera.
+
+    Examples
+    --------
+    >>> Optic("plate")
+    <Optic.PLATE: 'plate'>
+    """
+
+    WEDGE = "wedge"
+    """Rotating wedge prism, which moves near and far points alike."""
+    PLATE = "plate"
+    """Rotating tilted plane-parallel plate, which moves near points only."""
+
 
 # Choices for images of warped events: how to vote, what to do with polarity, which sharpness to measure.
 

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp import Camera, Fisheye, FlatSide, Prism, RadialTangential
+from amiwarp import Camera, Fisheye, FlatSide, Plate, Prism, RadialTangential
 
 Array = NDArray[np.float64]
 
@@ -213,6 +213,21 @@ def rotation(tilt: tuple[float, float]) -> Array:
     """Return the matrix (3, 3) of a rotation about x by ``tilt[0]``, then about y by ``tilt[1]`` [rad]."""
     cx, sx, cy, sy = np.cos(tilt[0]), np.sin(tilt[0]), np.cos(tilt[1]), np.sin(tilt[1])
     return np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+
+
+def through_plate(plate: Plate, rays: Array, phi: Array) -> tuple[Array, Array]:
+    """Trace bearings (n, 3) from the camera's centre through both faces of a plate 0.05 m away.
+
+    ``phi`` (n,) [rad] is the azimuth of the tilt. Return a point on each ray behind the plate [m], and its bearing.
+    """
+    s, c = np.sin(plate.tilt), np.cos(plate.tilt)
+    normal = np.stack([s * np.cos(phi), s * np.sin(phi), np.full_like(phi, c)], axis=1)
+    place, bearing = np.zeros_like(rays), rays
+    for distance, ratio in ((0.05, 1.0 / plate.index), (0.05 + plate.thickness, plate.index)):
+        along = np.sum(bearing * normal, axis=1, keepdims=True)
+        place = place + (distance - np.sum(place * normal, axis=1, keepdims=True)) / along * bearing
+        bearing = refract(bearing, normal, ratio)
+    return place, bearing
 
 
 def move(

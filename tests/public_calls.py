@@ -34,6 +34,8 @@ RANDOM = np.random.default_rng(0)
 CAMERA = aw.Camera.from_fov(4, 3, 1.0)
 TABLE = np.zeros((3, 4, 2), np.float32)
 PIXELS = aw.PixelMap(*np.ones((8, 3, 4)))
+DEPTHS = aw.DepthMap(np.ones((3, 4)), np.ones((3, 4)), np.ones((3, 4, 3)))
+PLATE = aw.Plate(0.01, 0.7)
 EVENTS = aw.Events.from_arrays([1, 2, 1], [0, 1, 2], [0, 400, 900], [1, 0, 1])
 ON_DEVICE = aw.DeviceEvents.from_arrays(EVENTS.x, EVENTS.y, EVENTS.t, EVENTS.p)
 SOURCE = aw.MemoryEvents(EVENTS, 4, 3)
@@ -279,6 +281,16 @@ OWN: dict[str, dict[str, Any]] = {
     "load_camera": {"path": "none.json"},
     "save_camera": {"path": _new(".json"), "camera": CAMERA},
     "PixelMap": _all(PIXELS),
+    "DepthMap": _all(DEPTHS),
+    "DepthMap.load": {"path": "none.npz"},
+    "DepthMap.save": {"path": _new(".npz")},
+    "DepthMap.save_points": {"path": _new(".ply")},
+    "Plate": {"thickness": 0.01, "tilt": 0.7},
+    "PlateModel": {"camera": CAMERA, "plate": PLATE},
+    "PlateModel.from_prism": {"prism": PLATE},
+    "PlateModel.from_values": {"prism": PLATE, "values": {"inverse_depth": 1.0, "phase": 0.0}},
+    "PlateModel.compensate_at": {"xy": XY, "theta": np.linspace(0, 6, 200), "inverse_depth": np.ones(200)},
+    "PlateModel.with_depths": {"depths": np.ones((3, 4))},
     "PixelMap.load": {"path": "none.npz"},
     "PixelMap.save": {"path": _new(".npz")},
     "pixel_thresholds": {"model": MODEL},
@@ -301,7 +313,9 @@ OWN: dict[str, dict[str, Any]] = {
     "CameraRotation.rotation": {"tau": np.zeros(2)},
     **{
         f"{name}.{method}": given
-        for name in ("CircleModel", "EllipseModel", "ExactModel", "RadialCircleModel", "RisleyModel")
+        for name in (
+            "CircleModel", "EllipseModel", "ExactModel", "PlateModel", "RadialCircleModel", "RisleyModel",
+        )
         for method, given in (("apex_from_size", {"size": 0.02}), ("size_from_apex", {"apex": 0.02}))
     },
     "CircleModel": {"deflection": 0.01},
@@ -407,6 +421,8 @@ OBJECTS: dict[str, Any] = {
     "UnsizedPrism": aw.UnsizedPrism(),
     "Picture": PICTURE,
     "PixelMap": PIXELS,
+    "DepthMap": DEPTHS,
+    "PlateModel": aw.PlateModel(CAMERA, PLATE),
     "CameraMotion": aw.CameraMotion(),
     "EncoderModel": aw.EncoderModel(),
     "PrismMotion": aw.PrismMotion(),
@@ -442,6 +458,8 @@ REFUSED = {
     "calibrate_lens": "the prism makes",
     "load_camera": "no such file",
     "PixelMap.load": "no such file",
+    "DepthMap.load": "no such file",
+    "depth": "depth is not determined",
     "pixel_thresholds": "no pixel fires twice",
     "load_world": "no such file",
     "plan_dataset": "no such file",

@@ -27,6 +27,7 @@ from amiwarp import (
     MemoryEvents,
     PhotometricSettings,
     Picture,
+    Plate,
     Prism,
     RadialCircleModel,
     Reconstruction,
@@ -57,6 +58,11 @@ CAMERA = Camera.from_fov(8, 6, 1.0)
 EVENTS = Events.from_arrays([1, 2, 1, 2], [1, 2, 1, 2], [0, 10, 20, 30], [0, 1, 0, 1])
 SOURCE = MemoryEvents(EVENTS, 8, 6)
 IMAGE = np.arange(48, dtype=np.float32).reshape(6, 8)
+
+
+def glass(name: Any) -> Prism | Plate:
+    """Return the glass of a model, a prism for what is no name of a model."""
+    return Plate(0.01, 0.7) if isinstance(name, str) and name == "plate" else Prism(0.02)
 
 
 def picture() -> Picture:
@@ -106,7 +112,7 @@ WRONG = ["", "Scene", "SCENE", "nothing", " scene", None, 0, True, 1.5, float("n
 OTHERS: list[tuple[str, tuple[str, ...], Callable[[Any], Any]]] = [
     ("open_recording", tuple(Format), lambda name: open_recording("nowhere", format=name)),
     ("Settings.model", ("auto", *MODELS), lambda name: settled(model=name)),
-    ("build_model", tuple(MODELS), lambda name: build_model(name, CAMERA, Prism(0.02), VALUES)),
+    ("build_model", tuple(MODELS), lambda name: build_model(name, CAMERA, glass(name), VALUES)),
     ("Settings.global_algorithm", GLOBAL_ALGORITHMS, lambda name: settled(global_algorithm=name)),
     ("Settings.local_algorithm", LOCAL_ALGORITHMS, lambda name: settled(local_algorithm=name)),
     (
@@ -115,7 +121,7 @@ OTHERS: list[tuple[str, tuple[str, ...], Callable[[Any], Any]]] = [
         lambda name: settled(photometric=PhotometricSettings(algorithm=name)),
     ),
 ]
-VALUES = {"apex": 0.02, "deflection": 0.01, "phase": 0.0}
+VALUES = {"apex": 0.02, "deflection": 0.01, "inverse_depth": 2.0, "phase": 0.0}
 MEANS_SOMETHING_ELSE = {("Settings.global_algorithm", None), ("open_recording", None)}
 """Here None has a meaning, which the docstring states."""
 

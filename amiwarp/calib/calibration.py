@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import checks, first_guess
+from amiwarp.calib import checks, first_guess, plate
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
 from amiwarp.calib.model_choice import ModelChooser
@@ -35,8 +35,8 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.optics.camera import LENS, Camera, with_lens
-from amiwarp.optics.models import MODELS, RisleyModel, predicted_error, size_names
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.models import MODELS, PlateModel, RisleyModel, predicted_error, size_names
+from amiwarp.optics.prism import Plate, Prism
 from amiwarp.tasks import Progress
 from amiwarp.validation import check_names, guarded
 
@@ -97,6 +97,8 @@ def calibrate(
     check_names(changes, [entry.name for entry in fields(Settings)], "calibrate: setting ")
     settings = replace(settings or Settings(), **changes)
     settings.check()
+    if isinstance(recording.prism, Plate) or settings.model == PlateModel.NAME:
+        return _plate(recording, settings, device, progress)
     if settings.model == AUTO and recording.encoder is not None and recording.encoder.second is not None:
         settings = replace(settings, model=RisleyModel.NAME)
     if settings.model != AUTO:
@@ -104,6 +106,29 @@ def calibrate(
     chooser = ModelChooser(recording, settings, device)
     exact = Calibrator(recording, chooser.settings, device, progress, meanwhile=chooser.prepare).run()
     return chooser.choose(exact, lambda again, free: Calibrator(again, free, device, progress, path=exact.path).run())
+
+
+def _plate(recording: Recording, settings: Settings, device: Any, progress: Progress | None) -> Calibration:
+    """Return the calibration of a plate: its phase, and the mean inverse depth of the scene."""
+    began, name = time.perf_counter(), recording.name
+    if not isinstance(recording.prism, Plate):
+        raise AmiwarpError(f"{name}: the plate is unknown; give its --thickness-mm and --plate-tilt-deg")
+    if settings.model not in (AUTO, PlateModel.NAME):
+        raise AmiwarpError(
+            f"{name}: the glass is a plate, the model {settings.model!r}; give model 'plate', or a prism"
+        )
+    if recording.encoder is None:
+        raise AmiwarpError(f"{name}: a plate's phase needs the encoder, which the recording lacks; add its log")
+    settings = replace(settings, model=PlateModel.NAME)
+    found = Calibrator(recording, replace(settings, stages=("sharpness",)), device, progress).run()
+    if "photometric" in settings.stages:
+
+        def report(share: float) -> None:
+            if progress is not None:
+                progress("photometric", share)
+
+        found = plate.refine_phase(found, recording, device, report)
+    return replace(found, seconds=time.perf_counter() - began)
 
 
 LEAST_BAD_SHARE = 0.01

@@ -31,7 +31,7 @@ from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.metrics import SharpnessMeter
 from amiwarp.optics.models import MODELS, ExactModel, Model, compensate_by_each, predicted_error, rms, rungs, wrap_angle
-from amiwarp.optics.prism import UnsizedPrism
+from amiwarp.optics.prism import UnsizedPrism, as_wedge
 from amiwarp.validation import real
 
 Vector = NDArray[np.float64]
@@ -67,7 +67,7 @@ class ModelChooser:
         if not first.parameters["apex"]:
             return first  # without a prism all models are the same
         # the camera and the flat side are those that the calibration found
-        prism = replace(self._recording.prism or UnsizedPrism(), flat_side=first.prism.flat_side)
+        prism = replace(as_wedge(self._recording.prism or UnsizedPrism()), flat_side=as_wedge(first.prism).flat_side)
         recording = replace(self._recording, camera=first.camera, prism=prism)
         if first.harmonics is not None and recording.encoder is not None:
             recording, self._ready = replace(recording, encoder=recording.encoder.with_harmonics(first.harmonics)), None
@@ -231,7 +231,7 @@ def express(trial: Trial, name: str, settings: Settings) -> Calibration:
 def _sharpness(trial: Trial, space: ParameterSpace, values: Mapping[str, float], settings: Settings) -> float:
     """Return the sharpness of all events, on a canvas as large as the search's, so that both values are comparable."""
     like = trial.space_of("exact", trial.exact)
-    largest = settings.bounds.get("apex", (0.0, 2.0 * trial.exact.prism.apex))[1]
+    largest = settings.bounds.get("apex", (0.0, 2.0 * as_wedge(trial.exact.prism).apex))[1]
     camera, kind, device = space.camera, settings.sharpness, trial.device
     plain = kind is Sharpness.PAPER_J
     pad = padding(replace(like, high={**like.high, "apex": largest}))
@@ -810,7 +810,7 @@ def candidate_space(
     tells how far events move per unit of each free parameter of the exact model [px rms]; None: it is measured.
     """
     found = exact.parameters
-    prism = replace(exact.prism, apex=found["apex"], index=found.get("index", exact.prism.index))
+    prism = replace(as_wedge(exact.prism), apex=found["apex"], index=found.get("index", exact.prism.index))
     size, start = MODELS[model].SIZE, values_of(model, found)
     start[size] = MODELS[model].size_from_apex(found["apex"], prism)
     start["phase"] = math.remainder(found["phase"], math.tau)

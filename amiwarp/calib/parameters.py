@@ -29,7 +29,7 @@ from amiwarp.optics.models import (
     size_names,
     wrap_angle,
 )
-from amiwarp.optics.prism import NominalPrism, Prism, UnsizedPrism
+from amiwarp.optics.prism import NominalPrism, Plate, Prism, UnsizedPrism
 from amiwarp.validation import guarded, instance, one_of, real, shown, vector
 
 NOMINAL_APEX = math.radians(2.0)
@@ -109,8 +109,8 @@ class ParameterSpace:
     """Name of the model, such as ``exact``."""
     camera: Camera
     """Nominal camera. If the focal length is free, its value replaces the camera's focal length."""
-    prism: Prism
-    """Nominal prism. It gives the flat side, and the index if that is not free."""
+    prism: Prism | Plate
+    """Nominal prism or plate. It gives the flat side, and the index if that is not free."""
     names: tuple[str, ...]
     """Names of the free parameters, in the order of the vector."""
     low: Mapping[str, float]
@@ -345,9 +345,9 @@ def check_names(
         vector(pair, 2, f"bounds of {name}", real)
 
 
-def nominal(prism: NominalPrism | None) -> Prism:
-    """Return a recording's nominal prism, with the apex :data:`NOMINAL_APEX` if its apex is unknown."""
-    return prism if isinstance(prism, Prism) else (prism or UnsizedPrism()).with_apex(NOMINAL_APEX)
+def nominal(prism: NominalPrism | None) -> Prism | Plate:
+    """Return a recording's nominal glass, with the apex :data:`NOMINAL_APEX` if the apex of its prism is unknown."""
+    return prism if isinstance(prism, Prism | Plate) else (prism or UnsizedPrism()).with_apex(NOMINAL_APEX)
 
 
 def _difference(name: str, a: float, b: float) -> float:
@@ -378,7 +378,7 @@ _HALF_RANGE = {"clock_offset": 5000.0, **dict.fromkeys(RATES, 5.0), **dict.fromk
 def make_space(
     model: str,
     camera: Camera,
-    prism: Prism,
+    prism: Prism | Plate,
     *,
     free: tuple[str, ...] | None,
     start: Mapping[str, float],
@@ -396,8 +396,8 @@ def make_space(
         Name of the model.
     camera : Camera
         The camera.
-    prism : Prism
-        The nominal prism. The size ranges from 0 to that of twice its apex, unless ``bounds`` are given for it.
+    prism : Prism or Plate
+        The nominal glass. The size ranges from 0 to :meth:`Model.largest_size`, unless ``bounds`` are given for it.
     free : tuple of str, or None
         Names of the free parameters; ``motion`` stands for all three rates. None: size and phase.
     start : mapping of str to float
@@ -511,9 +511,9 @@ def _check_given(
             raise AmiwarpError(f"bounds are given for {name}, which is not free; add {name} to the free parameters")
 
 
-def _default_bounds(kind: type[Model], name: str, value: float, prism: Prism) -> tuple[float, float]:
+def _default_bounds(kind: type[Model], name: str, value: float, prism: Prism | Plate) -> tuple[float, float]:
     if name == kind.SIZE:
-        return 0.0, kind.size_from_apex(2.0 * prism.apex, prism)
+        return 0.0, kind.largest_size(prism)
     if name in phase_names():
         return -PHASE.half_range, PHASE.half_range
     if name in dict(kind.ORBITS):  # the size of another prism
@@ -527,7 +527,7 @@ def _default_bounds(kind: type[Model], name: str, value: float, prism: Prism) ->
 def _pixels_per_unit(
     model: str,
     camera: Camera,
-    prism: Prism,
+    prism: Prism | Plate,
     *,
     names: tuple[str, ...],
     values: Mapping[str, float],

@@ -18,6 +18,7 @@ from amiwarp.io.files import errors_name, write_text
 from amiwarp.io.formats import check_ending
 from amiwarp.io.json_files import fields_of, read_json
 from amiwarp.optics.models import MODELS, Model, rungs
+from amiwarp.optics.prism import as_wedge
 from amiwarp.validation import check_names, one_of, shown
 
 FORMAT, VERSION = "amiwarp-preset", 1
@@ -127,7 +128,7 @@ def simplified(calibration: Calibration, model: str) -> Calibration:
             f"the model {model} needs parameters that a calibration of the model {calibration.model_name} does not "
             "have; calibrate with exact"
         )
-    prism = replace(calibration.prism, apex=found.get("apex", calibration.prism.apex),
+    prism = replace(as_wedge(calibration.prism), apex=found.get("apex", as_wedge(calibration.prism).apex),
                     index=found.get("index", calibration.prism.index))  # fmt: skip
     values, start = values_of(model, found), found.get(wanted.SIZE, wanted.size_from_apex(prism.apex, prism))
     simple = replace(calibration, model_name=model, prism=prism, parameters={**values, wanted.SIZE: start})

@@ -23,7 +23,7 @@ from amiwarp.io.formats import check_ending
 from amiwarp.io.json_files import build, camera_from_json, fields_of, read_json
 from amiwarp.optics.camera import Camera, CameraRotation, camera_to_json
 from amiwarp.optics.models import MODELS, ExactModel, Model, build_model
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.prism import Plate, Prism, as_wedge
 from amiwarp.validation import guarded, one_of, real, shown
 
 # Parts of a calibration's result: the search stages, the photometric stage and the choice of the model.
@@ -248,7 +248,7 @@ class Calibration:
     camera: Camera
     """Given camera, corrected where the events contradict it. If ``parameters`` contain a focal length, it replaces the
     camera's focal length."""
-    prism: Prism
+    prism: Prism | Plate
     """Nominal prism. It gives the flat side, corrected if the events contradict it, and the index if that was not free.
     """
     parameters: Mapping[str, float]
@@ -469,17 +469,22 @@ class Calibration:
         return result
 
 
-def prism_to_json(prism: Prism) -> dict[str, Any]:
-    """Return a prism, with the second one of a pair, in types that JSON knows."""
+def prism_to_json(prism: Prism | Plate) -> dict[str, Any]:
+    """Return a prism, with the second one of a pair, or a plate, in types that JSON knows."""
+    if isinstance(prism, Plate):
+        return {"thickness_m": prism.thickness, "tilt_rad": prism.tilt, "index": prism.index}
     found = {"apex_rad": prism.apex, "index": prism.index, "flat_side": prism.flat_side.value}
     return found if prism.second is None else {**found, "second": prism_to_json(prism.second)}
 
 
-def prism_from_json(data: Any, name: str) -> Prism:
-    """Return the prism of :func:`prism_to_json`."""
+def prism_from_json(data: Any, name: str) -> Prism | Plate:
+    """Return the prism or the plate of :func:`prism_to_json`."""
+    if isinstance(data, dict) and "thickness_m" in data:
+        plate = fields_of(data, name, "thickness_m", "tilt_rad", "index")
+        return Plate(plate["thickness_m"], plate["tilt_rad"], plate["index"])
     given = fields_of(data, name, "apex_rad", "index", "flat_side", optional=("second",))
     second = given.get("second")
-    behind = None if second is None else prism_from_json(second, f"{name}.second")
+    behind = None if second is None else as_wedge(prism_from_json(second, f"{name}.second"))
     return Prism(given["apex_rad"], given["index"], given["flat_side"], behind)
 
 

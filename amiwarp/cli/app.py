@@ -99,6 +99,11 @@ COMMANDS = {
         "Measure the ON and OFF threshold of every pixel, and find hot and dead pixels, from a calibrated recording.",
         "amiwarp pixels recording.h5 calibration.json pixels.npz",
     ),
+    "depth": Command(
+        "calibration",
+        "Find the depth of every edge from a camera at rest behind a rotating tilted plate, with its uncertainty.",
+        "amiwarp depth recording.h5 calibration.json depth.npz --ply points.ply --figure depth.png",
+    ),
     "chart": Command(
         "studies",
         "Measure speed and error of the settings on a recording with ground truth, and draw both Pareto fronts.",

@@ -771,3 +771,59 @@ def _pixel_lines(data: dict[str, Any]) -> list[str]:
         named = " ".join(f"({x}, {y})" for x, y in pixels[:MOST_NAMED]) + (" ..." if len(pixels) > MOST_NAMED else "")
         lines.append(f"{len(pixels)} {name} pixel{'' if len(pixels) == 1 else 's'} {named}".rstrip())
     return lines
+
+
+# ``amiwarp depth``: inverse depth of every edge, from a camera at rest behind a rotating tilted plate.
+
+
+def run_depth(
+    recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
+    calibration: Annotated[Path, typer.Argument(help="Calibration file from 'amiwarp calibrate' (.json).")],
+    out: Annotated[Path, typer.Argument(help="Map of inverse depth to write (.npz)."), OUTPUT],
+    *,
+    ply: Annotated[Path | None, typer.Option(help="Point cloud to write (.ply)."), OUTPUT] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Figure of the depths and their deviations to write (.png)."), OUTPUT
+    ] = None,
+    nearest_m: Annotated[float, typer.Option(help="Smallest depth that is tried (m).")] = 0.25,
+    common: Common,
+) -> None:
+    """Find the depth of every edge from a camera at rest behind a rotating tilted plate, with its uncertainty.
+
+    Scene and camera must be still. Depths are unknown where the events do not determine them to 10 %.
+    """
+    from amiwarp.calib import Calibration
+    from amiwarp.reconstruction.depth_at_rest import depth
+
+    check_ending(out, "depth maps are written", [".npz"])
+    for path, what, ending in ((ply, "points are written", ".ply"), (figure, "figures are written", ".png")):
+        if path is not None:
+            check_ending(path, what, [ending])
+    device = choose_device(common.device)
+    began = time.perf_counter()
+    with progress("finding depths") as advance:
+        found = depth(
+            open_recording(recording), Calibration.load(calibration), nearest_m=nearest_m, device=device,
+            progress=advance,
+        )  # fmt: skip
+    found.save(out)
+    if ply is not None:
+        found.save_points(ply)
+    if figure is not None:
+        from amiwarp.plotting.figures import draw_depths
+
+        draw_depths(figure, found)
+    depths = 1.0 / found.inverse_depth[found.known]
+    height, width = found.inverse_depth.shape
+    data: dict[str, Any] = {
+        "file": str(out), "width": width, "height": height, "known": int(found.known.sum()),
+        "depth_m": [float(x) for x in np.percentile(depths, [5, 50, 95])],
+        "relative_std": float(np.median((found.std / found.inverse_depth)[found.known])),
+        "ply": None if ply is None else str(ply), "figure": None if figure is None else str(figure),
+        "seconds": time.perf_counter() - began, "device": device,
+    }  # fmt: skip
+    near, middle, far = data["depth_m"]
+    report(common, data, [
+        f"{out}: {data['known']:,} of {width * height:,} pixels with a known depth, {near:.3g} to {far:.3g} m (median "
+        f"{middle:.3g} m), to {100 * data['relative_std']:.2g} %, in {data['seconds']:.1f} s on {device}"
+    ])  # fmt: skip

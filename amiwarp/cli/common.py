@@ -29,7 +29,7 @@ from amiwarp.io.camera_files import load_camera
 from amiwarp.io.files import check_regular
 from amiwarp.io.formats import LIMITS, Codec, OutputFormat, Rounding
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
+from amiwarp.optics.prism import FlatSide, NominalPrism, Plate, Prism, UnsizedPrism
 from amiwarp.tasks import Progress
 
 # Options that several commands use. A group of options is a dataclass.
@@ -90,12 +90,20 @@ class NominalPrismOptions:
     second_apex_deg: Annotated[
         float | None, in_prism(help="Apex angle of a second prism behind the first, a Risley pair (deg).")
     ] = None
+    thickness_mm: Annotated[
+        float | None, in_prism(help="Thickness of a tilted plane-parallel plate instead of a prism (mm).")
+    ] = None
+    plate_tilt_deg: Annotated[
+        float | None, in_prism(help="Angle between the normal of the plate and the rotation axis (deg).")
+    ] = None
 
     def build(self, known: NominalPrism | None) -> NominalPrism | None:
         """Return the nominal prism ``known`` with the values that options give; None if neither exists.
 
         The apex stays unknown if neither ``known`` nor the options hold one.
         """
+        if isinstance(known, Plate) or self.thickness_mm is not None or self.plate_tilt_deg is not None:
+            return self._plate(known if isinstance(known, Plate) else None)
         given = {"index": self.index, "flat_side": self.flat_side}
         changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         prism = replace(known or UnsizedPrism(), **changes)
@@ -109,6 +117,20 @@ class NominalPrismOptions:
             second = Prism(math.radians(self.second_apex_deg), prism.index, prism.flat_side)
             return replace(prism, second=second)
         return prism if changes else known
+
+    def _plate(self, known: Plate | None) -> Plate:
+        """Return the plate ``known`` with the values that options give."""
+        if self.nominal_apex_deg is not None or self.flat_side is not None:
+            raise AmiwarpError("--nominal-apex-deg and --flat-side are those of a prism; leave them out for a plate")
+        thickness, tilt = self.thickness_mm, self.plate_tilt_deg
+        if known is None and (thickness is None or tilt is None):
+            raise AmiwarpError("a plate needs --thickness-mm and --plate-tilt-deg; give both")
+        plate = known or Plate((thickness or 0.0) * 1e-3, math.radians(tilt or 0.0))
+        return Plate(
+            plate.thickness if thickness is None else thickness * 1e-3,
+            plate.tilt if tilt is None else math.radians(tilt),
+            plate.index if self.index is None else self.index,
+        )
 
 
 def complete(recording: Recording, camera: CameraOptions, prism: NominalPrismOptions | None = None) -> Recording:
@@ -241,6 +263,7 @@ FORMS = {
     "rad/s2": (("deg/s2", "rad/s2"), "30deg/s2 or 0.5rad/s2"),
     "px": (("px",), "554px"),
     "1": ((), "1.5168"),
+    "1/m": ((), "2"),
 }
 """Accepted suffixes of a parameter in each unit, and an example for error messages."""
 

@@ -37,7 +37,7 @@ from amiwarp.io.export import GAP_INTERVALS, save_flow_dsec, save_flow_mvsec, sa
 from amiwarp.io.file_scan import head_only
 from amiwarp.io.formats import EXTENSION_HELP, Codec, make_folder
 from amiwarp.optics.camera import camera_to_json
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.prism import NominalPrism, Plate, Prism
 
 # ``amiwarp info``: description of the content of a recording.
 
@@ -102,9 +102,16 @@ def describe(recording: Recording, file: str, *, head: bool = False) -> dict[str
     }
     if recording.prism is not None:
         p = recording.prism
-        apex = math.degrees(p.apex) if isinstance(p, Prism) else None
-        data["prism"] = {"apex_deg": apex, "index": p.index, "flat_side": p.flat_side.value}
+        data["prism"] = _glass(p)
     return data
+
+
+def _glass(p: NominalPrism) -> dict[str, Any]:
+    """Return the nominal glass, with lengths in mm and angles in degrees."""
+    if isinstance(p, Plate):
+        return {"thickness_mm": 1e3 * p.thickness, "plate_tilt_deg": math.degrees(p.tilt), "index": p.index}
+    apex = math.degrees(p.apex) if isinstance(p, Prism) else None
+    return {"apex_deg": apex, "index": p.index, "flat_side": p.flat_side.value}
 
 
 def _events(source: EventSource, *, head: bool) -> dict[str, Any]:
@@ -268,7 +275,12 @@ def _listed(names: list[str]) -> str:
 
 def _degrees(parameters: dict[str, float]) -> dict[str, float]:
     """Return the true parameters of the prism with angles in degrees, under names that end in ``_deg``."""
-    angles = ("apex", "phase", *(f"{name}_{axis}" for name in ("tilt", "cylinder", "wobble") for axis in "xy"))
+    angles = (
+        "apex",
+        "phase",
+        "plate_tilt",
+        *(f"{name}_{axis}" for name in ("tilt", "cylinder", "wobble") for axis in "xy"),
+    )
     return {f"{n}_deg" if n in angles else n: math.degrees(v) if n in angles else v for n, v in parameters.items()}
 
 
@@ -297,7 +309,11 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     rows += _sensor_rows(d)
     if d["truth"] is not None:
         points = "with the true position of each event" if d["truth_points"] else "without positions"
-        shown = [f"{n} {v:.5g}" for n, v in d["truth"].items() if n in ("apex_deg", "phase_deg", "index")]
+        shown = [
+            f"{n} {v:.5g}"
+            for n, v in d["truth"].items()
+            if n in ("apex_deg", "thickness", "plate_tilt_deg", "phase_deg", "index")
+        ]
         rows.append(("truth", f"{', '.join(shown)}; {points}"))
     if d["world"] is not None:
         rows += _world_rows(d["world"])
@@ -310,6 +326,8 @@ def _prism_text(p: dict[str, Any] | None) -> str:
     """Return the description of the nominal prism as text."""
     if p is None:
         return "unknown"
+    if "thickness_mm" in p:
+        return f"plate of {p['thickness_mm']:.5g} mm, tilted by {p['plate_tilt_deg']:.5g} deg, n {p['index']:.6g}"
     apex = "apex unknown" if p["apex_deg"] is None else f"nominal apex {p['apex_deg']:.5g} deg"
     return f"{apex}, n {p['index']:.6g}, flat face to the {p['flat_side']}"
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from amiwarp.choices import Seeing
+from amiwarp.choices import Optic, Seeing
 from amiwarp.cli.common import (
     OUTPUT,
     Common,
@@ -31,7 +31,7 @@ from amiwarp.io.files import text_lines
 from amiwarp.io.formats import check_ending
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.prism import FlatSide, Prism
+from amiwarp.optics.prism import FlatSide, Plate, Prism
 from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel
 from amiwarp.simulation.worlds.world import WorldScene
 
@@ -64,6 +64,13 @@ class RigOptions:
     camera: Annotated[
         Path | None, in_camera(help="Camera intrinsics: JSON or YAML (including the size), or calib.txt.")
     ] = None
+    optic: Annotated[
+        Optic, in_prism(help="Moving glass: wedge, or plate (tilted and plane-parallel; needs --world).")
+    ] = Optic.WEDGE
+    thickness_mm: Annotated[float, in_prism(help="Thickness of the plate (mm).")] = 10.0
+    plate_tilt_deg: Annotated[
+        float, in_prism(help="Angle between the normal of the plate and the rotation axis (deg).")
+    ] = 45.0
     apex_deg: Annotated[float, in_prism(help="True apex angle of the prism (deg).")] = 1.0
     nominal_apex_deg: Annotated[
         float | None, in_prism(help="Nominal apex angle stored in the recording (deg). Default: the true apex angle.")
@@ -121,6 +128,12 @@ class RigOptions:
             return Prism(math.radians(self.apex_deg), self.index, self.flat_side)
         second = Prism(math.radians(self.second_apex_deg), self.index, self.flat_side)
         return Prism(math.radians(self.apex_deg), self.index, self.flat_side, second)
+
+    def build_optic(self) -> Prism | Plate:
+        """Return the prism or the plate with its true parameters."""
+        if self.optic is Optic.WEDGE:
+            return self.build_prism()
+        return Plate(self.thickness_mm * 1e-3, math.radians(self.plate_tilt_deg), self.index)
 
     def build_nominal(self) -> Prism:
         """Return the nominal prism that is stored with the recording."""
@@ -405,14 +418,14 @@ def run_simulate(
     simulation = Simulation(
         _scene(picture, world, scene, duration, common.seed),
         rig.build_camera(),
-        rig.build_prism(),
+        rig.build_optic(),
         duration,
         motion=rig.build_motion(),
         camera_motion=CameraMotion(scene.rates),
         sensor=sensor.build(),
         pixels=None if pixels is None else PixelMap.load(pixels),
         encoder_model=encoder.build(),
-        nominal_prism=rig.build_nominal(),
+        nominal_prism=None if rig.optic is Optic.PLATE else rig.build_nominal(),
         seed=common.seed,
         device=device,
     )

@@ -40,7 +40,7 @@ from amiwarp.optics.camera import (
     camera_to_json,
     check_size,
 )
-from amiwarp.optics.prism import FlatSide, NominalPrism, Prism, UnsizedPrism
+from amiwarp.optics.prism import FlatSide, NominalPrism, Plate, Prism, UnsizedPrism, as_wedge
 from amiwarp.tasks import in_order
 from amiwarp.validation import array as as_numbers
 from amiwarp.validation import instance, one_of, real, rounded_times, shown, whole
@@ -802,7 +802,9 @@ def read_camera(attributes: Mapping[str, Any], where: str) -> Camera:
 
 
 def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
-    """Return the attributes of a nominal prism, without ``apex`` if that is unknown."""
+    """Return the attributes of a nominal prism, without ``apex`` if that is unknown, or those of a plate."""
+    if isinstance(prism, Plate):
+        return {"thickness": prism.thickness, "tilt": prism.tilt, "index": prism.index}
     known: dict[str, float | str] = {"apex": prism.apex} if isinstance(prism, Prism) else {}
     known |= {"index": prism.index, "flat_side": prism.flat_side.value}
     if isinstance(prism, Prism) and prism.second is not None:
@@ -811,14 +813,19 @@ def prism_attributes(prism: NominalPrism) -> dict[str, float | str]:
 
 
 def read_prism(attributes: Mapping[str, Any], where: str) -> NominalPrism:
-    """Return the nominal prism stored in attributes. The apex angle is unknown if ``apex`` is missing."""
+    """Return the nominal prism stored in attributes. The apex angle is unknown if ``apex`` is missing.
+
+    A plate has a ``thickness``.
+    """
+    if "thickness" in attributes:
+        return Plate(*(attribute(attributes, where, name, float) for name in ("thickness", "tilt", "index")))
     side = attribute(attributes, where, "flat_side", str, FlatSide.SCENE.value)
     prism = UnsizedPrism(attribute(attributes, where, "index", float), side)
     if "apex" not in attributes:
         return prism
     second = {name: attributes[f"second_{name}"] for name in ("apex", "index", "flat_side")
               if f"second_{name}" in attributes}  # fmt: skip
-    behind = read_prism(second, f"{where} second prism") if second else None
+    behind = as_wedge(read_prism(second, f"{where} second prism")) if second else None
     if isinstance(behind, UnsizedPrism):
         raise AmiwarpError(f"{where} has a second prism without 'second_apex'; add this attribute")
     return replace(prism.with_apex(attribute(attributes, where, "apex", float)), second=behind)

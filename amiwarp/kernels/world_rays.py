@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from amiwarp.kernels.camera import CameraParams, pixel_to_ray
+from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
+from amiwarp.kernels.plate import PlateParams, seen_from
 from amiwarp.kernels.prism_view import Steps, View, ray_without_prisms
 from amiwarp.kernels.refraction import ExactParams
 from amiwarp.kernels.world import (
@@ -33,6 +34,7 @@ class RayView:
     camera: CameraParams  # camera model
     prism: ExactParams  # prism model
     second: ExactParams  # second prism of a pair; without one, its apex angle is 0
+    plate: PlateParams  # plate model; thickness 0 without a plate
     poses: wp.array(dtype=Pose)  # pose of the camera at each instant
     aperture: wp.array(dtype=wp.vec3)  # rays of a pixel: x and y relative to the pixel's centre [px], and weight
     reach: int  # largest distance of these rays from the pixel's centre, rounded up [px]
@@ -45,6 +47,16 @@ def look_through(view: RayView, steps: Steps, k: int, x: float, y: float) -> wp.
     ray = pixel_to_ray(view.camera, wp.vec2(x, y))
     ray = ray_without_prisms(view.prism, view.second, ray, steps.at[k].azimuth, steps.at[k].second)
     return view.poses[k].rotation * wp.normalize(ray)
+
+
+@wp.func
+def look_from(view: RayView, steps: Steps, k: int, x: float, y: float) -> wp.vec3:
+    """Return the place in the world's frame from which a point of the image looks at instant ``k``."""
+    if view.plate.thickness == 0.0:
+        return view.poses[k].position
+    ray = pixel_to_ray(view.camera, wp.vec2(x, y))
+    centre = seen_from(view.plate, ray[0], ray[1], ray[2], steps.at[k].azimuth)
+    return view.poses[k].position + view.poses[k].rotation * centre
 
 
 @wp.struct
@@ -105,7 +117,7 @@ def cast_centres(world: World, view: RayView, steps: Steps, start: int, batch: B
         return
     for j in range(batch.count):
         s = sample_at(view, batch, j, i)
-        origin = view.poses[s.k].position
+        origin = look_from(view, steps, s.k, float(s.col), float(s.row))
         direction = look_through(view, steps, s.k, float(s.col), float(s.row))
         hit = cast(world, s.k, origin, direction, FAR)
         white = illumination(world, s.k, origin, direction, hit)
@@ -117,10 +129,11 @@ def cast_centres(world: World, view: RayView, steps: Steps, start: int, batch: B
 
 
 @wp.func
-def meet_around(world: World, view: RayView, batch: Batch, s: Sample, direction: wp.vec3) -> Hit:
-    """Return the nearest surface along a unit vector among the faces that a pixel and its eight neighbours see.
+def meet_around(world: World, view: RayView, batch: Batch, s: Sample, origin: wp.vec3, direction: wp.vec3) -> Hit:
+    """Return the nearest surface on a ray among the faces that a pixel and its eight neighbours see.
 
-    The normal is that at the pixel's centre. If the ray hits none of these faces, the face is -1.
+    ``direction``: unit vector. The normal is that at the pixel's centre. If the ray hits none of these faces, the face
+    is -1.
     """
     hit = Hit()
     hit.distance = FAR
@@ -133,7 +146,7 @@ def meet_around(world: World, view: RayView, batch: Batch, s: Sample, direction:
         face = batch.hits.face[s.base + row * view.camera.width + col]
         if face != last:
             last = face
-            met = meet_face(world, s.k, face, view.poses[s.k].position, direction)
+            met = meet_face(world, s.k, face, origin, direction)
             if met[0] < hit.distance:
                 hit.distance = met[0]
                 hit.face = face
@@ -156,7 +169,8 @@ def smooth_light(world: World, view: RayView, steps: Steps, batch: Batch, s: Sam
         if batch.hits.face[s.at] < 0:
             total += a[2] * sky(world, direction)
         else:
-            hit = meet_around(world, view, batch, s, direction)
+            origin = look_from(view, steps, s.k, float(s.col) + a[0], float(s.row) + a[1])
+            hit = meet_around(world, view, batch, s, origin, direction)
             if hit.face < 0:
                 return NAN
             total += a[2] * luminance(world, direction, hit, view.cone, batch.hits.white[s.at])
@@ -204,7 +218,8 @@ def cast_edges(
     s = place_at(view, batch, listed[t / rays])
     a = view.aperture[t % rays]
     direction = look_through(view, steps, s.k, float(s.col) + a[0], float(s.row) + a[1])
-    out[t] = a[2] * radiance(world, s.k, view.poses[s.k].position, direction, view.cone)
+    origin = look_from(view, steps, s.k, float(s.col) + a[0], float(s.row) + a[1])
+    out[t] = a[2] * radiance(world, s.k, origin, direction, view.cone)
 
 
 @wp.kernel
@@ -241,20 +256,37 @@ def instance_of(world: World, face: int) -> int:
 
 
 @wp.kernel
-def find_surfaces(world: World, instant: int, rays: wp.array(dtype=wp.vec3), pose: Pose, start: int, out: Surfaces):
+def find_surfaces(
+    world: World, instant: int, rays: wp.array(dtype=wp.vec3), centres: wp.array(dtype=wp.vec3), pose: Pose, start: int,
+    out: Surfaces,
+):  # fmt: skip
     """Find the surfaces that unit rays from a camera hit. A ray of NaN counts as seeing the sky.
 
-    ``rays``: directions in the camera's frame; ``pose``: pose of the camera.
+    ``rays``: directions in the camera's frame; ``centres``: where they begin in this frame, empty if they begin at its
+    origin; ``pose``: pose of the camera.
     """
     i = start + wp.tid()
     ray = rays[i]
+    centre = wp.vec3(0.0, 0.0, 0.0)
+    if centres.shape[0] > 0:
+        centre = centres[i]
+    origin = pose.position + pose.rotation * centre
     direction = pose.rotation * ray
-    hit = cast(world, instant, pose.position, direction, FAR)
-    out.depth[i] = wp.where(hit.face < 0, wp.inf, hit.distance * ray[2])
+    hit = cast(world, instant, origin, direction, FAR)
+    out.depth[i] = wp.where(hit.face < 0, wp.inf, centre[2] + hit.distance * ray[2])
     out.normal[i] = hit.normal
     out.instance[i] = instance_of(world, hit.face)
     out.mover[i] = hit.mover
-    out.place[i] = pose.position + hit.distance * direction
+    out.place[i] = origin + hit.distance * direction
+
+
+@wp.kernel
+def find_centres(
+    view: RayView, azimuth: wp.vec2, rays: wp.array(dtype=wp.vec3), start: int, out: wp.array(dtype=wp.vec3)
+):
+    """Compute the place in the camera's frame from which each ray looks through the plate."""
+    i = start + wp.tid()
+    out[i] = seen_from(view.plate, rays[i][0], rays[i][1], rays[i][2], azimuth)
 
 
 # -- the surface that each event saw
@@ -380,3 +412,28 @@ def find_seen_surfaces(
     out.instance[i] = wp.uint16(instance_of(world, met.face))
     out.depth[i] = wp.where(met.face < 0, wp.inf, met.distance * ray[2])
     out.place[i] = wp.where(met.face < 0, wp.vec3(NAN, NAN, NAN), pose.position + met.distance * direction)
+
+
+@wp.kernel
+def find_surfaces_through_plate(
+    world: World, view: RayView, steps: Steps, ticks: wp.array(dtype=int), start: int, points: wp.array(dtype=wp.vec2),
+    out: SeenSurfaces,
+):  # fmt: skip
+    """Find the surface that each event saw through the plate, and replace its pixel by that without the plate.
+
+    ``points``: pixel of each event [px]; ``ticks``: as in :func:`find_seen_surfaces`.
+    """
+    i = start + wp.tid()
+    k = wp.clamp(ticks[i] / steps.ticks, 0, steps.margin + steps.count - 1)
+    share = wp.clamp(float(ticks[i] - k * steps.ticks) / float(steps.ticks), 0.0, 1.0)
+    angle = steps.angle[k] + steps.turn[k] * share
+    ray = pixel_to_ray(view.camera, points[i])
+    pose = between(view.poses[k], view.poses[k + 1], share)
+    centre = seen_from(view.plate, ray[0], ray[1], ray[2], wp.vec2(wp.cos(angle), wp.sin(angle)))
+    met = meet_anywhere(world, k + int(share + 0.5), pose.position + pose.rotation * centre, pose.rotation * ray)
+    place = centre + met.distance * ray
+    out.instance[i] = wp.uint16(instance_of(world, met.face))
+    out.depth[i] = wp.where(met.face < 0, wp.inf, place[2])
+    out.place[i] = wp.where(met.face < 0, wp.vec3(NAN, NAN, NAN), pose.position + pose.rotation * place)
+    if met.face >= 0:
+        points[i] = ray_to_pixel(view.camera, place)

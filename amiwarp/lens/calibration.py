@@ -32,7 +32,7 @@ from amiwarp.lens.corner_fit import Fit, fit_lens, lens_values, match_corners, t
 from amiwarp.lens.poses import Pose, still_poses
 from amiwarp.optics.camera import Camera, Fisheye
 from amiwarp.optics.models import ExactModel, rms
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.prism import Prism, as_wedge
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.tasks import Progress, silent
 from amiwarp.validation import array, guarded, instance, real
@@ -604,7 +604,7 @@ class JointPrism:
 
     def model(self, camera: Camera, values: Mapping[str, float]) -> ExactModel:
         """Return the optical model of some parameter values."""
-        return ExactModel.from_values(camera, self.full.prism, values)
+        return ExactModel.from_values(camera, as_wedge(self.full.prism), values)
 
     def use(self, equations: Mapping[str, Equations], inside: NDArray[np.bool_]) -> None:
         """Go on with the equations of the events ``inside``, weighted alike in all poses, and with little damping."""

@@ -19,7 +19,7 @@ from amiwarp.lens.calibration import GOOD_POSES, TWO_BOARDS, LensCalibration, Le
 from amiwarp.lens.corner_fit import first_pose, fit_lens, tilt_of
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel
-from amiwarp.optics.prism import NominalPrism
+from amiwarp.optics.prism import NominalPrism, as_wedge
 from amiwarp.tasks import Progress, silent
 
 SETTLED_TURNS = 5
@@ -215,7 +215,7 @@ class LiveLens:
             return
         _, search = work.search(work.poses[0], ("apex", "phase"), {})
         search.run()
-        yield ExactModel.from_values(self._camera, search.full_space.prism, search.best)
+        yield ExactModel.from_values(self._camera, as_wedge(search.full_space.prism), search.best)
 
     def _tell(self, name: str) -> None:
         """Say what the latest pose shows, where in the image corners were so far, and what is missing."""

@@ -17,14 +17,17 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.kernels import plate as plate_kernels
 from amiwarp.kernels import refraction as kernels
 from amiwarp.kernels.launch import RecordedLaunch, launch
 from amiwarp.optics.camera import Camera, camera_params, with_lens
 from amiwarp.optics.prism import (
     FlatSide,
     NominalPrism,
+    Plate,
     Prism,
     apex_from_deflection,
+    as_wedge,
     check_angles,
     check_index,
     check_phase,
@@ -53,7 +56,7 @@ class Parameter:
     name: str
     """Name in settings, files and results."""
     unit: str
-    """Unit of its values: ``rad``, or ``1`` for a number."""
+    """Unit of its values: ``rad``, ``1/m``, or ``1`` for a number."""
     half_range: float = math.pi
     """Half width of its default bounds about its start value, in its unit. The size has bounds from its nominal value.
     """
@@ -95,6 +98,8 @@ class Model:
     STRUCT: ClassVar[Any]
     """Warp struct of its parameters, for which ``compensate`` and ``deflect`` of
     :mod:`amiwarp.kernels.refraction` have overloads."""
+    GLASS: ClassVar[type[Prism] | type[Plate]] = Prism
+    """Type of the glass in front of the camera."""
     FREE: ClassVar[tuple[str, ...]]
     """Names of the parameters that a calibration can find."""
     SIZE: ClassVar[str]
@@ -164,32 +169,64 @@ class Model:
         return size
 
     @classmethod
-    def start_values(cls, prism: Prism) -> dict[str, float]:
+    def nominal_size(cls, prism: Prism | Plate) -> float:
+        """Return the size with which a search starts if nothing but the nominal glass is known.
+
+        Parameters
+        ----------
+        prism : Prism or Plate
+            The nominal glass.
+
+        Returns
+        -------
+        float
+            Value of the parameter :attr:`SIZE`: here that of the prism's apex angle.
+        """
+        return cls.size_from_apex(as_wedge(prism).apex, as_wedge(prism))
+
+    @classmethod
+    def largest_size(cls, prism: Prism | Plate) -> float:
+        """Return the largest size that a search tries by default.
+
+        Parameters
+        ----------
+        prism : Prism or Plate
+            The nominal glass.
+
+        Returns
+        -------
+        float
+            Value of the parameter :attr:`SIZE`: here that of twice the prism's apex angle.
+        """
+        return cls.size_from_apex(2.0 * as_wedge(prism).apex, as_wedge(prism))
+
+    @classmethod
+    def start_values(cls, prism: Prism | Plate) -> dict[str, float]:
         """Return the values with which a search starts if nothing but the nominal prism is known.
 
         Parameters
         ----------
-        prism : Prism
-            The nominal prism.
+        prism : Prism or Plate
+            The nominal glass.
 
         Returns
         -------
         dict
             Value of each parameter by name, in its unit.
         """
-        given = {cls.SIZE: cls.size_from_apex(prism.apex, prism), "index": prism.index}
+        given = {cls.SIZE: cls.nominal_size(prism), "index": prism.index}
         return {name: given.get(name, 0.0) for name in cls.FREE}
 
     @classmethod
-    def from_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+    def from_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
         """Create the model from the values of its parameters.
 
         Parameters
         ----------
         camera : Camera
             The camera.
-        prism : Prism
-            Prism that gives what ``values`` do not contain, such as the flat side.
+        prism : Prism or Plate
+            Glass that gives what ``values`` do not contain, such as the flat side.
         values : mapping of str to float
             Values by name, in their units: size and phase at least. Names of other parameters are ignored.
 
@@ -206,20 +243,20 @@ class Model:
         return model_of(cls, camera, prism, values)
 
     @classmethod
-    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+    def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
         """Create the model of :meth:`from_values` from values that contain size and phase."""
         raise NotImplementedError
 
     @classmethod
-    def from_prism(cls, camera: Camera, prism: Prism, phase: float = 0.0) -> Self:
+    def from_prism(cls, camera: Camera, prism: Prism | Plate, phase: float = 0.0) -> Self:
         """Create the model of a prism.
 
         Parameters
         ----------
         camera : Camera
             The camera.
-        prism : Prism
-            The prism.
+        prism : Prism or Plate
+            The prism, or the plate.
         phase : float, default 0.0
             Added to the encoder's angle [rad].
 
@@ -382,13 +419,13 @@ def _wanted(angles: int) -> str:
 Made = TypeVar("Made", bound=Model)
 
 
-def model_of(kind: type[Made], camera: Camera, prism: Prism, values: Mapping[str, float]) -> Made:
+def model_of(kind: type[Made], camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Made:
     """Create a model as :meth:`Model.from_values` does, but without its checks of types: a search calls it often."""
     check_given(values, kind.FREE[:2])
     return kind._of_values(camera, prism, values)
 
 
-def build_model(model: str, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Model:
+def build_model(model: str, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Model:
     """Build the optical model of the parameter values; ``camera`` and ``prism`` give all other values."""
     return model_of(MODELS[one_of(model, MODELS, "model")], with_lens(camera, values), prism, values)
 
@@ -487,11 +524,11 @@ class _DeflectionModel(Model):
 
     @classmethod
     def size_from_apex(cls, apex: float, prism: NominalPrism) -> float:
-        return deflection_from_apex(apex, prism.index, prism.flat_side)
+        return deflection_from_apex(apex, prism.index, as_wedge(prism).flat_side)
 
     @classmethod
     def apex_from_size(cls, size: float, prism: NominalPrism) -> float:
-        return apex_from_deflection(size, prism.index, prism.flat_side)
+        return apex_from_deflection(size, prism.index, as_wedge(prism).flat_side)
 
 
 @guarded
@@ -531,8 +568,8 @@ class CircleModel(_DeflectionModel):
     """Side that the prism's flat face points to: scene or camera."""
 
     @classmethod
-    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
-        return cls(camera, values["deflection"], values["phase"], prism.flat_side)
+    def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
+        return cls(camera, values["deflection"], values["phase"], as_wedge(prism).flat_side)
 
     def kernel_values(self) -> tuple[Any, ...]:
         sine = math.sin(self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection)
@@ -583,8 +620,8 @@ class RadialCircleModel(_DeflectionModel):
         object.__setattr__(self, "index", check_index(self.index, "index"))
 
     @classmethod
-    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
-        return cls(camera, values["deflection"], values["phase"], prism.index, prism.flat_side)
+    def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
+        return cls(camera, values["deflection"], values["phase"], prism.index, as_wedge(prism).flat_side)
 
     def kernel_values(self) -> tuple[Any, ...]:
         deflection = self.deflection if self.flat_side is FlatSide.SCENE else -self.deflection
@@ -667,8 +704,8 @@ class ExactModel(Model):
                 object.__setattr__(self, name, check_angles(getattr(self, name), name))
 
     @classmethod
-    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
-        wedge = Prism(values["apex"], values.get("index", prism.index), prism.flat_side)
+    def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
+        wedge = Prism(values["apex"], values.get("index", prism.index), as_wedge(prism).flat_side)
         pairs = {
             name: (values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0))
             for name in ("tilt", "cylinder", "wobble") if not {f"{name}_x", f"{name}_y"}.isdisjoint(values)
@@ -754,12 +791,14 @@ class RisleyModel(Model):
         object.__setattr__(self, "ratio", real(self.ratio, "ratio", -1e6, 1e6))
 
     @classmethod
-    def start_values(cls, prism: Prism) -> dict[str, float]:
+    def start_values(cls, prism: Prism | Plate) -> dict[str, float]:
+        prism = as_wedge(prism)
         second = prism if prism.second is None else prism.second
         return {**super().start_values(prism), "second_apex": second.apex}
 
     @classmethod
-    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+    def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
+        prism = as_wedge(prism)
         second = prism if prism.second is None else prism.second
         other = Prism(values.get("second_apex", second.apex), second.index, second.flat_side)
         pair = Prism(values["apex"], prism.index, prism.flat_side, other)
@@ -848,7 +887,7 @@ class EllipseModel(Model):
         return ExactModel
 
     @classmethod
-    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+    def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
         return cls.from_model(ExactModel.from_values(camera, prism, values))
 
     @classmethod
@@ -966,10 +1005,155 @@ def _triangle(degree: int) -> NDArray[np.bool_]:
     return i[:, None] + i[None, :] <= degree
 
 
+# Plate model: the camera sees from a centre that moves on a circle.
+
+NOMINAL_INVERSE_DEPTH = 2.0
+"""Inverse depth with which a search starts [1/m]."""
+LARGEST_INVERSE_DEPTH = 20.0
+"""Upper limit of inverse depths [1/m]."""
+
+
+@guarded
+@dataclass(frozen=True, eq=False)
+class PlateModel(Model):
+    """Plate model: the camera sees each ray from a centre that the plate moves on a circle.
+
+    The direction of a ray does not change. So a scene at infinity does not move, and the orbit of a point is
+    proportional to its inverse depth: one for all pixels, or one for each (:attr:`depths`).
+
+    Raises
+    ------
+    AmiwarpError
+        If an inverse depth is not between 0 and 20 / m, the map of inverse depths does not have the camera's size, or
+        another field has an unusable value.
+
+    Notes
+    -----
+    A bearing u sees along the line from g N, where N = (sin α · w, cos α) is the normal of the faces at φ = θ + θ_b,
+    and g = t (1 − c / √(n² − 1 + c²)) with c = u · N. A point of inverse depth ρ on it appears at
+    u_xy + ρ g (N_xy u_z − N_z u_xy), with u_z unchanged. See ``docs/explanation/optics.md``.
+
+    Examples
+    --------
+    >>> import math
+    >>> import numpy as np
+    >>> camera = amiwarp.Camera(width=640, height=480, fx=554.0, fy=554.0, cx=320.0, cy=240.0)
+    >>> model = amiwarp.PlateModel(camera, amiwarp.Plate(0.01, math.radians(45.0)), inverse_depth=2.0)
+    >>> model.compensate_points(np.array([[320.0, 240.0]]), np.array([0.0])).round(1)
+    array([[323.7, 240. ]])
+    """
+
+    NAME, TEXT, NUMBERS, STRUCT = "plate", "tilted plate", "2, plate given", plate_kernels.PlateParams
+    GLASS = Plate
+    PARAMETERS = (Parameter("inverse_depth", "1/m", 5.0, limits=(0.0, LARGEST_INVERSE_DEPTH)), PHASE)
+
+    camera: Camera
+    """Camera intrinsics."""
+    plate: Plate
+    """Plate that shifts the rays."""
+    phase: float = 0.0
+    """Phase θ_b, added to the encoder's angle [rad]."""
+    inverse_depth: float = 0.0
+    """Inverse depth of the scene [1/m], as seen from the resting centre; 0: the plate moves nothing."""
+    depths: NDArray[np.float32] | None = field(default=None, repr=False)
+    """Inverse depth of what each pixel sees [1/m], shape ``(height, width)``, instead of :attr:`inverse_depth`."""
+
+    def __post_init__(self) -> None:
+        instance(self.camera, Camera, "camera")
+        instance(self.plate, Plate, "plate")
+        object.__setattr__(self, "phase", check_phase(self.phase))
+        largest = LARGEST_INVERSE_DEPTH
+        object.__setattr__(self, "inverse_depth", real(self.inverse_depth, "inverse_depth", 0.0, largest, " 1/m"))
+        if self.depths is None:
+            return
+        table, size = array(self.depths, "depths"), (self.camera.height, self.camera.width)
+        if table.shape != size:
+            raise AmiwarpError(f"depths has shape {table.shape}; expected {size}, the camera's rows and columns")
+        if not ((table >= 0.0) & (table <= largest)).all():
+            raise AmiwarpError(f"depths has values outside 0 .. {largest:g} 1/m; give the inverse depth of each pixel")
+        object.__setattr__(self, "depths", table.astype(np.float32, copy=False))
+
+    @classmethod
+    def nominal_size(cls, prism: Prism | Plate) -> float:
+        return NOMINAL_INVERSE_DEPTH
+
+    @classmethod
+    def largest_size(cls, prism: Prism | Plate) -> float:
+        return 2.0 * NOMINAL_INVERSE_DEPTH
+
+    @classmethod
+    def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
+        if not isinstance(prism, Plate):
+            raise AmiwarpError("the plate model needs the plate's thickness and tilt; give a Plate as the glass")
+        return cls(camera, prism, values["phase"], values["inverse_depth"])
+
+    def with_depths(self, depths: NDArray[Any]) -> PlateModel:
+        """Return this model with the inverse depth of what each pixel sees.
+
+        Parameters
+        ----------
+        depths : numpy.ndarray
+            Inverse depths [1/m], shape ``(height, width)``.
+
+        Returns
+        -------
+        PlateModel
+            The model.
+        """
+        return replace(self, depths=np.asarray(depths))
+
+    def kernel_values(self) -> tuple[Any, ...]:
+        sine, cosine = math.sin(self.plate.tilt), math.cos(self.plate.tilt)
+        inside = self.plate.index**2 - 1.0
+        return *phase_values(self.phase), self.plate.thickness, inside, sine, cosine, self.inverse_depth
+
+    def params(self, device: Any) -> Any:
+        values = self.kernel_values()
+        plate = struct_of(plate_kernels.PlateParams, values)
+        if self.depths is None:
+            return plate
+        if str(device) not in self._tables:
+            self._tables[str(device)] = wp.array(self.depths, dtype=float, device=device)
+        return struct_of(plate_kernels.PlateMapParams, [*values[:3], plate, self._tables[str(device)]])
+
+    @cached_property
+    def _tables(self) -> dict[str, Any]:
+        return {}
+
+    def compensate_at(self, xy: NDArray[Any], theta: NDArray[Any], inverse_depth: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the pixel without the plate of points at known depths.
+
+        Parameters
+        ----------
+        xy : numpy.ndarray
+            Observed pixels [px], shape (n, 2).
+        theta : numpy.ndarray
+            Plate angle of the encoder [rad], shape (n,).
+        inverse_depth : numpy.ndarray
+            Inverse depth of what each pixel sees [1/m], shape (n,).
+
+        Returns
+        -------
+        numpy.ndarray
+            Compensated pixels [px], shape (n, 2).
+        """
+        xy, theta, rho = array(xy, "xy"), array(theta, "theta"), array(inverse_depth, "inverse_depth")
+        if xy.ndim != 2 or xy.shape[1] != 2 or not theta.shape == rho.shape == xy.shape[:1]:
+            given = f"xy has shape {xy.shape}, theta {theta.shape} and inverse_depth {rho.shape}"
+            raise AmiwarpError(f"{given}; give (n, 2), (n,) and (n,)")
+        points = points_on_host(xy, theta)
+        depths = wp.array(rho.astype(np.float32), dtype=float, device="cpu")
+        plate = struct_of(plate_kernels.PlateParams, self.kernel_values())
+        out = wp.empty_like(points[0])
+        inputs = [plate, model_camera(self, "cpu"), *points, depths]
+        launch(plate_kernels.compensate_at_depths, len(out), inputs, [out], device="cpu")
+        return np.asarray(out.numpy(), np.float64)
+
+
 # The models by name.
 
 MODELS: dict[str, type[Model]] = {
-    model.NAME: model for model in (CircleModel, ExactModel, RadialCircleModel, EllipseModel, RisleyModel)
+    model.NAME: model for model in (CircleModel, ExactModel, RadialCircleModel, EllipseModel, RisleyModel, PlateModel)
 }
 """Optical models by name, ordered by their number of calibrated parameters, then by their measured cost per event."""
 

@@ -1,4 +1,4 @@
-"""The wedge prism: apex angle, refractive index, the side of its flat face, its deflection, and a second prism.
+"""The glass in front of the camera: a wedge prism, a pair of them or a plane-parallel plate, and a wedge's deflection.
 
 This is the glass only. Its motion is that of the encoder, :mod:`amiwarp.events.encoder`.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import TypeAlias, overload
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.validation import choice, guarded, instance, real, vector
@@ -17,6 +17,10 @@ LARGEST_APEX = math.radians(30.0)
 """Upper limit of the apex angle [rad]. Larger values are mistakes, such as angles in degrees."""
 LARGEST_INDEX = 4.0
 """Upper limit of the refractive index, which is that of germanium."""
+LARGEST_THICKNESS = 0.2
+"""Upper limit of a plate's thickness [m]. Larger values are mistakes, such as millimetres."""
+STEEPEST_TILT = math.radians(80.0)
+"""Upper limit of a plate's tilt [rad]. Larger values are mistakes, such as angles in degrees."""
 LARGEST_PHASE = 1e6
 """Largest accepted magnitude of a phase [rad]. Up to this phase float64 resolves 1e-10 rad."""
 _BELOW_LARGEST_APEX = math.nextafter(LARGEST_APEX, 0.0)
@@ -111,8 +115,66 @@ class UnsizedPrism:
         return Prism(apex, self.index, self.flat_side)
 
 
-NominalPrism: TypeAlias = Prism | UnsizedPrism
-"""Nominal prism before calibration, with or without a known apex angle."""
+@guarded
+@dataclass(frozen=True, slots=True)
+class Plate:
+    """Plane-parallel plate in air that rotates about the optical axis, given by thickness, tilt and refractive index.
+
+    Raises
+    ------
+    AmiwarpError
+        If the thickness is not between 0 and 0.2 m, the tilt not between 0 and 80 deg, or the index not between 1 and 4
+        (both excluded).
+
+    Examples
+    --------
+    >>> import math
+    >>> plate = amiwarp.Plate(thickness=0.01, tilt=math.radians(45.0))
+    >>> round(1e3 * plate.shift, 2)
+    3.34
+    """
+
+    thickness: float
+    """Distance between the two faces [m]."""
+    tilt: float
+    """Angle between the normal of the faces and the rotation axis [rad]."""
+    index: float = 1.5168
+    """Refractive index. The default is that of N-BK7 at the d line, 587.6 nm."""
+
+    def __post_init__(self) -> None:
+        hint = " m; is it given in millimetres?"
+        object.__setattr__(self, "thickness", real(self.thickness, "plate thickness", 0.0, LARGEST_THICKNESS, hint))
+        hint = " rad, 0 .. 80 deg; is it given in degrees?"
+        object.__setattr__(self, "tilt", real(self.tilt, "plate tilt", 0.0, STEEPEST_TILT, hint))
+        object.__setattr__(self, "index", check_index(self.index, "plate index"))
+
+    @property
+    def shift(self) -> float:
+        """Distance by which the plate shifts the ray on the camera's optical axis [m].
+
+        That is t sin α (1 − cos α / √(n² − sin² α)) for thickness t, tilt α and index n.
+        """
+        sine, cosine = math.sin(self.tilt), math.cos(self.tilt)
+        return self.thickness * sine * (1.0 - cosine / math.sqrt(self.index**2 - sine**2))
+
+
+NominalPrism: TypeAlias = Prism | UnsizedPrism | Plate
+"""Nominal glass before calibration: a prism, with or without a known apex angle, or a plate."""
+
+
+@overload
+def as_wedge(glass: Prism | Plate) -> Prism: ...
+
+
+@overload
+def as_wedge(glass: NominalPrism) -> Prism | UnsizedPrism: ...
+
+
+def as_wedge(glass: NominalPrism) -> Prism | UnsizedPrism:
+    """Return the glass if it is a wedge prism; raise :class:`AmiwarpError` for a plate."""
+    if isinstance(glass, Plate):
+        raise AmiwarpError("the glass is a plane-parallel plate, but this works with a wedge prism; give a prism")
+    return glass
 
 
 @guarded

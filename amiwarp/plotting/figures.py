@@ -23,6 +23,7 @@ from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.metrics import PictureQuality
 from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
+from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import write_text
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import MODELS
@@ -444,6 +445,22 @@ def draw_preview(path: Path, frame: FrameTruth, *, overwrite: bool = False) -> N
     for ax in axes.ravel():
         ax.set_axis_off()
     figure.suptitle(f"at {frame.t_us * 1e-3:.1f} ms")
+    save(figure, path, all_colours=True, overwrite=overwrite)
+
+
+def draw_depths(path: Path, found: DepthMap, *, overwrite: bool = False) -> None:
+    """Write a figure of a map of depths and of their relative standard deviations as a PNG."""
+    height, width = found.inverse_depth.shape
+    figure = blank((2 * COLUMN_WIDTH, COLUMN_WIDTH * height / width + TITLE_HEIGHT), layout="compressed")
+    left, right = figure.subplots(1, 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        _draw_depth(figure, left, 1.0 / found.inverse_depth)
+        share = np.ma.masked_invalid(100.0 * found.std / found.inverse_depth)
+    drawn = right.imshow(share, cmap="cividis", vmin=0.0)
+    right.set_title("standard deviation of the depth [%]")
+    figure.colorbar(drawn, ax=right, shrink=0.85)
+    for ax in (left, right):
+        ax.set_axis_off()
     save(figure, path, all_colours=True, overwrite=overwrite)
 
 

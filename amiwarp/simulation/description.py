@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,13 +12,14 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from amiwarp.choices import Seeing
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder, periodic
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, RisleyModel
-from amiwarp.optics.prism import Prism, check_angles, check_phase
+from amiwarp.optics.models import ExactModel, PlateModel, RisleyModel
+from amiwarp.optics.prism import Plate, Prism, check_angles, check_phase
 from amiwarp.simulation.pictures import linear_luminance, read_picture
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.validation import INT64, array, guarded, instance, one_of, real, vector, whole
@@ -661,8 +662,8 @@ class SimulationValues:
     """Scene in front of the camera: pictures at infinity, or a world."""
     camera: Camera
     """Camera intrinsics, of at most 4194304 pixels."""
-    prism: Prism
-    """Prism in front of the camera, with its true parameters."""
+    prism: Prism | Plate
+    """Prism or plate in front of the camera, with its true parameters. A plate needs a world, which is seen by rays."""
     duration_s: float
     """Duration of the recording [s]."""
     motion: PrismMotion = field(default_factory=PrismMotion)
@@ -673,8 +674,8 @@ class SimulationValues:
     """Model of the sensor's pixels and readout."""
     encoder_model: EncoderModel | None = field(default_factory=EncoderModel)
     """Errors of the encoder; None for a camera without a prism, whose recording has neither encoder nor prism."""
-    nominal_prism: Prism | None = None
-    """Nominal prism that is stored with the recording; None for the true prism."""
+    nominal_prism: Prism | Plate | None = None
+    """Nominal prism or plate that is stored with the recording; None for the true one."""
     seed: int = 0
     """Seed of all random numbers of the simulation."""
     device: str = "cpu"
@@ -687,12 +688,16 @@ class SimulationValues:
     def __post_init__(self) -> None:
         if not isinstance(self.scene, WorldScene):
             instance(self.scene, Scene, "simulation's scene")
-        kinds: dict[str, type] = {"camera": Camera, "prism": Prism, "motion": PrismMotion, "sensor": SensorModel,
-                 "camera_motion": CameraMotion}  # fmt: skip
+        kinds: dict[str, type] = {
+            "camera": Camera, "prism": Plate if isinstance(self.prism, Plate) else Prism, "motion": PrismMotion,
+            "sensor": SensorModel, "camera_motion": CameraMotion,
+        }  # fmt: skip
         if self.encoder_model is not None:
             kinds["encoder_model"] = EncoderModel
         for name, kind in kinds.items():
             instance(getattr(self, name), kind, f"simulation's {name}")
+        if isinstance(self.prism, Plate):
+            self._check_plate()
         real(self.duration_s, "duration_s", 1e-3, LONGEST_S, " s")
         if self.camera.width * self.camera.height > 1 << 22:
             given = f"{self.camera.width}x{self.camera.height}"
@@ -702,7 +707,8 @@ class SimulationValues:
             given, expected = (f"{width}x{height}" for width, height in (self.pixels.size, size))
             raise AmiwarpError(f"the pixel map has {given} pixels, the camera {expected}; give the map of this camera")
         whole(self.seed, "seed", 0, (1 << 31) - 1)
-        if (self.prism.second is None) != (self.motion.second is None):
+        second = None if isinstance(self.prism, Plate) else self.prism.second
+        if (second is None) != (self.motion.second is None):
             has, lacks = ("prism", "motion") if self.motion.second is None else ("motion", "prism")
             raise AmiwarpError(f"the {has} has a second prism, the {lacks} has none; give both or neither")
 
@@ -711,11 +717,30 @@ class SimulationValues:
         """Duration of the recording, rounded [us]."""
         return round(self.duration_s * 1e6)
 
+    def _check_plate(self) -> None:
+        """Let a world be seen by rays; raise :class:`AmiwarpError` for what a plate cannot show."""
+        if not isinstance(self.scene, WorldScene):
+            raise AmiwarpError("a plate does not move a picture, which is at infinity; give a world (--world room)")
+        if any((*self.motion.tilt, *self.motion.cylinder, *self.motion.wobble)):
+            raise AmiwarpError("tilt, cylinder and wobble are those of a prism; leave them out for a plate")
+        object.__setattr__(self, "scene", replace(self.scene, seeing=Seeing.RAYS))
+
     @property
-    def true_model(self) -> ExactModel | RisleyModel:
-        """True optical model of the prism, or of both prisms."""
+    def true_model(self) -> ExactModel | RisleyModel | PlateModel:
+        """True optical model of the prism, or of both prisms; for a plate, that of a scene at infinity."""
+        return self.bending if self.plate is None else self.plate
+
+    @property
+    def bending(self) -> ExactModel | RisleyModel:
+        """True model of how the glass changes the direction of rays; a plate does not change it."""
         motion, second = self.motion, self.motion.second
+        prism = Prism(0.0) if isinstance(self.prism, Plate) else self.prism
         if second is None:
-            return ExactModel(self.camera, self.prism, motion.phase, motion.tilt, motion.cylinder, motion.wobble)
+            return ExactModel(self.camera, prism, motion.phase, motion.tilt, motion.cylinder, motion.wobble)
         turned, by = second.angle([1e6 * self.duration_s])[0], motion.angle([1e6 * self.duration_s])[0]
-        return RisleyModel(self.camera, self.prism, motion.phase, second.phase, turned / by if by else 0.0)
+        return RisleyModel(self.camera, prism, motion.phase, second.phase, turned / by if by else 0.0)
+
+    @property
+    def plate(self) -> PlateModel | None:
+        """True model of the plate, for a scene at infinity; None for a prism."""
+        return PlateModel(self.camera, self.prism, self.motion.phase) if isinstance(self.prism, Plate) else None

@@ -14,8 +14,9 @@ from amiwarp.imaging.metrics import gaussian
 from amiwarp.kernels import prism_view, world_rays
 from amiwarp.kernels import world as kernels
 from amiwarp.kernels.launch import launch
+from amiwarp.kernels.plate import PlateParams
 from amiwarp.optics.camera import Camera, camera_params
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.models import LARGEST_INVERSE_DEPTH, ExactModel, Model, PlateModel
 from amiwarp.simulation.description import Scene, SimulationValues
 from amiwarp.simulation.pictures import DARK, Placement, log_map, place_picture
 from amiwarp.simulation.worlds.world import Body, Material, Trajectory, World, WorldScene
@@ -88,12 +89,15 @@ class ImageMotion:
     """Largest motion of the image per rotation angle of the camera about each of its axes [px/rad], shape (3,)."""
 
 
-def step_us(simulation: SimulationValues, *, world_speed: float = 0.0, longest: float = math.inf) -> int:
+def step_us(
+    simulation: SimulationValues, *, world_speed: float = 0.0, longest: float = math.inf, inverse_depth: float = 0.0
+) -> int:
     """Return the length of a time step [us]: in it the image moves by at most half a pixel, and nearly straight.
 
-    ``world_speed``: speed of the image of a world, prism excluded [px/s]; ``longest``: upper bound of the step [us].
+    ``world_speed``: speed of the image of a world, prism excluded [px/s]; ``longest``: upper bound of the step [us];
+    ``inverse_depth``: that of the nearest surface, for a plate [1/m].
     """
-    motion = image_motion(simulation)
+    motion = image_motion(simulation, inverse_depth)
     rates = simulation.camera_motion.largest_rates
     turning = np.array([each.largest_speed for each in (simulation.motion, simulation.motion.second) if each])
     speed = float(motion.prisms @ turning) + float(motion.camera @ rates) + world_speed
@@ -110,8 +114,11 @@ def step_us(simulation: SimulationValues, *, world_speed: float = 0.0, longest: 
     return int(step)
 
 
-def image_motion(simulation: SimulationValues) -> ImageMotion:
-    """Return the largest motion of the image on a grid of pixels, corners included, over one turn of the prism."""
+def image_motion(simulation: SimulationValues, inverse_depth: float = 0.0) -> ImageMotion:
+    """Return the largest motion of the image on a grid of pixels, corners included, over one turn of the prism.
+
+    ``inverse_depth``: that of the nearest surface, for a plate [1/m].
+    """
     camera, device = simulation.camera, simulation.device
     grid = np.stack(
         [m.ravel() for m in np.meshgrid(np.linspace(0, camera.width - 1, 9), np.linspace(0, camera.height - 1, 9))], 1
@@ -122,8 +129,16 @@ def image_motion(simulation: SimulationValues) -> ImageMotion:
     angles = wp.array(np.tile(theta, len(grid)).astype(np.float32), dtype=float, device=device)
     arc = (theta[1] / 2.0) / math.sin(theta[1] / 2.0)  # a step along a circle is longer than its chord
     prisms = []
-    for model in single_models(simulation):
-        path = replace(model, phase=0.0).compensate_points(xy, angles).numpy().reshape(len(grid), turns + 1, 2)
+    models: list[Model] = [*single_models(simulation)]
+    if simulation.plate is not None:
+        models = [replace(simulation.plate, inverse_depth=min(inverse_depth, LARGEST_INVERSE_DEPTH))]
+    for model in models:
+        path = (
+            replace(cast("Any", model), phase=0.0)
+            .compensate_points(xy, angles)
+            .numpy()
+            .reshape(len(grid), turns + 1, 2)
+        )
         along = np.linalg.norm(np.diff(path, axis=1), axis=2)
         prisms.append(float(np.max(along, initial=0.0, where=np.isfinite(along))) * arc / theta[1])
     shares = np.array(prisms) * (1.0 if len(prisms) == 1 else PAIR_MARGIN)
@@ -132,7 +147,7 @@ def image_motion(simulation: SimulationValues) -> ImageMotion:
 
 def single_models(simulation: SimulationValues) -> list[ExactModel]:
     """Return the exact model of the prism, or of each prism of a pair on its own."""
-    model = simulation.true_model
+    model = simulation.bending
     return [model] if isinstance(model, ExactModel) else list(model.singles())
 
 
@@ -606,18 +621,22 @@ def surfaces_at(
     rotation: NDArray[np.float64],
     position: NDArray[np.float64],
     instant: int = 0,
+    centres: NDArray[Any] | None = None,
 ) -> SurfaceView:
     """Return the surfaces that rays from a camera hit.
 
     ``rays``: directions in the camera's frame, shape (n, 3); ``rotation``, ``position`` [m]: pose of the camera;
-    ``instant``: index of the time in the last call of :meth:`DeviceWorld.set_instants`.
+    ``instant``: index of the time in the last call of :meth:`DeviceWorld.set_instants`; ``centres``: where the rays
+    begin in the camera's frame [m], shape (n, 3), by default at its origin.
     """
     n, device = len(rays), world.device
     out = world_rays.Surfaces()
     for name, dtype in (("depth", float), ("normal", wp.vec3), ("instance", int), ("mover", int), ("place", wp.vec3)):
         setattr(out, name, wp.empty(n, dtype=dtype, device=device))
     unit = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
-    inputs = [world.params, instant, wp.array(unit, dtype=wp.vec3, device=device), device_pose(rotation, position)]
+    starts = np.empty((0, 3), np.float32) if centres is None else centres.astype(np.float32)
+    places = [wp.array(values, dtype=wp.vec3, device=device) for values in (unit, starts)]
+    inputs = [world.params, instant, *places, device_pose(rotation, position)]
     launch(world_rays.find_surfaces, n, inputs, [out], device=device, smallest=SMALLEST_LAUNCH)
     return SurfaceView(*(getattr(out, name).numpy() for name in ("depth", "normal", "instance", "mover", "place")))
 
@@ -773,12 +792,7 @@ def parallax_speed(world: DeviceWorld, camera: Camera, trajectory: Trajectory, t
     velocity = (after[1][0] - before[1][0]) / MOMENT_S
     if not velocity.any():
         return 0.0
-    scale = PROBE / camera.width
-    small = Camera(
-        PROBE, max(1, round(camera.height * scale)), camera.fx * scale, camera.fy * scale,
-        (camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5,
-    )  # fmt: skip
-    seen = surfaces_at(world, pixel_rays(small), before[0][0], before[1][0], instant)
+    seen = surfaces_at(world, pixel_rays(small_camera(camera)), before[0][0], before[1][0], instant)
     near = seen.place[np.isfinite(seen.depth)].astype(np.float64) - before[1][0]
     if not len(near):
         return 0.0
@@ -786,6 +800,26 @@ def parallax_speed(world: DeviceWorld, camera: Camera, trajectory: Trajectory, t
     along = near / distance[:, None]
     across = np.linalg.norm(velocity - (along @ velocity)[:, None] * along, axis=1)
     return float(SAFETY * max(camera.fx, camera.fy) * (across / distance).max())
+
+
+def largest_inverse_depth(world: DeviceWorld, camera: Camera, trajectory: Trajectory, duration_s: float) -> float:
+    """Return the inverse depth of the nearest surface that a camera sees on its way [1/m], with a margin."""
+    nearest = math.inf
+    times = np.linspace(0.0, duration_s, MOMENTS if trajectory.moves or world.movers else 1)
+    world.set_instants(times)
+    for k, (rotation, position) in enumerate(zip(*trajectory.poses(times), strict=True)):
+        seen = surfaces_at(world, pixel_rays(small_camera(camera)), rotation, position, k)
+        nearest = min(nearest, float(seen.depth.min()))
+    return SAFETY / max(nearest, NEAREST_M)
+
+
+def small_camera(camera: Camera) -> Camera:
+    """Return a camera of the same view whose pixels are the grid of rays that measures distances."""
+    scale = PROBE / camera.width
+    return Camera(
+        PROBE, max(1, round(camera.height * scale)), camera.fx * scale, camera.fy * scale,
+        (camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5,
+    )  # fmt: skip
 
 
 def movers_speed(world: DeviceWorld, camera: Camera, trajectory: Trajectory, t: NDArray[np.float64]) -> NDArray[Any]:
@@ -1081,6 +1115,7 @@ class WorldSight:
         rays = aperture(samples, scene.blur)
         view = self._view = world_rays.RayView()
         view.camera = camera_params(camera, str(device))
+        self.set_plate(simulation.plate)
         view.aperture = wp.array(rays, dtype=wp.vec3, device=device)
         view.reach = max(1, math.ceil(float(np.abs(rays[:, :2]).max())))
         side = math.isqrt(samples)
@@ -1093,6 +1128,20 @@ class WorldSight:
         self._batch = world_rays.Batch()
         self._marks: wp.array = wp.empty(0, dtype=int, device=device)
         self._listed: wp.array = wp.empty(0, dtype=int, device=device)
+
+    def set_plate(self, plate: PlateModel | None) -> None:
+        """Set the plate through which the camera looks; None takes it out."""
+        self._view.plate = PlateParams() if plate is None else plate.params(self._world.device)
+
+    def centres(self, rays: NDArray[Any], angle: float) -> NDArray[np.float32]:
+        """Return where rays of the camera, shape (n, 3), begin at an azimuth of the plate [rad]: places [m], (n, 3)."""
+        device = self._world.device
+        given = wp.array(rays.astype(np.float32), dtype=wp.vec3, device=device)
+        out = wp.empty_like(given)
+        inputs = [self._view, wp.vec2(math.cos(angle), math.sin(angle)), given]
+        launch(world_rays.find_centres, len(rays), inputs, [out], device=device)
+        found: NDArray[np.float32] = out.numpy()
+        return found
 
     def set_instants(self, t_us: NDArray[np.float64], view: Any) -> None:
         """Set the poses of the camera and the bodies at the instants of a chunk.
@@ -1150,6 +1199,8 @@ class WorldSight:
     def look(self, view: Any, steps: Any, block: Any, n: int, faces: Any) -> Any:
         """Return the surfaces that ``n`` events saw, as a :class:`amiwarp.kernels.world_rays.SeenSurfaces`.
 
+        With a plate, this also finds the events' pixels without the plate, so that it can be called only once.
+
         ``view``, ``steps``: camera and instants of the chunk; ``block``: events; ``faces``: face of each texel of the
         maps, or an empty array without maps.
         """
@@ -1157,6 +1208,11 @@ class WorldSight:
         device = self._world.device
         for name, dtype in (("instance", wp.uint16), ("depth", float), ("place", wp.vec3)):
             setattr(out, name, wp.empty(n, dtype=dtype, device=device))
+        if self._view.plate.thickness:
+            inputs = [self._world.params, self._view, steps, block.ticks]
+            outputs = [block.points, out]
+            launch(world_rays.find_surfaces_through_plate, n, inputs, outputs, device=device, smallest=SMALLEST_LAUNCH)
+            return out
         inputs = [self._world.params, view, steps, self._view.poses, faces, block.points, block.ticks]
         launch(world_rays.find_seen_surfaces, n, inputs, [out], device=device, smallest=SMALLEST_LAUNCH)
         return out

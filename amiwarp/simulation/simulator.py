@@ -24,8 +24,8 @@ from amiwarp.io import RecordingWriter
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, Model, axis_rotation, wrap_angle
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.models import ExactModel, Model, PlateModel, axis_rotation, wrap_angle
+from amiwarp.optics.prism import Plate, Prism
 from amiwarp.simulation import scenery
 from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel, SimulationValues
 from amiwarp.simulation.pictures import DARK
@@ -38,6 +38,8 @@ from amiwarp.validation import TIME_LIMIT, array, guarded, real, shown
 
 ANGLE = 1e-3
 """Half of the angle over which derivatives with respect to direction are difference quotients [rad]."""
+DEFLECTING_STEPS = 4
+"""Number of steps of the fixed-point iteration that finds the pixel that sees a point through a plate."""
 MOMENT_S = 1e-4
 """Half of the time over which optical flow is computed as a difference quotient [s]."""
 
@@ -90,15 +92,19 @@ class TruthRenderer:
             positions of the joints.
         """
         t = t_us * 1e-6
-        scene, camera, model = self._scene, self._simulation.camera, self._simulation.true_model
+        scene, camera, model = self._scene, self._simulation.camera, self._simulation.bending
         (rotation,), (position,) = scene.trajectory.poses([t])
         self._world.set_instants(np.array([t]))
         pixels = camera.rays_to_pixels(self._rays)
         theta = np.repeat(wrap_angle(self._simulation.motion.angles([t_us])), len(pixels), axis=0)
         bare = scenery.surfaces_at(self._world, self._rays, rotation, position)
-        places = model.compensate_points(pixels, theta)
-        through = scenery.surfaces_at(self._world, camera.pixels_to_rays(places), rotation, position)
-        speed = self._flow(through, places, t)
+        if self._simulation.plate is None:
+            places = model.compensate_points(pixels, theta)
+            through = scenery.surfaces_at(self._world, camera.pixels_to_rays(places), rotation, position)
+            speed = self._flow(through, places, t)
+            prism_flow = self._prism_flow(model, places, speed, theta, t_us)
+        else:
+            prism_flow = self._plate_flow(self._simulation.plate, pixels, t, rotation, position)
         size = (camera.height, camera.width)
         return FrameTruth(
             t_us,
@@ -106,7 +112,7 @@ class TruthRenderer:
             bare.normal.reshape(*size, 3),
             bare.instance.reshape(size).astype(np.uint16),
             self._flow(bare, pixels, t).astype(np.float32).reshape(*size, 2),
-            self._prism_flow(model, places, speed, theta, t_us).astype(np.float32).reshape(*size, 2),
+            prism_flow.astype(np.float32).reshape(*size, 2),
             self._intensity(t_us, prism=False).reshape(size),
             self._intensity(t_us, prism=True).reshape(size),
             rotation,
@@ -173,9 +179,34 @@ class TruthRenderer:
             flow = flow + (turned[1] - turned[0]) / (20.0 * ANGLE) * rate
         return np.asarray(flow)
 
+    def _plate_flow(
+        self,
+        model: PlateModel,
+        pixels: NDArray[np.float64],
+        t: float,
+        rotation: NDArray[np.float64],
+        position: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Return the optical flow [px/s] that ``pixels`` see through the turning plate at time ``t`` [s], (n, 2)."""
+        motion = self._simulation.motion
+        centres = self._sight.centres(self._rays, motion.phase + float(motion.angle([t * 1e6])[0]))
+        seen = scenery.surfaces_at(self._world, self._rays, rotation, position, centres=centres)
+        away = np.where(np.isfinite(seen.depth)[:, None], (seen.place - position) @ rotation, self._rays)
+        places = self._simulation.camera.rays_to_pixels(away)
+        ends = []
+        for later in (t - MOMENT_S, t + MOMENT_S):
+            rays = self._ray_at(seen, places, t, later)
+            theta = np.full(len(pixels), float(motion.angle([later * 1e6])[0]))
+            at, observed = self._simulation.camera.rays_to_pixels(rays), pixels
+            for _ in range(DEFLECTING_STEPS):
+                observed = observed - (model.compensate_at(observed, theta, 1.0 / seen.depth) - at)
+            ends.append(observed)
+        return np.asarray((ends[1] - ends[0]) / (2.0 * MOMENT_S))
+
     def _intensity(self, t_us: int, *, prism: bool) -> NDArray[np.float32]:
         """Return the luminance of all pixels at a time, through the prism or without the prism, shape (n,)."""
         device, simulation = self._world.device, self._simulation
+        self._sight.set_plate(simulation.plate if prism else None)
         if not prism:
             simulation = cast("Simulation", simulation).without_prism()
         self._sight.set_instants(np.array([float(t_us)]), scenery.prism_view_of(simulation, device))
@@ -558,7 +589,11 @@ class Engine:
         if isinstance(scene, WorldScene):
             world = DeviceWorld(scene.world, self._device)
             speed, flicker = scenery.image_speed(world, simulation, scene), scenery.flicker_interval_s(scene.world)
-            self._step = scenery.step_us(simulation, world_speed=speed.total, longest=1e6 * flicker)
+            near = 0.0
+            if simulation.plate is not None:
+                near = scenery.largest_inverse_depth(world, simulation.camera, scene.trajectory, simulation.duration_s)
+            longest = 1e6 * flicker
+            self._step = scenery.step_us(simulation, world_speed=speed.total, longest=longest, inverse_depth=near)
             longest_chunk = 1e6 * MAPS_PER_CHUNK * min(flicker, scene.motion_px / max(speed.in_maps, 1e-9))
             self._sight = WorldSight(simulation, scene, world)
             if scene.seeing is Seeing.RAYS:
@@ -757,7 +792,11 @@ class Engine:
         faces = (
             self._maps.faces if isinstance(self._maps, WorldMapRing) else wp.empty(0, dtype=int, device=self._device)
         )
-        return DeviceBlock(block, partial(self._sight.look, self._view, steps, block, n, faces))
+        look = partial(self._sight.look, self._view, steps, block, n, faces)
+        if self._simulation.plate is not None:  # the pixels without the plate depend on the surfaces
+            seen = look()
+            return DeviceBlock(block, lambda: seen)
+        return DeviceBlock(block, look)
 
 
 def true_angles(motion: PrismMotion, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -811,17 +850,22 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
     rates = np.asarray(simulation.camera_motion.rates) if constant else np.full(3, np.nan)
     omega = dict(zip(("omega_x", "omega_y", "omega_z"), rates.ravel()[-3:].tolist(), strict=True))
     clock = {} if simulation.encoder_model is None else {"clock_offset_us": simulation.encoder_model.clock_offset_us}
+    glass = simulation.prism
+    uneven = {
+        f"{name}_{axis}": angle
+        for name in ("tilt", "cylinder", "wobble")
+        for axis, angle in zip("xy", getattr(simulation.motion, name), strict=True)
+    }
+    size = (
+        {"apex": glass.apex} if isinstance(glass, Prism) else {"thickness": glass.thickness, "plate_tilt": glass.tilt}
+    )
     return {
-        "apex": simulation.prism.apex,
-        "index": simulation.prism.index,
+        **size,
+        "index": glass.index,
         "phase": simulation.motion.phase,
         **of_second_prism(simulation),
         **clock,
-        **{
-            f"{name}_{axis}": angle
-            for name in ("tilt", "cylinder", "wobble")
-            for axis, angle in zip("xy", getattr(simulation.motion, name), strict=True)
-        },
+        **(uneven if isinstance(glass, Prism) else {}),
         **{name: value for name, value in omega.items() if math.isfinite(value)},
         **asdict(simulation.sensor),
     }
@@ -829,7 +873,7 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
 
 def of_second_prism(simulation: SimulationValues) -> dict[str, float]:
     """Return the true values of the second prism of a pair; none for one prism."""
-    model = simulation.true_model
+    model = simulation.bending
     if isinstance(model, ExactModel):
         return {}
     second = cast("Prism", model.prism.second)
@@ -895,7 +939,7 @@ class Simulation(SimulationValues):
         Simulation
             The same scene, sensor and seed with an apex angle of 0. Its recording has neither encoder nor prism.
         """
-        prism = replace(self.prism, apex=0.0, second=None)
+        prism = Prism(0.0) if isinstance(self.prism, Plate) else replace(self.prism, apex=0.0, second=None)
         motion = replace(self.motion, cylinder=(0.0, 0.0), second=None)
         return replace(self, prism=prism, motion=motion, nominal_prism=None, encoder_model=None)
 
@@ -1049,8 +1093,8 @@ class Simulation(SimulationValues):
         return Recording(events, camera, encoder, prism, known, self.metadata(), "simulation")
 
     @property
-    def _stored_prism(self) -> Prism | None:
-        """Nominal prism to store with the recording, or None for a plain event camera."""
+    def _stored_prism(self) -> Prism | Plate | None:
+        """Nominal prism or plate to store with the recording, or None for a plain event camera."""
         return None if self.encoder_model is None else self.nominal_prism or self.prism
 
     def write(
@@ -1112,7 +1156,7 @@ class Simulation(SimulationValues):
 def simulate(
     scene: Scene | WorldScene | str | Path | NDArray[Any],
     camera: Camera,
-    prism: Prism,
+    prism: Prism | Plate,
     *,
     duration_s: float,
     motion: PrismMotion | float = 720.0,
@@ -1120,7 +1164,7 @@ def simulate(
     sensor: SensorModel | None = None,
     pixels: PixelMap | None = None,
     encoder: EncoderModel | None = None,
-    nominal_prism: Prism | None = None,
+    nominal_prism: Prism | Plate | None = None,
     seed: int = 0,
     device: str = "cpu",
     on_device: bool = False,
@@ -1138,8 +1182,8 @@ def simulate(
         Scene, world, picture file, or pixel values (see :meth:`Scene.from_picture`).
     camera : Camera
         The camera.
-    prism : Prism
-        The true prism.
+    prism : Prism or Plate
+        The true prism; or a plate, in a world.
     duration_s : float
         Duration [s].
     motion : PrismMotion or float, optional
@@ -1152,8 +1196,8 @@ def simulate(
         Thresholds of each pixel, and hot and dead pixels, instead of random ones.
     encoder : EncoderModel, optional
         Errors of the encoder.
-    nominal_prism : Prism, optional
-        The prism stored with the recording; by default the true one.
+    nominal_prism : Prism or Plate, optional
+        The prism or plate stored with the recording; by default the true one.
     seed : int, optional
         Seed of all random numbers.
     device : str, optional

@@ -41,7 +41,7 @@ from amiwarp.kernels.slow_pixels import find_time_constants
 from amiwarp.kernels.votes import turn_events
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, ExactModel
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.prism import Prism, as_wedge
 from amiwarp.plotting.clouds import Renderer
 from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
 from amiwarp.reconstruction.picture import Picture, Reconstruction, save_picture
@@ -226,7 +226,7 @@ def _accuracy(recording: Recording, found: Calibration, device: Any) -> dict[str
     """Return the fields of :class:`DemoResult` that compare the calibration with the ground truth."""
     assert recording.camera is not None
     assert recording.truth is not None
-    truth = metrics.truth_model(recording.camera, recording.truth, found.prism.flat_side)
+    truth = metrics.truth_model(recording.camera, recording.truth, as_wedge(found.prism).flat_side)
     before, after, with_truth = blurs(recording, found, truth, device)
     return {
         "apex_deg": math.degrees(found.exact.parameters["apex"]),

@@ -15,7 +15,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import MODEL_COLOURS, VERMILION
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import EllipseModel, ExactModel, Model, predicted_error, rungs
-from amiwarp.optics.prism import Prism
+from amiwarp.optics.prism import Prism, as_wedge
 from amiwarp.plotting import figures
 from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.scenery import place_scene, seen_bearings
@@ -200,7 +200,7 @@ def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float]
     for k, (i, j) in enumerate(np.ndindex(yields.shape)):
         report("simulating", k / yields.size)
         rpm = float(speeds[j])
-        prism = replace(template.prism, apex=float(nodes[i]))
+        prism = replace(as_wedge(template.prism), apex=float(nodes[i]))
         case = replace(template, prism=prism, motion=PrismMotion(rpm), duration_s=120.0 / rpm)
         radius = orbit_radii(camera, prism)[0]
         found = np.array([_per_turn(case, tile, k) for k, tile in enumerate(cameras)]) - noise * 60.0 / rpm

@@ -32,7 +32,7 @@ from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_va
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, PHASE, ExactModel, Model, RisleyModel, build_model, size_names
-from amiwarp.optics.prism import NominalPrism
+from amiwarp.optics.prism import NominalPrism, as_wedge
 from amiwarp.reconstruction.picture import Picture, border_displacements
 
 # Rates of ON and OFF events over a recording at any zoom, counted once in bounded memory.
@@ -746,7 +746,7 @@ class Inspector:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
         self.recording, self.device, self.latest = recording, device, latest
         self._most_events = most_events
-        self.prism = nominal(recording.prism)
+        self.prism = as_wedge(nominal(recording.prism))
         """Nominal prism of the recording, with an assumed apex if it is unknown."""
         self.zero_us = (source.t_first + source.t_last) // 2
         """Time at which the prism angle is 0 if there is no encoder [us]."""
@@ -923,7 +923,7 @@ class Inspector:
                 f"the calibration is of {given[0]}x{given[1]} pixels, the events are of {size[0]}x{size[1]}; "
                 "calibrate this recording"
             )
-        self.prism, self.recording = calibration.prism, replace(self.recording, camera=calibration.camera)
+        self.prism, self.recording = as_wedge(calibration.prism), replace(self.recording, camera=calibration.camera)
         self._harmonics = calibration.harmonics
         self._forget_angles()
         self.set(self.knobs_of(calibration))

@@ -24,7 +24,7 @@ from amiwarp.kernels.equations import by_shift, multiply
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LENS, Camera, CameraRotation, given_lens
 from amiwarp.optics.models import MODELS, Model, compensate_by_each, predicted_error, rms
-from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection
+from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection, as_wedge
 
 if TYPE_CHECKING:
     from amiwarp.calib.photometric.cost import Cost
@@ -82,7 +82,7 @@ SCREENED = (*CAUSES[:3], *GATED)
 
 def turned(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, float]:
     """Return values that deflect the axial ray as before if the prism's other side is flat."""
-    prism, index = space.prism, values.get("index", space.prism.index)
+    prism, index = as_wedge(space.prism), values.get("index", space.prism.index)
     deflection = Prism(values["apex"], index, prism.flat_side).deflection
     phase = math.remainder(values["phase"] + math.pi, math.tau)
     return {**values, "apex": apex_from_deflection(deflection, index, _other(prism)), "phase": phase}
@@ -90,7 +90,7 @@ def turned(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, floa
 
 def other_side(space: ParameterSpace) -> ParameterSpace:
     """Return the parameter space with the prism's other side flat."""
-    prism = space.prism
+    prism = as_wedge(space.prism)
     apex = apex_from_deflection(prism.deflection, prism.index, _other(prism))
     return replace(space, prism=Prism(apex, prism.index, _other(prism)), start=turned(space, space.start))
 
@@ -758,7 +758,7 @@ def _center(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float,
     n = len(space.names)
     estimate = fit.fit((*space.names, *CENTER.names))
     # the unit of the search vector holds for the nominal prism
-    size = space.to_values(best)["apex"] / space.prism.apex
+    size = space.to_values(best)["apex"] / as_wedge(space.prism).apex
     std = math.sqrt(float(np.trace(estimate.covariance[n:, n:])))
     return size * float(np.linalg.norm(estimate.change[n:])), size * std
 

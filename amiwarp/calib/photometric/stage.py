@@ -39,6 +39,7 @@ from amiwarp.calib.sharpness import LEAST_INSIDE_PX, Search
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import LENS, Camera
 from amiwarp.optics.models import MODELS
+from amiwarp.optics.prism import as_wedge
 
 Vector = NDArray[np.float64]
 
@@ -1118,7 +1119,7 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
     apart = [
         rival.answer.stage.x[:n] - best.answer.stage.x[:n]
         for best, rival, _ in rivals
-        if best.space.prism.flat_side is rival.space.prism.flat_side
+        if as_wedge(best.space.prism).flat_side is as_wedge(rival.space.prism).flat_side
     ]
     answer = _final(search, answer, check, apart)
     notes = [
@@ -1218,10 +1219,11 @@ def _corrections(given: ParameterSpace, space: ParameterSpace, answer: Answer) -
     """Return a sentence for each correction of the given camera and prism."""
     found, std = answer.result.parameters, answer.result.uncertainty
     out = []
-    if space.prism.flat_side is not given.prism.flat_side:
+    side, given_side = as_wedge(space.prism).flat_side, as_wedge(given.prism).flat_side
+    if side is not given_side:
         out.append(
-            f"the events show that the flat face of the prism points to the {space.prism.flat_side.value}, not to the "
-            f"{given.prism.flat_side.value}: the calibration uses this side"
+            f"the events show that the flat face of the prism points to the {side.value}, not to the "
+            f"{given_side.value}: the calibration uses this side"
         )
     for name in space.names:
         if name not in given.names:

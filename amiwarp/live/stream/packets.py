@@ -66,7 +66,7 @@ def _check_camera(where: str, fields: Any) -> None:
 
 def _check_prism(where: str, fields: Any) -> None:
     _check_object(where, fields)
-    _check_numbers(where, fields, "apex", "index")
+    _check_numbers(where, fields, "apex", "index", "thickness", "tilt")
     _check_words(where, fields, "flat_side")
 
 

@@ -32,7 +32,7 @@ from amiwarp.io import open_recording, save_recording
 from amiwarp.io.files import scratch_folder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import ExactModel, Model, axis_rotation, rungs, wrap_angle
-from amiwarp.optics.prism import FlatSide
+from amiwarp.optics.prism import FlatSide, as_wedge
 from amiwarp.tasks import Progress, only_new_garbage, release_memory
 
 # Ground truth of the charts: the recording's true parameters, and the exact model in float64.
@@ -80,7 +80,7 @@ class KnownRecording:
         held = Recording(
             MemoryEvents(events, *recording.events.size), camera, encoder, recording.prism, truth, {}, recording.name
         )
-        model = truth_model(camera, truth, recording.prism.flat_side)
+        model = truth_model(camera, truth, as_wedge(recording.prism).flat_side)
         return cls(held, events, camera, encoder.with_clock_offset(truth.parameters.get("clock_offset_us", 0.0)), model)
 
     def calibration(self) -> Calibration:

@@ -369,7 +369,7 @@ class Streams(RecordedStreams):
     @cached_property
     def true_model(self) -> Model:
         """True model of the prism."""
-        return self.simulation.true_model
+        return self.simulation.bending
 
     def compensated_late(self, delay_us: int, most: int) -> NDArray[np.float32]:
         """Return the places of events that the true model gives if the events are late by ``delay_us``, shape (n, 2).

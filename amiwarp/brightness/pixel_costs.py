@@ -1,0 +1,99 @@
+"""Photometric cost of each pixel as a function of the optical model, from which a plate's phase and depths are found.
+
+For each model the brightness map is solved anew, so that the cost is that of variable projection. The equations of a
+pixel depend only on the map near it. So one solution gives the costs of all pixels, and an inverse depth is tried for
+all of them at once.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.brightness.solver import BrightnessMap, EventTable, Smoothness, Tiles, off_excess
+from amiwarp.events.device_events import DeviceEvents
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.recording import Events
+from amiwarp.kernels import pixel_costs as kernels
+from amiwarp.kernels.launch import launch
+from amiwarp.optics.models import Model
+
+SCALE = 0.5
+"""Residual at which an equation gets half weight [thresholds]."""
+STEPS = 30
+"""Number of conjugate-gradient steps of a solution, which starts from the last map; the first one takes two rounds."""
+DENSITY = 2.0
+"""Map nodes per pixel. With one, interpolation makes orbits of a pixel 5 to 10 % too large."""
+SMOOTHNESS = 0.02
+"""Weight of the smoothness prior, which makes the solver converge faster."""
+DAMPING = 1e-6
+"""Weight of the squared map values, which determines the mean of the map."""
+
+
+class PixelCosts:
+    """Costs of the pixels over one time window of events. Owns the pairs of events and the brightness map."""
+
+    def __init__(
+        self, events: Events | DeviceEvents, size: tuple[int, int], encoder: Encoder, *, longest_gap_us: int,
+        margin_px: float, device: Any,
+    ) -> None:  # fmt: skip
+        """Make the pairs of events. ``margin_px``: largest displacement by the models that follow [px].
+
+        Raises :class:`amiwarp.AmiwarpError` if no pixel fires twice.
+        """
+        width, height = size
+        table = EventTable([events], np.zeros((height, width), np.int32), device)
+        table.exclude_hot_pixels()
+        first, last = table.covers
+        self.pairs = table.pairs(encoder, longest_gap_us=longest_gap_us, middle_us=(first + last) // 2)
+        border = math.ceil(margin_px) + 2
+        tiles = Tiles(np.full((1, 2), -border, np.float32), height + 2 * border, width + 2 * border, 1.0)
+        self._map = BrightnessMap(
+            self.pairs, tiles.at_density(DENSITY), off_excess=off_excess(self.pairs) if len(self.pairs) else 0.0,
+            damping=DAMPING, smoothness=Smoothness(SMOOTHNESS), middle_us=(first + last) // 2,
+        )  # fmt: skip
+        self._size, self._device = size, self._map.device
+        self._sums = wp.zeros(width * height, dtype=wp.int64, device=self._device)
+        self._rounds = 2
+        key = self.pairs.column("y").astype(np.int64) * width + self.pairs.column("x")
+        self.count: NDArray[np.int64] = np.bincount(key, minlength=width * height).reshape(height, width)
+        """Number of pairs of each pixel, shape (height, width)."""
+
+    def of(self, model: Model) -> NDArray[np.float64]:
+        """Return the cost of each pixel, summed over its pairs, for the map that fits the model; shape (height, width).
+
+        The cost of a pair with the residual r is s² log(1 + (r / s)²), nearly r² [thresholds²].
+        """
+        self._solve(model)
+        return SCALE**2 * self._summed(kernels.add_costs, [self._map.residuals.values, SCALE])
+
+    def gradient(self, model: Model, plus: Model, minus: Model, width: float) -> NDArray[np.float64]:
+        """Return the derivative of half the cost of each pixel along a line of models, shape (height, width).
+
+        The line goes from the model ``minus`` to ``plus``, whose distance is ``width``. The derivative loses the part
+        that a change of the map explains. So the sum over pixels is that of the cost of variable projection.
+        """
+        self._solve(model)
+        there, back = ({"model": end, "drift": 0.0, "camera_rotation": None} for end in (plus, minus))
+        slope = self._map.find_slope(there, back, width)
+        self._map.prepare_projection()
+        rest = self._map.unexplained(slope, steps=STEPS)
+        return self._summed(kernels.add_products, [rest, self._map.residuals.values, self._map.residuals.weight])
+
+    def _solve(self, model: Model) -> None:
+        self._map.place(model)
+        self._map.solve(SCALE, steps=STEPS, rounds=self._rounds)
+        self._rounds = 1
+
+    def _summed(self, kernel: Any, inputs: list[Any]) -> NDArray[np.float64]:
+        """Return the sums over each pixel's pairs that a kernel computes, shape (height, width)."""
+        width, height = self._size
+        self._sums.zero_()
+        n = len(self.pairs)
+        # one CPU thread only: several would add to the same sums
+        launch(kernel, n, [self.pairs.arrays, *inputs, width], [self._sums], device=self._device, smallest=n + 1)
+        return np.asarray(self._sums.numpy().reshape(height, width) / float(kernels.UNIT))

@@ -1,0 +1,174 @@
+"""Maps of depth: inverse depth of what each pixel sees with its uncertainty, as files of arrays and of points."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.io.files import NewFile, errors_name, input_path
+from amiwarp.io.formats import check_ending
+from amiwarp.io.plain_files import open_array
+from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.validation import array, guarded
+
+ARRAYS = ("inverse_depth", "std", "points")
+"""Names of the arrays of a map in a file."""
+
+
+@guarded
+@dataclass(frozen=True, eq=False)
+class DepthMap:
+    """Inverse depth of what each pixel sees through a rotating tilted plate, from the camera's resting centre.
+
+    Raises
+    ------
+    AmiwarpError
+        If the arrays have different shapes, or a value is out of range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> unknown = np.array([[2.0, np.nan]], np.float32)
+    >>> depth = amiwarp.DepthMap(unknown, 0.1 * unknown, np.zeros((1, 2, 3), np.float32))
+    >>> depth.known
+    array([[ True, False]])
+    """
+
+    inverse_depth: NDArray[np.float32]
+    """Inverse depth [1/m], shape (height, width); NaN where it is unknown."""
+    std: NDArray[np.float32]
+    """Standard deviation of :attr:`inverse_depth` [1/m], shape (height, width); NaN where it is unknown."""
+    points: NDArray[np.float32]
+    """Point in the camera's frame that each pixel sees [m], shape (height, width, 3); NaN where it is unknown."""
+
+    def __post_init__(self) -> None:
+        shape = np.shape(self.inverse_depth)
+        for name in ARRAYS:
+            values = array(getattr(self, name), f"depth map's {name}")
+            expected = (*shape, 3) if name == "points" else shape
+            if values.shape != expected or len(shape) != 2 or not all(1 <= n <= LARGEST_SIZE for n in shape):
+                raise AmiwarpError(f"depth map's {name} has shape {values.shape}; expected (height, width), points x 3")
+            if name != "points" and (values < 0.0).any():
+                raise AmiwarpError(f"depth map's {name} has a negative value; expected values of 0 or above, or NaN")
+            object.__setattr__(self, name, values.astype(np.float32, copy=False))
+
+    def __repr__(self) -> str:
+        height, width = self.inverse_depth.shape
+        return f"DepthMap({width} x {height} px, {int(self.known.sum())} known)"
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Whether the depth of a pixel is known, shape (height, width)."""
+        return np.isfinite(self.inverse_depth)
+
+    def filled(self) -> NDArray[np.float32]:
+        """Return the inverse depth of each pixel, or that of the nearest pixel with a known depth.
+
+        Returns
+        -------
+        ndarray
+            Inverse depth [1/m], shape (height, width).
+
+        Raises
+        ------
+        AmiwarpError
+            If no depth is known.
+        """
+        from scipy.ndimage import distance_transform_edt
+
+        if not self.known.any():
+            raise AmiwarpError("the depth map knows no depth; record a scene with more texture")
+        nearest = distance_transform_edt(~self.known, return_distances=False, return_indices=True)
+        return np.asarray(self.inverse_depth[tuple(nearest)])
+
+    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write the map to a file of NumPy arrays with the names of the attributes.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file, which ends in ``.npz``.
+        overwrite : bool, default False
+            Whether to replace an existing file.
+
+        Raises
+        ------
+        AmiwarpError
+            If the file has another extension, exists and ``overwrite`` is False, or cannot be written.
+        """
+        path = Path(path)
+        check_ending(path, "depth maps are written", [".npz"])
+        with NewFile(path, overwrite=overwrite) as new, open(new.part, "wb") as file:
+            np.savez_compressed(file, **{name: getattr(self, name) for name in ARRAYS})
+
+    def save_points(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write the known points to a PLY file, coloured from near (yellow) to far (violet).
+
+        Parameters
+        ----------
+        path : str or Path
+            The file, which ends in ``.ply``.
+        overwrite : bool, default False
+            Whether to replace an existing file.
+
+        Raises
+        ------
+        AmiwarpError
+            If the file has another extension, exists and ``overwrite`` is False, or cannot be written, or no depth is
+            known.
+        """
+        import matplotlib as mpl
+        import trimesh
+
+        path = Path(path)
+        check_ending(path, "points are written", [".ply"])
+        if not self.known.any():
+            raise AmiwarpError("the depth map knows no depth, so there are no points; record a scene with more texture")
+        values = self.inverse_depth[self.known]
+        low, high = np.percentile(values, [2, 98])
+        colours = mpl.colormaps["viridis"](np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0), bytes=True)
+        cloud: Any = trimesh.PointCloud(  # type: ignore[no-untyped-call]
+            self.points[self.known], colours
+        )
+        with NewFile(path, overwrite=overwrite) as new, open(new.part, "wb") as file:
+            file.write(cloud.export(file_type="ply"))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> DepthMap:
+        """Read a map that :meth:`save` wrote.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file.
+
+        Returns
+        -------
+        DepthMap
+            The map.
+
+        Raises
+        ------
+        AmiwarpError
+            If the file cannot be read, or does not hold the arrays of a map. The message names the array.
+        """
+        path = Path(path)
+        values = {}
+        with errors_name(path, lambda: "is no depth map"), zipfile.ZipFile(input_path(path)) as archive:
+            names = archive.namelist()
+            for name in ARRAYS:
+                if f"{name}.npy" not in names:
+                    raise AmiwarpError(f"has no array {name}; make the map with 'amiwarp depth'")
+                with open_array(archive, name, "f") as (stream, shape, dtype):
+                    if len(shape) != (3 if name == "points" else 2) or max(shape) > LARGEST_SIZE:
+                        raise AmiwarpError(f"array {name} has shape {shape}; expected (height, width)")
+                    data = stream.read(int(np.prod(shape)) * dtype.itemsize)
+                    values[name] = np.frombuffer(data, dtype).reshape(shape)
+            return cls(**values)

@@ -1,0 +1,143 @@
+"""Shift of rays by a tilted plane-parallel plate, and where a point at a known depth then appears.
+
+A plate leaves the direction of a ray and shifts it along the normal N of its faces: the camera sees along the ray as if
+its centre were at g N. A point at inverse depth ρ on the ray appears, from the resting centre, at a displacement that
+is linear in ρ. ``docs/explanation/optics.md`` derives both.
+"""
+
+import warp as wp
+
+from amiwarp.kernels.camera import NAN, CameraParams, PinholeParams, invalid_pixel, pixel_to_ray, ray_to_pixel
+from amiwarp.kernels.refraction import INVERSION_STEPS, compensate, compensate_direction, deflect, displace
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+
+@wp.struct
+class PlateParams:
+    """Tilted plane-parallel plate in front of a plane scene."""
+
+    phase: float  # phase of the plate's angle [rad]
+    phase_cos: float  # cosine of the phase
+    phase_sin: float  # sine of the phase
+    thickness: float  # distance between the faces [m]
+    inside: float  # square of the refractive index, minus 1
+    sin_tilt: float  # sine of the angle between the faces' normal and the optical axis
+    cos_tilt: float  # cosine of this angle
+    inverse_depth: float  # inverse depth of the scene [1/m]
+
+
+@wp.struct
+class PlateMapParams:
+    """Tilted plane-parallel plate, and the inverse depth of what each pixel sees."""
+
+    phase: float  # phase of the plate's angle [rad]
+    phase_cos: float  # cosine of the phase
+    phase_sin: float  # sine of the phase
+    plate: PlateParams  # the plate
+    table: wp.array2d(dtype=float)  # inverse depth of what each pixel sees [1/m]
+
+
+@wp.func
+def plate_shift(m: PlateParams, x: float, y: float, z: float, w0: float, w1: float) -> float:
+    """Return the distance g by which the plate shifts a ray along the faces' normal [m]; NaN if none passes.
+
+    g = t (1 − c / √(n² − 1 + c²)) by Snell's law at both faces, where c is the cosine between ray and normal.
+    """
+    c = (m.sin_tilt * (w0 * x + w1 * y) + m.cos_tilt * z) / wp.sqrt(x * x + y * y + z * z)
+    return m.thickness * (1.0 - wp.where(c > 0.0, c, NAN) / wp.sqrt(m.inside + c * c))
+
+
+@wp.func
+def seen_from(m: PlateParams, x: float, y: float, z: float, w: wp.vec2) -> wp.vec3:
+    """Return the place, in the camera's frame, from which the camera sees along a ray through the plate [m]."""
+    g = plate_shift(m, x, y, z, w[0], w[1])
+    return wp.vec3(g * m.sin_tilt * w[0], g * m.sin_tilt * w[1], g * m.cos_tilt)
+
+
+@wp.func
+def move_direction(m: PlateParams, inverse_depth: float, x: float, y: float, z: float, w0: float, w1: float):
+    """Return the direction from the resting centre to the point at an inverse depth [1/m] on the ray of a pixel."""
+    k = inverse_depth * plate_shift(m, x, y, z, w0, w1)
+    return x + k * (m.sin_tilt * w0 * z - m.cos_tilt * x), y + k * (m.sin_tilt * w1 * z - m.cos_tilt * y), z
+
+
+@wp.func
+def compensate_direction(model: PlateParams, x: float, y: float, z: float, w0: float, w1: float):
+    """Return the direction without the plate of a scene at the plate's one inverse depth."""
+    return move_direction(model, model.inverse_depth, x, y, z, w0, w1)
+
+
+@wp.func
+def deflect(model: PlateParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    """Return the observed pixel of a point of a plane scene, by a fixed-point iteration."""
+    observed = xy
+    error = wp.vec2(0.0, 0.0)
+    for _ in range(INVERSION_STEPS):
+        error = compensate(model, camera, observed, w) - xy
+        observed = observed - error
+    if not (wp.length(error) < 0.01):
+        return invalid_pixel()
+    return observed
+
+
+# -- a map of inverse depths
+
+
+@wp.func
+def inverse_depth_at(m: PlateMapParams, x: float, y: float) -> float:
+    """Return the inverse depth [1/m] of what the nearest pixel sees; NaN for NaN."""
+    if not (wp.abs(x) < 1.0e9 and wp.abs(y) < 1.0e9):  # a NaN pixel must not become an index
+        return NAN
+    col = wp.clamp(int(wp.floor(x + 0.5)), 0, m.table.shape[1] - 1)
+    row = wp.clamp(int(wp.floor(y + 0.5)), 0, m.table.shape[0] - 1)
+    return m.table[row, col]
+
+
+@wp.func
+def compensate(model: PlateMapParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    """Return the pixel without the plate of what a pixel sees."""
+    ray = pixel_to_ray(camera, xy)
+    x, y, z = move_direction(model.plate, inverse_depth_at(model, xy[0], xy[1]), ray[0], ray[1], ray[2], w[0], w[1])
+    return ray_to_pixel(camera, wp.vec3(x, y, z))
+
+
+@wp.func
+def displace(model: PlateMapParams, camera: PinholeParams, x: float, y: float, w0: float, w1: float):
+    """Return the compensated position of an event, for a camera without distortion."""
+    a, b, _ = move_direction(
+        model.plate, model.table[int(y), int(x)], (x - camera.cx) * camera.inverse_fx,
+        (y - camera.cy) * camera.inverse_fy, 1.0, w0, w1,
+    )  # fmt: skip
+    return camera.fx * a + camera.cx, camera.fy * b + camera.cy
+
+
+@wp.func
+def deflect(model: PlateMapParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    """Return the observed pixel of a scene point. NaN where the map does not say which of two depths the pixel sees."""
+    observed = xy
+    error = wp.vec2(0.0, 0.0)
+    for _ in range(INVERSION_STEPS):
+        error = compensate(model, camera, observed, w) - xy
+        observed = observed - error
+    if not (wp.length(error) < 0.01):
+        return invalid_pixel()
+    return observed
+
+
+@wp.kernel
+def compensate_at_depths(
+    model: PlateParams,
+    camera: CameraParams,
+    xy: wp.array(dtype=wp.vec2),
+    theta: wp.array(dtype=float),
+    inverse_depth: wp.array(dtype=float),
+    start: int,
+    out: wp.array(dtype=wp.vec2),
+):
+    """Compensate one pixel per thread at its own inverse depth [1/m]."""
+    i = start + wp.tid()
+    phi = theta[i] + model.phase
+    ray = pixel_to_ray(camera, xy[i])
+    x, y, z = move_direction(model, inverse_depth[i], ray[0], ray[1], ray[2], wp.cos(phi), wp.sin(phi))
+    out[i] = ray_to_pixel(camera, wp.vec3(x, y, z))

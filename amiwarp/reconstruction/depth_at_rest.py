@@ -1,0 +1,122 @@
+"""Depth at rest: inverse depth of every edge from a camera at rest behind a rotating tilted plate."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from amiwarp.brightness.depths import SMALLEST_PX, find_depths, orbit_px
+from amiwarp.calib.plate import LARGEST_INVERSE, check_still, costs_at_rest
+from amiwarp.calib.result import Calibration
+from amiwarp.compensation.recordings import check_size
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_events import device_of
+from amiwarp.events.recording import Recording
+from amiwarp.io.depth_map import DepthMap
+from amiwarp.optics.models import LARGEST_INVERSE_DEPTH, PlateModel
+from amiwarp.tasks import Progress
+from amiwarp.validation import guarded, real
+
+LEAST_PAIRS = 3
+"""Smallest number of pairs of events of a pixel whose depth is known."""
+KNOWN_SHARE = 0.1
+"""Largest relative standard deviation of an inverse depth that counts as known."""
+
+
+@guarded
+def depth(
+    recording: Recording,
+    calibration: Calibration,
+    *,
+    nearest_m: float = 1.0 / LARGEST_INVERSE,
+    device: Any = None,
+    progress: Progress | None = None,
+) -> DepthMap:
+    """Find the inverse depth of every edge in a recording of a camera at rest behind a rotating tilted plate.
+
+    Parameters
+    ----------
+    recording : Recording
+        Recording of a still scene with a camera at rest, of two turns of the plate or more.
+    calibration : Calibration
+        Calibration of the plate.
+    nearest_m : float, optional
+        Smallest depth that is tried [m], 0.05 or above.
+    device : str or warp.Device, optional
+        Device to compute on, by default that of :class:`DeviceMemoryEvents`, else the CPU.
+    progress : Progress, optional
+        Called with the finished share.
+
+    Returns
+    -------
+    DepthMap
+        Inverse depth, its standard deviation and the point that each pixel sees; unknown where the events do not
+        determine them to 10 %.
+
+    Raises
+    ------
+    AmiwarpError
+        If the calibration is that of a wedge, the camera or the scene moves, the sensor sizes differ, or there are too
+        few events.
+
+    Notes
+    -----
+    The radius of the orbit on which the plate moves a point is proportional to its inverse depth. The method is
+    described in ``docs/how-to/depth.md``.
+
+    Examples
+    --------
+    >>> wedge = amiwarp.Calibration.load("calibration.json")  # doctest: +SKIP
+    >>> amiwarp.depth(recording, wedge)  # doctest: +SKIP
+    Traceback (most recent call last):
+    amiwarp.errors.AmiwarpError: the calibration is that of a wedge, which moves near and far points alike: ...
+    """
+    name, nearest = recording.name, real(nearest_m, "nearest_m", 1.0 / LARGEST_INVERSE_DEPTH, 100.0, " m")
+    model = calibration.model
+    if not isinstance(model, PlateModel):
+        raise AmiwarpError(
+            f"{name}: the calibration is that of a wedge, which moves near and far points alike: depth is not "
+            "determined; record through a rotating tilted plate"
+        )
+    if not len(recording.events):
+        raise AmiwarpError(f"{name}: has no events; give a recording with events")
+    check_size(calibration, recording.events.size, name)
+    encoder = calibration.encoder_for(recording.encoder, recording.events.t_first, recording.events.t_last)
+    on = device_of(recording.events, device)
+    costs = costs_at_rest(recording, model, encoder, 1.0 / nearest, on)
+
+    def report(share: float) -> None:
+        if progress is not None:
+            progress("finding depths", share)
+
+    found = find_depths(costs, model, 1.0 / nearest, report)
+    check_still(found, name)
+    known = (found.count >= LEAST_PAIRS) & (found.std < KNOWN_SHARE * found.inverse_depth)
+    if not known.any():
+        raise AmiwarpError(
+            f"{name}: the events determine no depth: too little texture, or everything is beyond "
+            f"{orbit_limit_m(model):.2g} m; record a nearer scene with more texture, or a longer time"
+        )
+    inverse = np.where(known, found.inverse_depth, np.float32(np.nan))
+    return DepthMap(inverse, np.where(known, found.std, np.float32(np.nan)), _points(model, inverse))
+
+
+def orbit_limit_m(model: PlateModel) -> float:
+    """Return the depth beyond which orbits are too small to measure [m]."""
+    return orbit_px(model) / SMALLEST_PX
+
+
+def _points(model: PlateModel, inverse: Any) -> Any:
+    """Return the points that pixels see on the mean of a turn [m], shape (height, width, 3)."""
+    y, x = np.mgrid[: model.camera.height, : model.camera.width]
+    xy = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        depths = 1.0 / np.nan_to_num(inverse.ravel().astype(np.float64), nan=1.0)
+        angles = [np.full(len(xy), k * math.tau / 8) for k in range(8)]
+        mean = np.mean([model.compensate_at(xy, theta, 1.0 / depths) for theta in angles], axis=0)
+    rays = model.camera.pixels_to_rays(mean)
+    points = rays / rays[:, 2:] * depths[:, None]
+    points[~np.isfinite(inverse.ravel())] = np.nan
+    return points.reshape(*inverse.shape, 3).astype(np.float32)

@@ -1,0 +1,206 @@
+"""The rotating tilted plate: model, simulator, files, calibration of its phase, and depth at rest."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import amiwarp
+from amiwarp.brightness.depths import orbit_px
+from reference import optics as reference
+
+CAMERA = amiwarp.Camera.from_fov(96, 72, math.radians(50.0))
+PLATE = amiwarp.Plate(0.03, math.radians(45.0))
+PHASE = 0.7
+NEAR_M, FAR_M = 0.4, 0.8
+"""Depths of the two walls of the test's world."""
+
+
+def random_points(camera: amiwarp.Camera, n: int = 2000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return random pixels, angles and inverse depths."""
+    rng = np.random.default_rng(1)
+    xy = rng.uniform((0, 0), (camera.width - 1, camera.height - 1), (n, 2))
+    return xy, rng.uniform(-9, 9, n), rng.uniform(0.0, 3.0, n)
+
+
+@pytest.mark.parametrize("distortion", [None, amiwarp.RadialTangential(-0.2, 0.05, 1e-3, -1e-3)])
+@pytest.mark.parametrize("tilt_deg", [10.0, 45.0, 70.0])
+def test_model_agrees_with_a_trace_of_rays(distortion: amiwarp.Distortion | None, tilt_deg: float) -> None:
+    camera = replace(amiwarp.Camera.from_fov(320, 240, 1.0), distortion=distortion)
+    plate = amiwarp.Plate(0.01, math.radians(tilt_deg), 1.6)
+    model = amiwarp.PlateModel(camera, plate, PHASE)
+    xy, theta, rho = random_points(camera)
+    origin, direction = reference.through_plate(plate, reference.pixels_to_rays(camera, xy), theta + PHASE)
+    # the scene point at depth 1 / rho on the ray behind the plate, seen from the camera's resting centre
+    depth = 1.0 / np.maximum(rho, 1e-9)
+    point = origin + ((depth - origin[:, 2]) / direction[:, 2])[:, None] * direction
+    rays = point / np.linalg.norm(point, axis=1, keepdims=True)
+    np.testing.assert_allclose(
+        model.compensate_at(xy, theta, rho), reference.rays_to_pixels(camera, rays), rtol=0, atol=2e-3  # px
+    )  # fmt: skip
+
+
+def test_one_depth_for_all_pixels_is_a_map_of_equal_depths(device: str) -> None:
+    camera = amiwarp.Camera.from_fov(64, 48, 1.0)
+    xy, theta, _ = random_points(camera)
+    plane = amiwarp.PlateModel(camera, PLATE, PHASE, inverse_depth=2.5)
+    table = plane.with_depths(np.full((48, 64), 2.5))
+    expected = plane.compensate_at(xy, theta, np.full(len(xy), 2.5))
+    for model in (plane, table):
+        np.testing.assert_allclose(model.compensate_points(xy, theta), expected, rtol=0, atol=1e-4)
+    seen = plane.deflect_points(expected, theta)
+    np.testing.assert_allclose(seen, xy, rtol=0, atol=1e-3)  # px
+
+
+def test_on_the_axis_the_orbit_is_the_shift_times_the_inverse_depth() -> None:
+    model = amiwarp.PlateModel(CAMERA, PLATE, PHASE, inverse_depth=2.0)
+    theta = np.linspace(0.0, 6.0, 50)
+    centre = np.tile([[CAMERA.cx, CAMERA.cy]], (50, 1))
+    away = model.compensate_points(centre, theta) - centre
+    np.testing.assert_allclose(np.hypot(*away.T), 2.0 * orbit_px(model), rtol=1e-4)
+    np.testing.assert_allclose(np.arctan2(away[:, 1], away[:, 0]), np.angle(np.exp(1j * (theta + PHASE))), atol=1e-4)
+
+
+def test_a_scene_at_infinity_does_not_move() -> None:
+    xy, theta, _ = random_points(CAMERA)
+    np.testing.assert_allclose(
+        amiwarp.PlateModel(CAMERA, PLATE, PHASE).compensate_points(xy, theta), xy, rtol=0, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ((10.0, 0.5), "is it given in millimetres"),
+        ((0.01, 45.0), "is it given in degrees"),
+        ((0.01, 0.5, 1.0), "plate index"),
+    ],
+)
+def test_unusable_plates_are_refused(values: tuple[float, ...], message: str) -> None:
+    with pytest.raises(amiwarp.AmiwarpError, match=message):
+        amiwarp.Plate(*values)
+
+
+# A world of two textured walls, the nearer one in the left half of the view.
+
+
+def wall(name: str, depth: float, left: float, right: float, seed: int) -> amiwarp.Body:
+    """Return a textured wall in front of a camera at the origin that looks along y."""
+    corners = [(left, depth, -1.0), (right, depth, -1.0), (right, depth, 1.0), (left, depth, 1.0)]
+    cells = np.random.default_rng(seed).random((24, 24)).astype(np.float32)
+    picture = np.kron(cells, np.ones((8, 8), np.float32)) * 0.8 + 0.1
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * [[(right - left) * 3.0, 6.0]] * depth**-1 * 0.25
+    mesh = amiwarp.Mesh(corners, [[0, 1, 2], [0, 2, 3]], uv=uv)
+    return amiwarp.Body(name, mesh, amiwarp.Material(texture=picture))
+
+
+def walls(seed: int = 0, **changes: object) -> amiwarp.Simulation:
+    """Return a simulation of a camera at rest in front of two walls."""
+    near, far = wall("near", NEAR_M, -0.6, 0.0, seed), wall("far", FAR_M, -1.2, 1.2, seed + 1)
+    world = amiwarp.World("walls", (near, far), ambient=1.0)
+    way = amiwarp.Trajectory.still([0, 0, 0], look_at=[0, 1, 0])
+    values = {
+        "scene": amiwarp.WorldScene(world, way), "camera": CAMERA, "prism": PLATE, "duration_s": 0.35,
+        "motion": amiwarp.PrismMotion(720.0, PHASE), "seed": seed,
+    }  # fmt: skip
+    return amiwarp.Simulation(**(values | changes))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def seen() -> amiwarp.Recording:
+    """Recording of two walls through the plate."""
+    return walls().run(truth_times_us=[0])
+
+
+def test_events_have_the_place_and_depth_that_they_saw(seen: amiwarp.Recording) -> None:
+    assert seen.truth is not None
+    assert seen.encoder is not None
+    events, truth = seen.events.slice(0, len(seen.events)), seen.truth.of_events(0, len(seen.events))
+    assert truth.points is not None
+    assert truth.depth is not None
+    assert set(np.unique(truth.depth.round(4))) == {np.float32(NEAR_M), np.float32(FAR_M)}
+    latency_us = 100
+    model = amiwarp.PlateModel(CAMERA, PLATE, PHASE)
+    xy = np.stack([events.x, events.y], axis=1).astype(np.float64)
+    moved = model.compensate_at(xy, seen.encoder.angle_at(events.t - latency_us), 1.0 / truth.depth)
+    away = np.linalg.norm(moved - truth.points, axis=1)
+    assert np.median(away) < 0.02  # px: the jitter of the latency
+
+
+def test_a_picture_is_refused() -> None:
+    scene = amiwarp.Scene.from_picture(np.ones((8, 8), np.float32))
+    with pytest.raises(amiwarp.AmiwarpError, match="at infinity; give a world"):
+        walls(scene=scene)
+
+
+def test_without_the_plate_nothing_moves() -> None:
+    recording = walls(duration_s=0.05, sensor=amiwarp.SensorModel.ideal()).without_prism().run()
+    assert len(recording.events) == 0
+
+
+def test_files_hold_the_plate(seen: amiwarp.Recording, tmp_path: Path) -> None:
+    amiwarp.save_recording(tmp_path / "r.h5", seen)
+    assert amiwarp.open_recording(tmp_path / "r.h5").prism == PLATE
+
+
+@pytest.fixture(scope="module")
+def calibration(seen: amiwarp.Recording) -> amiwarp.Calibration:
+    """Calibration of the recording."""
+    return amiwarp.calibrate(seen)
+
+
+def test_phase_is_calibrated_and_stored(calibration: amiwarp.Calibration, tmp_path: Path) -> None:
+    error_px = (calibration.parameters["phase"] - PHASE) * orbit_px(calibration.model) / FAR_M  # type: ignore[arg-type]
+    assert abs(error_px) < 0.06
+    assert 0.0 < calibration.uncertainty["phase"] < 0.05
+    calibration.save(tmp_path / "c.json")
+    again = amiwarp.Calibration.load(tmp_path / "c.json")
+    assert (again.prism, again.parameters, again.model_name) == (PLATE, calibration.parameters, "plate")
+
+
+def test_depth_is_found(seen: amiwarp.Recording, calibration: amiwarp.Calibration, tmp_path: Path) -> None:
+    assert seen.truth is not None
+    assert seen.truth.frames is not None
+    found = amiwarp.depth(seen, calibration)
+    truth = seen.truth.frames[0].depth
+    inside = found.known & (np.abs(np.arange(CAMERA.width) - CAMERA.cx) > 8)  # beside the edge of the near wall
+    assert inside.sum() > 500
+    error = np.abs(found.inverse_depth * truth - 1.0)[inside]
+    assert np.median(error) < 0.05
+    away = np.abs(found.inverse_depth - 1.0 / truth)[inside] / found.std[inside]
+    assert 0.5 < np.mean(away < 1.0) < 0.95
+    np.testing.assert_allclose(found.points[found.known][:, 2], 1.0 / found.inverse_depth[found.known], rtol=1e-5)
+    found.save(tmp_path / "d.npz")
+    again = amiwarp.DepthMap.load(tmp_path / "d.npz")
+    np.testing.assert_array_equal(again.inverse_depth, found.inverse_depth)
+    assert np.isfinite(again.filled()).all()
+    found.save_points(tmp_path / "d.ply")
+    assert f"element vertex {int(found.known.sum())}".encode() in (tmp_path / "d.ply").read_bytes()[:200]
+
+
+def test_a_wedge_does_not_determine_depth(seen: amiwarp.Recording, calibration: amiwarp.Calibration) -> None:
+    wedge = replace(
+        calibration, model_name="exact", prism=amiwarp.Prism(0.02), parameters={"apex": 0.02, "phase": 0.0},
+        uncertainty={}, free=("apex", "phase"),
+    )  # fmt: skip
+    with pytest.raises(amiwarp.AmiwarpError, match="depth is not determined"):
+        amiwarp.depth(seen, wedge)
+
+
+def test_a_moving_camera_is_refused(seen: amiwarp.Recording, calibration: amiwarp.Calibration) -> None:
+    # each turn of the plate sees another random scene, as a fast camera does
+    parts = [walls(seed, duration_s=0.0834).run().events for seed in range(4)]
+    events = [part.slice(0, len(part)) for part in parts]
+    t = np.concatenate([each.t + k * 83_400 for k, each in enumerate(events)])
+    x, y, p = (np.concatenate([getattr(each, name) for each in events]) for name in "xyp")
+    moving = replace(seen, events=amiwarp.MemoryEvents(amiwarp.Events(x, y, t, p), 96, 72), truth=None)
+    with pytest.raises(amiwarp.AmiwarpError, match="camera at rest only"):
+        amiwarp.depth(moving, calibration)
+
+
+def test_few_events_are_refused(seen: amiwarp.Recording, calibration: amiwarp.Calibration) -> None:
+    few = replace(seen, events=amiwarp.MemoryEvents(seen.events.slice(0, 100), 96, 72), truth=None)
+    with pytest.raises(amiwarp.AmiwarpError, match="100 events do not determine depths"):
+        amiwarp.depth(few, calibration)
