@@ -101,6 +101,7 @@ from .optics.prism import Prism as Prism
 from .optics.prism import UnsizedPrism as UnsizedPrism
 from .optics.prism import apex_from_deflection as apex_from_deflection
 from .optics.prism import deflection_from_apex as deflection_from_apex
+from .optics.vibration import VibrationModel as VibrationModel
 from .reconstruction.depth_at_rest import depth as depth
 from .reconstruction.picture import Picture as Picture
 from .reconstruction.picture import Reconstruction as Reconstruction
@@ -113,6 +114,7 @@ from .simulation.description import PrismMotion as PrismMotion
 from .simulation.description import Scene as Scene
 from .simulation.description import SensorModel as SensorModel
 from .simulation.description import SimulationValues as SimulationValues
+from .simulation.description import Vibration as Vibration
 from .simulation.pictures import PictureFolder as PictureFolder
 from .simulation.pictures import Pictures as Pictures
 from .simulation.pictures import PictureStack as PictureStack

@@ -2,12 +2,12 @@
 
 import enum
 
-OPTICAL_MODELS = ("circle", "exact", "radial", "ellipse", "risley", "plate")
+OPTICAL_MODELS = ("circle", "exact", "radial", "ellipse", "risley", "plate", "vibration")
 """Names of the optical models, for programs that do not load them."""
 
 
 class Optic(enum.StrEnum):
-    """Moving glass in front of a simulated camera.
+    """What moves the image of a simulated camera.
 
     Examples
     --------
@@ -19,6 +19,8 @@ class Optic(enum.StrEnum):
     """Rotating wedge prism, which moves near and far points alike."""
     PLATE = "plate"
     """Rotating tilted plane-parallel plate, which moves near points only."""
+    VIBRATION = "vibration"
+    """No glass: the camera itself vibrates. Its recording has no encoder."""
 
 
 # Choices for images of warped events: how to vote, what to do with polarity, which sharpness to measure.
@@ -167,7 +169,7 @@ class View(enum.StrEnum):
     Y_AXIS = "y-θ"
 
 
-# Options of simulated worlds that have a fixed set of values.
+# Options of simulations that have a fixed set of values.
 
 
 class Seeing(enum.StrEnum):

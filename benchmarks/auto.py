@@ -40,7 +40,7 @@ from amiwarp import (
     truth_model,
 )
 from amiwarp.calib.model_choice import Places, candidate_space, fit, linear_motions
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import rungs
 from amiwarp.studies.cluster import machine
 
 FOV_DEG, APEX_DEG = (30.0, 60.0, 90.0), (0.25, 1.0, 2.0)
@@ -91,7 +91,7 @@ def true_errors(recording: Recording, c: Calibration) -> dict[str, float]:
     for name in ("circle", "radial"):
         space = candidate_space(name, exact, (), rad_per_us=1e-4, duration_us=1e6)
         ((_, found[name]),) = fit(linear_motions([space], places), places.compensated(truth), places)
-    return {name: found[name] for name in MODELS}
+    return {name: found[name] for name in rungs()}
 
 
 def row_of(recording: Recording, args: argparse.Namespace) -> dict[str, Any]:
@@ -104,7 +104,7 @@ def row_of(recording: Recording, args: argparse.Namespace) -> dict[str, Any]:
         return {"refused": str(error)}
     assert c.ladder is not None
     errors, budget = true_errors(recording, c), c.ladder.budget_px
-    wanted = next(name for name in MODELS if errors[name] <= budget)
+    wanted = next(name for name in rungs() if errors[name] <= budget)
     truth = truth_model(recording.camera, recording.truth, FlatSide.SCENE)
     return {
         "picked": c.model_name,
@@ -184,8 +184,8 @@ def table_row(r: dict[str, Any]) -> str:
     case = f"| {r.get('case', r['picture'])} | {r['fov_deg']:g}° | {r['apex_deg']:g}° |"
     if "refused" in r:
         return f"{case} refused: {r['refused']} |"
-    errors = " / ".join(f"{r['true_px'][n]:.3f}" for n in list(MODELS)[:-1])
-    predicted = " / ".join(f"{r['predicted_px'][n]:.3f}" for n in list(MODELS)[:-1])
+    errors = " / ".join(f"{r['true_px'][n]:.3f}" for n in list(rungs())[:-1])
+    predicted = " / ".join(f"{r['predicted_px'][n]:.3f}" for n in list(rungs())[:-1])
     mark = "" if r["right"] else (" (near)" if r["near"] else " **wrong**")
     freed = ", ".join(r["freed"]) or "none"
     return (

@@ -315,10 +315,27 @@ OWN: dict[str, dict[str, Any]] = {
         f"{name}.{method}": given
         for name in (
             "CircleModel", "EllipseModel", "ExactModel", "PlateModel", "RadialCircleModel", "RisleyModel",
+            "VibrationModel",
         )
         for method, given in (("apex_from_size", {"size": 0.02}), ("size_from_apex", {"apex": 0.02}))
     },
+    **{
+        f"{name}.{method}": given
+        for name, size in (
+            ("CircleModel", "deflection"), ("EllipseModel", "apex"), ("ExactModel", "apex"),
+            ("RadialCircleModel", "deflection"), ("VibrationModel", "amplitude"),
+        )
+        for method, given in (
+            ("turned_values", {"values": {size: 0.01, "phase": 0.0}, "angle": 0.1}),
+            ("reversed_values", {"values": {size: 0.01, "phase": 0.0}}),
+            ("default_bounds", {"name": size, "value": 0.01}),
+        )
+    },
     "CircleModel": {"deflection": 0.01},
+    "VibrationModel": {"amplitude": 0.01},
+    "VibrationModel.from_values": {"values": {"amplitude": 0.01, "phase": 0.0}},
+    "VibrationModel.rotations": {"theta": np.linspace(0, 6, 20)},
+    "Vibration": {"hz": 100.0, "amplitude": 0.01},
     "CircleModel.from_values": {"values": {"deflection": 0.01, "phase": 0.0}},
     "RadialCircleModel.from_values": {"values": {"deflection": 0.01, "phase": 0.0}},
     "RadialCircleModel": {"deflection": 0.01},
@@ -418,6 +435,8 @@ OBJECTS: dict[str, Any] = {
     "EllipseModel": aw.EllipseModel(CAMERA, *[TABLE] * 3),
     "ExactModel": MODEL,
     "RisleyModel": aw.RisleyModel(CAMERA, PAIR),
+    "VibrationModel": aw.VibrationModel(CAMERA, 0.01),
+    "Vibration": aw.Vibration(100.0, 0.01),
     "UnsizedPrism": aw.UnsizedPrism(),
     "Picture": PICTURE,
     "PixelMap": PIXELS,

@@ -121,7 +121,7 @@ OTHERS: list[tuple[str, tuple[str, ...], Callable[[Any], Any]]] = [
         lambda name: settled(photometric=PhotometricSettings(algorithm=name)),
     ),
 ]
-VALUES = {"apex": 0.02, "deflection": 0.01, "inverse_depth": 2.0, "phase": 0.0}
+VALUES = {"amplitude": 0.01, "apex": 0.02, "deflection": 0.01, "inverse_depth": 2.0, "phase": 0.0}
 MEANS_SOMETHING_ELSE = {("Settings.global_algorithm", None), ("open_recording", None)}
 """Here None has a meaning, which the docstring states."""
 

@@ -24,7 +24,7 @@ from amiwarp.calib import checks, first_guess, plate
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
 from amiwarp.calib.model_choice import ModelChooser
-from amiwarp.calib.parameters import MOTION, RATES, ParameterSpace, default_free, make_space, nominal
+from amiwarp.calib.parameters import MOTION, RATES, ParameterSpace, make_space, nominal
 from amiwarp.calib.photometric import stage
 from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
@@ -230,8 +230,10 @@ class Calibrator:
                 tried = calibrator.explained(tried)
             elif self.settings.free is None and tried.camera_turned:
                 tried = calibrator.with_rotation(tried)
-        else:
+        elif MODELS[self.settings.model].PRISM:
             tried = calibrator.with_straight_path(tried)
+        else:
+            tried = calibrator.at_found_speed(tried)
         found = self._told(replace(tried.found(), harmonics=calibrator.harmonics))
         if not tried.accepted:  # the answer of sharpness alone may be off by tenths of a pixel
             reasons = [w for w in found.warnings if "photometric" in w]
@@ -258,7 +260,7 @@ class Calibrator:
             with upload_ahead(recording, searches[0]) as ahead:
                 for search in searches:
                     search.run()
-                search = max(searches, key=lambda s: s.score)
+                search = _in_larger_sense(recording, max(searches, key=lambda s: s.score))
                 if recording.encoder is None and self.path is None and _path_is_examined(search):
                     search = _with_path(recording, search)
                 if rival is not None:
@@ -316,6 +318,28 @@ class Calibrator:
         zero = float(path.angle_at([middle_time(self.recording)])[0])
         again = replace(self, path=replace(path, angle=path.angle - zero)).attempt()
         return tried if again.calibration is None or again.cost > tried.cost else again
+
+    def at_found_speed(self, tried: Attempt) -> Attempt:
+        """Calibrate again at the speed that was found: known angles let the sensor's timing be examined."""
+        found = tried.calibration
+        if found is None or found.zero_us is None or not tried.accepted or "rpm" not in found.free:
+            return tried
+        known = {n: x for n, x in found.parameters.items() if n != "rpm"}
+        settings = replace(self.settings, free=tuple(n for n in found.free if n != "rpm"), start=known,
+                           global_algorithm=None)  # fmt: skip
+        events = self.recording.events
+        path = constant_speed(found.parameters["rpm"], events.t_first, events.t_last, found.zero_us)
+        again = replace(self, settings=settings, path=path).attempt()
+        if again.calibration is None:
+            return again
+        speed, std = found.parameters["rpm"], found.uncertainty["rpm"]
+        calibration = replace(
+            again.calibration, path=None, free=(*again.calibration.free, "rpm"),
+            parameters={**again.calibration.parameters, "rpm": speed},
+            uncertainty={**again.calibration.uncertainty, "rpm": std},
+            stages=(*found.stages, *again.calibration.stages),
+        )  # fmt: skip
+        return replace(again, calibration=calibration)
 
     def _told(self, found: Calibration) -> Calibration:
         """Return the calibration, with a warning if it found that the prism's speed is not constant."""
@@ -560,7 +584,8 @@ def _path_is_examined(search: Search) -> bool:
     """Return whether the path of the prism's angle is examined: for a still camera, if no speed is given."""
     space, settings = search.space, search.settings
     given = "rpm" in settings.start or "rpm" in (settings.free or ())
-    return space.cartesian and not space.moving and not given and "photometric" in settings.stages
+    steady = not MODELS[space.model].PRISM  # ripple within a turn looks like harmonics of a vibration
+    return space.cartesian and not space.moving and not (given or steady) and "photometric" in settings.stages
 
 
 def _with_path(recording: Recording, search: Search) -> Search:
@@ -583,6 +608,20 @@ def _with_path(recording: Recording, search: Search) -> Search:
     found = _search_on(path, search)
     found.run(found.best)
     return found
+
+
+def _in_larger_sense(recording: Recording, search: Search) -> Search:
+    """Return the search in the sense of rotation in which the size is that of the larger circle, if there are two."""
+    best, space = search.best, search.space
+    values = MODELS[space.model].reversed_values(best)
+    if values is None or "rpm" not in space.names or values[space.size_name] <= best[space.size_name]:
+        return search
+    rpm = -best["rpm"]
+    again = prepare(recording, replace(search.settings, start={**search.settings.start, "rpm": rpm}), path=None,
+                    device=search.device, progress=search.progress)[0]  # fmt: skip
+    again.run({**again.space.start, **values, "rpm": rpm})
+    again.stages = search.stages + again.stages
+    return again
 
 
 def _search_on(path: Encoder, search: Search) -> Search:
@@ -613,7 +652,7 @@ def _encoders(recording: Recording, settings: Settings, path: Encoder | None) ->
     either sign. If the events show that the speed varies much, they are paths with either sense of rotation.
     """
     kind = MODELS[settings.model]
-    free = default_free(kind) if settings.free is None else settings.free
+    free = kind.FREED if settings.free is None else settings.free
     free = tuple(n for n in free if n not in LINEAR_UNKNOWNS)
     if not {*size_names(), "phase"} & set(free) and settings.start.get(kind.SIZE) == 0.0:
         return [constant_speed(0.0, recording.events.t_first, recording.events.t_last, middle_time(recording))], free
@@ -633,7 +672,12 @@ def _encoders(recording: Recording, settings: Settings, path: Encoder | None) ->
     rpm = settings.start.get("rpm")
     if rpm is None and "rpm" not in free and (paths := varying_paths(recording)):
         return paths, free
-    speeds = [rpm] if rpm is not None else [s * first_guess.estimate_rpm(recording) for s in (1.0, -1.0)]
+    if rpm is None:
+        found = first_guess.estimate_rpm(recording, kind.TIME_BIN_US, kind.MOVER)
+        # a motion that can be described by either sense is searched in one
+        speeds = [found, -found] if kind.reversed_values(dict.fromkeys(kind.FREE, 0.0)) is None else [found]
+    else:
+        speeds = [rpm]
     first, last = recording.events.t_first, recording.events.t_last
     encoders = [constant_speed(s, first, last, middle_time(recording)) for s in speeds]
     return encoders, free if "rpm" in free else (*free, "rpm")
@@ -660,8 +704,9 @@ def _space(
     if ("motion" in free or set(RATES) & set(free)) and turned > 0.0 and not set(RATES) & set(start):
         found = dict(zip(RATES, first_guess.estimate_rates(events, encoder, camera), strict=True))
         start |= {n: rate for n, rate in found.items() if "motion" in free or n in free}
+    prism = nominal(recording.prism, MODELS[settings.model])
     return make_space(
-        settings.model, camera, nominal(recording.prism), free=free, start=start, bounds=settings.bounds,
+        settings.model, camera, prism, free=free, start=start, bounds=settings.bounds,
         rad_per_us=turned / max(duration, 1), duration_us=float(duration), middle_us=middle_time(recording),
     )  # fmt: skip
 

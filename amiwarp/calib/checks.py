@@ -11,7 +11,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.imaging.iwe import Image
 from amiwarp.imaging.metrics import edge_coherence
-from amiwarp.optics.models import MODELS
+from amiwarp.optics.models import MODELS, Model
 from amiwarp.optics.prism import Prism
 
 FEWEST_EVENTS = 2000
@@ -184,35 +184,45 @@ def _in_words(gain: float) -> str:
     return f"{gain:.1f} standard deviations" if gain > 0.0 else "it is less sharp, or the same"
 
 
-def check_size(size: str, least: float, bound: float, name: str) -> None:
-    """Check that the size of the prism's orbit may be at least ``least`` under its upper ``bound`` [rad]."""
+def check_size(kind: type[Model], least: float, bound: float, name: str) -> None:
+    """Check that the size of the orbit by a kind of model may be at least ``least`` under its upper ``bound`` [rad]."""
     if least > bound:
+        size = kind.SIZE
+        remedy = "give the prism's nominal apex, or wider bounds" if kind.PRISM else "give wider bounds"
         raise NoSharpOptimumError(
-            f"{name}: the image is sharpest for the largest {size} that is tried, {math.degrees(bound):.3g} deg (twice "
-            f"the nominal one, 2 deg if none is given, unless bounds are given): give the prism's nominal apex, or "
-            f"wider bounds ({size}=0:{2.0 * math.degrees(bound):.3g}deg)"
+            f"{name}: the image is sharpest for the largest {size} that is tried, {math.degrees(bound):.3g} deg "
+            f"({kind.SIZE_HINT}, unless bounds are given): {remedy} ({size}=0:{2.0 * math.degrees(bound):.3g}deg)"
         )
 
 
 def check_texture(
-    best: NDArray[np.float64], opposite: NDArray[np.float64], still: NDArray[np.float64], name: str
+    best: NDArray[np.float64],
+    opposite: NDArray[np.float64],
+    still: NDArray[np.float64],
+    name: str,
+    mover: str = Model.MOVER,
 ) -> None:
     """Check that the image is sharper at the optimum than by chance, and than without compensation.
 
-    Each array holds the sharpness of disjoint parts of the events: at the optimum, with half a turn added to the phase,
-    and without motion compensation.
+    Each array holds the sharpness of disjoint parts of the events: at the optimum, half a turn later, and without
+    motion compensation. ``mover`` names what moves the image.
     """
     gain = significance(best, opposite)
     if not gain >= LEAST_SIGNIFICANCE:
         raise NoSharpOptimumError(
-            f"{name}: no motion of a prism makes the image sharper than chance does ({_in_words(gain)}): "
+            f"{name}: no motion of a {mover} makes the image sharper than chance does ({_in_words(gain)}): "
             "no texture, too few events, or a wrong encoder; show the camera a scene with edges"
         )
     gain = significance(best, still)
     if not gain >= LEAST_SIGNIFICANCE:
+        cause = (
+            "no prism turned, its apex is too small for these events, or the encoder is wrong; check prism and encoder"
+        )
+        if mover != Model.MOVER:
+            cause = f"the {mover} is too small for these events, or its frequency is wrong; give rpm"
         raise NoSharpOptimumError(
-            f"{name}: the image is as sharp with no motion compensation ({_in_words(gain)}): no prism turned, its apex "
-            "is too small for these events, or the encoder is wrong; check prism and encoder, or record more events"
+            f"{name}: the image is as sharp with no motion compensation ({_in_words(gain)}): {cause}, or record more "
+            "events"
         )
 
 

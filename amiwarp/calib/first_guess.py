@@ -17,29 +17,34 @@ from amiwarp.optics.camera import Camera
 CELL = 8
 """Side of the cells in which events are counted [px]."""
 BIN_US = 1000
-"""Length of the time bins in which events are counted [us]."""
+"""Length of the time bins in which events are counted, unless another one is given [us]."""
 LONGEST_US = 3_000_000
 """Longest duration from the start of the recording that is analysed [us]."""
 FASTEST_BINS = 5
-"""Shortest detectable period of the prism [time bins]: five bins of 1 ms are 12,000 rpm."""
+"""Shortest detectable period [time bins]: five bins of 1 ms are 12,000 rpm."""
+MOST_BINS = 5000
+"""Largest number of time bins."""
 LEAST_CORRELATION = 0.1
 """Smallest autocorrelation of event counts at which the events are considered to repeat."""
 ANGLE_BINS, MOST_TURNS = 96, 24
 """Angle bins per turn and largest number of turns for the check of an encoder's scale."""
 
 
-def estimate_rpm(recording: Recording) -> float:
-    """Return the prism's speed [1/min], without its sign, from the autocorrelation of signed event counts per cell.
+def estimate_rpm(recording: Recording, bin_us: int = BIN_US, mover: str = "prism") -> float:
+    """Return the speed [1/min], without its sign, from the autocorrelation of signed event counts per cell.
 
+    ``bin_us`` is the length of a time bin [us], a fifth of the shortest turn; ``mover`` names what turns or vibrates.
     Raises :class:`AmiwarpError` if the events do not repeat or the recording has less than two turns.
     """
-    counts = signed_counts(recording)
+    counts = signed_counts(recording, bin_us)
     if len(counts) < 2 * FASTEST_BINS:
         raise AmiwarpError(
-            f"{recording.name}: the events last {len(counts) * BIN_US * 1e-3:g} ms, which is too short to estimate the "
-            "prism's speed; record two turns or more, or give rpm or an encoder"
+            f"{recording.name}: the events last {len(counts) * bin_us * 1e-3:g} ms, which is too short to estimate the "
+            f"{mover}'s speed; record two turns or more, or give rpm or an encoder"
         )
-    return 60e6 / (_period(autocorrelation(counts), recording.name) * BIN_US)
+    # in short bins, chance is a larger share of the counts
+    least = LEAST_CORRELATION * bin_us / BIN_US
+    return 60e6 / (_period(autocorrelation(counts), recording.name, mover, least) * bin_us)
 
 
 def encoder_turns_per_period(recording: Recording, encoder: Encoder) -> float:
@@ -60,10 +65,11 @@ def encoder_turns_per_period(recording: Recording, encoder: Encoder) -> float:
     return _period(autocorrelation(counts), recording.name) / ANGLE_BINS
 
 
-def signed_counts(recording: Recording) -> NDArray[np.float32]:
-    """Return ON minus OFF events per time bin and cell, shape (bins, cells)."""
+def signed_counts(recording: Recording, bin_us: int) -> NDArray[np.float32]:
+    """Return ON minus OFF events per time bin of a length [us] and cell, shape (bins, cells)."""
     first, last = _analysed_span(recording)
-    return _signed_counts(recording, first, last, lambda t: (t - first) // BIN_US)
+    last = min(last, first + MOST_BINS * bin_us - 1)
+    return _signed_counts(recording, first, last, lambda t: (t - first) // bin_us)
 
 
 def _analysed_span(recording: Recording) -> tuple[int, int]:
@@ -102,9 +108,11 @@ def autocorrelation(counts: NDArray[np.float32]) -> NDArray[np.float64]:
     return cast("NDArray[np.float64]", unbiased / max(unbiased[0], 1e-30))
 
 
-def _period(correlation: NDArray[np.float64], name: str) -> float:
+def _period(
+    correlation: NDArray[np.float64], name: str, mover: str = "prism", least: float = LEAST_CORRELATION
+) -> float:
     """Return the period of a correlation [bins]: its first strong peak, refined at multiples of the period."""
-    period = _first_period(correlation, name)
+    period = _first_period(correlation, name, mover, least)
     multiple = 1
     while 2 * multiple * period < 0.6 * len(correlation):
         multiple *= 2
@@ -112,13 +120,13 @@ def _period(correlation: NDArray[np.float64], name: str) -> float:
     return period
 
 
-def _first_period(correlation: NDArray[np.float64], name: str) -> float:
+def _first_period(correlation: NDArray[np.float64], name: str, mover: str, least: float) -> float:
     inner = correlation[1:-1]
     peaks = 1 + np.flatnonzero((inner > correlation[:-2]) & (inner >= correlation[2:]))
     peaks = peaks[peaks >= FASTEST_BINS]
-    if not len(peaks) or correlation[peaks].max() < LEAST_CORRELATION:
+    if not len(peaks) or correlation[peaks].max() < least:
         raise AmiwarpError(
-            f"{name}: the events do not repeat, so the prism's speed cannot be estimated (the scene moves, or the "
+            f"{name}: the events do not repeat, so the {mover}'s speed cannot be estimated (the scene moves, or the "
             "recording has less than two turns); give rpm or an encoder"
         )
     first = peaks[correlation[peaks] >= 0.7 * correlation[peaks].max()][0]

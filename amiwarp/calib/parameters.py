@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.optics import vibration  # noqa: F401  # a model in a file of its own, which enters itself in MODELS
 from amiwarp.optics.camera import LENS, Camera, CameraRotation, given_lens
 from amiwarp.optics.models import (
     MODELS,
@@ -83,7 +84,7 @@ def phase_names() -> set[str]:
 
 
 def default_free(kind: type[Model]) -> tuple[str, ...]:
-    """Return the names of the parameters that are free by default: size and phase of each prism."""
+    """Return the names of size and phase of each prism, which are free by default."""
     return tuple(name for orbit in kind.ORBITS for name in orbit)
 
 
@@ -345,8 +346,13 @@ def check_names(
         vector(pair, 2, f"bounds of {name}", real)
 
 
-def nominal(prism: NominalPrism | None) -> Prism | Plate:
-    """Return a recording's nominal glass, with the apex :data:`NOMINAL_APEX` if the apex of its prism is unknown."""
+def nominal(prism: NominalPrism | None, kind: type[Model] | None = None) -> Prism | Plate:
+    """Return a recording's nominal glass, with the apex :data:`NOMINAL_APEX` if the apex of its prism is unknown.
+
+    For a ``kind`` of model without a prism, its apex is 0.
+    """
+    if kind is not None and not kind.PRISM:
+        return Prism(0.0)
     return prism if isinstance(prism, Prism | Plate) else (prism or UnsizedPrism()).with_apex(NOMINAL_APEX)
 
 
@@ -369,8 +375,17 @@ def values_of(model: str, values: Mapping[str, float]) -> dict[str, float]:
     return {name: value for name, value in values.items() if name not in foreign}
 
 
+def kept_by_global_search(space: ParameterSpace) -> tuple[str, ...]:
+    """Return the names of the free parameters whose start values the global search keeps."""
+    fine = {name for name, parameter in optical_parameters().items() if parameter.fine}
+    exact_speed = () if MODELS[space.model].PRISM else ("rpm",)  # many turns tell it better than a coarse image
+    return tuple(n for n in space.names if n in MOTION or n in fine or n in exact_speed)
+
+
 # Set-up of a parameter space: checks of names and bounds, and the scale of each parameter in pixels.
 
+MOST_TURNS_OFF = 0.25
+"""Largest error of the number of turns in a recording that the frequency of a vibrating camera may start with."""
 _HALF_RANGE = {"clock_offset": 5000.0, **dict.fromkeys(RATES, 5.0), **dict.fromkeys(CHANGES, 50.0)}
 """Half width of the default bounds of each parameter about its start value, in the parameter's unit."""
 
@@ -397,9 +412,9 @@ def make_space(
     camera : Camera
         The camera.
     prism : Prism or Plate
-        The nominal glass. The size ranges from 0 to :meth:`Model.largest_size`, unless ``bounds`` are given for it.
+        The nominal glass, which gives the default bounds of the size.
     free : tuple of str, or None
-        Names of the free parameters; ``motion`` stands for all three rates. None: size and phase.
+        Names of the free parameters; ``motion`` stands for all three rates. None: those that the model names.
     start : mapping of str to float
         Start values, in the parameters' units.
     bounds : mapping of str to (float, float)
@@ -425,13 +440,14 @@ def make_space(
         order, or if a free parameter moves no event.
     """
     kind = MODELS[model]
-    names = _ordered_names(kind, default_free(kind) if free is None else free)
+    names = _ordered_names(kind, kind.FREED if free is None else free)
     _check_given(kind, names, start, bounds)
     nominal = {**kind.start_values(prism), "focal_length": camera.fx}
     values = {n: start.get(n, nominal.get(n, 0.0)) for n in (*default_free(kind), *names, *start)}
     low, high = {}, {}
     for name in names:
-        low[name], high[name] = bounds.get(name) or _default_bounds(kind, name, values[name], prism)
+        default = _default_bounds(kind, name, values[name], camera, prism, duration_us)
+        low[name], high[name] = bounds.get(name) or default
         if not low[name] < high[name]:
             raise AmiwarpError(f"bounds of {name} are {low[name]:.6g} .. {high[name]:.6g}; give the lower bound first")
         values[name] = min(max(values[name], low[name]), high[name])
@@ -511,16 +527,19 @@ def _check_given(
             raise AmiwarpError(f"bounds are given for {name}, which is not free; add {name} to the free parameters")
 
 
-def _default_bounds(kind: type[Model], name: str, value: float, prism: Prism | Plate) -> tuple[float, float]:
-    if name == kind.SIZE:
-        return 0.0, kind.largest_size(prism)
+def _default_bounds(
+    kind: type[Model], name: str, value: float, camera: Camera, prism: Prism | Plate, duration_us: float
+) -> tuple[float, float]:
     if name in phase_names():
         return -PHASE.half_range, PHASE.half_range
-    if name in dict(kind.ORBITS):  # the size of another prism
+    if name != kind.SIZE and name in dict(kind.ORBITS):  # the size of another prism
         return 0.0, 2.0 * value
+    if name in kind.FREE:
+        return kind.default_bounds(name, value, camera, prism)
     share = {"rpm": 0.02, "focal_length": 0.2}
-    ranges = _HALF_RANGE | {parameter.name: parameter.half_range for parameter in kind.PARAMETERS}
-    half = share[name] * abs(value) if name in share else ranges[name]
+    half = share[name] * abs(value) if name in share else _HALF_RANGE[name]
+    if name == "rpm" and not kind.PRISM:
+        half = MOST_TURNS_OFF * 60e6 / max(duration_us, 1.0)
     return value - half, value + half
 
 
@@ -540,7 +559,8 @@ def _pixels_per_unit(
     size.
     """
     kind = MODELS[model].closed_form()
-    nominal = {**values, **{size: kind.start_values(prism)[size] for size, _ in kind.ORBITS}}
+    typical = {size: kind.start_values(prism)[size] for size, _ in kind.ORBITS}
+    nominal = {**values, **typical, kind.SIZE: kind.typical_size(camera, prism)}
     lens = {"center_x": 1.0, "center_y": 1.0, "k1": 0.01, "fy_over_fx": 0.01}
     steps = {**dict.fromkeys((kind.SIZE, *optical_parameters()), 0.02), **lens}
     for size, phase in kind.ORBITS:

@@ -250,6 +250,7 @@ class Calibration:
     camera's focal length."""
     prism: Prism | Plate
     """Nominal prism. It gives the flat side, corrected if the events contradict it, and the index if that was not free.
+    Its apex is 0 for a camera without a prism.
     """
     parameters: Mapping[str, float]
     """Parameter values by name: angles in rad, ``clock_offset`` in us, ``rpm`` in 1/min, ``focal_length`` in px,
@@ -367,7 +368,7 @@ class Calibration:
             "version": VERSION,
             "model": self.model_name,
             "camera": camera_to_json(self.camera),
-            "prism": prism_to_json(self.prism),
+            "prism": self._prism_to_json(),
             "parameters": {name: self._parameter(name) for name in self.parameters},
             "sharpness": {
                 "kind": self.sharpness_name,
@@ -386,6 +387,11 @@ class Calibration:
             "stages": [asdict(stage) for stage in self.stages],
         }
 
+    def _prism_to_json(self) -> dict[str, Any] | None:
+        if not MODELS[self.model_name].PRISM:
+            return None
+        return prism_to_json(self.prism)
+
     def _parameter(self, name: str) -> dict[str, Any]:
         value = self.parameters[name]
         unit = units()[name]
@@ -394,6 +400,8 @@ class Calibration:
             out["std"] = self.uncertainty[name]
         if unit == "rad":
             out["degrees"] = math.degrees(value)
+        if name == "rpm" and not MODELS[self.model_name].PRISM:
+            out["hz"] = value / 60.0
         return out
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -448,6 +456,7 @@ class Calibration:
         model = one_of(data["model"], MODELS, "field model")
         given = fields_of(data["parameters"], "parameters", *MODELS[model].FREE[:2], optional=tuple(units()))
         entries = {name: _entry(name, entry) for name, entry in given.items()}
+        prism = prism_from_json(data["prism"], "prism") if MODELS[model].PRISM else Prism(0.0)
         sharpness = build(_Sharpness, data["sharpness"], "sharpness")
         path = None if data.get("path") is None else build(_Path, data["path"], "path")
         names = [f.name for f in fields(_PlainFields)]
@@ -455,7 +464,7 @@ class Calibration:
         result = cls(
             model_name=model,
             camera=camera_from_json(data["camera"], "camera"),
-            prism=prism_from_json(data["prism"], "prism"),
+            prism=prism,
             parameters={name: entry.value for name, entry in entries.items()},
             uncertainty={name: entry.std for name, entry in entries.items() if entry.std is not None},
             free=tuple(name for name, entry in entries.items() if entry.free),
@@ -498,6 +507,8 @@ class _Entry:
     std: float | None = None
     degrees: float | None = None
     """The value in degrees, for human readers; ignored on reading."""
+    hz: float | None = None
+    """The frequency of a vibration [Hz], for human readers; ignored on reading."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 from amiwarp.calib import checks
 from amiwarp.calib.calibration_events import CalibrationEvents, EventsAhead
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
-from amiwarp.calib.parameters import MOTION, ParameterSpace, like_size, of_orbit, phase_names, units
+from amiwarp.calib.parameters import (
+    MOTION,
+    ParameterSpace,
+    kept_by_global_search,
+    like_size,
+    of_orbit,
+    phase_names,
+    units,
+)
 from amiwarp.calib.result import StageSummary
 from amiwarp.calib.settings import Settings, stage_share
 from amiwarp.choices import Sharpness
@@ -398,7 +406,7 @@ class Search:
         """
         s, space = self.settings, self.space
         starts = [space.to_vector(space.start if start is None else start)]
-        still = space.without(MOTION) if space.moving else space  # the global search keeps a rotation's start values
+        still = space.without(kept_by_global_search(space))
         if start is None and s.global_algorithm is not None and still.names:
             found = [dict(still.start)]
             for part in self._global_parts(still):
@@ -497,14 +505,14 @@ class Search:
             # variance, whatever the measure of the search: the paper's J may prefer an image without compensation
             plain = self.settings.sharpness is Sharpness.VARIANCE
             variance = parts if plain else self._objective_by_parts(Sharpness.VARIANCE)
-            unmoved = MODELS[space.model].still_values(best)
-            away = {phase: best[phase] + math.pi for _, phase in MODELS[space.model].ORBITS}
-            points = (best, {**best, **away}, unmoved)
+            kind = MODELS[space.model]
+            away = {phase: best[phase] + math.pi for _, phase in kind.ORBITS}
+            points = (best, {**kind.turned_values(best, math.pi), **away}, kind.still_values(best))
             sharp, opposite, still = (variance.each(values) for values in points)
             if "photometric" in self.settings.stages:
                 size, most = space.size_name, space.high[space.size_name]
-                checks.check_size(size, best[size] + LEAST_INSIDE_PX / space.pixels[size], most, name)
-            checks.check_texture(sharp, opposite, still, name)
+                checks.check_size(kind, best[size] + LEAST_INSIDE_PX / space.pixels[size], most, name)
+            checks.check_texture(sharp, opposite, still, name, kind.MOVER)
             # not the border outside the sensor, and as much inside, where the view ends: at most a quarter of it
             inset = self.pad + min(self.pad, min(camera.width, camera.height) // 4)
             checks.check_directions(self.fine.image(best), inset, name)

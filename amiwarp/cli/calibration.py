@@ -71,7 +71,7 @@ class SearchOptions:
     model: Annotated[
         str | None,
         typer.Option(
-            help=f"Prism model: {', '.join(OPTICAL_MODELS)}, or auto: the smallest model within --budget-px. "
+            help=f"Optical model: {', '.join(OPTICAL_MODELS)}, or auto: the smallest prism model within --budget-px. "
             "Default: auto.",
             rich_help_panel=_SEARCH,
         ),
@@ -178,9 +178,11 @@ class ParameterOptions:
         str | None,
         typer.Option(
             help="Parameters to estimate, separated by commas: apex (or deflection), phase, clock_offset, rpm, tilt_x, "
-            "tilt_y, cylinder_x, cylinder_y, wobble_x, wobble_y, index, focal_length; motion (or rate_x, rate_y, "
-            "rate_z) and change_x, change_y, change_z for a rotating camera; off_ratio and leak of the sensor. "
-            "Default: apex,phase, and rpm without an encoder.",
+            "tilt_y, cylinder_x, cylinder_y, wobble_x, wobble_y, index, focal_length; of a vibration amplitude, phase, "
+            "rpm, backward_x, backward_y, roll_x, roll_y, second_x, second_y, second_backward_x, second_backward_y; "
+            "motion (or rate_x, rate_y, rate_z) and change_x, change_y, change_z for a rotating camera; off_ratio and "
+            "leak of the sensor. "
+            "Default: apex,phase, and rpm without an encoder; all of a vibration.",
             rich_help_panel=_PARAMETERS,
         ),
     ] = None
@@ -350,6 +352,7 @@ def calibration_lines(c: Calibration, data: dict[str, Any]) -> list[Any]:
         *_ladder(c.ladder),
         f"sharpness ({sharp['kind']}): {sharp['before']:.5g} before, {sharp['after']:.5g} after",
         *_photometric(c),
+        *_frequency(data["parameters"].get("rpm", {})),
         *(f"warning: {text}" for text in c.warnings),
         f"{data['file']}: {data['model']} model, {c.events:,} events, {c.seconds:.2f} s on {data['device']}",
     ]
@@ -393,6 +396,14 @@ def _held_out(r: ModelCandidate) -> tuple[str, ...]:
     low, high = (max(x, 0.0) for x in r.seen_px)
     lost = f"{r.loss:.2g} ± {r.loss_std:.1g}"
     return f"{r.sharpness:.5g}", lost, f"{low:.3f} to {in_pixels(high)}", f"{r.cost_ns:.3g} ns"
+
+
+def _frequency(rpm: dict[str, Any]) -> list[str]:
+    """Return a line of text with the frequency of a vibration, if it was calibrated."""
+    if "hz" not in rpm:
+        return []
+    std = f" ± {rpm['std'] / 60.0:.2g}" if "std" in rpm else ""
+    return [f"frequency: {abs(rpm['hz']):.7g}{std} Hz"]
 
 
 def _photometric(c: Calibration) -> list[str]:

@@ -274,13 +274,9 @@ def _listed(names: list[str]) -> str:
 
 
 def _degrees(parameters: dict[str, float]) -> dict[str, float]:
-    """Return the true parameters of the prism with angles in degrees, under names that end in ``_deg``."""
-    angles = (
-        "apex",
-        "phase",
-        "plate_tilt",
-        *(f"{name}_{axis}" for name in ("tilt", "cylinder", "wobble") for axis in "xy"),
-    )
+    """Return the true parameters of the optic with angles in degrees, under names that end in ``_deg``."""
+    pairs = ("tilt", "cylinder", "wobble", "backward", "roll", "second", "second_backward")
+    angles = ("apex", "amplitude", "phase", "plate_tilt", *(f"{name}_{axis}" for name in pairs for axis in "xy"))
     return {f"{n}_deg" if n in angles else n: math.degrees(v) if n in angles else v for n, v in parameters.items()}
 
 
@@ -309,11 +305,8 @@ def _rows(d: dict[str, Any]) -> list[tuple[str, str]]:
     rows += _sensor_rows(d)
     if d["truth"] is not None:
         points = "with the true position of each event" if d["truth_points"] else "without positions"
-        shown = [
-            f"{n} {v:.5g}"
-            for n, v in d["truth"].items()
-            if n in ("apex_deg", "thickness", "plate_tilt_deg", "phase_deg", "index")
-        ]
+        short = ("apex_deg", "amplitude_deg", "thickness", "plate_tilt_deg", "phase_deg", "index", "rpm")
+        shown = [f"{n} {v:.5g}" for n, v in d["truth"].items() if n in short]
         rows.append(("truth", f"{', '.join(shown)}; {points}"))
     if d["world"] is not None:
         rows += _world_rows(d["world"])

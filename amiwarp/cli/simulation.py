@@ -32,7 +32,7 @@ from amiwarp.io.formats import check_ending
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Plate, Prism
-from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel
+from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel, Vibration
 from amiwarp.simulation.worlds.world import WorldScene
 
 if TYPE_CHECKING:
@@ -65,7 +65,11 @@ class RigOptions:
         Path | None, in_camera(help="Camera intrinsics: JSON or YAML (including the size), or calib.txt.")
     ] = None
     optic: Annotated[
-        Optic, in_prism(help="Moving glass: wedge, or plate (tilted and plane-parallel; needs --world).")
+        Optic,
+        in_prism(
+            help="What moves the image: wedge, plate (tilted and plane-parallel; needs --world), or vibration (the "
+            "camera itself, without glass and encoder)."
+        ),
     ] = Optic.WEDGE
     thickness_mm: Annotated[float, in_prism(help="Thickness of the plate (mm).")] = 10.0
     plate_tilt_deg: Annotated[
@@ -81,7 +85,9 @@ class RigOptions:
     speed: Annotated[
         Path | None, in_prism(help="Speed over time, instead of --rpm: CSV with 'seconds,rpm' on each line.")
     ] = None
-    phase_deg: Annotated[float, in_prism(help="Azimuth of the prism at encoder angle 0 (deg).")] = 0.0
+    phase_deg: Annotated[
+        float, in_prism(help="Azimuth of the prism at encoder angle 0, or phase of a vibration at the start (deg).")
+    ] = 0.0
     tilt_deg: Annotated[
         str, in_prism(help="Tilt of the prism's rotation axis about the camera's x and y axes (deg).", metavar="X,Y")
     ] = "0,0"
@@ -166,6 +172,57 @@ def _read_speed(path: Path) -> list[tuple[float, ...]]:
         if len(rows) > MOST_SPEEDS:
             raise AmiwarpError(f"{path}: has over {MOST_SPEEDS} speeds; give fewer, which are interpolated")
     return rows
+
+
+_in_optic = partial(typer.Option, rich_help_panel="Vibration")
+
+
+@dataclass(frozen=True)
+class VibrationOptions:
+    """Options for the vibration of a camera without a prism."""
+
+    hz: Annotated[float | None, _in_optic(help="Frequency of the vibration (Hz). Default: 100.")] = None
+    amplitude_deg: Annotated[
+        float | None, _in_optic(help="Radius of the vibration's forward circle (deg). Default: 0.4.")
+    ] = None
+    backward_deg: Annotated[
+        str | None,
+        _in_optic(
+            help="Rotation about the camera's x and y axes by the backward circle at the start (deg): with it, the "
+            "vibration is an ellipse, or a line if both circles are equally large. Default: 0,0.",
+            metavar="X,Y",
+        ),
+    ] = None
+    roll_deg: Annotated[
+        str | None,
+        _in_optic(
+            help="Rotation about the optical axis: factors of cosine and sine (deg). Default: 0,0.", metavar="C,S"
+        ),
+    ] = None
+    second_deg: Annotated[
+        str | None,
+        _in_optic(
+            help="Rotation about x and y by the second harmonic at the start (deg): its forward and its backward "
+            "circle. Default: 0,0,0,0.",
+            metavar="X,Y,X,Y",
+        ),
+    ] = None
+
+    def build(self, rig: RigOptions) -> Prism | Plate | Vibration:
+        """Return what moves the image. Raises :class:`AmiwarpError` for options of a vibration with other optics."""
+        given = [name for name, value in vars(self).items() if value is not None]
+        if rig.optic is not Optic.VIBRATION:
+            if given:
+                option = f"--{given[0].replace('_', '-')}"
+                raise AmiwarpError(f"{option} applies to a vibration; give --optic vibration, or remove {option}")
+            return rig.build_optic()
+        backward = numbers(self.backward_deg or "0,0", 2, "--backward-deg")
+        roll = numbers(self.roll_deg or "0,0", 2, "--roll-deg")
+        second = numbers(self.second_deg or "0,0,0,0", 4, "--second-deg")
+        (bx, by), (rc, rs), (fx, fy, sx, sy) = (map(math.radians, each) for each in (backward, roll, second))
+        amplitude = math.radians(0.4 if self.amplitude_deg is None else self.amplitude_deg)
+        hz = 100.0 if self.hz is None else self.hz
+        return Vibration(hz, amplitude, math.radians(rig.phase_deg), (bx, by), (rc, rs), (fx, fy), (sx, sy))
 
 
 @dataclass(frozen=True)
@@ -396,6 +453,7 @@ def run_simulate(
     duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 1.0,
     world: WorldOptions,
     scene: SceneOptions,
+    vibration: VibrationOptions,
     rig: RigOptions,
     sensor: SensorOptions,
     pixels: Annotated[
@@ -408,6 +466,7 @@ def run_simulate(
     """Simulate the recording of a picture or a world by an event camera behind the prism, with its ground truth.
 
     A picture lies at infinity. A world is three-dimensional, and the camera moves through it: give --world room.
+    With --optic vibration, the camera vibrates in place of the prism.
     """
     from amiwarp.simulation.simulator import Simulation
 
@@ -418,14 +477,14 @@ def run_simulate(
     simulation = Simulation(
         _scene(picture, world, scene, duration, common.seed),
         rig.build_camera(),
-        rig.build_optic(),
+        vibration.build(rig),
         duration,
         motion=rig.build_motion(),
         camera_motion=CameraMotion(scene.rates),
         sensor=sensor.build(),
         pixels=None if pixels is None else PixelMap.load(pixels),
         encoder_model=encoder.build(),
-        nominal_prism=None if rig.optic is Optic.PLATE else rig.build_nominal(),
+        nominal_prism=rig.build_nominal() if rig.optic is Optic.WEDGE else None,
         seed=common.seed,
         device=device,
     )

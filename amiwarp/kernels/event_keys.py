@@ -3,11 +3,14 @@
 :mod:`amiwarp.kernels.pixels` describes the keys.
 """
 
+from typing import Any
+
 import warp as wp
 
-from amiwarp.kernels.camera import pixel_to_ray, ray_to_pixel
+from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
 from amiwarp.kernels.pixels import LAG_ZERO, LARGEST_LAG, LOW_BITS, LOW_MASK, TICKS, Sink
 from amiwarp.kernels.prism_view import Steps, View, ray_without_prisms
+from amiwarp.kernels.refraction import compensate
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,6 +26,14 @@ class Block:
     cause: wp.array(dtype=wp.uint8)
     points: wp.array(dtype=wp.vec2)
     ticks: wp.array(dtype=int)  # time of the crossing since the first instant of the table
+
+
+@wp.func
+def azimuth_at(steps: Steps, at: int) -> wp.vec2:
+    """Return (cos, sin) of the true azimuth at a time since the first instant of the table [ticks]."""
+    k = wp.clamp(at / steps.ticks, 0, steps.margin + steps.count)
+    angle = steps.angle[k] + steps.turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
+    return wp.vec2(wp.cos(angle), wp.sin(angle))
 
 
 @wp.kernel
@@ -44,11 +55,21 @@ def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.
     at = int(t) * TICKS - lag + steps.margin * steps.ticks
     block.ticks[i] = at
     k = wp.clamp(at / steps.ticks, 0, steps.margin + steps.count)
-    angle = steps.angle[k] + steps.turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
     second = steps.second_angle[k] + steps.second_turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
     ray = pixel_to_ray(view.camera, wp.vec2(float(col), float(row)))
-    w, w2 = wp.vec2(wp.cos(angle), wp.sin(angle)), wp.vec2(wp.cos(second), wp.sin(second))
-    block.points[i] = ray_to_pixel(view.camera, ray_without_prisms(view.prism, view.second, ray, w, w2))
+    w2 = wp.vec2(wp.cos(second), wp.sin(second))
+    block.points[i] = ray_to_pixel(
+        view.camera, ray_without_prisms(view.prism, view.second, ray, azimuth_at(steps, at), w2)
+    )
+
+
+@wp.kernel
+def find_points_at_rest(
+    model: Any, camera: CameraParams, steps: Steps, block: Block, start: int, points: wp.array(dtype=wp.vec2)
+):
+    """Find the pixel that each event's scene point has if the camera does not vibrate as ``model`` says."""
+    i = start + wp.tid()
+    points[i] = compensate(model, camera, block.points[i], azimuth_at(steps, block.ticks[i]))
 
 
 @wp.kernel

@@ -68,6 +68,8 @@ class Parameter:
     """Text of its slider in ``amiwarp view``; empty without a slider."""
     slider: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Minimum, maximum and step of its slider, angles in degrees; the slider starts at 0."""
+    fine: bool = False
+    """Whether its effect is so small that the global search keeps its start value."""
 
 
 PHASE = Parameter("phase", "rad")
@@ -102,6 +104,18 @@ class Model:
     """Type of the glass in front of the camera."""
     FREE: ClassVar[tuple[str, ...]]
     """Names of the parameters that a calibration can find."""
+    FREED: ClassVar[tuple[str, ...]]
+    """Names of the parameters that a calibration finds unless settings name others; by default size and phase."""
+    PRISM: ClassVar[bool] = True
+    """Whether a prism moves the image. Else the camera itself moves, and recordings have no prism."""
+    MOVER: ClassVar[str] = "prism"
+    """What moves the image, in words."""
+    SIZE_HINT: ClassVar[str] = "twice the nominal one, 2 deg if none is given"
+    """Largest size that is tried without given bounds, in words."""
+    TIME_BIN_US: ClassVar[int] = 1000
+    """Length of the time bins in which repetition of the events is looked for [us]: a fifth of the shortest turn."""
+    SECTORS: ClassVar[int] = 64
+    """Number of parts of a turn, each of which has events, unless the sensor loses them."""
     SIZE: ClassVar[str]
     """Name of the parameter that sets the size of the orbit."""
     ANGLES: ClassVar[int] = 1
@@ -120,6 +134,8 @@ class Model:
         cls.SIZE = cls.FREE[0]
         if "ORBITS" not in vars(cls):
             cls.ORBITS = ((cls.SIZE, cls.FREE[1]),)
+        if "FREED" not in vars(cls):
+            cls.FREED = tuple(name for orbit in cls.ORBITS for name in orbit)
 
     @classmethod
     def closed_form(cls) -> type[Model]:
@@ -199,6 +215,86 @@ class Model:
             Value of the parameter :attr:`SIZE`: here that of twice the prism's apex angle.
         """
         return cls.size_from_apex(2.0 * as_wedge(prism).apex, as_wedge(prism))
+
+    @classmethod
+    def typical_size(cls, camera: Camera, prism: Prism | Plate) -> float:
+        """Return a typical size, at which the effect of the parameters is measured.
+
+        Parameters
+        ----------
+        camera : Camera
+            The camera.
+        prism : Prism or Plate
+            The nominal glass.
+
+        Returns
+        -------
+        float
+            Value of the parameter :attr:`SIZE`: here that with which a search starts.
+        """
+        return cls.start_values(prism)[cls.SIZE]
+
+    @classmethod
+    def default_bounds(cls, name: str, value: float, camera: Camera, prism: Prism | Plate) -> tuple[float, float]:
+        """Return the bounds of a parameter of the model that a search keeps unless others are given.
+
+        Parameters
+        ----------
+        name : str
+            Name of the parameter, one of :attr:`FREE`.
+        value : float
+            Its start value, in its unit.
+        camera : Camera
+            The camera.
+        prism : Prism or Plate
+            The nominal glass. Here the size ranges from 0 to :meth:`largest_size`.
+
+        Returns
+        -------
+        low, high : float
+            The bounds, in the parameter's unit.
+        """
+        if one_of(name, cls.FREE, "name") == cls.SIZE:
+            return 0.0, cls.largest_size(prism)
+        if name == PHASE.name:
+            return -PHASE.half_range, PHASE.half_range
+        half = next(parameter.half_range for parameter in cls.PARAMETERS if parameter.name == name)
+        return value - half, value + half
+
+    @classmethod
+    def turned_values(cls, values: Mapping[str, float], angle: float) -> dict[str, float]:
+        """Return the values of the motion at angles that are larger by a constant.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Values by name, in their units.
+        angle : float
+            The constant [rad].
+
+        Returns
+        -------
+        dict
+            The values: here with another phase.
+        """
+        check_given(values, cls.FREE[:2])
+        return {**values, PHASE.name: values[PHASE.name] + angle}
+
+    @classmethod
+    def reversed_values(cls, values: Mapping[str, float]) -> dict[str, float] | None:
+        """Return values that describe the same motion by the angle -θ.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Values by name, in their units.
+
+        Returns
+        -------
+        dict or None
+            The values, others unchanged; None if the sense of rotation tells one motion from another, as for a prism.
+        """
+        return None
 
     @classmethod
     def start_values(cls, prism: Prism | Plate) -> dict[str, float]:

@@ -18,8 +18,9 @@ from amiwarp.events.encoder import TWO_PI, Encoder, periodic
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, PlateModel, RisleyModel
+from amiwarp.optics.models import ExactModel, Model, PlateModel, RisleyModel
 from amiwarp.optics.prism import Plate, Prism, check_angles, check_phase
+from amiwarp.optics.vibration import VibrationModel
 from amiwarp.simulation.pictures import linear_luminance, read_picture
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.validation import INT64, array, guarded, instance, one_of, real, vector, whole
@@ -167,6 +168,75 @@ class PrismMotion:
     def largest_speed(self) -> float:
         """Largest magnitude of the prism's speed [rad/s]."""
         return float(np.abs(self._table()[:, 1]).max())
+
+
+@guarded
+@dataclass(frozen=True, slots=True, eq=False)
+class Vibration:
+    """Vibration of a camera without a prism, to simulate in place of a prism: small rotations at one frequency.
+
+    Examples
+    --------
+    >>> vibration = amiwarp.Vibration(hz=100.0, amplitude=0.007)
+    >>> vibration.motion.angle([0.0, 5_000.0]).round(4)
+    array([0.    , 3.1416])
+    """
+
+    hz: float | ArrayLike
+    """Frequency [Hz], or a table of rows (time [s], frequency), as the speed of :class:`PrismMotion`."""
+    amplitude: float
+    """Radius of the forward circle [rad], as in :class:`amiwarp.VibrationModel`."""
+    phase: float = 0.0
+    """Phase of the forward circle at the start [rad]."""
+    backward: tuple[float, float] = (0.0, 0.0)
+    """Rotation about the camera's x and y axes by the backward circle at the start [rad]."""
+    roll: tuple[float, float] = (0.0, 0.0)
+    """Rotation about the optical axis: factors of the cosine and sine of the angle [rad]."""
+    second: tuple[float, float] = (0.0, 0.0)
+    """Rotation about x and y by the forward circle of the second harmonic at the start [rad]."""
+    second_backward: tuple[float, float] = (0.0, 0.0)
+    """The same by the backward circle of the second harmonic [rad]."""
+
+    def __post_init__(self) -> None:
+        _ = self.motion, self.model(Camera.from_fov(8, 8, 1.0))  # their checks
+
+    @property
+    def motion(self) -> PrismMotion:
+        """Angle of the vibration over time."""
+        hz = array(self.hz, "vibration hz").astype(np.float64)
+        if hz.ndim == 0:
+            return PrismMotion(60.0 * real(self.hz, "vibration hz", 1e-3, 1e5, " Hz"), self.phase)
+        return PrismMotion(hz * (1.0, 60.0) if hz.ndim == 2 and hz.shape[1] == 2 else hz, self.phase)
+
+    def model(self, camera: Camera) -> VibrationModel:
+        """Return the model of the camera's rotation.
+
+        Parameters
+        ----------
+        camera : Camera
+            The camera.
+
+        Returns
+        -------
+        VibrationModel
+            The model.
+        """
+        parts = (self.backward, self.roll, self.second, self.second_backward)
+        return VibrationModel(camera, self.amplitude, self.phase, *parts)
+
+    def parameters(self) -> dict[str, float]:
+        """Return the true values by the names that calibration uses.
+
+        Returns
+        -------
+        dict
+            Values in their units. ``rpm`` is missing if the frequency changes.
+        """
+        parts = {"backward": self.backward, "roll": self.roll, "second": self.second,
+                 "second_backward": self.second_backward}  # fmt: skip
+        pairs = {f"{name}_{axis}": float(x) for name, pair in parts.items() for axis, x in zip("xy", pair, strict=True)}
+        speed = {"rpm": 60.0 * float(self.hz)} if isinstance(self.hz, int | float) else {}
+        return {"amplitude": float(self.amplitude), "phase": float(self.phase), **pairs, **speed}
 
 
 @guarded
@@ -662,18 +732,20 @@ class SimulationValues:
     """Scene in front of the camera: pictures at infinity, or a world."""
     camera: Camera
     """Camera intrinsics, of at most 4194304 pixels."""
-    prism: Prism | Plate
-    """Prism or plate in front of the camera, with its true parameters. A plate needs a world, which is seen by rays."""
+    prism: Prism | Plate | Vibration
+    """Prism or plate in front of the camera, with its true parameters, or vibration of a camera without glass. A plate
+    needs a world, which is seen by rays."""
     duration_s: float
     """Duration of the recording [s]."""
     motion: PrismMotion = field(default_factory=PrismMotion)
-    """Motion of the prism: speed, phase, tilt, cylinder power and wobble."""
+    """Motion of the prism: speed, phase, tilt, cylinder power and wobble. A vibration has its own."""
     camera_motion: CameraMotion = field(default_factory=CameraMotion)
     """Rotation of the camera; by default none."""
     sensor: SensorModel = field(default_factory=SensorModel)
     """Model of the sensor's pixels and readout."""
     encoder_model: EncoderModel | None = field(default_factory=EncoderModel)
-    """Errors of the encoder; None for a camera without a prism, whose recording has neither encoder nor prism."""
+    """Errors of the encoder; None for a camera without a prism, whose recording has neither encoder nor prism. A
+    vibrating camera has none either way."""
     nominal_prism: Prism | Plate | None = None
     """Nominal prism or plate that is stored with the recording; None for the true one."""
     seed: int = 0
@@ -688,10 +760,14 @@ class SimulationValues:
     def __post_init__(self) -> None:
         if not isinstance(self.scene, WorldScene):
             instance(self.scene, Scene, "simulation's scene")
+        if isinstance(self.prism, Vibration):
+            object.__setattr__(self, "motion", self.prism.motion)
+            object.__setattr__(self, "encoder_model", None)
         kinds: dict[str, type] = {
-            "camera": Camera, "prism": Plate if isinstance(self.prism, Plate) else Prism, "motion": PrismMotion,
-            "sensor": SensorModel, "camera_motion": CameraMotion,
+            "camera": Camera, "motion": PrismMotion, "sensor": SensorModel, "camera_motion": CameraMotion,
         }  # fmt: skip
+        if not isinstance(self.prism, Plate | Vibration):
+            kinds["prism"] = Prism
         if self.encoder_model is not None:
             kinds["encoder_model"] = EncoderModel
         for name, kind in kinds.items():
@@ -707,8 +783,7 @@ class SimulationValues:
             given, expected = (f"{width}x{height}" for width, height in (self.pixels.size, size))
             raise AmiwarpError(f"the pixel map has {given} pixels, the camera {expected}; give the map of this camera")
         whole(self.seed, "seed", 0, (1 << 31) - 1)
-        second = None if isinstance(self.prism, Plate) else self.prism.second
-        if (second is None) != (self.motion.second is None):
+        if (self.glass.second is None) != (self.motion.second is None):
             has, lacks = ("prism", "motion") if self.motion.second is None else ("motion", "prism")
             raise AmiwarpError(f"the {has} has a second prism, the {lacks} has none; give both or neither")
 
@@ -731,10 +806,14 @@ class SimulationValues:
         return self.bending if self.plate is None else self.plate
 
     @property
+    def glass(self) -> Prism:
+        """The prism; one with an apex angle of 0 for a plate or a vibrating camera."""
+        return self.prism if isinstance(self.prism, Prism) else Prism(0.0)
+
+    @property
     def bending(self) -> ExactModel | RisleyModel:
-        """True model of how the glass changes the direction of rays; a plate does not change it."""
-        motion, second = self.motion, self.motion.second
-        prism = Prism(0.0) if isinstance(self.prism, Plate) else self.prism
+        """True model of how the glass changes the direction of rays; plate and vibration do not change it."""
+        motion, second, prism = self.motion, self.motion.second, self.glass
         if second is None:
             return ExactModel(self.camera, prism, motion.phase, motion.tilt, motion.cylinder, motion.wobble)
         turned, by = second.angle([1e6 * self.duration_s])[0], motion.angle([1e6 * self.duration_s])[0]
@@ -744,3 +823,8 @@ class SimulationValues:
     def plate(self) -> PlateModel | None:
         """True model of the plate, for a scene at infinity; None for a prism."""
         return PlateModel(self.camera, self.prism, self.motion.phase) if isinstance(self.prism, Plate) else None
+
+    @property
+    def moving_model(self) -> Model:
+        """True model of what changes the direction of rays: the prisms, or the vibration."""
+        return self.prism.model(self.camera) if isinstance(self.prism, Vibration) else self.bending

@@ -17,7 +17,7 @@ from amiwarp.kernels.launch import launch
 from amiwarp.kernels.plate import PlateParams
 from amiwarp.optics.camera import Camera, camera_params
 from amiwarp.optics.models import LARGEST_INVERSE_DEPTH, ExactModel, Model, PlateModel
-from amiwarp.simulation.description import Scene, SimulationValues
+from amiwarp.simulation.description import Scene, SimulationValues, Vibration
 from amiwarp.simulation.pictures import DARK, Placement, log_map, place_picture
 from amiwarp.simulation.worlds.world import Body, Material, Trajectory, World, WorldScene
 
@@ -84,7 +84,10 @@ class ImageMotion:
     """Largest motion of the image that a turn of the prism or of the camera by a unit angle causes."""
 
     prisms: NDArray[np.float64]
-    """Largest motion of the image per rotation angle of each prism [px/rad], shape (1,) or (2,)."""
+    """Largest motion of the image per rotation angle of each prism, or per angle of a vibration [px/rad]; shape (1,) or
+    (2,)."""
+    bends: NDArray[np.float64]
+    """Largest change of this motion per angle [px/rad²], of the same shape."""
     camera: NDArray[np.float64]
     """Largest motion of the image per rotation angle of the camera about each of its axes [px/rad], shape (3,)."""
 
@@ -101,7 +104,7 @@ def step_us(
     rates = simulation.camera_motion.largest_rates
     turning = np.array([each.largest_speed for each in (simulation.motion, simulation.motion.second) if each])
     speed = float(motion.prisms @ turning) + float(motion.camera @ rates) + world_speed
-    bend = float(motion.prisms @ turning**2) / 8.0  # [px/s²]: the distance from the chord, per squared step
+    bend = float(motion.bends @ turning**2) / 8.0  # [px/s²]: the distance from the chord, per squared step
     step = 1e6 * min(LARGEST_MOTION / max(speed, 1e-9), math.sqrt(LARGEST_BEND / max(bend, 1e-9)))
     step = min(float(LONGEST_STEP), longest, step)
     frames = getattr(simulation.scene, "frames", None)
@@ -114,8 +117,18 @@ def step_us(
     return int(step)
 
 
+def shake(simulation: SimulationValues, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rotation of a vibrating camera from its orientation at rest at times [us], shape (n, 3, 3).
+
+    Without a vibration it is the identity, shape (3, 3).
+    """
+    if not isinstance(simulation.prism, Vibration):
+        return np.eye(3)
+    return simulation.prism.model(simulation.camera).rotations(simulation.motion.angle(t_us))
+
+
 def image_motion(simulation: SimulationValues, inverse_depth: float = 0.0) -> ImageMotion:
-    """Return the largest motion of the image on a grid of pixels, corners included, over one turn of the prism.
+    """Return the largest motion of the image on a grid of pixels, corners included, over one turn of what moves it.
 
     ``inverse_depth``: that of the nearest surface, for a plate [1/m].
     """
@@ -128,21 +141,22 @@ def image_motion(simulation: SimulationValues, inverse_depth: float = 0.0) -> Im
     xy = wp.array(np.repeat(grid, turns + 1, axis=0).astype(np.float32), dtype=wp.vec2, device=device)
     angles = wp.array(np.tile(theta, len(grid)).astype(np.float32), dtype=float, device=device)
     arc = (theta[1] / 2.0) / math.sin(theta[1] / 2.0)  # a step along a circle is longer than its chord
-    prisms = []
-    models: list[Model] = [*single_models(simulation)]
+    prisms, bends = [], []
+    shakes = isinstance(simulation.prism, Vibration)
+    models: list[Model] = [simulation.moving_model] if shakes else [*single_models(simulation)]
     if simulation.plate is not None:
         models = [replace(simulation.plate, inverse_depth=min(inverse_depth, LARGEST_INVERSE_DEPTH))]
     for model in models:
-        path = (
-            replace(cast("Any", model), phase=0.0)
-            .compensate_points(xy, angles)
-            .numpy()
-            .reshape(len(grid), turns + 1, 2)
-        )
+        placed = model if shakes else replace(cast("Any", model), phase=0.0)
+        path = placed.compensate_points(xy, angles).numpy().reshape(len(grid), turns + 1, 2)
         along = np.linalg.norm(np.diff(path, axis=1), axis=2)
         prisms.append(float(np.max(along, initial=0.0, where=np.isfinite(along))) * arc / theta[1])
-    shares = np.array(prisms) * (1.0 if len(prisms) == 1 else PAIR_MARGIN)
-    return ImageMotion(shares, _camera_image_motion(simulation, grid))
+        bends.append(prisms[-1])  # of a circle
+        if shakes:
+            curved = np.linalg.norm(np.diff(path, n=2, axis=1), axis=2)
+            bends[-1] = float(np.max(curved, initial=0.0, where=np.isfinite(curved))) / theta[1] ** 2
+    share = 1.0 if len(prisms) == 1 else PAIR_MARGIN
+    return ImageMotion(np.array(prisms) * share, np.array(bends) * share, _camera_image_motion(simulation, grid))
 
 
 def single_models(simulation: SimulationValues) -> list[ExactModel]:
@@ -190,6 +204,11 @@ def seen_bearings(simulation: SimulationValues) -> NDArray[np.float64]:
     )
     border = np.round(border)
     turn = np.arange(24) * (2.0 * np.pi / 24)
+    if isinstance(simulation.prism, Vibration):
+        rays = np.asarray(camera.pixels_to_rays(border), np.float64)
+        rays = rays[np.isfinite(rays).all(axis=1)]
+        shakes = simulation.prism.model(camera).rotations(np.asarray(turn, np.float64))
+        return np.concatenate([rays @ turned.T for turned in shakes])
     others = turn if simulation.motion.second is not None else np.zeros(1)
     theta = np.stack([m.ravel() for m in np.meshgrid(turn, others)], axis=1)
     xy = wp.array(np.repeat(border, len(theta), axis=0).astype(np.float32), dtype=wp.vec2, device=device)
@@ -1111,6 +1130,7 @@ class WorldSight:
 
     def __init__(self, simulation: SimulationValues, scene: WorldScene, world: DeviceWorld) -> None:
         self._scene, self._world, device = scene, world, world.device
+        self._simulation = simulation
         camera, samples = simulation.camera, scene.samples or RAYS_PER_PIXEL
         rays = aperture(samples, scene.blur)
         view = self._view = world_rays.RayView()
@@ -1151,7 +1171,8 @@ class WorldSight:
         t = np.maximum(t_us, 0.0) * 1e-6
         self._world.set_instants(t)
         poses: NDArray[Any] = np.zeros(len(t), cast("Any", kernels.Pose).numpy_dtype())
-        poses["rotation"], poses["position"] = self._scene.trajectory.poses(t)
+        rotation, poses["position"] = self._scene.trajectory.poses(t)
+        poses["rotation"] = rotation @ shake(self._simulation, t_us)
         self._view.poses = wp.array(poses, dtype=kernels.Pose, device=self._world.device)
         self._view.prism, self._view.second = view.prism, view.second
 

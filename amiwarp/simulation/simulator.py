@@ -24,10 +24,18 @@ from amiwarp.io import RecordingWriter
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel, Model, PlateModel, axis_rotation, wrap_angle
+from amiwarp.optics.models import ExactModel, Model, PlateModel, axis_rotation, model_camera, wrap_angle
 from amiwarp.optics.prism import Plate, Prism
 from amiwarp.simulation import scenery
-from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel, SimulationValues
+from amiwarp.simulation.description import (
+    CameraMotion,
+    EncoderModel,
+    PrismMotion,
+    Scene,
+    SensorModel,
+    SimulationValues,
+    Vibration,
+)
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.scenery import DeviceWorld, MapRing, WorldMapRing, WorldSight
 from amiwarp.simulation.worlds.world import WorldScene
@@ -74,7 +82,9 @@ class TruthRenderer:
             raise AmiwarpError("the scene is a picture at infinity, which has no depth; give a WorldScene as the scene")
         self._simulation, self._scene = simulation, simulation.scene
         self._world = DeviceWorld(self._scene.world, simulation.device)
-        self._sight = WorldSight(simulation, self._scene, self._world)
+        self._sight = self._sight_at_rest = WorldSight(simulation, self._scene, self._world)
+        if isinstance(simulation.prism, Vibration):
+            self._sight_at_rest = WorldSight(replace(simulation, prism=simulation.glass), self._scene, self._world)
         self._rays = scenery.pixel_rays(simulation.camera)
 
     def at(self, t_us: int) -> FrameTruth:
@@ -92,7 +102,7 @@ class TruthRenderer:
             positions of the joints.
         """
         t = t_us * 1e-6
-        scene, camera, model = self._scene, self._simulation.camera, self._simulation.bending
+        scene, camera, model = self._scene, self._simulation.camera, self._simulation.moving_model
         (rotation,), (position,) = scene.trajectory.poses([t])
         self._world.set_instants(np.array([t]))
         pixels = camera.rays_to_pixels(self._rays)
@@ -206,16 +216,17 @@ class TruthRenderer:
     def _intensity(self, t_us: int, *, prism: bool) -> NDArray[np.float32]:
         """Return the luminance of all pixels at a time, through the prism or without the prism, shape (n,)."""
         device, simulation = self._world.device, self._simulation
-        self._sight.set_plate(simulation.plate if prism else None)
+        sight = self._sight if prism else self._sight_at_rest
+        sight.set_plate(simulation.plate if prism else None)
         if not prism:
             simulation = cast("Simulation", simulation).without_prism()
-        self._sight.set_instants(np.array([float(t_us)]), scenery.prism_view_of(simulation, device))
+        sight.set_instants(np.array([float(t_us)]), scenery.prism_view_of(simulation, device))
         table: NDArray[Any] = np.zeros(1, cast("Any", prism_view.Step).numpy_dtype())
         first, second = true_angles(simulation.motion, np.array([float(t_us)]))
         table["azimuth"], table["second"] = azimuths_of(first), azimuths_of(second)
         steps = prism_view.Steps()
         steps.at = wp.array(table, dtype=prism_view.Step, device=device)
-        return np.array(self._sight.light(steps, 0, 1).numpy()[0])
+        return np.array(sight.light(steps, 0, 1).numpy()[0])
 
 
 # Ground truth that a simulation records next to the events: labels, instants and poses of its world, known pixels.
@@ -536,6 +547,9 @@ class DeviceBlock:
     """Columns of the events: the kernels' struct :class:`amiwarp.kernels.event_keys.Block`."""
     look: Callable[[], Any] | None = None
     """Function that finds the surfaces that the events saw, valid until the next chunk; None for a picture scene."""
+    at_rest: wp.array | None = None
+    """Pixel of each event's scene point in a vibrating camera's view at rest [px]; None if the camera has no vibration.
+    """
 
     def events(self) -> Events:
         """Return the events in host memory."""
@@ -543,14 +557,18 @@ class DeviceBlock:
         return Events(b.x.numpy(), b.y.numpy(), b.t.numpy(), b.p.numpy())
 
     def points(self) -> NDArray[np.float32]:
-        """Return the scene point of each event: its pixel without the prism [px], shape (n, 2)."""
-        return np.asarray(self.arrays.points.numpy())
+        """Return the scene point of each event: its pixel without prism and vibration [px], shape (n, 2)."""
+        return np.asarray(self._points.numpy())
+
+    @property
+    def _points(self) -> wp.array:
+        return self.arrays.points if self.at_rest is None else self.at_rest
 
     def on_device(self) -> tuple[DeviceEvents, wp.array]:
         """Return the finished events, and their scene points without the prism, without a copy."""
         b = self.arrays
         wait(b.t.device)
-        return DeviceEvents(b.x, b.y, b.t, b.p), b.points
+        return DeviceEvents(b.x, b.y, b.t, b.p), self._points
 
     def truth(self) -> EventTruth:
         """Return the ground truth of the events.
@@ -564,7 +582,7 @@ class DeviceBlock:
 
         In a world, call this method before the engine simulates the next chunk.
         """
-        found = {name: getattr(self.arrays, name) for name in (*NAMES, "points", "cause")}
+        found = {name: getattr(self.arrays, name) for name in (*NAMES, "points", "cause")} | {"points": self._points}
         if self.look is not None:
             seen = self.look()
             found |= {name: getattr(seen, name) for name in ("instance", "depth", "place")}
@@ -693,9 +711,9 @@ class Engine:
         after = np.minimum(before + 1, len(times) - 1)
         weight = np.clip((t - times[before]) / np.maximum(times[after] - times[before], 1.0), 0.0, 1.0)
         weight[before == after] = 0.0  # with weight 0 the kernel reads only one map
-        orientation = maps.orientations(t)
+        orientation, axis = maps.orientations(t), scenery.shake(self._simulation, t) @ self._axis
         to_texel = maps.placement.to_texel()
-        table["to_texel"] = to_texel @ self._axis if orientation is None else to_texel @ orientation @ self._axis
+        table["to_texel"] = to_texel @ axis if orientation is None else to_texel @ orientation @ axis
         table["before"], table["after"], table["weight"] = slots[before], slots[after], weight
 
     def _kernel(self) -> Any:
@@ -787,8 +805,14 @@ class Engine:
         launch.launch(event_keys.unpack, n, inputs, [block], device=self._device)
         if stamps is not None:
             block.t = stamps
+        at_rest = None
+        if isinstance(self._simulation.prism, Vibration):
+            at_rest = wp.empty_like(block.points)
+            model = self._simulation.moving_model
+            inputs = [model.params(self._device), model_camera(model, self._device), steps, block]
+            launch.launch(event_keys.find_points_at_rest, n, inputs, [at_rest], device=self._device)
         if self._sight is None:
-            return DeviceBlock(block)
+            return DeviceBlock(block, at_rest=at_rest)
         faces = (
             self._maps.faces if isinstance(self._maps, WorldMapRing) else wp.empty(0, dtype=int, device=self._device)
         )
@@ -796,7 +820,7 @@ class Engine:
         if self._simulation.plate is not None:  # the pixels without the plate depend on the surfaces
             seen = look()
             return DeviceBlock(block, lambda: seen)
-        return DeviceBlock(block, look)
+        return DeviceBlock(block, look, at_rest)
 
 
 def true_angles(motion: PrismMotion, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -850,7 +874,10 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
     rates = np.asarray(simulation.camera_motion.rates) if constant else np.full(3, np.nan)
     omega = dict(zip(("omega_x", "omega_y", "omega_z"), rates.ravel()[-3:].tolist(), strict=True))
     clock = {} if simulation.encoder_model is None else {"clock_offset_us": simulation.encoder_model.clock_offset_us}
+    moving = {name: value for name, value in omega.items() if math.isfinite(value)}
     glass = simulation.prism
+    if isinstance(glass, Vibration):
+        return {**glass.parameters(), **moving, **asdict(simulation.sensor)}
     uneven = {
         f"{name}_{axis}": angle
         for name in ("tilt", "cylinder", "wobble")
@@ -866,7 +893,7 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
         **of_second_prism(simulation),
         **clock,
         **(uneven if isinstance(glass, Prism) else {}),
-        **{name: value for name, value in omega.items() if math.isfinite(value)},
+        **moving,
         **asdict(simulation.sensor),
     }
 
@@ -932,14 +959,14 @@ class Simulation(SimulationValues):
     """
 
     def without_prism(self) -> Simulation:
-        """Return this simulation with the prism taken out, which makes it that of a plain event camera.
+        """Return this simulation without prism and vibration, which makes it that of a plain event camera.
 
         Returns
         -------
         Simulation
             The same scene, sensor and seed with an apex angle of 0. Its recording has neither encoder nor prism.
         """
-        prism = Prism(0.0) if isinstance(self.prism, Plate) else replace(self.prism, apex=0.0, second=None)
+        prism = replace(self.glass, apex=0.0, second=None)
         motion = replace(self.motion, cylinder=(0.0, 0.0), second=None)
         return replace(self, prism=prism, motion=motion, nominal_prism=None, encoder_model=None)
 
@@ -990,8 +1017,8 @@ class Simulation(SimulationValues):
         Yields
         ------
         tuple
-            Events, and the scene point of each event: its pixel without the prism [px], shape ``(n, 2)``, NaN if its
-            ray misses the image plane.
+            Events, and the scene point of each event: its pixel without prism and vibration [px], shape ``(n, 2)``, NaN
+            if its ray misses the image plane.
         """
         for block, _ in self._run_engine(chunk_us, progress):
             yield block.events(), block.points()
@@ -1094,8 +1121,9 @@ class Simulation(SimulationValues):
 
     @property
     def _stored_prism(self) -> Prism | Plate | None:
-        """Nominal prism or plate to store with the recording, or None for a plain event camera."""
-        return None if self.encoder_model is None else self.nominal_prism or self.prism
+        """Nominal prism or plate to store with the recording, or None for a camera without glass."""
+        glass = self.prism if isinstance(self.prism, Plate) else self.glass
+        return None if self.encoder_model is None else self.nominal_prism or glass
 
     def write(
         self,
@@ -1156,7 +1184,7 @@ class Simulation(SimulationValues):
 def simulate(
     scene: Scene | WorldScene | str | Path | NDArray[Any],
     camera: Camera,
-    prism: Prism | Plate,
+    prism: Prism | Plate | Vibration,
     *,
     duration_s: float,
     motion: PrismMotion | float = 720.0,
@@ -1182,12 +1210,13 @@ def simulate(
         Scene, world, picture file, or pixel values (see :meth:`Scene.from_picture`).
     camera : Camera
         The camera.
-    prism : Prism or Plate
-        The true prism; or a plate, in a world.
+    prism : Prism, Plate or Vibration
+        The true prism; or a plate, in a world; or the vibration of a camera without glass, whose recording has neither
+        encoder nor prism.
     duration_s : float
         Duration [s].
     motion : PrismMotion or float, optional
-        Motion of the prism, or its constant speed [turns/min].
+        Motion of the prism, or its constant speed [turns/min]. A vibration has its own frequency.
     camera_motion : CameraMotion, optional
         Rotation of the camera; by default none.
     sensor : SensorModel, optional

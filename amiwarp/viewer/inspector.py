@@ -937,12 +937,12 @@ class Inspector:
     def knobs_of(self, calibration: Calibration) -> Knobs:
         """Return the parameters of a calibration of this camera, with the phase at the inspector's angle zero."""
         p, prism = calibration.parameters, calibration.prism
-        kind, rpm, phase = MODELS[calibration.model_name], p.get("rpm", 0.0), p["phase"]
+        kind, rpm = MODELS[calibration.model_name], p.get("rpm", 0.0)
         if calibration.zero_us is not None:
-            phase += rpm * math.tau / 60e6 * (self.zero_us - calibration.zero_us)
+            p = kind.turned_values(p, rpm * math.tau / 60e6 * (self.zero_us - calibration.zero_us))
         offset = p.get("clock_offset", self._recorded_offset_us)
         return Knobs.given(
-            p, model=kind.NAME, apex=kind.apex_from_size(p[kind.SIZE], prism), phase=phase, clock_offset=offset,
+            p, model=kind.NAME, apex=kind.apex_from_size(p[kind.SIZE], prism), phase=p["phase"], clock_offset=offset,
             rpm=rpm, focal_length=p.get("focal_length"),
         )  # fmt: skip
 

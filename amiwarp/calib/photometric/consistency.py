@@ -668,7 +668,39 @@ def _angle_columns(cost: Cost, best: Vector) -> dict[str, Any]:
     if cost.space.moving or pairs.arrays.slope.shape[0] or not (one and _orbit(cost.space)):
         return {}
     rows = pairs.angle_patterns((0.5 * camera.width, 0.5 * camera.height))
-    return {name: shifted(cost, best, rows[k]) for k, name in enumerate(PATTERNS)}
+    # harmonics of a vibration's angle look like those of its motion
+    examined = PATTERNS if MODELS[cost.space.model].PRISM else SKEW
+    return {name: shifted(cost, best, rows[PATTERNS.index(name)]) for name in examined}
+
+
+def by_refractory(cost: Cost, best: Vector) -> Vector:
+    """Return the change of the answer ``best`` [px] per angle by which what moves turns in the refractory period [rad].
+
+    The period sets the reference of a pair, its first event, later. The map must be solved at ``best``.
+    """
+    names = cost.space.names
+    columns = slopes(cost, cost.space, best, names) | {"refractory": cost.by_angle(best)[0]}
+    hessian = linear_fit(cost, columns).hessian.sum(axis=0)
+    return np.asarray(-_pseudo_inverse(hessian[:-1, :-1]) @ hessian[:-1, -1])
+
+
+def change_of_speed_px(cost: Cost, best: Vector) -> float:
+    """Return how far a steady change of the speed over the recording moves events [px rms]; 0 if not significant.
+
+    It is the estimate of a linearised fit, which finds a share of the change only. The map must be solved at ``best``.
+    """
+    pairs, names = cost.brightness.pairs, cost.space.names
+    times = pairs.time.astype(np.float64)
+    late = (times - times.mean()) / max(float(times.std()), 1e-9)
+    waves = {"late": late, "square": late**2 - np.mean(late**2)}
+    columns = slopes(cost, cost.space, best, names)
+    for name, wave in waves.items():
+        shift = np.zeros((2, pairs.arrays.stride), np.float32)
+        shift[:, : len(pairs)] = wave
+        columns[name] = shifted(cost, best, wp.array(shift, dtype=float, device=cost.brightness.device))
+    estimate, significance, _ = linear_fit(cost, columns).adding((*names, "late"), ("square",))
+    moved = px_per_rad(cost.space, best) * abs(float(estimate.change[-1])) * float(waves["square"].std())
+    return moved if significance >= SIGNIFICANT else 0.0
 
 
 @dataclass(frozen=True)
@@ -690,7 +722,7 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> AngleFi
     explains does not count.
     """
     angles = _angle_columns(cost, best)
-    groups = [{name: angles[name] for name in group} for group in (HARMONICS, SKEW) if angles]
+    groups = [{name: angles[name] for name in group} for group in (HARMONICS, SKEW) if angles.keys() >= {*group}]
     if not angles or not (names or telling(cost, groups, LEAST_ANGLE_GAIN)):
         return None
     given = _rivals_of_angles(cost, best)
@@ -701,7 +733,7 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> AngleFi
             others |= {n: x for n, x in _cause_columns(cost, best, cause).items() if n not in given}
     fit = linear_fit(cost, given | angles | others)
     if not names:
-        for group, other in ((HARMONICS, SKEW), (SKEW, HARMONICS)):
+        for group, other in ((HARMONICS, SKEW), (SKEW, HARMONICS)) if len(groups) == 2 else ((SKEW, ()),):
             _, significance, gain = fit.adding((*given, *others, *other), group)
             names += group if significance >= SIGNIFICANT and gain >= LEAST_ANGLE_GAIN else ()
         if not names:

@@ -434,11 +434,9 @@ FEWEST_TILES = 6
 """Number of tiles of the scene that are always used."""
 
 
-SECTORS = 64
-"""Number of parts of a turn in which silence is looked for."""
 FEWEST_OF_SECTOR, SILENT_SHARE = 20, 0.05
 """Median number of events of a part of a turn from which on silence is looked for, and the share of that number below
-which a part is silent."""
+which a part is silent. The model tells the number of parts."""
 
 
 class _PairCollector:
@@ -482,7 +480,7 @@ class _PairCollector:
         search, source = self.search, self.recording.events
         space, best, calibration_events = search.space, search.best, search.calibration_events
         joined = None if search.ahead is None else search.ahead.take(spans)
-        sector = turn_length(self.recording, calibration_events.encoder) / SECTORS
+        sector = turn_length(self.recording, calibration_events.encoder) / MODELS[space.model].SECTORS
         parts = [part for span in spans for part in split_at_silence(source.between(*span), sector)]
         self._heard_us += sum(int(part.t[-1]) - int(part.t[0]) for part in parts)
         self._read_us += sum(stop - start for start, stop in spans)

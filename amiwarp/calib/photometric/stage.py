@@ -82,14 +82,26 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
             time_constant = turn / rad_per_us
         if len(v) == len(answer.stage.x):
             found.answers.timing = answer.stage.x - v
+        if not MODELS[found.answers.cost.space.model].PRISM:
+            found.answers.cost.converge(answer.stage.x)
+            answer = answer.judged(*judge_speed(consistency.change_of_speed_px(found.answers.cost, answer.stage.x)))
+            doubt = consistency.by_refractory(found.answers.cost, answer.stage.x)
+            found.answers.doubt = direction * rad_per_us * refractory_doubt_us(sensor) * doubt
+            blind_rad = rad_per_us * (sensor.refractory_us or REFRACTORY_DOUBT_US)
+            answer = answer.judged(
+                *judge_blindness(fastest_px_per_rad(found.answers.cost.space, answer.stage.x) * blind_rad)
+            )
     answers = found.answers
     answer = checked(answers, answer).judged(*judge_lag(time_constant * rad_per_us))
+    doubt_px = answers.doubt_px(answer.stage.x)
+    answer = answer.judged(doubt_px <= LARGEST_DOUBT_PX, doubt_in_words(doubt_px, sensor))
     answer = answer.judged(*judge_losses(missing)) if examined else answer
     if examined and search.angles_hold and answer.result.accepted:
         answer, delay = without_angle_error(answers, answer, direction * rad_per_us)
     notes = (
         *timing_notes(sensor.refractory_us - given.refractory_us, time_constant),
         *loss_notes(found.silent_share, missing), *delay, *answer.result.warnings,
+        *([doubt_in_words(doubt_px, sensor)] if doubt_px >= NOTABLE_DOUBT_PX else []),
     )  # fmt: skip
     timed = replace(answer.result, warnings=notes, refractory_us=sensor.refractory_us, time_constant_us=time_constant)
     return found.finished(replace(answer, result=timed))
@@ -299,6 +311,17 @@ class AnswerSearch:
     """Cost above which an answer is of no use."""
     timing: Vector = field(default_factory=lambda: np.zeros(0))
     """Change of the first answer by a correction of the sensor's timing [px]; empty for none."""
+    doubt: Vector = field(default_factory=lambda: np.zeros(0))
+    """Change of the answer by the doubt about the refractory period [px]; empty if it does not count."""
+
+    def doubt_px(self, v: Vector) -> float:
+        """Return how far the model at ``v`` moves by :attr:`doubt`, constant lag removed [px rms]."""
+        space = self.cost.space
+        if not len(self.doubt):
+            return 0.0
+        doubt = np.zeros(len(v))
+        doubt[: len(self.doubt)] = self.doubt
+        return consistency.distance(*(space.build(space.to_values(at)) for at in (v + doubt, v)))
 
     @property
     def origin(self) -> Vector:
@@ -499,6 +522,14 @@ LARGEST_INCONSISTENCY_PX = 0.1
 """Largest accepted error that the check of the answer's consistency leaves [px]."""
 
 
+LARGEST_BLIND_PX = 0.6
+"""Largest motion of a vibrating camera's image within the refractory period [px]. With 0.5 px the error was 0.009 px,
+with 0.9 px 0.03 to 0.08 px."""
+LARGEST_CHANGE_OF_SPEED_PX = 0.01
+"""Largest accepted change of a vibration's frequency over a recording, as motion of events by a linearised fit, which
+finds a share of it [px rms]."""
+
+
 def is_far(moved: float) -> bool:
     """Return whether an answer lies so far from that of the sharpness stage that it is refused [px]."""
     return moved > 0.95 * LARGEST_MOVE_PX
@@ -545,6 +576,35 @@ def judge_lens(given: ParameterSpace, space: ParameterSpace, answer: Answer) -> 
         f"the given lens is wrong by more than can be corrected (the search ended at {values}): give its true field of "
         "view or focal length, and its distortion; a fisheye lens is no pinhole"
     )
+
+
+def judge_speed(moved_px: float) -> tuple[bool, str]:
+    """Return whether to accept an answer at a constant speed, whose change moves events by ``moved_px``; the reason."""
+    if moved_px <= LARGEST_CHANGE_OF_SPEED_PX:
+        return True, ""
+    return False, (
+        f"the frequency of the vibration changes, which moves events by {moved_px:.2f} px or more; record while it is "
+        "steady, or a shorter time"
+    )
+
+
+def judge_blindness(moved_px: float) -> tuple[bool, str]:
+    """Return whether to accept an answer if the image moves by ``moved_px`` while a pixel is blind, and the reason."""
+    if moved_px <= LARGEST_BLIND_PX:
+        return True, ""
+    return False, (
+        f"the image moves by up to {moved_px:.2f} px within the sensor's refractory period, over {LARGEST_BLIND_PX:g} "
+        "px, so that events are lost: let the camera vibrate less or more slowly"
+    )
+
+
+def fastest_px_per_rad(space: ParameterSpace, v: Vector) -> float:
+    """Return the largest motion of the image's middle per angle at a search vector [px/rad]."""
+    camera, turns = space.camera, 96
+    middle = np.array([[0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]])
+    theta = np.linspace(0.0, math.tau, turns + 1)
+    path = space.build(space.to_values(v)).compensate_points(np.repeat(middle, turns + 1, axis=0), theta)
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).max()) * turns / math.tau
 
 
 def judge_shake(amplitude_px: float) -> tuple[bool, str]:
@@ -829,6 +889,13 @@ LEAST_REFRACTORY_GAIN = 0.015
 LEAST_SLOW_GAIN = 0.03
 """Smallest share that slow photoreceptors must explain. Seven of eight photographs without them explain 0.005 at most,
 but a smaller lag does less harm than its correction, whose light is estimated."""
+REFRACTORY_DOUBT_US = 100.0
+"""Standard deviation of the refractory period of a sensor whose period is not given [us], for a vibrating camera: its
+image moves too fast for the events to tell the period."""
+KNOWN_SHARE = 0.3
+"""Standard deviation of a period that is given, as a share of it: it stands for the jitter of the time stamps too."""
+NOTABLE_DOUBT_PX, LARGEST_DOUBT_PX = 0.01, 0.05
+"""Change of an answer by the doubt about this period from which on it is reported, and refused [px rms]."""
 LARGEST_RAD = 0.5
 """Largest angle that is searched [rad]."""
 FACTOR, MOST_TRIALS = 1.7, 7
@@ -1012,6 +1079,22 @@ def _lowest(cost_at: Callable[[float], float], angles: list[float], costs: list[
     best = angles[int(np.argmin(costs))]
     none = cost_at(0.0)
     return best if cost_at(best) < none else 0.0
+
+
+def refractory_doubt_us(sensor: SensorTiming) -> float:
+    """Return the standard deviation of a sensor's refractory period [us]."""
+    return KNOWN_SHARE * sensor.refractory_us if sensor.refractory_us else REFRACTORY_DOUBT_US
+
+
+def doubt_in_words(px: float, sensor: SensorTiming) -> str:
+    """Return by how much the doubt about the refractory period changes an answer [px]."""
+    known = sensor.refractory_us
+    given = f"given as {known:.0f} us" if known else "which is not given"
+    remedy = "let the camera vibrate less" if known else "give it by --refractory-us"
+    return (
+        f"the image moves fast for the sensor: an error of {refractory_doubt_us(sensor):.0f} us in its refractory "
+        f"period, {given}, changes the answer by {px:.2f} px; {remedy}"
+    )
 
 
 def timing_notes(refractory_us: float, time_constant_us: float) -> list[str]:
@@ -1202,7 +1285,9 @@ def _final(search: AnswerSearch, answer: Answer, check: consistency.Consistency,
     result, v, space = answer.result, answer.stage.x, search.cost.space
     timing = np.zeros(len(v))
     timing[: len(search.timing)] = TIMING_SHARE * search.timing
-    systematic = check.systematic + np.outer(check.step, check.step) + np.outer(timing, timing)
+    doubt = np.zeros(len(v))
+    doubt[: len(search.doubt)] = search.doubt
+    systematic = check.systematic + np.outer(check.step, check.step) + np.outer(timing, timing) + np.outer(doubt, doubt)
     for change in apart:
         systematic[: len(change), : len(change)] += RIVAL_STD**2 * np.outer(change, change)
     if np.linalg.norm(check.step) <= LARGEST_LAST_STEP_PX:

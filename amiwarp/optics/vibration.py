@@ -1,0 +1,217 @@
+"""A vibrating camera without a prism: it rotates by small angles, one frequency and its second harmonic.
+
+The model's angle theta is that of the vibration, 2π f t. The formulas are in ``docs/explanation/optics.md``.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.kernels.vibration import VibrationParams
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import MODELS, PHASE, Model, Parameter, check_given, phase_values, struct_of
+from amiwarp.optics.prism import NominalPrism, Prism, apex_from_deflection, check_phase, deflection_from_apex
+from amiwarp.validation import array, guarded, instance, one_of, real, vector
+
+LARGEST_AMPLITUDE = 0.2
+"""Upper limit of each part of a vibration [rad]. Larger values are mistakes, such as angles in degrees."""
+TYPICAL_PX, LARGEST_PX = 4.0, 12.0
+"""Displacement of the image by which parameters are scaled, and the largest one that is searched [px]."""
+
+
+def _parameters(label: str, name: str, *, fine: bool) -> tuple[Parameter, Parameter]:
+    """Return two parameters, x and y, of a part of the vibration; ``label`` names it for a reader."""
+    degrees = math.degrees(LARGEST_AMPLITUDE)
+    x, y = (
+        Parameter(f"{name}_{axis}", "rad", fine=fine, limits=(-degrees, degrees), label=f"{label}, {axis}",
+                  slider=(-1.0, 1.0, 0.005))
+        for axis in "xy"
+    )  # fmt: skip
+    return x, y
+
+
+@guarded
+@dataclass(frozen=True)
+class VibrationModel(Model):
+    """Vibrating camera: rotates each bearing by the camera's rotation from its orientation at rest.
+
+    Raises
+    ------
+    AmiwarpError
+        If a part of the vibration is 0.2 rad or more, or another field has an unusable value.
+
+    Notes
+    -----
+    The camera's rotation vector about its x and y axes, as a complex number x + iy, is
+    ``amplitude`` e^i(θ+phase) + ``backward`` e^-iθ + ``second`` e^2iθ + ``second_backward`` e^-2iθ.
+    About the optical axis it is ``roll`` · (cos θ, sin θ). See ``docs/explanation/optics.md``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> camera = amiwarp.Camera(width=640, height=480, fx=500.0, fy=500.0, cx=320.0, cy=240.0)
+    >>> model = amiwarp.VibrationModel(camera, amplitude=0.01)
+    >>> model.compensate_points(np.array([[320.0, 240.0]]), np.array([0.0])).round(2)
+    array([[320., 235.]])
+    """
+
+    NAME, TEXT, NUMBERS, STRUCT = "vibration", "vibrating camera", "10", VibrationParams
+    PARAMETERS = (
+        Parameter("amplitude", "rad"),
+        PHASE,
+        *_parameters("backward circle", "backward", fine=False),
+        *_parameters("roll", "roll", fine=True),
+        *_parameters("second harmonic", "second", fine=True),
+        *_parameters("second harmonic, backward", "second_backward", fine=True),
+    )
+    FREED = tuple(parameter.name for parameter in PARAMETERS)
+    PRISM, MOVER, SIZE_HINT = False, "vibration", f"{LARGEST_PX:g} px"
+    TIME_BIN_US, SECTORS = 200, 8  # no events come where a vibration along a line turns back
+
+    camera: Camera
+    """Camera intrinsics."""
+    amplitude: float
+    """Radius of the forward circle: largest rotation of the camera by it [rad]."""
+    phase: float = 0.0
+    """Phase of the forward circle at θ = 0 [rad]."""
+    backward: tuple[float, float] = (0.0, 0.0)
+    """Rotation about the camera's x and y axes by the backward circle at θ = 0 [rad]."""
+    roll: tuple[float, float] = (0.0, 0.0)
+    """Rotation about the optical axis: factors of cos θ and sin θ [rad]."""
+    second: tuple[float, float] = (0.0, 0.0)
+    """Rotation about x and y by the forward circle of the second harmonic at θ = 0 [rad]."""
+    second_backward: tuple[float, float] = (0.0, 0.0)
+    """Rotation about x and y by the backward circle of the second harmonic at θ = 0 [rad]."""
+
+    def __post_init__(self) -> None:
+        instance(self.camera, Camera, "camera")
+        object.__setattr__(self, "amplitude", check_amplitude(self.amplitude))
+        object.__setattr__(self, "phase", check_phase(self.phase))
+        for name in PARTS:
+            if getattr(self, name) is not getattr(VibrationModel, name):  # a tuple of the caller
+                object.__setattr__(self, name, check_part(getattr(self, name), name))
+
+    @classmethod
+    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+        pairs = {name: (values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0)) for name in PARTS}
+        return cls(camera, values["amplitude"], values["phase"], **pairs)
+
+    @classmethod
+    def typical_size(cls, camera: Camera, prism: Prism) -> float:
+        return TYPICAL_PX / camera.fx
+
+    @classmethod
+    def default_bounds(cls, name: str, value: float, camera: Camera, prism: Prism) -> tuple[float, float]:
+        if one_of(name, cls.FREE, "name") == PHASE.name:
+            return super().default_bounds(name, value, camera, prism)
+        largest = min(LARGEST_PX / camera.fx, LARGEST_AMPLITUDE)
+        return (0.0 if name == cls.SIZE else -largest), largest
+
+    @classmethod
+    def size_from_apex(cls, apex: float, prism: NominalPrism) -> float:
+        return deflection_from_apex(apex, prism.index, prism.flat_side)
+
+    @classmethod
+    def apex_from_size(cls, size: float, prism: NominalPrism) -> float:
+        return apex_from_deflection(size, prism.index, prism.flat_side)
+
+    @classmethod
+    def still_values(cls, values: Mapping[str, float]) -> dict[str, float]:
+        moving = {cls.SIZE, *cls.FREE[2:]}
+        return {name: 0.0 if name in moving else value for name, value in values.items()}
+
+    @classmethod
+    def turned_values(cls, values: Mapping[str, float], angle: float) -> dict[str, float]:
+        found = super().turned_values(values, angle)
+        for name, times in (("backward", -1.0), ("roll", -1.0), ("second", 2.0), ("second_backward", -2.0)):
+            part = complex(values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0))
+            part *= cmath.rect(1.0, times * angle)
+            found |= {f"{name}_x": part.real, f"{name}_y": part.imag}
+        return found
+
+    @classmethod
+    def reversed_values(cls, values: Mapping[str, float]) -> dict[str, float]:
+        check_given(values, cls.FREE[:2])
+        forward = cmath.rect(values["amplitude"], values["phase"])
+        given = {name: values.get(name, 0.0) for name in cls.FREE[2:]}
+        backward = complex(given["backward_x"], given["backward_y"])
+        changed = {
+            "amplitude": abs(backward), "phase": cmath.phase(backward), "backward_x": forward.real,
+            "backward_y": forward.imag, "roll_x": given["roll_x"], "roll_y": -given["roll_y"],
+            "second_x": given["second_backward_x"], "second_y": given["second_backward_y"],
+            "second_backward_x": given["second_x"], "second_backward_y": given["second_y"],
+        }  # fmt: skip
+        return {**values, **changed}
+
+    def rotations(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the camera's rotation from its orientation at rest, in float64 on the host.
+
+        Parameters
+        ----------
+        theta : numpy.ndarray
+            Angle of the vibration [rad], shape (n,).
+
+        Returns
+        -------
+        numpy.ndarray
+            Matrices from the camera's frame to that of the camera at rest, shape (n, 3, 3).
+
+        Raises
+        ------
+        AmiwarpError
+            If ``theta`` has another shape.
+        """
+        from scipy.spatial.transform import Rotation
+
+        theta = array(theta, "theta")
+        if theta.ndim != 1:
+            raise AmiwarpError(f"theta has shape {theta.shape}; give angles of shape (n,)")
+        circles = {1: cmath.rect(self.amplitude, self.phase), -1: complex(*self.backward),
+                   2: complex(*self.second), -2: complex(*self.second_backward)}  # fmt: skip
+        vector = sum(size * np.exp(1j * k * theta) for k, size in circles.items())
+        roll = self.roll[0] * np.cos(theta) + self.roll[1] * np.sin(theta)
+        return np.asarray(Rotation.from_rotvec(np.stack([vector.real, vector.imag, roll], axis=1)).as_matrix())
+
+    def kernel_values(self) -> tuple[Any, ...]:
+        # the kernels' angle is φ = θ + phase
+        turn = cmath.rect(1.0, self.phase)
+        backward, second = complex(*self.backward) * turn, complex(*self.second) * turn.conjugate() ** 2
+        roll, second_backward = complex(*self.roll) * turn, complex(*self.second_backward) * turn**2
+        vectors = (np.array([z.real, z.imag]) for z in (backward, roll, second, second_backward))
+        return self.amplitude, *phase_values(self.phase), *vectors
+
+    def params(self, device: Any) -> Any:
+        amplitude, *phase, backward, roll, second, second_backward = self.kernel_values()
+        vectors = (wp.vec2(*pair.tolist()) for pair in (backward, roll, second, second_backward))
+        return struct_of(VibrationParams, [amplitude, *phase, *vectors])
+
+
+PARTS = ("backward", "roll", "second", "second_backward")
+"""Names of the parts of a vibration, besides the forward circle."""
+
+
+def check_amplitude(value: object) -> float:
+    """Return ``value`` as the radius of a circle [rad]; raise :class:`AmiwarpError` if it is negative or too large."""
+    return real(value, "amplitude", 0.0, LARGEST_AMPLITUDE, " rad; is it given in degrees?")
+
+
+def check_part(value: object, what: str) -> tuple[float, float]:
+    """Return two angles of a part of a vibration [rad]; raise :class:`AmiwarpError` for others."""
+
+    def angle(given: object, name: str) -> float:
+        return real(given, name, -LARGEST_AMPLITUDE, LARGEST_AMPLITUDE, " rad; is it given in degrees?")
+
+    x, y = vector(value, 2, what, angle)
+    return x, y
+
+
+MODELS[VibrationModel.NAME] = VibrationModel
