@@ -19,7 +19,15 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.vibration import VibrationParams
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, PHASE, Model, Parameter, check_given, phase_values, struct_of
-from amiwarp.optics.prism import NominalPrism, Prism, apex_from_deflection, check_phase, deflection_from_apex
+from amiwarp.optics.prism import (
+    NominalPrism,
+    Plate,
+    Prism,
+    apex_from_deflection,
+    as_wedge,
+    check_phase,
+    deflection_from_apex,
+)
 from amiwarp.validation import array, guarded, instance, one_of, real, vector
 
 LARGEST_AMPLITUDE = 0.2
@@ -101,16 +109,16 @@ class VibrationModel(Model):
                 object.__setattr__(self, name, check_part(getattr(self, name), name))
 
     @classmethod
-    def _of_values(cls, camera: Camera, prism: Prism, values: Mapping[str, float]) -> Self:
+    def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
         pairs = {name: (values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0)) for name in PARTS}
         return cls(camera, values["amplitude"], values["phase"], **pairs)
 
     @classmethod
-    def typical_size(cls, camera: Camera, prism: Prism) -> float:
+    def typical_size(cls, camera: Camera, prism: Prism | Plate) -> float:
         return TYPICAL_PX / camera.fx
 
     @classmethod
-    def default_bounds(cls, name: str, value: float, camera: Camera, prism: Prism) -> tuple[float, float]:
+    def default_bounds(cls, name: str, value: float, camera: Camera, prism: Prism | Plate) -> tuple[float, float]:
         if one_of(name, cls.FREE, "name") == PHASE.name:
             return super().default_bounds(name, value, camera, prism)
         largest = min(LARGEST_PX / camera.fx, LARGEST_AMPLITUDE)
@@ -118,11 +126,13 @@ class VibrationModel(Model):
 
     @classmethod
     def size_from_apex(cls, apex: float, prism: NominalPrism) -> float:
-        return deflection_from_apex(apex, prism.index, prism.flat_side)
+        wedge = as_wedge(prism)
+        return deflection_from_apex(apex, wedge.index, wedge.flat_side)
 
     @classmethod
     def apex_from_size(cls, size: float, prism: NominalPrism) -> float:
-        return apex_from_deflection(size, prism.index, prism.flat_side)
+        wedge = as_wedge(prism)
+        return apex_from_deflection(size, wedge.index, wedge.flat_side)
 
     @classmethod
     def still_values(cls, values: Mapping[str, float]) -> dict[str, float]:

@@ -200,7 +200,7 @@ def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float]
     for k, (i, j) in enumerate(np.ndindex(yields.shape)):
         report("simulating", k / yields.size)
         rpm = float(speeds[j])
-        prism = replace(as_wedge(template.prism), apex=float(nodes[i]))
+        prism = replace(template.glass, apex=float(nodes[i]))
         case = replace(template, prism=prism, motion=PrismMotion(rpm), duration_s=120.0 / rpm)
         radius = orbit_radii(camera, prism)[0]
         found = np.array([_per_turn(case, tile, k) for k, tile in enumerate(cameras)]) - noise * 60.0 / rpm
