@@ -44,7 +44,7 @@ class Depths:
     inverse_depth: NDArray[np.float32]
     """Inverse depth [1/m]."""
     std: NDArray[np.float32]
-    """Standard deviation of the inverse depth [1/m]; infinity in windows without events."""
+    """Standard deviation of the inverse depth [1/m]; infinity in windows that do not determine it."""
     count: NDArray[np.int64]
     """Number of pairs of events of each pixel."""
     cost: float
@@ -72,7 +72,9 @@ def find_depths(
     best = np.clip(best + step, 0.0, LARGEST_INVERSE_DEPTH).astype(np.float32)
     count = gaussian_filter(costs.count.astype(np.float64), WINDOW_PX)
     std = deviation(tried, windows, count, best, FLOOR_PX / radius)
-    total = np.take_along_axis(np.stack(pixels), windows.argmin(axis=0)[None], axis=0).sum()
+    lowest_at = windows.argmin(axis=0)
+    std[(lowest_at == 0) | (lowest_at == len(tried) - 1)] = np.inf  # the lowest cost may lie beyond what was tried
+    total = np.take_along_axis(np.stack(pixels), lowest_at[None], axis=0).sum()
     return Depths(best, std.astype(np.float32), costs.count, float(total / max(costs.count.sum(), 1)))
 
 
