@@ -111,7 +111,9 @@ def _glass(p: NominalPrism) -> dict[str, Any]:
     if isinstance(p, Plate):
         return {"thickness_mm": 1e3 * p.thickness, "plate_tilt_deg": math.degrees(p.tilt), "index": p.index}
     apex = math.degrees(p.apex) if isinstance(p, Prism) else None
-    return {"apex_deg": apex, "index": p.index, "flat_side": p.flat_side.value}
+    found = {"apex_deg": apex, "index": p.index, "flat_side": p.flat_side.value}
+    second = p.second if isinstance(p, Prism) else None
+    return found if second is None else {**found, "second": _glass(second)}
 
 
 def _events(source: EventSource, *, head: bool) -> dict[str, Any]:
@@ -159,6 +161,7 @@ def _encoder(encoder: Encoder, source: EventSource) -> dict[str, Any]:
         "samples": len(encoder.t),
         "rpm": rpm_between(encoder, source.t_first, source.t_last) if len(source) else encoder.rpm,
         "turns": float(np.ptp(encoder.angle)) / (2.0 * math.pi),
+        "second_rpm": None if encoder.second is None else encoder.second.rpm,
         "interval_us": encoder.interval_us,
         "clock_offset_us": encoder.clock_offset_us,
         "first_us": first,
@@ -276,7 +279,8 @@ def _listed(names: list[str]) -> str:
 def _degrees(parameters: dict[str, float]) -> dict[str, float]:
     """Return the true parameters of the optic with angles in degrees, under names that end in ``_deg``."""
     pairs = ("tilt", "cylinder", "wobble", "backward", "roll", "second", "second_backward")
-    angles = ("apex", "amplitude", "phase", "plate_tilt", *(f"{name}_{axis}" for name in pairs for axis in "xy"))
+    single = ("apex", "amplitude", "phase", "plate_tilt", "second_apex", "second_phase")
+    angles = (*single, *(f"{name}_{axis}" for name in pairs for axis in "xy"))
     return {f"{n}_deg" if n in angles else n: math.degrees(v) if n in angles else v for n, v in parameters.items()}
 
 
@@ -322,7 +326,8 @@ def _prism_text(p: dict[str, Any] | None) -> str:
     if "thickness_mm" in p:
         return f"plate of {p['thickness_mm']:.5g} mm, tilted by {p['plate_tilt_deg']:.5g} deg, n {p['index']:.6g}"
     apex = "apex unknown" if p["apex_deg"] is None else f"nominal apex {p['apex_deg']:.5g} deg"
-    return f"{apex}, n {p['index']:.6g}, flat face to the {p['flat_side']}"
+    text = f"{apex}, n {p['index']:.6g}, flat face to the {p['flat_side']}"
+    return text if "second" not in p else f"{text}; behind it: {_prism_text(p['second'])}"
 
 
 def _encoder_text(e: dict[str, Any] | None) -> str:
@@ -330,6 +335,7 @@ def _encoder_text(e: dict[str, Any] | None) -> str:
     if e is None:
         return "none"
     parts = [f"{e['samples']:,} samples, {e['rpm']:.6g} rpm, {e['turns']:.4g} turns"]
+    parts += [] if e["second_rpm"] is None else [f"second prism {e['second_rpm']:.6g} rpm"]
     parts.append("covers the events" if e["covers_events"] else f"covers only {e['first_us']} .. {e['last_us']} us")
     parts.append(f"{len(e['gaps'])} gaps" if e["gaps"] else "no gaps")
     if e["index_pulses"]:

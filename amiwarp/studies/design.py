@@ -15,7 +15,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import MODEL_COLOURS, VERMILION
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import EllipseModel, ExactModel, Model, predicted_error, rungs
-from amiwarp.optics.prism import Prism, as_wedge
+from amiwarp.optics.prism import Prism
 from amiwarp.plotting import figures
 from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.scenery import place_scene, seen_bearings
