@@ -42,7 +42,7 @@ LONGEST_RAD = 0.3
 """Longest step of the phase [rad]."""
 FLOOR_PX = 0.05
 """Standard deviation of the phase by errors of the method, as the motion of a point at the mean depth [px]. In
-simulations of 320x240 px the phase is off by 1 to 2.4 deg, because depths and phase are found from the same events."""
+simulations of 320x240 px the phase is off by 1 to 2 deg, because depths and phase are found from the same events."""
 SETTLED_RAD = 0.002
 """Step of the phase that ends the search [rad]."""
 CLUSTER_PX = 8
