@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 import amiwarp
 from amiwarp import ExactModel, Prism, PrismMotion, RisleyModel
@@ -95,14 +96,23 @@ def measure(case: Case, pictures: Path, device: str) -> dict[str, Any]:
     xy = rng.uniform((0, 0), (SIZE[0] - 1, SIZE[1] - 1), (20_000, 2))
     t = rng.uniform(0.0, 1e6 * case.duration_s, len(xy))
     theta = motion.angles(t)
-    away = found.model.compensate_points(xy, theta) - truth.compensate_points(xy, theta)
-    away -= away.mean(axis=0)  # a constant shift of the picture blurs nothing
+    rates = np.array(case.rpm) * math.tau / 60e6
+    places = found.model.compensate_points(xy, theta)
+
+    def distance(lag_us: float) -> float:
+        """Return the error if events are stamped late by a constant time, which a calibration of phases cannot see."""
+        away = places - truth.compensate_points(xy, theta - lag_us * rates)
+        away -= away.mean(axis=0)  # a constant shift of the picture blurs nothing
+        return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+
+    lag = float(minimize_scalar(distance, bounds=(-500.0, 500.0), method="bounded", options={"xatol": 0.1}).x)
     assert found.photometric is not None
-    error = float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+    error = distance(lag)
     true = dict(zip(("apex", "second_apex"), (first.apex, second.apex), strict=True))
     z = {name: (found.parameters[name] - value) / found.uncertainty[name] for name, value in true.items()}
     return {
-        **row, "seconds": took, "refused": None, "error_px": error, "z": z, "cost": found.photometric.cost,
+        **row, "seconds": took, "refused": None, "error_px": error, "with_lag_px": distance(0.0),
+        "lag_us": lag, "z": z, "cost": found.photometric.cost,
         "warnings": list(found.warnings), "silent": error > LARGEST_PX and not found.warnings,
     }  # fmt: skip
 

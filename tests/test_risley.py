@@ -154,6 +154,12 @@ def test_it_is_calibrated_stored_and_compensated(recording: amiwarp.Recording, t
     np.testing.assert_allclose(np.stack([out.x, out.y], axis=1), places, atol=1e-4)
 
 
+def test_a_prism_at_rest_is_named(recording: amiwarp.Recording) -> None:
+    assert recording.encoder is not None
+    with pytest.raises(AmiwarpError, match="the second prism turned 0.0 degrees during the events"):
+        amiwarp.calibrate(replace(recording, encoder=recording.encoder.with_second(1e-6)))
+
+
 def test_command_line(texture: NDArray[np.uint8], tmp_path: Path) -> None:
     from PIL import Image
 

@@ -564,13 +564,16 @@ def prepare(
         checks.check_unmasked_events(len(events), recording.events.mask, name)
     searches = []
     for encoder in encoders:
-        check_prisms(encoder, MODELS[settings.model].ANGLES)
+        kind = MODELS[settings.model]
+        check_prisms(encoder, kind.ANGLES)
         checks.check_coverage(encoder, int(events.t[0]), int(events.t[-1]), name)
         checks.check_pulses(encoder, name)
         space = _space(recording, camera, encoder, events, settings, free)
         calibration_events = _calibration_events(events, encoder, space, middle_time(recording), settings.fold)
         if space.sized:
-            checks.check_turned(encoder.angle_at(events.t[:: max(1, len(events) // 10_000)]), name)
+            angles = encoder.angles_at(events.t[:: max(1, len(events) // 10_000)]).reshape(-1, kind.ANGLES)
+            for k, which in enumerate(("the prism", "the second prism")[: kind.ANGLES]):
+                checks.check_turned(angles[:, k], name, which)
         searches.append(Search(space, calibration_events, settings, device, progress))
     return searches
 

@@ -132,15 +132,15 @@ def moves_too_fast(name: str, repetition: float) -> AmiwarpError:
     )
 
 
-def check_turned(theta: NDArray[np.float64], name: str) -> None:
-    """Check that the prism turned far enough.
+def check_turned(theta: NDArray[np.float64], name: str, which: str = "the prism") -> None:
+    """Check that a prism turned far enough; ``which`` names it.
 
     In less than a quarter turn, the size and the phase of the prism's orbit cannot be determined separately.
     """
     turned = float(np.ptp(theta))
     if turned < SMALLEST_ROTATION:
         raise AmiwarpError(
-            f"{name}: the prism turned {math.degrees(turned):.1f} degrees during the events; "
+            f"{name}: {which} turned {math.degrees(turned):.1f} degrees during the events; "
             "record at least a quarter turn (90 degrees), better a whole one"
         )
 
