@@ -245,6 +245,36 @@ def test_a_small_orbit_tells_less_of_the_index_than_its_noise_says() -> None:
     assert JointPrism({}, full, {}).systematic_of_index(worse) > 2.0 * off[1]  # so does an uncertain lens
 
 
+@pytest.mark.parametrize("seed", [3, 7])
+def test_coefficients_that_trade_against_each_other_hide_no_index(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """One coefficient of a rational lens, moved alone by its deviation, gives a lens that cannot be."""
+    full = make_space(
+        "exact", CAMERA, replace(PRISM, apex=2.0 * PRISM.apex), free=("apex", "phase", "index"), start={}, bounds={},
+        rad_per_us=75e-6, duration_us=250e3,
+    )  # fmt: skip
+    off = []
+    for most in (2, 3):
+        monkeypatch.setattr(corner_fit, "_gain_is_real", lambda less, more, count, most=most: count <= most)
+        fit = fit_lens(ROUGH, BOARD, seen(seed, CAMERA, noise=0.01))
+        off.append(JointPrism({}, full, {}).systematic_of_index(fit))
+    assert fit.deviations["k4"] > 3.0
+    assert off[1] < 1.2 * off[0]
+
+
+def test_a_lens_that_folds_between_the_corners_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(corner_fit, "_gain_is_real", lambda *_: True)
+    fit = fit_lens(ROUGH, BOARD, seen(1, CAMERA, noise=0.01))
+    assert fit.left_out == ("k4", "k5", "k6")
+    assert np.isfinite(np.asarray(fit.camera.pixels_to_rays(np.array([[10.0, 10.0], [160.0, 120.0]])))).all()
+
+
+def test_the_axes_of_a_lens_hold_its_covariance() -> None:
+    fit = fit_lens(ROUGH, BOARD, seen(0, CAMERA, noise=0.05))
+    steps, lengths = fit.axes(np.array([[40, 40], [280, 60], [160, 200]]))
+    assert lengths == pytest.approx(1.0)  # no coefficient moves pixels far
+    assert steps.T @ steps == pytest.approx(fit.covariance, rel=1e-9, abs=1e-18)
+
+
 def test_two_boards_are_noticed() -> None:
     one = cv2.resize(photographed(BOARD), (240, 180))
     both = np.hstack([one, one])

@@ -751,15 +751,16 @@ class JointPrism:
         size = (fit.camera.height, fit.camera.width)
         xy = _places(np.ones(size, bool) if self.inside is None else self.inside)
 
-        values, given = space.to_values(v), lens_values(fit.camera, fit.names)
-        steps = {name: max(fit.deviations[name], 1e-9) for name in fit.names}
+        values, steps, shares = space.to_values(v), *fit.axes(xy)
         models = [space.build(space.to_values(v + FOLLOW_PX * unit)) for unit in np.eye(len(v))]
-        for name, step in steps.items():
-            lens_moved = with_lens_values(fit.camera, {name: given[name] + step})
-            models.append(replace(space, camera=lens_moved).build(values))
+        given = lens_values(fit.camera, fit.names)
+        for step in np.concatenate([steps, -steps]):
+            lens_moved = {name: x + by for (name, x), by in zip(given.items(), step.tolist(), strict=True)}
+            models.append(replace(space, camera=with_lens_values(fit.camera, lens_moved)).build(values))
         at, *ends = displacements([space.build(values), *models], xy)
         prism = (np.stack(ends[: len(v)], axis=1) - at[:, None]) / FOLLOW_PX
-        lens = (np.stack(ends[len(v) :], axis=1) - at[:, None]) / np.array([*steps.values()])
+        there, back = np.split(np.stack(ends[len(v) :], axis=1), 2, axis=1)
+        lens = (there - back) / (2.0 * shares)
         seen = np.isfinite(prism).all(axis=1) & np.isfinite(lens).all(axis=1)
         prism, follows = prism[seen], -np.linalg.lstsq(prism[seen], lens[seen], rcond=None)[0]
         middle = np.array([[fit.camera.cx, fit.camera.cy]])
@@ -772,8 +773,7 @@ class JointPrism:
             others = np.delete(prism, k, axis=1)
             own = prism[:, k] - others @ np.linalg.lstsq(others, prism[:, k], rcond=None)[0]
             by_shape[k] = SHAPE_ERROR / cube / math.sqrt(2.0 * float(np.mean(own**2)))
-        by_lens = follows @ fit.covariance @ follows.T
-        return np.asarray(by_lens + np.outer(by_size, by_size) + np.diag(by_shape**2))
+        return np.asarray(follows @ follows.T + np.outer(by_size, by_size) + np.diag(by_shape**2))
 
     def calibration(
         self, camera: Camera, values: Mapping[str, float], uncertainty: Mapping[str, float], seconds: float

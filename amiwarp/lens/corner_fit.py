@@ -40,6 +40,8 @@ HUBER = 2.0
 ROUNDS, MOST_STEPS = 3, 60
 """Number of rounds of robust weights of the answer, and the largest number of evaluations in each. Fits that only give
 a start have one round."""
+LENS_STEP_PX = 10.0
+"""Largest move of pixels by each parameter of a lens in a step that tells what follows the lens [px rms]."""
 PATCH, SAMPLES = 0.42, 25
 """Half side of the patch around a corner [squares], and the number of its samples along a side."""
 STRIP = (1.0 - MARKER_SHARE) / 2.0
@@ -79,10 +81,32 @@ class Fit:
         """Distance of predicted and seen corners [px rms]."""
         return rms(np.concatenate(self.residuals))
 
+    def axes(self, xy: NDArray[Any]) -> tuple[Vector, Vector]:
+        """Return steps of the free parameters along the axes of their covariance, and their lengths [deviations].
+
+        A step is a row of shape (names,). Coefficients of a rational lens trade against each other: one alone, moved by
+        its deviation, gives a lens that cannot be. A step moves the pixels ``xy`` by at most :data:`LENS_STEP_PX` for
+        each of the parameters; they cancel mostly.
+        """
+        spread = np.maximum([*self.deviations.values()], 1e-12)
+        shares, axes = np.linalg.eigh(self.covariance / np.outer(spread, spread))
+        whole = (spread[:, None] * axes * np.sqrt(np.maximum(shares, 0.0))).T
+        rays = np.asarray(self.camera.pixels_to_rays(xy.astype(np.float64)), np.float64)
+        by = Projection(self.camera).of(np.zeros(6), rays[np.isfinite(rays).all(axis=1)])[1]
+        known = parameter_names(self.camera)
+        moves = np.sqrt((by**2).sum(axis=1).mean(axis=0))[[known.index(name) for name in self.names]]
+        lengths = np.minimum(1.0, LENS_STEP_PX / np.maximum(np.abs(whole) * moves, 1e-12).max(axis=1))
+        return lengths[:, None] * whole, lengths
+
 
 def lens_values(camera: Camera, names: Iterable[str]) -> dict[str, float]:
     """Return intrinsics and coefficients of a camera by name, in the order of ``names``."""
     return {n: getattr(camera if n in INTRINSICS else camera.distortion, n) for n in names}
+
+
+def parameter_names(camera: Camera) -> tuple[str, ...]:
+    """Return the names of all parameters of a camera that has a distortion, in the order of :class:`Projection`."""
+    return *INTRINSICS, *(field.name for field in fields(type(camera.distortion)))  # type: ignore[arg-type]
 
 
 def with_lens_values(camera: Camera, values: Mapping[str, float]) -> Camera:
@@ -188,7 +212,7 @@ def fit_lens(camera: Camera, board: Board, seen: Sequence[Corners]) -> Fit:
             left_out += group  # the rational model is for lenses that a third coefficient does not describe
             continue
         more = _fit(best.camera, best.poses, board, seen, (*names, *group))
-        if _gain_is_real(best, more, len(group)):
+        if _gain_is_real(best, more, len(group)) and _is_seen_through(more.camera, seen):
             best, names = more, (*names, *group)
         else:
             left_out += group
@@ -212,6 +236,12 @@ def _gain_is_real(less: Fit, more: Fit, count: int) -> bool:
     return bool(f.sf(max(ratio, 0.0), count, more.freedom) < LEAST_CHANCE)
 
 
+def _is_seen_through(camera: Camera, seen: Sequence[Corners]) -> bool:
+    """Return whether all corners lie where the lens does not fold. A rational one can have a pole between them."""
+    xy = np.concatenate([corners.xy for corners in seen])
+    return bool(np.isfinite(np.asarray(camera.pixels_to_rays(xy))).all())
+
+
 def _fit(
     camera: Camera,
     poses: Vector,
@@ -223,8 +253,7 @@ def _fit(
     """Return the fit of the parameters ``names`` of the lens, and of all poses, from a start."""
     from scipy.optimize import least_squares
 
-    kind = type(camera.distortion)
-    all_names = (*INTRINSICS, *(field.name for field in fields(kind)))  # type: ignore[arg-type]
+    all_names = parameter_names(camera)
     free, count = [all_names.index(n) for n in names], len(names)
     points, xy = [board.points[c.ids] for c in seen], np.concatenate([c.xy for c in seen])
     ends = np.cumsum([2 * len(p) for p in points]).tolist()
