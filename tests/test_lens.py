@@ -245,6 +245,22 @@ def test_a_small_orbit_tells_less_of_the_index_than_its_noise_says() -> None:
     assert JointPrism({}, full, {}).systematic_of_index(worse) > 2.0 * off[1]  # so does an uncertain lens
 
 
+def test_a_small_orbit_tells_less_of_its_size_than_its_noise_says() -> None:
+    fit, off = fit_lens(ROUGH, BOARD, seen(0, CAMERA, noise=1e-5)), []
+    for apex in (PRISM.apex, 2.0 * PRISM.apex):
+        space = make_space(
+            "exact", fit.camera, replace(PRISM, apex=apex), free=("apex", "phase"), start={}, bounds={},
+            rad_per_us=75e-6, duration_us=250e3,
+        )  # fmt: skip
+        v = space.to_vector(space.start)
+        found = space.deviations(v, JointPrism({}, space, {})._systematic(space, v, fit))
+        off.append(found["apex"] / apex)
+        assert found["phase"] < 0.01 * off[-1]
+    in_the_middle = calibration.SIZE_ERROR / (CAMERA.fx * PRISM.deflection) ** 2
+    assert 0.7 * in_the_middle < off[0] < in_the_middle  # farther out, orbits are larger
+    assert off[1] == pytest.approx(off[0] / 4.0, rel=0.05)
+
+
 @pytest.mark.parametrize("seed", [3, 7])
 def test_coefficients_that_trade_against_each_other_hide_no_index(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     """One coefficient of a rational lens, moved alone by its deviation, gives a lens that cannot be."""
