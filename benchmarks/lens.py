@@ -94,7 +94,7 @@ def one(lens: str, seed: int, count: int, device: str, index: float) -> dict[str
         nominal = amiwarp.Prism(prism.apex * (1.1 if seed % 2 else 0.9))
         recordings.append(replace(made, camera=None, name=f"pose {k}", prism=nominal))
     fov = 640.0 / (0.9 * true.fx) if lens == "fisheye" else 2.0 * math.atan(320.0 / (0.9 * true.fx))
-    row: dict[str, Any] = {"lens": lens, "seed": seed}
+    row: dict[str, Any] = {"lens": lens, "seed": seed, "index": index}
     began = time.perf_counter()
     try:
         found = amiwarp.calibrate_lens(recordings, BOARD, fov=fov, fisheye=lens == "fisheye", device=device)
