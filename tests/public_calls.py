@@ -323,7 +323,8 @@ OWN: dict[str, dict[str, Any]] = {
         f"{name}.{method}": given
         for name, size in (
             ("CircleModel", "deflection"), ("EllipseModel", "apex"), ("ExactModel", "apex"),
-            ("RadialCircleModel", "deflection"), ("VibrationModel", "amplitude"),
+            ("PlateModel", "inverse_depth"), ("RadialCircleModel", "deflection"), ("RisleyModel", "apex"),
+            ("VibrationModel", "amplitude"),
         )
         for method, given in (
             ("turned_values", {"values": {size: 0.01, "phase": 0.0}, "angle": 0.1}),

@@ -373,9 +373,12 @@ def test_commands_that_write_native_recordings_name_the_conversion(place: Path) 
     assert "write s.h5, then run: amiwarp convert s.h5 s.raw" in result.stderr
 
 
+DEPTHS = np.ones((3, 4)), np.ones((3, 4)), np.ones((3, 4, 3))
 CALLS: dict[str, Callable[[Path, Any], object]] = {
     "Board.save": lambda path, _: amiwarp.Board(3, 4, 0.03).save(path),
     "Calibration.save": lambda path, given: given.calibration.save(path),
+    "DepthMap.save": lambda path, _: amiwarp.DepthMap(*DEPTHS).save(path),
+    "DepthMap.save_points": lambda path, _: amiwarp.DepthMap(*DEPTHS).save_points(path),
     "PixelMap.save": lambda path, _: amiwarp.PixelMap(*np.ones((8, 3, 4))).save(path),
     "RecordingWriter": lambda path, _: amiwarp.RecordingWriter(path, width=64, height=48).__enter__(),
     "Simulation.write": lambda path, given: given.simulation.write(path),

@@ -156,7 +156,7 @@ def test_it_is_calibrated_stored_and_compensated(recording: amiwarp.Recording, t
 
 def test_a_prism_at_rest_is_named(recording: amiwarp.Recording) -> None:
     assert recording.encoder is not None
-    with pytest.raises(AmiwarpError, match="the second prism turned 0.0 degrees during the events"):
+    with pytest.raises(AmiwarpError, match=r"the second prism turned 0\.0 degrees during the events"):
         amiwarp.calibrate(replace(recording, encoder=recording.encoder.with_second(1e-6)))
 
 

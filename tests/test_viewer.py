@@ -27,7 +27,7 @@ from amiwarp import (
 )
 from amiwarp.calib.bad_pixels import MaskedEventSource
 from amiwarp.choices import Axis, Colour, View
-from amiwarp.optics.models import MODELS, build_model
+from amiwarp.optics.models import build_model, rungs
 from amiwarp.viewer.drawing import WIDEST_PX, Look, Scene, axis_range, colours_of, orbit_lines, residual, third_axis
 from amiwarp.viewer.inspector import Inspector, Knobs, Selection, read_span, recorded_counts
 from reference.calibration_sample import exact_calibration
@@ -124,7 +124,7 @@ def test_the_first_window_is_one_turn_in_the_middle(inspector: Inspector, record
     assert start + length / 2 == pytest.approx(middle, abs=2)
 
 
-@pytest.mark.parametrize("model", list(MODELS))
+@pytest.mark.parametrize("model", list(rungs()))
 def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recording: Recording, model: str) -> None:
     inspector.set(replace(true_knobs(recording), model=model, clock_offset=300.0))
     inspector.open(*inspector.first_window())
