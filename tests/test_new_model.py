@@ -132,6 +132,12 @@ def test_nothing_is_left_of_it() -> None:
         amiwarp.Settings(model="cylinder").check()
 
 
+def test_the_guide_shows_a_short_file() -> None:
+    root = Path(__file__).parents[1]
+    assert "literalinclude} ../../tests/cylinder_model.py" in (root / "docs/how-to/add-an-optic.md").read_text()
+    assert len((root / "tests/cylinder_model.py").read_text().splitlines()) <= 150
+
+
 def knows(path: Path, model: type[amiwarp.Model]) -> bool:
     """Whether a source file names a model, its struct or its text in files; documentation does not count."""
     names, found, source = {model.__name__, model.STRUCT.key}, False, path.read_text()
