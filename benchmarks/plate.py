@@ -1,6 +1,6 @@
 """Depth at rest behind a rotating tilted plate: errors in simulated worlds, and what noise and wrong glass do to them.
 
-    python -m benchmarks.plate --out benchmarks/results/plate.json [--desk]
+    python -m benchmarks.plate --out FILE.json [--device cuda:0] [--size 640 480] [--seeds 20] [--desk]
 
 Plate: 10 mm, 45 deg, N-BK7; 720 turns/min; camera at rest, 60 deg. The panels are twelve textured rectangles at 0.3 to
 1 m; the desk is the named world. Depths are compared with the depth map of the simulator at known pixels, which all are
@@ -24,7 +24,6 @@ from amiwarp.brightness.depths import orbit_px
 
 PLATE = amiwarp.Plate(0.01, math.radians(45.0))
 PHASE = math.radians(40.0)
-SIZE = (320, 240)
 
 
 def panels(seed: int, contrast: float = 0.8) -> amiwarp.WorldScene:
@@ -44,20 +43,23 @@ def panels(seed: int, contrast: float = 0.8) -> amiwarp.WorldScene:
     return amiwarp.WorldScene(world, amiwarp.Trajectory.still([0, 0, 0], look_at=[0, 1, 0]))
 
 
-def measure(name: str, scene: amiwarp.WorldScene, seed: int, **changes: Any) -> dict[str, Any]:
+def measure(
+    name: str, scene: amiwarp.WorldScene, seed: int, size: list[int], device: str, **changes: Any
+) -> dict[str, Any]:
     """Return the errors of phase and depth of one simulation. ``nominal``: plate that the recording states."""
     nominal = changes.pop("nominal", PLATE)
     values = {"duration_s": 0.42, "sensor": amiwarp.SensorModel()} | changes
-    camera = amiwarp.Camera.from_fov(*SIZE, math.radians(60.0))
+    camera = amiwarp.Camera.from_fov(*size, math.radians(60.0))
     simulation = amiwarp.Simulation(
-        scene, camera, PLATE, motion=amiwarp.PrismMotion(720.0, PHASE), nominal_prism=nominal, seed=seed, **values
-    )
+        scene, camera, PLATE, motion=amiwarp.PrismMotion(720.0, PHASE), nominal_prism=nominal, seed=seed,
+        device=device, **values,
+    )  # fmt: skip
     recording = simulation.run(truth_times_us=[0])
     row: dict[str, Any] = {"case": name, "seed": seed, "events": len(recording.events)}
     began = time.perf_counter()
     try:
-        calibration = amiwarp.calibrate(recording)
-        found = amiwarp.depth(recording, calibration)
+        calibration = amiwarp.calibrate(recording, device=device)
+        found = amiwarp.depth(recording, calibration, device=device)
     except amiwarp.AmiwarpError as error:
         return {**row, "refused": str(error)}
     row["seconds"] = time.perf_counter() - began
@@ -80,11 +82,11 @@ def measure(name: str, scene: amiwarp.WorldScene, seed: int, **changes: Any) -> 
     }  # fmt: skip
 
 
-def cases(desk: bool) -> list[tuple[str, amiwarp.WorldScene, int, dict[str, Any]]]:
+def cases(desk: bool, seeds: int) -> list[tuple[str, amiwarp.WorldScene, int, dict[str, Any]]]:
     """Return name, scene, seed and changes of each simulation."""
     noisy = replace(amiwarp.SensorModel(), shot_noise_hz=20.0, leak_hz=1.0, mismatch=0.1)
     listed: list[tuple[str, amiwarp.WorldScene, int, dict[str, Any]]] = [
-        *(("panels", panels(seed), seed, {}) for seed in range(3)),
+        *(("panels", panels(seed), seed, {}) for seed in range(seeds)),
         ("panels, noise", panels(0), 0, {"sensor": noisy}),
         ("panels, 2 turns", panels(0), 0, {"duration_s": 0.17}),
         ("panels, low contrast", panels(0, 0.2), 0, {}),
@@ -101,12 +103,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--desk", action="store_true", help="also simulate the desk, which takes minutes on a CPU")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--size", type=int, nargs=2, default=[320, 240])
+    parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     rows = []
-    for name, scene, seed, changes in cases(options.desk):
-        rows.append(measure(name, scene, seed, **changes))
+    for name, scene, seed, changes in cases(options.desk, options.seeds):
+        rows.append(measure(name, scene, seed, options.size, options.device, **changes))
         print(rows[-1], flush=True)
-        options.out.write_text(json.dumps({"protocol": __doc__, "size": SIZE, "rows": rows}, indent=1) + "\n")
+        options.out.write_text(json.dumps({"protocol": __doc__, "size": options.size, "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
