@@ -83,9 +83,9 @@ def filtered(
     turn = filter.turn[pairs.tile[i]]
     before = float(brightness_before(model, camera, pairs, atlas, image, k, i, MEMORY * turn - filter.ahead))
     w0, w1 = event_state(model, pairs, k, i)
-    past = advanced(model, w0, w1, -MEMORY * turn)
+    begun = advanced(model, w0, w1, -MEMORY * turn)
     pixel = wp.vec2(float(pairs.x[i]), float(pairs.y[i]))
-    xy = contracted_position(model, camera, pixel, past[0], past[1], lag_of(pairs, k, i))
+    xy = contracted_position(model, camera, pixel, begun[0], begun[1], lag_of(pairs, k, i))
     level = float(brightness_at_position(image, atlas, pairs.tile[i], xy))
     if wp.isnan(level):
         level = before

@@ -544,7 +544,7 @@ def compensate_by_each(models: Sequence[Model], xy: NDArray[Any], theta: NDArray
     pixels = wp.array(np.tile(xy.astype(np.float32), (len(models), 1)), dtype=wp.vec2, device="cpu", copy=False)
     angles = np.empty((len(models), n), np.float32)
     angles[:] = theta
-    if models[0].ANGLES > 1:  # a pair is compared with pairs only
+    if models and models[0].ANGLES > 1:  # a pair is compared with pairs only
         angles = np.stack([model.all_angles(own) for model, own in zip(models, angles, strict=True)]).astype(np.float32)
     points = [pixels, wp.array(angles.ravel(), dtype=float, device="cpu", copy=False)]
     out = wp.empty_like(pixels)

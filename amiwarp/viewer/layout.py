@@ -203,14 +203,22 @@ def _texts(state: ViewState) -> dict[str, str]:
     }  # fmt: skip
     if state.against is not None:
         out |= _knob_texts(state.against, "b_")
-    letters = ",".join(f"{name}:{source.name.lower()}" for name, source in state.sources)
+    foreign = _foreign(state.knobs.model)
+    told = [(name, source) for name, source in state.sources if name not in foreign]
+    letters = ",".join(f"{name}:{source.name.lower()}" for name, source in told)
     return {**out, "sources": letters}
+
+
+def _foreign(model: str) -> set[str]:
+    """Return the names of the parameters that no model of the same optic has."""
+    return OTHERS.keys() - {name for each in alternatives(model).values() for name in each.FREE}
 
 
 def _knob_texts(knobs: Knobs, before: str) -> dict[str, str]:
     """Return the values of parameters as texts, with ``before`` in front of their names."""
     out = {f"{before}model": knobs.model}
-    for name in LIMITS:
+    foreign = _foreign(knobs.model)
+    for name in (each for each in LIMITS if each not in foreign):
         if (value := knobs.value(name)) is not None:
             out[before + name] = f"{value / UNITS[name]:.10g}"
     return out

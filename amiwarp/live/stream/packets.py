@@ -66,8 +66,10 @@ def _check_camera(where: str, fields: Any) -> None:
 
 def _check_prism(where: str, fields: Any) -> None:
     _check_object(where, fields)
-    _check_numbers(where, fields, "apex", "index", "thickness", "tilt")
-    _check_words(where, fields, "flat_side")
+    sizes = ("thickness", "tilt") if "thickness" in fields else ("apex",)
+    seconds = ("second_apex", "second_index") if "second_apex" in fields else ()
+    _check_numbers(where, fields, *sizes, "index", *seconds)
+    _check_words(where, fields, "flat_side", "second_flat_side")
 
 
 def _check_object(where: str, fields: Any) -> None:
