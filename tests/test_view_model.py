@@ -38,7 +38,15 @@ from amiwarp.viewer import drawing, jobs
 from amiwarp.viewer import inspector as timeline
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.drawing import ImageKind, Scale, events_text, make_images
-from amiwarp.viewer.inspector import EventRates, Inspector, Knobs, Selection, Source, suggest_region
+from amiwarp.viewer.inspector import (
+    EventRates,
+    Inspector,
+    Knobs,
+    Selection,
+    Source,
+    foreign_names,
+    suggest_region,
+)
 from amiwarp.viewer.jobs import (
     calibrated_events,
     cost_surface,
@@ -290,7 +298,9 @@ def test_every_parameter_has_a_source(recording: Recording, inspector: Inspector
     assert truth is not None
     assert truth.apex == TRUE.apex
     assert inspector.knobs == truth
-    assert set(inspector.sources.values()) == {Source.TRUTH, Source.FILE}
+    foreign = foreign_names(truth.model)
+    assert {source for name, source in inspector.sources.items() if name not in foreign} == {Source.TRUTH, Source.FILE}
+    assert {inspector.sources[name] for name in foreign & inspector.sources.keys()} == {Source.ASSUMED}
     fresh = Inspector(recording)
     assert fresh.sources["apex"] is Source.FILE
     assert fresh.sources["phase"] is Source.ASSUMED

@@ -31,7 +31,7 @@ from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, upload_event
 from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_variance
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, PHASE, ExactModel, Model, RisleyModel, build_model, size_names
+from amiwarp.optics.models import MODELS, PHASE, ExactModel, Model, RisleyModel, alternatives, build_model, size_names
 from amiwarp.optics.prism import NominalPrism, as_wedge
 from amiwarp.reconstruction.picture import Picture, border_displacements
 
@@ -393,6 +393,13 @@ OTHERS = {name: p for name, p in optical_parameters().items() if name not in (*s
 """Parameters of the optical models but for sizes and phase, by name."""
 SLIDING = {name: p for name, p in OTHERS.items() if p.label}
 """Those among :data:`OTHERS` that have a slider."""
+
+
+def foreign_names(model: str) -> set[str]:
+    """Return the names among :data:`OTHERS` of parameters that no model of the same optic has."""
+    return OTHERS.keys() - {name for each in alternatives(model).values() for name in each.FREE}
+
+
 CURVE_HALF_WIDTH = {
     "apex": math.radians(0.4), "phase": math.radians(30.0), "clock_offset": 5000.0, "rpm": 6.0,
     **{name: p.half_range for name, p in SLIDING.items()},
@@ -965,7 +972,7 @@ class Inspector:
         if self.truth is None:
             raise AmiwarpError(f"{self.recording.name}: holds no true parameters of its prism; simulate a recording")
         self.set(self.truth)
-        known = set(self.sources) - {"camera", "prism", "rpm"}
+        known = set(self.sources) - {"camera", "prism", "rpm"} - foreign_names(self.truth.model)
         self.sources |= dict.fromkeys(known, Source.TRUTH)
 
     def as_calibration(self) -> Calibration:

@@ -12,7 +12,17 @@ from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS, alternatives
 from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look, Scale, picture_state
-from amiwarp.viewer.inspector import OTHERS, SLIDING, Inspector, Knobs, Selection, Source, colours_on_offer, truth_text
+from amiwarp.viewer.inspector import (
+    OTHERS,
+    SLIDING,
+    Inspector,
+    Knobs,
+    Selection,
+    Source,
+    colours_on_offer,
+    foreign_names,
+    truth_text,
+)
 from amiwarp.viewer.jobs import EXPORTS, FILMS, CostSurface, FoundCalibration, LiveFigures
 from amiwarp.viewer.serve import FOLDER, Check, flag, number, one_of
 
@@ -203,21 +213,16 @@ def _texts(state: ViewState) -> dict[str, str]:
     }  # fmt: skip
     if state.against is not None:
         out |= _knob_texts(state.against, "b_")
-    foreign = _foreign(state.knobs.model)
+    foreign = foreign_names(state.knobs.model)
     told = [(name, source) for name, source in state.sources if name not in foreign]
     letters = ",".join(f"{name}:{source.name.lower()}" for name, source in told)
     return {**out, "sources": letters}
 
 
-def _foreign(model: str) -> set[str]:
-    """Return the names of the parameters that no model of the same optic has."""
-    return OTHERS.keys() - {name for each in alternatives(model).values() for name in each.FREE}
-
-
 def _knob_texts(knobs: Knobs, before: str) -> dict[str, str]:
     """Return the values of parameters as texts, with ``before`` in front of their names."""
     out = {f"{before}model": knobs.model}
-    foreign = _foreign(knobs.model)
+    foreign = foreign_names(knobs.model)
     for name in (each for each in LIMITS if each not in foreign):
         if (value := knobs.value(name)) is not None:
             out[before + name] = f"{value / UNITS[name]:.10g}"
