@@ -83,8 +83,8 @@ def phase_names() -> set[str]:
     return {phase for model in MODELS.values() for _, phase in model.ORBITS}
 
 
-def default_free(kind: type[Model]) -> tuple[str, ...]:
-    """Return the names of size and phase of each prism, which are free by default."""
+def orbit_names(kind: type[Model]) -> tuple[str, ...]:
+    """Return the names of size and phase of each prism."""
     return tuple(name for orbit in kind.ORBITS for name in orbit)
 
 
@@ -443,7 +443,7 @@ def make_space(
     names = _ordered_names(kind, kind.FREED if free is None else free)
     _check_given(kind, names, start, bounds)
     nominal = {**kind.start_values(prism), "focal_length": camera.fx}
-    values = {n: start.get(n, nominal.get(n, 0.0)) for n in (*default_free(kind), *names, *start)}
+    values = {n: start.get(n, nominal.get(n, 0.0)) for n in (*orbit_names(kind), *names, *start)}
     low, high = {}, {}
     for name in names:
         default = _default_bounds(kind, name, values[name], camera, prism, duration_us)
@@ -530,10 +530,6 @@ def _check_given(
 def _default_bounds(
     kind: type[Model], name: str, value: float, camera: Camera, prism: Prism | Plate, duration_us: float
 ) -> tuple[float, float]:
-    if name in phase_names():
-        return -PHASE.half_range, PHASE.half_range
-    if name != kind.SIZE and name in dict(kind.ORBITS):  # the size of another prism
-        return 0.0, 2.0 * value
     if name in kind.FREE:
         return kind.default_bounds(name, value, camera, prism)
     share = {"rpm": 0.02, "focal_length": 0.2}

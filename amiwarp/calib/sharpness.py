@@ -506,8 +506,7 @@ class Search:
             plain = self.settings.sharpness is Sharpness.VARIANCE
             variance = parts if plain else self._objective_by_parts(Sharpness.VARIANCE)
             kind = MODELS[space.model]
-            away = {phase: best[phase] + math.pi for _, phase in kind.ORBITS}
-            points = (best, {**kind.turned_values(best, math.pi), **away}, kind.still_values(best))
+            points = (best, kind.turned_values(best, math.pi), kind.still_values(best))
             sharp, opposite, still = (variance.each(values) for values in points)
             if "photometric" in self.settings.stages:
                 size, most = space.size_name, space.high[space.size_name]

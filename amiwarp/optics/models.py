@@ -121,7 +121,7 @@ class Model:
     ANGLES: ClassVar[int] = 1
     """Number of angles of its state: one prism has one, a pair has two."""
     ORBITS: ClassVar[tuple[tuple[str, str], ...]]
-    """Names of size and phase of each prism, which a calibration finds by default."""
+    """Names of size and phase of each prism."""
 
     camera: Camera
     """Camera intrinsics."""
@@ -256,7 +256,9 @@ class Model:
         """
         if one_of(name, cls.FREE, "name") == cls.SIZE:
             return 0.0, cls.largest_size(prism)
-        if name == PHASE.name:
+        if name in dict(cls.ORBITS):  # the size of another prism
+            return 0.0, 2.0 * value
+        if name in dict(cls.ORBITS).values():
             return -PHASE.half_range, PHASE.half_range
         half = next(parameter.half_range for parameter in cls.PARAMETERS if parameter.name == name)
         return value - half, value + half
@@ -275,10 +277,10 @@ class Model:
         Returns
         -------
         dict
-            The values: here with another phase.
+            The values: here with other phases of all prisms.
         """
         check_given(values, cls.FREE[:2])
-        return {**values, PHASE.name: values[PHASE.name] + angle}
+        return {**values, **{phase: values[phase] + angle for _, phase in cls.ORBITS if phase in values}}
 
     @classmethod
     def reversed_values(cls, values: Mapping[str, float]) -> dict[str, float] | None:

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.calib.parameters import DRIFTS, RATES, ParameterSpace, default_free, phase_names, widened
+from amiwarp.calib.parameters import DRIFTS, RATES, ParameterSpace, orbit_names, phase_names, widened
 from amiwarp.calib.photometric.cost import place_arguments, size_and_phase_directions
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.equations import by_shift, multiply
@@ -474,7 +474,7 @@ def _columns(cost: Cost, best: Vector) -> dict[str, Any]:
 
 def _orbit(space: ParameterSpace) -> list[str]:
     """Return the names of the free ones of size and phase, of each prism."""
-    return [n for n in space.names if n in default_free(MODELS[space.model])]
+    return [n for n in space.names if n in orbit_names(MODELS[space.model])]
 
 
 def _systematic(space: ParameterSpace, fit: LinearFit) -> Vector:
