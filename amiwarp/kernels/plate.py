@@ -7,8 +7,8 @@ is linear in ρ. ``docs/explanation/optics.md`` derives both.
 
 import warp as wp
 
-from amiwarp.kernels.camera import NAN, CameraParams, PinholeParams, invalid_pixel, pixel_to_ray, ray_to_pixel
-from amiwarp.kernels.refraction import INVERSION_STEPS, compensate, compensate_direction, deflect, displace
+from amiwarp.kernels.camera import NAN, CameraParams, PinholeParams, pixel_to_ray, ray_to_pixel
+from amiwarp.kernels.refraction import compensate, compensate_direction, deflect, displace, inverted
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
@@ -71,14 +71,7 @@ def compensate_direction(model: PlateParams, x: float, y: float, z: float, w0: f
 @wp.func
 def deflect(model: PlateParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
     """Return the observed pixel of a point of a plane scene, by a fixed-point iteration."""
-    observed = xy
-    error = wp.vec2(0.0, 0.0)
-    for _ in range(INVERSION_STEPS):
-        error = compensate(model, camera, observed, w) - xy
-        observed = observed - error
-    if not (wp.length(error) < 0.01):
-        return invalid_pixel()
-    return observed
+    return inverted(model, camera, xy, w)
 
 
 # -- a map of inverse depths
@@ -115,14 +108,7 @@ def displace(model: PlateMapParams, camera: PinholeParams, x: float, y: float, w
 @wp.func
 def deflect(model: PlateMapParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
     """Return the observed pixel of a scene point. NaN where the map does not say which of two depths the pixel sees."""
-    observed = xy
-    error = wp.vec2(0.0, 0.0)
-    for _ in range(INVERSION_STEPS):
-        error = compensate(model, camera, observed, w) - xy
-        observed = observed - error
-    if not (wp.length(error) < 0.01):
-        return invalid_pixel()
-    return observed
+    return inverted(model, camera, xy, w)
 
 
 @wp.kernel

@@ -374,6 +374,22 @@ def deflect(model: PairParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2) ->
     return ray_to_pixel(camera, wp.vec3(x, y, z))
 
 
+# -- models whose displacement belongs to the observed pixel
+
+
+@wp.func
+def inverted(model: Any, camera: CameraParams, xy: wp.vec2, w: wp.vec2) -> wp.vec2:
+    """Return the observed pixel that compensation moves to ``xy``, by a fixed-point iteration; NaN if it diverges."""
+    observed = xy
+    error = wp.vec2(0.0, 0.0)
+    for _ in range(INVERSION_STEPS):
+        error = compensate(model, camera, observed, w) - xy
+        observed = observed - error
+    if not (wp.length(error) < 0.01):
+        return invalid_pixel()
+    return observed
+
+
 # -- ellipse: offset and first harmonic of the displacement of each observed pixel
 
 
@@ -421,14 +437,7 @@ def deflect(model: EllipseParams, camera: CameraParams, xy: wp.vec2, w: wp.vec2)
 
     The table belongs to the observed pixel, so that a fixed-point iteration solves for it.
     """
-    observed = xy
-    error = wp.vec2(0.0, 0.0)
-    for _ in range(INVERSION_STEPS):
-        error = compensate(model, camera, observed, w) - xy
-        observed = observed - error
-    if not (wp.length(error) < 0.01):
-        return invalid_pixel()
-    return observed
+    return inverted(model, camera, xy, w)
 
 
 # -- all models: pixels to pixels
