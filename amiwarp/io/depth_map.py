@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import NewFile, errors_name, input_path
+from amiwarp.io.files import NewFile
 from amiwarp.io.formats import check_ending
-from amiwarp.io.plain_files import open_array
+from amiwarp.io.plain_files import map_arrays, save_map
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import array, guarded
 
@@ -103,10 +102,7 @@ class DepthMap:
         AmiwarpError
             If the file has another extension, exists and ``overwrite`` is False, or cannot be written.
         """
-        path = Path(path)
-        check_ending(path, "depth maps are written", [".npz"])
-        with NewFile(path, overwrite=overwrite) as new, open(new.part, "wb") as file:
-            np.savez_compressed(file, **{name: getattr(self, name) for name in ARRAYS})
+        save_map(Path(path), "depth map", {name: getattr(self, name) for name in ARRAYS}, overwrite=overwrite)
 
     def save_points(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write the known points to a PLY file, coloured from near (yellow) to far (violet).
@@ -159,16 +155,6 @@ class DepthMap:
         AmiwarpError
             If the file cannot be read, or does not hold the arrays of a map. The message names the array.
         """
-        path = Path(path)
-        values = {}
-        with errors_name(path, lambda: "is no depth map"), zipfile.ZipFile(input_path(path)) as archive:
-            names = archive.namelist()
-            for name in ARRAYS:
-                if f"{name}.npy" not in names:
-                    raise AmiwarpError(f"has no array {name}; make the map with 'amiwarp depth'")
-                with open_array(archive, name, "f") as (stream, shape, dtype):
-                    if len(shape) != (3 if name == "points" else 2) or max(shape) > LARGEST_SIZE:
-                        raise AmiwarpError(f"array {name} has shape {shape}; expected (height, width)")
-                    data = stream.read(int(np.prod(shape)) * dtype.itemsize)
-                    values[name] = np.frombuffer(data, dtype).reshape(shape)
+        kinds = dict.fromkeys(ARRAYS, "f")
+        with map_arrays(Path(path), "depth map", "amiwarp depth", kinds, {"points": 3}) as values:
             return cls(**values)

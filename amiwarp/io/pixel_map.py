@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.files import NewFile, errors_name, input_path
-from amiwarp.io.formats import check_ending
-from amiwarp.io.plain_files import open_array
+from amiwarp.io.plain_files import map_arrays, save_map
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import array, guarded
 
@@ -123,10 +120,7 @@ class PixelMap:
         AmiwarpError
             If the file has another extension, exists and ``overwrite`` is False, or cannot be written.
         """
-        path = Path(path)
-        check_ending(path, "pixel maps are written", [".npz"])
-        with NewFile(path, overwrite=overwrite) as new, open(new.part, "wb") as file:
-            np.savez_compressed(file, **{name: getattr(self, name) for name in KINDS})
+        save_map(Path(path), "pixel map", {name: getattr(self, name) for name in KINDS}, overwrite=overwrite)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> PixelMap:
@@ -147,16 +141,5 @@ class PixelMap:
         AmiwarpError
             If the file cannot be read, or does not hold the arrays of a map. The message names the array.
         """
-        path = Path(path)
-        values = {}
-        with errors_name(path, lambda: "is no pixel map"), zipfile.ZipFile(input_path(path)) as archive:
-            names = archive.namelist()
-            for name, kinds in KINDS.items():
-                if f"{name}.npy" not in names:
-                    raise AmiwarpError(f"has no array {name}; make the map with 'amiwarp pixels'")
-                with open_array(archive, name, kinds) as (stream, shape, dtype):
-                    if len(shape) != 2 or max(shape) > LARGEST_SIZE:
-                        raise AmiwarpError(f"array {name} has shape {shape}; expected (height, width)")
-                    data = stream.read(shape[0] * shape[1] * dtype.itemsize)
-                    values[name] = np.frombuffer(data, dtype).reshape(shape)
+        with map_arrays(Path(path), "pixel map", "amiwarp pixels", KINDS) as values:
             return cls(**values)

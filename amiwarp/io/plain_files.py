@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, Recording, regroup
 from amiwarp.io.file_scan import FileEvents, Packet, microseconds, read_pieces, whole_pixels
-from amiwarp.io.files import LONGEST_LINE, errors_name, input_path, open_input, scratch_folder
-from amiwarp.io.formats import BIN_EVENT_BYTES, BIN_MARK_ROW, Outline, bin_columns, looks_like_bin
-from amiwarp.optics.camera import Camera, RadialTangential
+from amiwarp.io.files import LONGEST_LINE, NewFile, errors_name, input_path, open_input, scratch_folder
+from amiwarp.io.formats import BIN_EVENT_BYTES, BIN_MARK_ROW, Outline, bin_columns, check_ending, looks_like_bin
+from amiwarp.optics.camera import LARGEST_SIZE, Camera, RadialTangential
 from amiwarp.tasks import in_order
 
 # Reader of text in the format of the Event Camera Dataset: one event ``t x y p`` per line, t in seconds, p 1 or 0.
@@ -275,6 +275,38 @@ def _header(stream: IO[bytes], name: str, file_bytes: int, kinds: str) -> Array:
     if by_columns and len(shape) > 1:
         raise AmiwarpError(f"array {name} is stored by columns; save numpy.ascontiguousarray of it")
     return stream, shape, dtype
+
+
+# Maps of a sensor's pixels: arrays with one value or vector per pixel.
+
+
+def save_map(path: Path, what: str, arrays: Mapping[str, NDArray[Any]], *, overwrite: bool) -> None:
+    """Write the arrays of a map, by name, to a ``.npz`` file; ``what`` names such a map."""
+    check_ending(path, f"{what}s are written", [".npz"])
+    with NewFile(path, overwrite=overwrite) as new, open(new.part, "wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+@contextlib.contextmanager
+def map_arrays(
+    path: Path, what: str, command: str, kinds: Mapping[str, str], axes: Mapping[str, int] | None = None
+) -> Iterator[dict[str, NDArray[Any]]]:
+    """Read the arrays that :func:`save_map` wrote; errors in the ``with`` block name the file.
+
+    ``command`` makes such a map. ``kinds``: kinds of data types that each array may have; ``axes``: numbers of axes of
+    the arrays that do not have two.
+    """
+    values = {}
+    with errors_name(path, lambda: f"is no {what}"), zipfile.ZipFile(input_path(path)) as archive:
+        names = archive.namelist()
+        for name, allowed in kinds.items():
+            if f"{name}.npy" not in names:
+                raise AmiwarpError(f"has no array {name}; make the map with '{command}'")
+            with open_array(archive, name, allowed) as (stream, shape, dtype):
+                if len(shape) != (axes or {}).get(name, 2) or max(shape) > LARGEST_SIZE:
+                    raise AmiwarpError(f"array {name} has shape {shape}; expected (height, width)")
+                values[name] = np.frombuffer(stream.read(math.prod(shape) * dtype.itemsize), dtype).reshape(shape)
+        yield values
 
 
 def _number(archive: zipfile.ZipFile, name: str) -> int:
