@@ -29,11 +29,14 @@ class Block:
 
 
 @wp.func
-def azimuth_at(steps: Steps, at: int) -> wp.vec2:
-    """Return (cos, sin) of the true azimuth at a time since the first instant of the table [ticks]."""
+def azimuth_at(steps: Steps, angle: wp.array(dtype=float), turn: wp.array(dtype=float), at: int) -> wp.vec2:
+    """Return (cos, sin) of the true azimuth of a prism at a time since the first instant of the table [ticks].
+
+    ``angle`` and ``turn`` are those of one prism in ``steps``.
+    """
     k = wp.clamp(at / steps.ticks, 0, steps.margin + steps.count)
-    angle = steps.angle[k] + steps.turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
-    return wp.vec2(wp.cos(angle), wp.sin(angle))
+    azimuth = angle[k] + turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
+    return wp.vec2(wp.cos(azimuth), wp.sin(azimuth))
 
 
 @wp.kernel
@@ -54,13 +57,10 @@ def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.
     lag = LARGEST_LAG - (low >> 3) - LAG_ZERO
     at = int(t) * TICKS - lag + steps.margin * steps.ticks
     block.ticks[i] = at
-    k = wp.clamp(at / steps.ticks, 0, steps.margin + steps.count)
-    second = steps.second_angle[k] + steps.second_turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
     ray = pixel_to_ray(view.camera, wp.vec2(float(col), float(row)))
-    w2 = wp.vec2(wp.cos(second), wp.sin(second))
-    block.points[i] = ray_to_pixel(
-        view.camera, ray_without_prisms(view.prism, view.second, ray, azimuth_at(steps, at), w2)
-    )
+    w = azimuth_at(steps, steps.angle, steps.turn, at)
+    w2 = azimuth_at(steps, steps.second_angle, steps.second_turn, at)
+    block.points[i] = ray_to_pixel(view.camera, ray_without_prisms(view.prism, view.second, ray, w, w2))
 
 
 @wp.kernel
@@ -69,7 +69,8 @@ def find_points_at_rest(
 ):
     """Find the pixel that each event's scene point has if the camera does not vibrate as ``model`` says."""
     i = start + wp.tid()
-    points[i] = compensate(model, camera, block.points[i], azimuth_at(steps, block.ticks[i]))
+    w = azimuth_at(steps, steps.angle, steps.turn, block.ticks[i])
+    points[i] = compensate(model, camera, block.points[i], w)
 
 
 @wp.kernel

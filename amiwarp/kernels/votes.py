@@ -122,18 +122,24 @@ def load_states(model: PairParams, events: EventArrays, first: int, states: wp.a
         store_float(states, 2 * k + 1, b)
 
 
+@wp.func
+def theta_u16_at(encoder: EncoderParams, t: wp.int64) -> wp.uint16:
+    """Return theta_u16, the prism angle [1/65536 turn], at event time ``t`` [us]."""
+    return wp.uint16((theta_u32_at(encoder, t) + wp.uint32(32768)) >> wp.uint32(16))
+
+
 @wp.kernel
 def turn_events(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, turn: wp.array(dtype=wp.uint16)):
     """Compute theta_u16 of each event: the prism angle at its time, rounded to 1/65536 turn."""
     i = start + wp.tid()
-    turn[i] = wp.uint16((theta_u32_at(encoder, t[i]) + wp.uint32(32768)) >> wp.uint32(16))
+    turn[i] = theta_u16_at(encoder, t[i])
 
 
 @wp.kernel
 def turn_second(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, turn: wp.array(dtype=wp.uint16)):
     """Compute theta_u16 of the second prism at each event."""
     i = start + wp.tid()
-    turn[i] = wp.uint16((theta_u32_at(of_second(encoder), t[i]) + wp.uint32(32768)) >> wp.uint32(16))
+    turn[i] = theta_u16_at(of_second(encoder), t[i])
 
 
 @wp.kernel

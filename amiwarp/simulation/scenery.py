@@ -16,7 +16,7 @@ from amiwarp.kernels import world as kernels
 from amiwarp.kernels.launch import launch
 from amiwarp.kernels.plate import PlateParams
 from amiwarp.optics.camera import Camera, camera_params
-from amiwarp.optics.models import LARGEST_INVERSE_DEPTH, ExactModel, Model, PlateModel
+from amiwarp.optics.models import LARGEST_INVERSE_DEPTH, Model, PlateModel
 from amiwarp.simulation.description import Scene, SimulationValues, Vibration
 from amiwarp.simulation.pictures import DARK, Placement, log_map, place_picture
 from amiwarp.simulation.worlds.world import Body, Material, Trajectory, World, WorldScene
@@ -143,7 +143,7 @@ def image_motion(simulation: SimulationValues, inverse_depth: float = 0.0) -> Im
     arc = (theta[1] / 2.0) / math.sin(theta[1] / 2.0)  # a step along a circle is longer than its chord
     prisms, bends = [], []
     shakes = isinstance(simulation.prism, Vibration)
-    models: list[Model] = [simulation.moving_model] if shakes else [*single_models(simulation)]
+    models: list[Model] = [simulation.moving_model] if shakes else [*simulation.bending.singles()]
     if simulation.plate is not None:
         models = [replace(simulation.plate, inverse_depth=min(inverse_depth, LARGEST_INVERSE_DEPTH))]
     for model in models:
@@ -159,15 +159,9 @@ def image_motion(simulation: SimulationValues, inverse_depth: float = 0.0) -> Im
     return ImageMotion(np.array(prisms) * share, np.array(bends) * share, _camera_image_motion(simulation, grid))
 
 
-def single_models(simulation: SimulationValues) -> list[ExactModel]:
-    """Return the exact model of the prism, or of each prism of a pair on its own."""
-    model = simulation.bending
-    return [model] if isinstance(model, ExactModel) else list(model.singles())
-
-
 def prism_view_of(simulation: SimulationValues, device: Any) -> Any:
     """Return the kernels' :class:`amiwarp.kernels.prism_view.View` with camera and prisms, without maps."""
-    view, (prism, *second) = prism_view.View(), single_models(simulation)
+    view, (prism, *second) = prism_view.View(), simulation.bending.singles()
     view.camera, view.prism = camera_params(simulation.camera, str(device)), prism.params(device)
     if second:
         view.second = second[0].params(device)
