@@ -130,9 +130,9 @@ def line(row: dict[str, Any]) -> str:
     )
     if row["refused"]:
         return f"{head}refused: {row['refused']}"
-    told = f"; {'; '.join(row['warnings'])}" if row["warnings"] else ""
+    warned = f"; {'; '.join(row['warnings'])}" if row["warnings"] else ""
     said = "SILENT " if row["silent"] else ""
-    return f"{head}{said}{row['error_px']:.4f} px, frequency {row['frequency_error']:.1e}{told}"
+    return f"{head}{said}{row['error_px']:.4f} px, frequency {row['frequency_error']:.1e}{warned}"
 
 
 def main() -> None:

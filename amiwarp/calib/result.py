@@ -368,7 +368,7 @@ class Calibration:
             "version": VERSION,
             "model": self.model_name,
             "camera": camera_to_json(self.camera),
-            "prism": self._prism_to_json(),
+            "prism": prism_to_json(self.prism) if MODELS[self.model_name].PRISM else None,
             "parameters": {name: self._parameter(name) for name in self.parameters},
             "sharpness": {
                 "kind": self.sharpness_name,
@@ -386,11 +386,6 @@ class Calibration:
             "warnings": list(self.warnings),
             "stages": [asdict(stage) for stage in self.stages],
         }
-
-    def _prism_to_json(self) -> dict[str, Any] | None:
-        if not MODELS[self.model_name].PRISM:
-            return None
-        return prism_to_json(self.prism)
 
     def _parameter(self, name: str) -> dict[str, Any]:
         value = self.parameters[name]

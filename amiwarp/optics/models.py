@@ -185,38 +185,6 @@ class Model:
         return size
 
     @classmethod
-    def nominal_size(cls, prism: Prism | Plate) -> float:
-        """Return the size with which a search starts if nothing but the nominal glass is known.
-
-        Parameters
-        ----------
-        prism : Prism or Plate
-            The nominal glass.
-
-        Returns
-        -------
-        float
-            Value of the parameter :attr:`SIZE`: here that of the prism's apex angle.
-        """
-        return cls.size_from_apex(as_wedge(prism).apex, as_wedge(prism))
-
-    @classmethod
-    def largest_size(cls, prism: Prism | Plate) -> float:
-        """Return the largest size that a search tries by default.
-
-        Parameters
-        ----------
-        prism : Prism or Plate
-            The nominal glass.
-
-        Returns
-        -------
-        float
-            Value of the parameter :attr:`SIZE`: here that of twice the prism's apex angle.
-        """
-        return cls.size_from_apex(2.0 * as_wedge(prism).apex, as_wedge(prism))
-
-    @classmethod
     def typical_size(cls, camera: Camera, prism: Prism | Plate) -> float:
         """Return a typical size, at which the effect of the parameters is measured.
 
@@ -247,7 +215,7 @@ class Model:
         camera : Camera
             The camera.
         prism : Prism or Plate
-            The nominal glass. Here the size ranges from 0 to :meth:`largest_size`.
+            The nominal glass. Here the size ranges from 0 to that of twice its apex angle.
 
         Returns
         -------
@@ -255,7 +223,7 @@ class Model:
             The bounds, in the parameter's unit.
         """
         if one_of(name, cls.FREE, "name") == cls.SIZE:
-            return 0.0, cls.largest_size(prism)
+            return 0.0, cls.size_from_apex(2.0 * as_wedge(prism).apex, as_wedge(prism))
         if name in dict(cls.ORBITS):  # the size of another prism
             return 0.0, 2.0 * value
         if name in dict(cls.ORBITS).values():
@@ -312,7 +280,8 @@ class Model:
         dict
             Value of each parameter by name, in its unit.
         """
-        given = {cls.SIZE: cls.nominal_size(prism), "index": prism.index}
+        wedge = as_wedge(prism)
+        given = {cls.SIZE: cls.size_from_apex(wedge.apex, wedge), "index": wedge.index}
         return {name: given.get(name, 0.0) for name in cls.FREE}
 
     @classmethod
@@ -1172,12 +1141,14 @@ class PlateModel(Model):
         object.__setattr__(self, "depths", table.astype(np.float32, copy=False))
 
     @classmethod
-    def nominal_size(cls, prism: Prism | Plate) -> float:
-        return NOMINAL_INVERSE_DEPTH
+    def start_values(cls, prism: Prism | Plate) -> dict[str, float]:
+        return {cls.SIZE: NOMINAL_INVERSE_DEPTH, PHASE.name: 0.0}
 
     @classmethod
-    def largest_size(cls, prism: Prism | Plate) -> float:
-        return 2.0 * NOMINAL_INVERSE_DEPTH
+    def default_bounds(cls, name: str, value: float, camera: Camera, prism: Prism | Plate) -> tuple[float, float]:
+        if name == cls.SIZE:
+            return 0.0, 2.0 * NOMINAL_INVERSE_DEPTH
+        return super().default_bounds(name, value, camera, prism)
 
     @classmethod
     def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:

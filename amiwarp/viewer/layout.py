@@ -214,8 +214,8 @@ def _texts(state: ViewState) -> dict[str, str]:
     if state.against is not None:
         out |= _knob_texts(state.against, "b_")
     foreign = foreign_names(state.knobs.model)
-    told = [(name, source) for name, source in state.sources if name not in foreign]
-    letters = ",".join(f"{name}:{source.name.lower()}" for name, source in told)
+    shown = [(name, source) for name, source in state.sources if name not in foreign]
+    letters = ",".join(f"{name}:{source.name.lower()}" for name, source in shown)
     return {**out, "sources": letters}
 
 

@@ -856,6 +856,7 @@ def _drift(space: ParameterSpace, best: Vector, fit: LinearFit) -> tuple[float, 
                       for d in size_and_phase_directions(space, best)])  # fmt: skip
     change = along @ estimate.change[n:]
     std = np.sqrt(np.diag(along @ estimate.covariance[n:, n:] @ along.T))
-    told = np.where(np.abs(change) > SIGNIFICANT * std, change, 0.0)
-    size, phase = (max(told[k::2].tolist(), key=abs) for k in (0, 1))  # of the prism for which it changes most
+    significant = np.where(np.abs(change) > SIGNIFICANT * std, change, 0.0)
+    # size and phase of each prism in turn: those of the prism for which they change most
+    size, phase = (max(significant[k::2].tolist(), key=abs) for k in (0, 1))
     return size, phase
