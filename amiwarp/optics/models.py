@@ -1146,7 +1146,7 @@ class PlateModel(Model):
 
     @classmethod
     def default_bounds(cls, name: str, value: float, camera: Camera, prism: Prism | Plate) -> tuple[float, float]:
-        if name == cls.SIZE:
+        if one_of(name, cls.FREE, "name") == cls.SIZE:
             return 0.0, 2.0 * NOMINAL_INVERSE_DEPTH
         return super().default_bounds(name, value, camera, prism)
 
