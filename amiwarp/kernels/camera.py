@@ -190,9 +190,10 @@ def ray_to_pixel(c: CameraParams, ray: wp.vec3) -> wp.vec2:
 
 
 @wp.kernel
-def fill_rays(c: CameraParams, rays: wp.array2d(dtype=wp.vec3)):
-    """Fill the camera's table of bearings: one bearing per pixel."""
-    row, col = wp.tid()
+def fill_rays(c: CameraParams, start: int, rays: wp.array2d(dtype=wp.vec3)):
+    """Fill the camera's table of bearings: one pixel per thread."""
+    i = start + wp.tid()
+    row, col = i // c.width, i % c.width
     rays[row, col] = solve_ray(c, wp.vec2(float(col), float(row)))
 
 

@@ -213,7 +213,7 @@ class LiveLens:
             yield self._model
         if len(self.poses) >= 2:
             return
-        _, search = work.search(work.poses[0], ("apex", "phase"), {})
+        [(_, search)] = work.searches(work.poses, ("apex", "phase"), {})
         search.run()
         yield ExactModel.from_values(self._camera, as_wedge(search.full_space.prism), search.best)
 

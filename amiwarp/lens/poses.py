@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from amiwarp.calib.first_guess import ANGLE_RANGES, CELL
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, MemoryEvents, Recording
+from amiwarp.tasks import in_order
 
 LEAST_TURNS, MOST_TURNS = 1.5, 3.0
 """Shortest still span, and the longest part of one that is used, from its middle [turns]."""
@@ -42,13 +44,13 @@ def still_poses(recordings: Sequence[Recording]) -> tuple[list[Pose], dict[str, 
     Raises :class:`AmiwarpError`, with the reason of the first recording, if none has any.
     """
     spans, reasons = list[tuple[Recording, tuple[int, int]]](), dict[str, str]()
-    for recording in recordings:
-        try:
-            spans += [(recording, span) for span in _spans_of(recording)]
-        except AmiwarpError as error:
-            if len(reasons) == len(recordings) - 1:
-                raise AmiwarpError(f"{recordings[0].name}: {reasons.get(recordings[0].name, error)}") from error
-            reasons[recording.name] = str(error)
+    for recording, found in zip(recordings, in_order(partial(_spans_of, one) for one in recordings), strict=True):
+        if isinstance(found, AmiwarpError):
+            reasons[recording.name] = str(found)
+        else:
+            spans += [(recording, span) for span in found]
+    if not spans:
+        raise AmiwarpError(f"{recordings[0].name}: {reasons[recordings[0].name]}")
     if len(spans) > MOST_POSES:
         spans = [spans[k] for k in np.linspace(0, len(spans) - 1, MOST_POSES).round().astype(int)]
     several = {recording.name for recording in recordings if sum(one is recording for one, _ in spans) > 1}
@@ -62,8 +64,15 @@ def _pose(recording: Recording, start: int, stop: int, *, several: bool) -> Pose
     return Pose(f"{recording.name}{where}", replace(recording, events=events))
 
 
-def _spans_of(recording: Recording) -> list[tuple[int, int]]:
-    """Return start and end of every still span [us], each at most :data:`MOST_TURNS` long."""
+def _spans_of(recording: Recording) -> list[tuple[int, int]] | AmiwarpError:
+    """Return start and end of every still span [us], each at most :data:`MOST_TURNS` long, or why there is none."""
+    try:
+        return _found_spans(recording)
+    except AmiwarpError as error:
+        return error
+
+
+def _found_spans(recording: Recording) -> list[tuple[int, int]]:
     encoder, source = recording.encoder, recording.events
     if encoder is None:
         raise AmiwarpError(f"has no encoder; record the angle of a turning prism, {WITHOUT_PRISM}")

@@ -388,12 +388,17 @@ def _run(kernel_name: str, camera: Camera, rows: Any, sizes: tuple[int, int]) ->
 # Camera parameters on a device, for kernels.
 
 
+FEW_RAYS = 1 << 12
+"""Fewest rays of a camera's table that a thread of its own solves: each takes several steps of Newton's method."""
+
+
 @lru_cache(maxsize=16)
 def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
     """Return the camera's parameters on ``device``, with a table of bearing vectors if the lens distorts."""
     import warp as wp
 
     from amiwarp.kernels import camera as kernels
+    from amiwarp.kernels.launch import launch
 
     c = kernels.CameraParams()
     c.fx, c.fy, c.cx, c.cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -412,7 +417,7 @@ def camera_params(camera: Camera, device: str) -> kernels.CameraParams:
     k = astuple(d)
     c.k = type(c.k)(*k, *(0.0,) * (8 - len(k)))
     rays = wp.empty((camera.height, camera.width), dtype=wp.vec3, device=device)
-    wp.launch(kernels.fill_rays, dim=rays.shape, inputs=[c], outputs=[rays], device=device)
+    launch(kernels.fill_rays, rays.size, [c], [rays], device=device, smallest=FEW_RAYS)
     c.rays = rays
     return c
 
