@@ -11,12 +11,13 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.calib.calibration import prepare
@@ -40,6 +41,7 @@ from amiwarp.tasks import Progress, in_order, silent
 from amiwarp.validation import array, guarded, instance, real
 
 Vector = NDArray[np.float64]
+Result = TypeVar("Result")
 
 USUAL_FOV = math.radians(60.0)
 """Horizontal field of view that is assumed if none is known [rad]."""
@@ -99,10 +101,10 @@ the orbits at the centre of the image [px], and times its cube. The share by whi
 small falls about with the square of their radius: in 25 sets of poses each, a fisheye's orbits of 2.8 px at the centre
 were too large by 0.0022 px rms, those of 4.7 px of another lens too small by 0.0011 px. In orbits of 5.4 px, indices of
 1.6 came out 0.01 too large."""
-SHARED_FOCAL = 0.00011
-"""Standard deviation of a relative error of the focal length that the pictures of a set share, so that leaving out a
-pose does not show it. It makes errors of 50 sets of poses, 25 of each of two lenses, as likely as possible; 50 others
-give the same."""
+SHARED_FOCAL, SHARED_CENTRE_PX = 0.00011, 0.04
+"""Standard deviations of errors that the pictures of a set share, so that leaving out a pose does not show them: of the
+focal length, as a share, and of each coordinate of the principal point [px]. The first makes the errors of 50 sets of
+poses of two lenses as likely as possible, and 50 others give the same; the second was found from 175 sets."""
 REGIONS = (("upper", "middle", "lower"), ("left", "centre", "right"))
 """Names of the nine regions of the image in which corners are counted."""
 STEEP = math.radians(15.0)
@@ -424,20 +426,24 @@ class LensWork:
         the start would otherwise be common to all poses: the principal point would follow it, and the scatter of the
         poses not show it.
         """
-        out = {}
         recordings = {pose.name: pose.recording for pose in self.poses}
-        for k, name in enumerate(names):
-            share = 0.2 + 0.8 * k / len(names)
-            self.progress(f"picture {k + 1} of {len(names)}", (done + share) / (MOST_PASSES + 1))
+
+        def picture(name: str, angle: float) -> NDArray[np.uint8]:
             work = Reconstruction(recordings[name], model=model, device=self.device)
             work.smoothness, work.with_silence = SMOOTHNESS, False
             assert work.turn_us is not None  # a still span has turns
-            angle = math.tau * k / len(names)
             start = window_start(recordings[name], turns, work.turn_us, angle) if turns > 1.0 else None
             log = work.window(*work.span(start, turns=turns)).to_host().log
             low, high = np.percentile(log, (1.0, 99.0))
-            out[name] = np.clip((log - low) / max(high - low, 1e-6) * 255.0, 0.0, 255.0).astype(np.uint8)
-        return out
+            return np.clip((log - low) / max(high - low, 1e-6) * 255.0, 0.0, 255.0).astype(np.uint8)
+
+        def jobs() -> Iterator[Callable[[], NDArray[np.uint8]]]:
+            for k, name in enumerate(names):
+                share = 0.2 + 0.8 * k / len(names)
+                self.progress(f"picture {k + 1} of {len(names)}", (done + share) / (MOST_PASSES + 1))
+                yield partial(picture, name, math.tau * k / len(names))
+
+        return dict(zip(names, for_each_pose(jobs(), self.device), strict=True))
 
     def _use_lens(self, joint: JointPrism, sight: Sight) -> None:
         """Go on with the lens that was seen; the prism's orbits stay as large."""
@@ -477,9 +483,10 @@ class LensWork:
             )
             del seen[worst]
             self._check_count(len(seen), "that fit together")
-        shared = np.zeros(len(fit.names))
-        shared[:2] = SHARED_FOCAL * fit.camera.fx, SHARED_FOCAL * fit.camera.fy
-        return Sight(pictures, seen, replace(fit, covariance=fit.covariance + np.outer(shared, shared)))
+        shared = np.zeros((3, len(fit.names)))
+        shared[0, :2] = SHARED_FOCAL * fit.camera.fx, SHARED_FOCAL * fit.camera.fy
+        shared[1, 2] = shared[2, 3] = SHARED_CENTRE_PX
+        return Sight(pictures, seen, replace(fit, covariance=fit.covariance + shared.T @ shared))
 
     def _before_the_lens(self) -> NDArray[np.bool_]:
         """Return the pixels whose events are used with the rough lens, shape (height, width)."""
@@ -715,12 +722,14 @@ class JointPrism:
 
     def _slopes(self, costs: Iterable[Cost], v: Vector) -> list[Slopes]:
         """Return the derivatives of the cost of each pose at a vector of parameters."""
-        out = []
-        for cost in costs:
+
+        def slopes(cost: Cost) -> Slopes:
             cost.predict(v)
             cost.residuals(v, rounds=2)
-            out.append(cost.slopes(v, with_parts=True))
-        return out
+            return cost.slopes(v, with_parts=True)
+
+        costs = list(costs)
+        return [*for_each_pose((partial(slopes, cost) for cost in costs), costs[0].brightness.device)]
 
     def linearise(self, camera: Camera, names: tuple[str, ...]) -> None:
         """Find how the costs of all poses change with the parameters ``names`` at the present values.
@@ -807,6 +816,19 @@ class JointPrism:
             sharpness_after=search.sharpness_in(space, found), stages=(), events=len(search.calibration_events.events),
             seconds=seconds,
         )  # fmt: skip
+
+
+def for_each_pose(jobs: Iterable[Callable[[], Result]], device: Any) -> Iterator[Result]:
+    """Run the jobs of poses, and yield their results in order.
+
+    On a CPU some run at the same time, as one alone leaves cores idle between its kernels. On a GPU they take turns, as
+    its graphs cannot be recorded in several threads.
+    """
+    if not wp.get_device(device).is_cpu:
+        yield from (job() for job in jobs)
+        return
+    with contextlib.closing(in_order(jobs)) as results:
+        yield from results
 
 
 def window_start(recording: Recording, turns: float, turn_us: float, angle: float) -> int:
