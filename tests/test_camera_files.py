@@ -128,3 +128,12 @@ def test_calib_txt_needs_the_size(tmp_path: Path) -> None:
     with pytest.raises(AmiwarpError, match=r"holds no size of the image; give size=\(width, height\)"):
         load_camera(path)
     assert load_camera(path, (240, 180)).fy == 201.0
+
+
+def test_a_camera_among_many_comments_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yml"
+    path.write_text("# measured twice\n" * 3000 + ROS)
+    assert load_camera(path).fx == 438.783367
+    path.write_text("# measured twice\n" * 5000 + ROS)
+    with pytest.raises(AmiwarpError, match="is larger than 64 KiB, so it is no camera"):
+        load_camera(path)

@@ -14,7 +14,17 @@ import numpy as np
 import pytest
 
 from amiwarp import Events, RecordingWriter
-from amiwarp.io.hdf5_files import CHUNK, ChunkFile, EncodedChunk, encode, encode_parts, make_dataset
+from amiwarp.io.hdf5_files import (
+    BLOSC_HEADER_BYTES,
+    CHUNK,
+    ChunkFile,
+    EncodedChunk,
+    checksums,
+    decode,
+    encode,
+    encode_parts,
+    make_dataset,
+)
 
 assert hdf5plugin.FILTERS  # its import registers the filter
 
@@ -232,3 +242,18 @@ def test_an_interrupt_waits_until_the_file_is_created(tmp_path: Path, monkeypatc
         signal.signal(signal.SIGINT, handler)
     assert len(files) == 1
     assert not files[0]  # closed
+
+
+def test_a_chunk_too_short_for_its_header_is_damaged():
+    values, out = np.arange(CHUNK), np.empty(CHUNK, np.int64)
+    assert decode([encode(values)], out)
+    for length in range(BLOSC_HEADER_BYTES):
+        frame = bytes(length)
+        [checksum] = checksums([memoryview(frame)])
+        assert not decode([frame + checksum.to_bytes(4, "little")], out)
+
+
+def test_a_new_file_has_the_usual_permissions(tmp_path):
+    ChunkFile(tmp_path / "a.h5").close()
+    (tmp_path / "b").touch()
+    assert (tmp_path / "a.h5").stat().st_mode == (tmp_path / "b").stat().st_mode

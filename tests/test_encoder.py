@@ -203,6 +203,7 @@ def test_a_stream_is_the_encoder_of_its_last_samples(sizes, origin, offset):
 def test_a_stream_leaves_out_what_comes_late():
     stream = EncoderStream()
     stream.append([0, 1000, 900, 1000, 2000], [0.0, 1.0, 7.0, 7.0, 2.0])
+    assert stream.dropped == 2
     stream.append([1500, 2000, 3000], [7.0, 7.0, 3.0])
     assert stream.dropped == 4
     np.testing.assert_allclose(stream.over(0, 3000).angle, [0.0, 1.0, 2.0, 3.0])
@@ -335,6 +336,7 @@ def test_csv_of_angles_counts_and_index(tmp_path):
         ("t_us,angle_deg\n0,1\n1,nan\n", "line 3 is '1,nan'"),
         ("t_us,angle_deg\n0,1\n1e300,2\n", "line 3"),
         ("t_us,angle_deg\n0,1\n0,2\n", "line 3: t_us is not later"),
+        ("t_us,angle_deg\n0,1\n\n5,2\n5,3\n", "line 5: t_us is not later"),
         ("t_us,count\n0,1\n1,2\n", "counts_per_turn"),
         ("t_us,angle_deg,index\n0,1,0\n1,2,7\n", "line 3: index"),
         ("t_us,angle_deg\n\udcff,1\n", "line 2 is '.*,1'; expected 2 numbers"),

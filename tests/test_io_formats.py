@@ -6,6 +6,7 @@ import json
 import lzma
 import os
 import pickle
+import sqlite3
 import struct
 import tarfile
 import zipfile
@@ -16,11 +17,21 @@ import numpy as np
 import pytest
 from faery.extension import aedat, evt
 
-from amiwarp import AmiwarpError, Camera, Events, MemoryEvents, RadialTangential, convert, open_recording
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    Events,
+    MemoryEvents,
+    RadialTangential,
+    Recording,
+    convert,
+    open_recording,
+    save_recording,
+)
 from amiwarp.io import file_scan as scan
 from amiwarp.io import read_encoder_triggers
-from amiwarp.io.prophesee import Evt2Decoder, Evt3Decoder, words_of
-from amiwarp.io.ros import read_packets
+from amiwarp.io.prophesee import Evt2Decoder, Evt3Decoder, _halves_are_swapped, words_of
+from amiwarp.io.ros import _types_of, read_packets
 from reference.io_samples import make_events, refusal, to_faery, write_aedat4
 from reference.io_samples_extra import (
     ENCODERS,
@@ -593,3 +604,45 @@ def test_real_files_of_other_kinds_are_named(data_dir):
     }
     for name, message in real.items():
         assert f"{name}: {message}" in str(refusal(open_recording, data_dir / name))
+
+
+@pytest.mark.parametrize("shift", [0, 32])
+def test_the_order_of_halves_is_told_by_times_that_may_stand_still(shift):
+    """The other halves hold vectors, a few of which look like words of the time, and fall."""
+    time = np.repeat(np.arange(50), 2) | 0x8 << 28
+    vectors = np.where(np.arange(100) % 20 == 0, 0x8 << 28 | 2000 - np.arange(100), 0x7 << 28 | 3)
+    words = time.astype(np.uint64) << np.uint64(shift) | vectors.astype(np.uint64) << np.uint64(32 - shift)
+    assert _halves_are_swapped(words) == (shift == 0)
+
+
+def test_raw_sizes_that_no_sensor_generation_has(tmp_path):
+    words = np.array([0x8 << 60 | 5 << 32, 1 << 60 | 3 << 54 | 64 << 43 | 9 << 32 | 1], np.uint64)
+    head = b"% evt 2.1\n% format EVT21;endianness=little;height=100;width=200\n% sensor_name IMX636\n% end\n"
+    (tmp_path / "a.raw").write_bytes(head + words.tobytes())
+    assert open_recording(tmp_path / "a.raw").events.size == (200, 100)
+
+
+def test_impossible_times_of_a_text_file_are_named(tmp_path):
+    (tmp_path / "a.txt").write_text("0.1 1 2 1\n5e12 1 2 1\n")
+    with pytest.raises(AmiwarpError, match=r"line 2"):
+        open_recording(tmp_path / "a.txt").events.slice(0, 9)
+
+
+def test_types_in_the_interface_definition_language():
+    rule = "=" * 80
+    text = f"{rule}\nIDL: far/msg/Turn\nmodule far {{ module msg {{ struct Turn {{ int32 count; }}; }}; }};\n"
+    assert [name for name, _ in _types_of(text, "far/msg/Turn")["far/msg/Turn"][1]] == ["count"]
+
+
+def test_each_message_of_a_bag_can_be_read_alone(tmp_path):
+    n = 1000
+    events = Events.from_arrays(np.arange(n) % 320, np.full(n, 7), 5000 + 100 * np.arange(n), np.arange(n) % 2)
+    save_recording(tmp_path / "a.h5", Recording(MemoryEvents(events, *SIZE)))
+    convert(tmp_path / "a.h5", tmp_path / "a.db3")
+    with sqlite3.connect(tmp_path / "a.db3") as database:
+        rows = database.execute("SELECT data FROM messages ORDER BY id").fetchall()
+    store = typestore(False)
+    messages = [store.deserialize_cdr(data, "event_camera_msgs/msg/EventPacket") for (data,) in rows]
+    assert len(messages) > 1
+    decoded = [Evt3Decoder().decode(message.events.view("<u2"))[0] for message in messages]
+    np.testing.assert_array_equal(np.concatenate([y for _, y, _, _ in decoded]), events.y)

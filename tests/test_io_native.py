@@ -29,6 +29,7 @@ from amiwarp import (
     Recording,
     RecordingWriter,
     Truth,
+    convert,
     open_recording,
     save_recording,
 )
@@ -562,3 +563,19 @@ def test_pieces_that_do_not_follow_leave_nothing(tmp_path, order, message):
             pieces = [lambda cut=cut: (events[cut], np.ones(len(events.t[cut]), np.uint8), {}) for cut in order]
             writer.fill(pieces, count=CHUNK, t_first=int(events.t[0]), done=lambda *_: None)
     assert_nothing_left(tmp_path)
+
+
+def test_only_native_chunks_are_copied_as_they_are(tmp_path):
+    events = make(3000)
+    save_recording(tmp_path / "a.h5", Recording(MemoryEvents(events, *SIZE)))
+    convert(tmp_path / "a.h5", tmp_path / "dsec.h5", format="dsec")
+    native, dsec = (open_recording(tmp_path / name).events for name in ("a.h5", "dsec.h5"))
+    stored = native.encoded_times_and_polarities(0, 3000)
+    assert {name: len(chunks) for name, chunks in stored.items()} == {"events/t": 1, "events/p": 1}
+    assert dsec.encoded_times_and_polarities(0, 3000) == {}
+
+
+def test_full_chunks_do_not_wait_in_memory(tmp_path):
+    with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        writer.append(make(2 * CHUNK + 9))
+        assert writer._pending_count == 9

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from amiwarp import AmiwarpError, Calibration, Camera, load_camera
 from amiwarp.calib.presets import Preset
-from amiwarp.io.json_files import MOST_BYTES, read_json
+from amiwarp.io.json_files import MOST_BYTES, read_json, value_of
+from amiwarp.optics.prism import FlatSide
 from amiwarp.simulation.pictures import open_pictures
 
 READERS: dict[str, Callable[[Path], Any]] = {
@@ -241,3 +242,9 @@ def test_a_calibration_comes_back_whole(calibration: Calibration, tmp_path: Path
     again = Calibration.load(tmp_path / "c.json")
     assert again == calibration
     assert all(isinstance(x, float) and math.isfinite(x) for x in again.parameters.values())
+
+
+def test_a_choice_is_read_as_a_member(tmp_path: Path) -> None:
+    assert value_of(FlatSide, "camera", "side") is FlatSide.CAMERA
+    with pytest.raises(AmiwarpError, match="field side is 'top'"):
+        value_of(FlatSide, "top", "side")

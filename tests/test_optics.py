@@ -23,6 +23,7 @@ from amiwarp import (
     Prism,
     RadialCircleModel,
     RadialTangential,
+    RisleyModel,
     apex_from_deflection,
     deflection_from_apex,
     predicted_error,
@@ -715,3 +716,13 @@ def test_a_rotation_is_undone_as_the_rotation_of_bearings(device: str) -> None:
         turned = Rotation.from_rotvec(rotation.rotation(np.array([time]))[0]).apply(rays)
         expected = turned[:, :2] / turned[:, 2:] * [150.0, 140.0] + [90.0, 55.0]
         np.testing.assert_allclose(out.numpy(), [expected, expected], rtol=0, atol=1e-3)  # px
+
+
+def test_bounds_lie_about_the_value() -> None:
+    camera, prism = Camera.from_fov(64, 48, 1.0), Prism(0.02)
+    half = next(p.half_range for p in ExactModel.PARAMETERS if p.name == "tilt_x")
+    assert ExactModel.default_bounds("tilt_x", 0.5 * half, camera, prism) == (-0.5 * half, 1.5 * half)
+    pair = replace(prism, second=Prism(0.01))
+    assert RisleyModel.default_bounds("second_apex", 0.01, camera, pair) == (0.0, 0.02)
+    low, high = RisleyModel.default_bounds("second_phase", 0.3, camera, pair)
+    assert -low == high == math.pi

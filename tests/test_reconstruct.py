@@ -42,6 +42,7 @@ from amiwarp.cli.app import app
 from amiwarp.io.plain_files import read_calib
 from amiwarp.reconstruction.picture import (
     nodes_near,
+    off_excess_by_counts,
     save_film,
     save_picture,
     save_video,
@@ -439,3 +440,11 @@ def test_what_cannot_be(recording: Recording, picture: Picture, tmp_path: Path) 
 def _folder(path: Path) -> Path:
     path.mkdir()
     return path
+
+
+def test_too_few_events_do_not_tell_the_ratio_of_the_thresholds() -> None:
+    n = 900
+    t = np.arange(n) * 1000
+    events = Events.from_arrays(np.arange(n) % 30, np.zeros(n, int), t, np.arange(n) % 3 > 0)
+    source = MemoryEvents(events, 30, 1)
+    assert off_excess_by_counts(source, 100_000.0, 0, 900_000) == 0.0

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 import amiwarp
 from amiwarp import AmiwarpError, Camera, Encoder, Fisheye, Prism, PrismMotion, RadialTangential, RisleyModel
 from amiwarp.cli.app import app
+from amiwarp.events.device_events import encoder_params
 from amiwarp.imaging.iwe import CanvasShape, Votes, upload_events
 from reference import optics as reference
 from tests.test_world_truth import square
@@ -216,3 +217,15 @@ def test_worlds_are_seen_through_both_prisms() -> None:
     early = replace(events, t=np.maximum(events.t - 100, 0))
     moved = amiwarp.compensate_events(early, simulation.true_model, recording.encoder)
     assert np.median(np.linalg.norm(moved - recording.truth.points(0, len(events)), axis=1)) < 0.02
+
+
+@pytest.mark.parametrize("ratio", [1e6 + 0.5, -1e6 - 0.5, math.nan])
+def test_impossible_ratios_are_refused(ratio: float) -> None:
+    assert RisleyModel(CAMERA, PAIR, ratio=1e6).ratio == 1e6
+    with pytest.raises(AmiwarpError, match="ratio"):
+        RisleyModel(CAMERA, PAIR, ratio=ratio)
+
+
+def test_an_encoder_that_begins_later_reaches_back_to_the_first_event() -> None:
+    params = encoder_params(encoder_of_pair(), 100, 9000, "cpu")  # the second encoder begins at 300
+    assert (params.start.numpy()[0], params.second_start.numpy()[0]) == (0, 0)

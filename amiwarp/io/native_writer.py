@@ -1148,7 +1148,6 @@ class _GrowingDataset:
         self.waiting_bytes += values.nbytes
 
     def replace(self, values: NDArray[Any]) -> None:
-        self._dataset.resize(0, axis=0)
         self._waiting, self._written, self.waiting_bytes = [values], 0, values.nbytes
 
     @property
