@@ -150,6 +150,10 @@ def test_a_board_is_found_and_its_absence_explained() -> None:
     assert BOARD.missing(np.full((240, 320), 128, np.uint8)) == "a board of 6 x 5 inner corners is not seen"
     squares = amiwarp.Board(7, 6, 0.03).missing(picture)
     assert squares == "a board of 6 x 5 inner corners is seen, not of 7 x 6; count the inner corners, not the squares"
+    other = amiwarp.Board(12, 4, 0.03)
+    assert other.missing(picture) == "a board of 6 x 5 inner corners is seen, not of 12 x 4"
+    noise = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8), (0, 0), 3.0)
+    assert other.missing(np.asarray(noise)) == "a board of 12 x 4 inner corners is not seen"
 
 
 def test_a_charuco_board_is_found_in_parts_and_not_in_a_mirror() -> None:
@@ -461,11 +465,11 @@ def test_a_moving_board_is_refused(tmp_path: Path) -> None:
     path = amiwarp.Trajectory([0.0, 0.25], [[0, 0, 0], [0.06, 0.0, 0.0]], np.tile([0, 0, 0, 1.0], (2, 1)))
     camera = amiwarp.Camera.from_fov(160, 120, 1.0)
     recording = amiwarp.simulate(amiwarp.WorldScene(world, path), camera, PRISM, duration_s=0.25, seed=1)
-    with pytest.raises(amiwarp.AmiwarpError, match="moves all the time; hold the board still"):
+    with pytest.raises(amiwarp.AmiwarpError, match="no turn of the prism repeats the one before: hold the board"):
         amiwarp.calibrate_lens([recording], BOARD)
     amiwarp.save_recording(tmp_path / "moving.h5", recording)
     said = run_live(tmp_path / "moving.h5", tmp_path / "camera.json", "--fast", *LIVE)
-    assert "moves all the time; hold the board still" in said
+    assert "no turn of the prism repeats the one before: hold the board" in said
 
 
 def test_parallel_boards_are_refused() -> None:

@@ -237,11 +237,13 @@ class Board:
         wanted = f"a board of {self.columns} x {self.rows} inner corners"
         if self.charuco:
             return f"{wanted} with markers of {self.charuco} is not seen"
-        for columns, rows in _other_sizes(self.columns, self.rows):
-            if _find_chessboard(picture, columns, rows, thorough=False) is not None:
-                hint = "; count the inner corners, not the squares" if columns == self.columns - 1 else ""
-                return f"a board of {columns} x {rows} inner corners is seen, not of {self.columns} x {self.rows}{hint}"
-        return f"{wanted} is not seen"
+        cv2, given = opencv(), (self.columns, self.rows)
+        found, _, seen = cv2.findChessboardCornersSBWithMeta(picture, (4, 3), cv2.CALIB_CB_LARGER)
+        size = tuple(sorted(seen.shape, reverse=self.columns >= self.rows)) if found else given
+        if size == given:
+            return f"{wanted} is not seen"
+        hint = "; count the inner corners, not the squares" if size == (self.columns - 1, self.rows - 1) else ""
+        return f"a board of {size[0]} x {size[1]} inner corners is seen, not of {self.columns} x {self.rows}{hint}"
 
     def has_another(self, picture: NDArray[np.uint8], corners: Corners) -> bool:
         """Return whether a picture shows a second board of this kind beside the one that was found.
@@ -305,13 +307,6 @@ def _find_chessboard(picture: NDArray[np.uint8], columns: int, rows: int, *, tho
     if not found:
         return None
     return Corners(np.arange(columns * rows), np.asarray(corners, np.float64).reshape(-1, 2))
-
-
-def _other_sizes(columns: int, rows: int) -> list[tuple[int, int]]:
-    """Return numbers of inner corners near the given ones, the likeliest first: squares counted for corners."""
-    near = [(columns + a, rows + b) for a in (-2, -1, 0, 1, 2) for b in (-2, -1, 0, 1, 2) if (a, b) != (0, 0)]
-    near = [(columns - 1, rows - 1), *(size for size in near if size != (columns - 1, rows - 1))]
-    return [size for size in near if min(size) >= 3]
 
 
 def _sheet(width: float, height: float, repeats: float = 1.0) -> Mesh:

@@ -23,7 +23,10 @@ LEAST_REPETITION = 0.75
 """Smallest correlation of the events of two successive turns while nothing moves. A still board's was 0.96 to 0.98,
 that of a board that moved by 1.8 px in a turn 0.82, and by 3.7 px 0.52."""
 WITHOUT_PRISM = "because without it a still board gives no events"
-MOVES = "the board or the camera moves all the time; hold the board still for two turns of the prism"
+MOVES = (
+    "no turn of the prism repeats the one before: hold the board and the camera still for two turns; without a prism, "
+    "a still board gives no events"
+)
 MOST_POSES = 40
 """Largest number of poses that are used. More would lengthen the work, and hardly improve the lens."""
 
