@@ -23,6 +23,8 @@ MARGIN = 1.0
 """White margin around the squares of a printed board [squares]."""
 BLACK, WHITE = 0.04, 0.9
 """Reflectance of printed ink and of paper."""
+LEAST_NAMED = 5, 4
+"""Smallest other board that is named. Walls of grey squares have boards of 4 x 3 in two of three pictures."""
 PAGE_MM = 25.4
 """Millimetres per inch, the unit of Matplotlib's pages."""
 
@@ -238,7 +240,7 @@ class Board:
         if self.charuco:
             return f"{wanted} with markers of {self.charuco} is not seen"
         cv2, given = opencv(), (self.columns, self.rows)
-        found, _, seen = cv2.findChessboardCornersSBWithMeta(picture, (4, 3), cv2.CALIB_CB_LARGER)
+        found, _, seen = cv2.findChessboardCornersSBWithMeta(picture, LEAST_NAMED, cv2.CALIB_CB_LARGER)
         size = tuple(sorted(seen.shape, reverse=self.columns >= self.rows)) if found else given
         if size == given:
             return f"{wanted} is not seen"
