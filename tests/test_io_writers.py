@@ -509,3 +509,18 @@ def test_events_are_taken_block_by_block(tmp_path, name):
     events = make_events(5500)
     assert_columns(CLIENTS[name][1](exported(tmp_path, name, Counted(events, *SIZE))), events)
     assert taken == [1000] * 5 + [500]
+
+
+def test_a_camera_of_another_size_is_refused(tmp_path: Path) -> None:
+    """A sensor size that the source knows is not replaced by the camera's."""
+    source = save(tmp_path / "a.h5", make_events())
+    with pytest.raises(AmiwarpError, match="camera is 640x480, the recording 320x240"):
+        convert(source, tmp_path / "b.h5", camera=Camera.from_fov(640, 480, 1.0))
+    assert not (tmp_path / "b.h5").exists()
+
+
+def test_seeds_beyond_63_bits_are_refused(tmp_path: Path) -> None:
+    source = save(tmp_path / "a.h5", make_events())
+    convert(source, tmp_path / "b.raw", rounding="dithered", seed=2**63 - 1)
+    with pytest.raises(AmiwarpError, match="seed"):
+        convert(source, tmp_path / "c.raw", rounding="dithered", seed=2**63)
