@@ -520,7 +520,9 @@ def test_a_camera_of_another_size_is_refused(tmp_path: Path) -> None:
 
 
 def test_seeds_beyond_63_bits_are_refused(tmp_path: Path) -> None:
-    source = save(tmp_path / "a.h5", make_events())
+    events = make_events()
+    moved = Events(events.x + np.float32(0.25), events.y.astype(np.float32), events.t, events.p)
+    source = save(tmp_path / "a.h5", moved)
     convert(source, tmp_path / "b.raw", rounding="dithered", seed=2**63 - 1)
     with pytest.raises(AmiwarpError, match="seed"):
         convert(source, tmp_path / "c.raw", rounding="dithered", seed=2**63)
