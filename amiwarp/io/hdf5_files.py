@@ -57,10 +57,6 @@ compression."""
 BLOSC, FLETCHER32 = 32001, 3
 """Numbers of the Blosc and of the Fletcher-32 filter in HDF5."""
 
-BLOSC_HEADER_BYTES = 16
-"""Size of the header of a Blosc frame [bytes]."""
-
-
 CHECKSUM_ROW = 2048
 """Number of 16-bit words that the checksum sums at a time."""
 
@@ -129,8 +125,6 @@ def _deflate(values: NDArray[Any]) -> bytes:
 def decode(stored: Sequence[bytes], out: NDArray[Any]) -> bool:
     """Decode stored chunks, one after the other, into ``out``. Return whether all chunks are undamaged."""
     places = [out[at : at + CHUNK] for at in range(0, len(out), CHUNK)]
-    if any(len(chunk) < BLOSC_HEADER_BYTES + 4 for chunk in stored):
-        return False
     frames = [memoryview(chunk)[:-4] for chunk in stored]
     if [int.from_bytes(chunk[-4:], "little") for chunk in stored] != checksums(frames):
         return False
@@ -139,7 +133,8 @@ def decode(stored: Sequence[bytes], out: NDArray[Any]) -> bool:
 
 def _decompress(frame: memoryview, out: NDArray[Any]) -> bool:
     """Decompress a Blosc frame into ``out``. Return whether it has the right size and can be decoded."""
-    # After four bytes, the header holds the sizes before and after compression. Blosc itself would trust them.
+    # After four bytes, the header of 16 bytes holds the sizes before and after compression. Blosc itself
+    # would trust them. A frame that is shorter than its header disagrees with them.
     if [int.from_bytes(frame[at : at + 4], "little") for at in (4, 12)] != [out.nbytes, len(frame)]:
         return False
     try:
