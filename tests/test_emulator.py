@@ -158,6 +158,14 @@ def test_commands_are_obeyed_answered_and_refused() -> None:
     assert np.ptp(counted(found)[-100:, 1]) <= 1
 
 
+def test_a_change_is_told_at_once() -> None:
+    controller = Controller(Motor())
+    controller.advance(1)
+    controller.feed(encode(SetSpeed(600.0, 5000.0), 0), S)
+    status = [m for _, m in FrameDecoder().feed(controller.advance(S + 800_000)) if isinstance(m, ControllerStatus)]
+    assert [(m.state, m.target_rpm) for m in status[-2:]] == [(2, 600.0), (1, 600.0)]
+
+
 def test_a_host_that_is_silent_is_told_of_and_stops_nothing() -> None:
     controller = Controller(Motor(300.0))
     messages = sent(controller, 5 * S)

@@ -115,6 +115,17 @@ def test_an_unfinished_recording_has_its_index_pulses(tmp_path):
     assert len(encoder.index_t) > 3
 
 
+def test_an_unfinished_recording_may_lack_its_last_angles(tmp_path):
+    with live(tmp_path / "a.h5", flush_s=0.0) as writer:
+        writer.append_encoder([1, 2, 3], [0.0, 0.1, 0.2], [2])
+        writer._small["encoder/t"].add(np.array([4, 5]))  # whose angles were not written yet
+        writer._small["encoder/index_t"].add(np.array([5]))
+        writer.append(make(10))
+        encoder = open_recording(writer.part).encoder
+        writer.set_encoder(encoder)
+    assert (encoder.t.tolist(), encoder.angle.tolist(), encoder.index_t.tolist()) == ([1, 2, 3], [0.0, 0.1, 0.2], [2])
+
+
 def test_compensated_events_keep_fractions_flags_and_nan(tmp_path):
     sensor = make(CHUNK + 99)
     x = sensor.x.astype(np.float32) - 20.25

@@ -130,6 +130,16 @@ def test_truth_is_the_compensated_place(recording: amiwarp.Recording) -> None:
     assert parameters["ratio"] == pytest.approx(-500 / 720)
 
 
+def test_files_hold_both_prisms(tmp_path: Path) -> None:
+    events = amiwarp.MemoryEvents(amiwarp.Events.from_arrays([1, 2], [3, 4], [100, 9000], [0, 1]), 320, 240)
+    recording = amiwarp.Recording(events, prism=PAIR, encoder=encoder_of_pair())
+    amiwarp.save_recording(tmp_path / "pair.h5", recording)
+    opened = amiwarp.open_recording(tmp_path / "pair.h5")
+    assert opened.prism == PAIR
+    assert opened.encoder is not None
+    np.testing.assert_array_equal(opened.encoder.angles_at([500, 700]), encoder_of_pair().angles_at([500, 700]))
+
+
 def test_it_is_calibrated_stored_and_compensated(recording: amiwarp.Recording, tmp_path: Path) -> None:
     path = tmp_path / "pair.h5"
     amiwarp.save_recording(path, recording)

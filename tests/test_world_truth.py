@@ -627,3 +627,8 @@ def test_ctrl_c_while_an_instant_is_rendered_leaves_nothing(tmp_path: Path) -> N
     assert done.stdout.splitlines()[-1:] == ["interrupted"], done.stderr
     assert done.returncode in (0, 128 + signal.SIGINT)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_labels_of_another_type_are_refused() -> None:
+    with pytest.raises(AmiwarpError, match="world labels' name is 1"):
+        amiwarp.WorldLabels(1, ("wall",), ("building",))  # type: ignore[arg-type]

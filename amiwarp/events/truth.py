@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.validation import array, as_times, check_ascending, guarded, shown
+from amiwarp.validation import array, as_times, check_ascending, guarded, instance, shown
 
 Item = TypeVar("Item", covariant=True)
 """What a store returns: an array, or a record."""
@@ -126,6 +126,7 @@ class WorldLabels:
     """Class label of each instance, in the order of ``instances``; an empty string for an instance without a class."""
 
     def __post_init__(self) -> None:
+        instance(self.name, str, "world labels' name")
         for names in (self.instances, self.categories):
             if not isinstance(names, tuple | list) or not all(isinstance(name, str) for name in names):
                 raise AmiwarpError(f"world labels have {shown(names)}; give a tuple of texts")
