@@ -526,3 +526,10 @@ def test_seeds_beyond_63_bits_are_refused(tmp_path: Path) -> None:
     convert(source, tmp_path / "b.raw", rounding="dithered", seed=2**63 - 1)
     with pytest.raises(AmiwarpError, match="seed"):
         convert(source, tmp_path / "c.raw", rounding="dithered", seed=2**63)
+
+
+def test_the_earliest_times_are_written(tmp_path: Path) -> None:
+    t = -(2**62) + np.array([5, 7])
+    source = save(tmp_path / "a.h5", Events.from_arrays([1, 2], [3, 4], t, [0, 1]))
+    convert(source, tmp_path / "a.npz")
+    np.testing.assert_array_equal(open_recording(tmp_path / "a.npz").events.slice(0, 2).t, t)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from typer.testing import CliRunner
@@ -15,6 +16,7 @@ from amiwarp import AmiwarpError, Camera, Encoder, Fisheye, Prism, PrismMotion, 
 from amiwarp.cli.app import app
 from amiwarp.events.device_events import encoder_params
 from amiwarp.imaging.iwe import CanvasShape, Votes, upload_events
+from amiwarp.kernels.refraction import PairParams, advanced, state_of
 from reference import optics as reference
 from tests.test_world_truth import square
 
@@ -85,6 +87,22 @@ def test_the_clock_offset_moves_both_prisms(device: str) -> None:
     late, none = voted(encoder.with_clock_offset(2000.0), 0.0), voted(encoder, 0.0)
     apart = np.abs(voted(encoder, 2000.0) - late).sum()
     assert apart < 0.1 * np.abs(none - late).sum()
+
+
+@wp.kernel
+def turn(model: PairParams, angles: wp.array(dtype=wp.vec2), by: float, states: wp.array(dtype=wp.vec2)):
+    """Turn the first prism by an angle [rad], and the second one with it."""
+    i = wp.tid()
+    w0, w1 = state_of(model, angles[i][0], angles[i][1])
+    states[i] = advanced(model, w0, w1, by)
+
+
+def test_the_second_prism_turns_with_the_first_by_their_ratio(device: str) -> None:
+    model, angles = RisleyModel(CAMERA, PAIR, *PHASES, ratio=-0.7), samples(50)[1]
+    states = wp.empty(50, dtype=wp.vec2, device=device)
+    given = wp.array(angles.astype(np.float32), dtype=wp.vec2, device=device)
+    wp.launch(turn, 50, [model.params(device), given, 0.3], [states], device=device)
+    np.testing.assert_allclose(states.numpy(), angles + PHASES + np.array([0.3, -0.21]), atol=1e-5)
 
 
 def test_encoders_must_suit_the_model() -> None:
