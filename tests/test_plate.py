@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import amiwarp
 from amiwarp.brightness.depths import orbit_px
+from amiwarp.cli.app import app
 from reference import optics as reference
 
 CAMERA = amiwarp.Camera.from_fov(96, 72, math.radians(50.0))
@@ -180,13 +182,57 @@ def test_depth_is_found(seen: amiwarp.Recording, calibration: amiwarp.Calibratio
     assert f"element vertex {int(found.known.sum())}".encode() in (tmp_path / "d.ply").read_bytes()[:200]
 
 
-def test_a_wedge_does_not_determine_depth(seen: amiwarp.Recording, calibration: amiwarp.Calibration) -> None:
-    wedge = replace(
+def test_events_are_compensated_at_their_depths(
+    seen: amiwarp.Recording, calibration: amiwarp.Calibration, tmp_path: Path
+) -> None:
+    """The plane's one depth leaves the other wall's events on an orbit; the map's leaves next to nothing."""
+    assert seen.truth is not None
+    assert seen.truth.frames is not None
+    inverse = 1.0 / seen.truth.frames[0].depth
+    depth = amiwarp.DepthMap(inverse, 0.01 * inverse, np.zeros((72, 96, 3), np.float32))
+    depth.save(tmp_path / "d.npz")
+    calibration.save(tmp_path / "c.json")
+    amiwarp.save_recording(tmp_path / "r.h5", seen)
+    amiwarp.compensate(seen, calibration, tmp_path / "plane.h5")
+    arguments = ["r.h5", "depth.h5", "--calibration", "c.json", "--depth", "d.npz"]
+    result = CliRunner().invoke(app, ["compensate", *(str(tmp_path / a) if "." in a else a for a in arguments)])
+    assert result.exit_code == 0, result.output
+    away = []
+    truth = seen.truth.of_events(0, len(seen.events))
+    assert truth.points is not None
+    for name in ("plane.h5", "depth.h5"):
+        events = amiwarp.open_recording(tmp_path / name).events.slice(0, len(seen.events))
+        missed = np.stack([events.x, events.y], axis=1) - truth.points
+        away.append(np.median(np.linalg.norm(missed, axis=1)))
+    assert away[1] < 0.3 * away[0]
+    with pytest.raises(amiwarp.AmiwarpError, match="a depth map is for a rotating tilted plate"):
+        amiwarp.compensate(seen, wedge_of(calibration), tmp_path / "w.h5", depth=depth)
+    small = amiwarp.DepthMap(inverse[1:], inverse[1:], np.zeros((71, 96, 3), np.float32))
+    with pytest.raises(amiwarp.AmiwarpError, match="the camera's rows and columns"):
+        amiwarp.compensate(seen, calibration, tmp_path / "s.h5", depth=small)
+
+
+def test_unknown_depths_are_filled_by_what_is_known_well_about_them() -> None:
+    inverse, std = np.full((60, 200), np.nan, np.float32), np.full((60, 200), np.nan, np.float32)
+    inverse[20:40, 20:40], std[20:40, 20:40] = 2.0, 0.01
+    inverse[30, 40:42], std[30, 40:42] = 9.0, 0.9  # beside it, and known badly
+    found = amiwarp.DepthMap(inverse, std, np.zeros((60, 200, 3), np.float32)).filled()
+    np.testing.assert_array_equal(found[np.isfinite(inverse)], inverse[np.isfinite(inverse)])
+    np.testing.assert_allclose(found[30, 42:60], 2.0, atol=0.05)
+    assert found[30, 199] == 9.0  # too far from all: the nearest
+
+
+def wedge_of(calibration: amiwarp.Calibration) -> amiwarp.Calibration:
+    """Return a calibration of a wedge in place of the plate."""
+    return replace(
         calibration, model_name="exact", prism=amiwarp.Prism(0.02), parameters={"apex": 0.02, "phase": 0.0},
         uncertainty={}, free=("apex", "phase"),
     )  # fmt: skip
+
+
+def test_a_wedge_does_not_determine_depth(seen: amiwarp.Recording, calibration: amiwarp.Calibration) -> None:
     with pytest.raises(amiwarp.AmiwarpError, match="depth is not determined"):
-        amiwarp.depth(seen, wedge)
+        amiwarp.depth(seen, wedge_of(calibration))
 
 
 def test_a_moving_camera_is_refused(seen: amiwarp.Recording, calibration: amiwarp.Calibration) -> None:

@@ -479,6 +479,13 @@ def run_compensate(
         Path | None,
         typer.Option(help="Preset from 'amiwarp chart': sets the prism model to use. Default: the calibrated model."),
     ] = None,
+    depth: Annotated[
+        Path | None,
+        typer.Option(
+            help="Depth map from 'amiwarp depth' (.npz), for a rotating tilted plate. Default: a plane at the "
+            "calibrated depth."
+        ),
+    ] = None,
     format: Format = None,
     codec: HdfCodec = Codec.BLOSC,
     round: Round = None,
@@ -498,6 +505,7 @@ def run_compensate(
     from amiwarp.calib import Calibration
     from amiwarp.calib.presets import Preset, simplified
     from amiwarp.compensation.recordings import compensate
+    from amiwarp.io.depth_map import DepthMap
 
     device = choose_device(common.device)
     found = Calibration.load(calibration)
@@ -506,11 +514,13 @@ def run_compensate(
     log = encoder.build(recording, topic)
     opened = open_recording(recording, topic=topic)
     opened = opened if log is None else replace(opened, encoder=log)
+    depths = None if depth is None else DepthMap.load(depth)
     files = iwe.build(opened, device)
     with progress("compensating") as advance, files or contextlib.nullcontext():
         done = compensate(
-            opened, found, out, device=device, progress=advance, on_block=None if files is None else files.add,
-            format=format, codec=codec, rounding=round, seed=common.seed,
+            opened, found, out, depth=depths, device=device, progress=advance,
+            on_block=None if files is None else files.add, format=format, codec=codec, rounding=round,
+            seed=common.seed,
         )  # fmt: skip
     data: dict[str, Any] = {
         "file": str(out),

@@ -23,6 +23,7 @@ from amiwarp.events.device_events import DeviceEvents, azimuths, device_for, lim
 from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, EventSource, MetadataValue, Recording
 from amiwarp.io import RecordingWriter
+from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.export import bag_of, export, left_out
 from amiwarp.io.files import check_output
 from amiwarp.io.formats import Codec, OutputFormat, Rounding, check_codec, check_rounding, output_format
@@ -33,7 +34,7 @@ from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import join_columns
 from amiwarp.kernels.launch import RecordedLaunch, launch, load, page_locked, specialised
 from amiwarp.optics.camera import camera_params, pinhole_params
-from amiwarp.optics.models import Model
+from amiwarp.optics.models import Model, PlateModel
 from amiwarp.tasks import Progress, in_order
 from amiwarp.validation import guarded
 
@@ -332,6 +333,7 @@ def compensate(
     calibration: Calibration,
     out_path: str | os.PathLike[str],
     *,
+    depth: DepthMap | None = None,
     device: Any = "cpu",
     progress: Progress | None = None,
     on_block: Callable[[Events], None] | None = None,
@@ -357,6 +359,9 @@ def compensate(
         Calibration of the same camera and prism.
     out_path : str or os.PathLike
         Path of the new recording. Its extension gives the format, as for :func:`convert`.
+    depth : DepthMap, optional
+        Depth of what each pixel sees, for a rotating tilted plate. Without it, a plate's scene is a plane at the
+        calibrated depth. Unknown depths are filled by :meth:`DepthMap.filled`.
     device : str or warp.Device, optional
         Device to compute on.
     progress : Progress, optional
@@ -382,8 +387,9 @@ def compensate(
     Raises
     ------
     AmiwarpError
-        If the calibration is for another sensor size, the encoder does not cover the events, the format cannot hold
-        them, or the output cannot be written, is the recording itself, or exists. No partial file remains.
+        If the calibration is for another sensor size, the encoder does not cover the events, a depth map is given for
+        another optic than a plate or has another size, the format cannot hold the events, or the output cannot be
+        written, is the recording itself, or exists. No partial file remains.
 
     Examples
     --------
@@ -406,6 +412,7 @@ def compensate(
     rounding = check_rounding(out_path, rounding, chosen)
     width, height = recording.events.size
     check_size(calibration, recording.events.size, recording.name)
+    model = calibration.model if depth is None else at_depths(calibration.model, depth)
     n = len(recording.events)
     encoder = recording.encoder
     if n:
@@ -425,9 +432,7 @@ def compensate(
 
     compensator = None
     if encoder is not None and n:
-        compensator = BlockCompensator(
-            calibration.model, encoder, recording.events.t_first, recording.events.t_last, device
-        )
+        compensator = BlockCompensator(model, encoder, recording.events.t_first, recording.events.t_last, device)
     if chosen is not OutputFormat.NATIVE:
         with contextlib.closing(_counted(recording.events, compensator, count)) as blocks:
             dropped = export(
@@ -446,6 +451,16 @@ def compensate(
             pieces = compensated_pieces(recording.events, compensator)
             writer.fill(pieces, count=PIECE, t_first=recording.events.t_first, done=count)
     return CompensationSummary(done, outside, time.perf_counter() - began)
+
+
+def at_depths(model: Model, depth: DepthMap) -> PlateModel:
+    """Return the model of a plate with the depth of what each pixel sees."""
+    if not isinstance(model, PlateModel):
+        raise AmiwarpError(
+            f"a depth map is for a rotating tilted plate, but the calibration is that of a {model.TEXT}, which moves "
+            "near and far points alike; leave the depth map out"
+        )
+    return model.with_depths(depth.filled())
 
 
 def _counted(
