@@ -45,13 +45,13 @@ EXTRA_JOBS = 2
 turn."""
 
 
-def in_order(jobs: Iterable[Callable[[], Result]]) -> Generator[Result, None, None]:
-    """Run jobs in parallel threads, and yield their results in the order of the jobs.
+def in_order(jobs: Iterable[Callable[[], Result]], most: int = MAX_THREADS) -> Generator[Result, None, None]:
+    """Run jobs in at most ``most`` parallel threads, and yield their results in the order of the jobs.
 
     A bounded number of jobs is in flight. The exception of a job is raised when its result is due. When the generator
     is closed, waiting jobs are dropped and running jobs are completed.
     """
-    threads = min(cpu_threads(), MAX_THREADS)
+    threads = min(cpu_threads(), most)
     waiting: deque[Future[Result]] = deque()
     pool = ThreadPoolExecutor(threads, thread_name_prefix="amiwarp-io")
     try:
