@@ -95,6 +95,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert file.read(4) == b"\x89HDF"
     values = {"apex": math.radians(2.0), "index": 1.5168, "phase": 0.0, "tilt_x": 0.0, "tilt_y": 0.0}
     exact_calibration(CAMERA, Prism(math.radians(2.0)), values).save(folder / "cal.json")
+    inverse = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
+    amiwarp.DepthMap(inverse, 0.1 * inverse, np.zeros((*inverse.shape, 3), np.float32)).save(folder / "depth.npz")
     camera = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     (folder / "cam.json").write_text(json.dumps(camera))
     for name in ("enc.csv", "enc2.csv"):
@@ -144,6 +146,7 @@ OVER_INPUTS = (
     ("compensate a.h5 {} --calibration cal.json", "cal.json"),
     ("compensate a.h5 out.h5 --calibration cal.json --iwe {}", "cal.json"),
     ("compensate a.h5 {} --calibration cal.json --preset tr.tum", "tr.tum"),
+    ("compensate a.h5 {} --calibration cal.json --depth depth.npz", "depth.npz"),
     ("compensate a.h5 {} --calibration cal.json --encoder enc.csv", "enc.csv"),
     ("compensate a.h5 {} --calibration cal.json --encoder enc.csv --second-encoder enc2.csv", "enc2.csv"),
     ("reconstruct a.h5 {} --calibration cal.json", "a.h5"),
@@ -541,6 +544,7 @@ ENDLESS = (
     "compensate {} out.h5 --calibration cal.json",
     "compensate a.h5 out.h5 --calibration {}",
     "compensate a.h5 out.h5 --calibration cal.json --preset {}",
+    "compensate a.h5 out.h5 --calibration cal.json --depth {}",
     "compensate a.h5 out.h5 --calibration cal.json --encoder {}",
     "compensate a.h5 out.h5 --calibration cal.json --encoder enc.csv --second-encoder {}",
     "reconstruct {} out.png --calibration cal.json",
