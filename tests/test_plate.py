@@ -215,7 +215,7 @@ def test_events_are_compensated_at_their_depths(
 def test_unknown_depths_are_filled_by_what_is_known_well_about_them() -> None:
     inverse, std = np.full((60, 200), np.nan, np.float32), np.full((60, 200), np.nan, np.float32)
     inverse[20:40, 20:40], std[20:40, 20:40] = 2.0, 0.01
-    inverse[30, 40:42], std[30, 40:42] = 9.0, 0.9  # beside it, and known badly
+    inverse[30, 40:42], std[30, 40:42] = 9.0, 0.9  # beside it, with a large deviation
     found = amiwarp.DepthMap(inverse, std, np.zeros((60, 200, 3), np.float32)).filled()
     np.testing.assert_array_equal(found[np.isfinite(inverse)], inverse[np.isfinite(inverse)])
     np.testing.assert_allclose(found[30, 42:60], 2.0, atol=0.05)
@@ -223,7 +223,7 @@ def test_unknown_depths_are_filled_by_what_is_known_well_about_them() -> None:
 
 
 def wedge_of(calibration: amiwarp.Calibration) -> amiwarp.Calibration:
-    """Return a calibration of a wedge in place of the plate."""
+    """Return the calibration with a wedge instead of the plate."""
     return replace(
         calibration, model_name="exact", prism=amiwarp.Prism(0.02), parameters={"apex": 0.02, "phase": 0.0},
         uncertainty={}, free=("apex", "phase"),

@@ -443,10 +443,10 @@ def test_unknown_and_large_flow_is_marked() -> None:
 
 def test_flow_as_mvsec_stores_it(recording: amiwarp.Recording, tmp_path: Path) -> None:
     frames = frames_of(recording)
-    told: list[float] = []
+    shares: list[float] = []
     path = tmp_path / "gt_flow_dist.npz"
-    assert amiwarp.save_flow_mvsec(path, frames, with_prism=True, progress=lambda _, share: told.append(share)) == 5
-    np.testing.assert_allclose(told, np.arange(1, 11) / 10)
+    assert amiwarp.save_flow_mvsec(path, frames, with_prism=True, progress=lambda _, share: shares.append(share)) == 5
+    np.testing.assert_allclose(shares, np.arange(1, 11) / 10)
     with np.load(tmp_path / "gt_flow_dist.npz") as found:
         assert sorted(found) == ["timestamps", "x_flow_dist", "y_flow_dist"]
         np.testing.assert_array_equal(found["timestamps"], frames.t * 1e-6)

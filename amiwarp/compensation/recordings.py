@@ -412,7 +412,7 @@ def compensate(
     rounding = check_rounding(out_path, rounding, chosen)
     width, height = recording.events.size
     check_size(calibration, recording.events.size, recording.name)
-    model = calibration.model if depth is None else at_depths(calibration.model, depth)
+    model = calibration.model if depth is None else _at_depths(calibration.model, depth)
     n = len(recording.events)
     encoder = recording.encoder
     if n:
@@ -453,7 +453,7 @@ def compensate(
     return CompensationSummary(done, outside, time.perf_counter() - began)
 
 
-def at_depths(model: Model, depth: DepthMap) -> PlateModel:
+def _at_depths(model: Model, depth: DepthMap) -> PlateModel:
     """Return the model of a plate with the depth of what each pixel sees."""
     if not isinstance(model, PlateModel):
         raise AmiwarpError(

@@ -73,8 +73,8 @@ class DepthMap:
     def filled(self) -> NDArray[np.float32]:
         """Return the inverse depth of each pixel, where it is unknown as a mean of known ones about it.
 
-        They are weighted by their variances and, with a Gaussian function of 12 px, by their distances. The nearest one
-        alone would often be wrong, as depths are known badly beside unknown ones.
+        They are weighted by their inverse variances and, with a Gaussian function of 12 px, by their distances. The
+        nearest known depth alone would often be wrong: depths at the border of a known part are uncertain.
 
         Returns
         -------
@@ -93,7 +93,7 @@ class DepthMap:
             raise AmiwarpError("the depth map knows no depth; record a scene with more texture")
         nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
         filled = np.where(known, self.inverse_depth, self.inverse_depth[tuple(nearest)]).astype(np.float64)
-        least = max(float(np.nanmin(self.std)), 1e-3 * float(np.nanmax(self.inverse_depth)), 1e-12)
+        least = max(1e-3 * float(np.nanmax(self.inverse_depth)), 1e-12)  # a deviation may be 0
         weight = np.where(known, np.maximum(self.std, least), np.inf) ** -2.0
         weights = gaussian_filter(weight, FILL_PX)
         near = ~known & (weights > 1e-9 * weights.max())

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -37,11 +37,10 @@ from amiwarp.optics.camera import Camera, Fisheye
 from amiwarp.optics.models import ExactModel, rms
 from amiwarp.optics.prism import Prism, as_wedge
 from amiwarp.reconstruction.picture import Reconstruction
-from amiwarp.tasks import Progress, in_order, silent
+from amiwarp.tasks import Progress, Result, in_order, silent
 from amiwarp.validation import array, guarded, instance, real
 
 Vector = NDArray[np.float64]
-Result = TypeVar("Result")
 
 USUAL_FOV = math.radians(60.0)
 """Horizontal field of view that is assumed if none is known [rad]."""
