@@ -1122,7 +1122,7 @@ def test_a_recording_without_a_prism_is_played_fills_its_pane_and_gets_camera_an
         for _ in range(4):  # apex, speed, index and field of view
             page.locator(f"#do-{step}").click()
             ready(page)
-        assert (field(page, "fov_deg"), field(page, "index")) == values
+        until(lambda wanted=values: (field(page, "fov_deg"), field(page, "index")) == wanted)
     again = opened(of=saved)
     assert again.locator("#field-fov_deg").count() == 0
     assert again.locator("#image-before").count() == 1
