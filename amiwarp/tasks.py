@@ -8,6 +8,7 @@ import ctypes
 import gc
 import os
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,9 +18,20 @@ Result = TypeVar("Result")
 
 _limit: int | None = None
 """Largest number of threads while :func:`limited_cpu_threads` is active."""
+_of_thread = threading.local()
 
 
 def cpu_threads() -> int:
+    """Return the number of CPU cores that this process may use, or 1 in a thread that works on one core."""
+    return 1 if works_on_one_core() else cores()
+
+
+def works_on_one_core() -> bool:
+    """Return whether other threads use the other cores, so that helpers would only wait for one."""
+    return getattr(_of_thread, "one_core", False)
+
+
+def cores() -> int:
     """Return the number of CPU cores that this process may use."""
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
     return available if _limit is None else min(available, _limit)
@@ -45,15 +57,22 @@ EXTRA_JOBS = 2
 turn."""
 
 
-def in_order(jobs: Iterable[Callable[[], Result]], most: int = MAX_THREADS) -> Generator[Result, None, None]:
+def in_order(
+    jobs: Iterable[Callable[[], Result]], most: int = MAX_THREADS, *, fill_cores: bool = False
+) -> Generator[Result, None, None]:
     """Run jobs in at most ``most`` parallel threads, and yield their results in the order of the jobs.
 
     A bounded number of jobs is in flight. The exception of a job is raised when its result is due. When the generator
-    is closed, waiting jobs are dropped and running jobs are completed.
+    is closed, waiting jobs are dropped and running jobs are completed. With ``fill_cores``, jobs are such that each
+    keeps a core busy: where there is a thread for each core, kernels of a job are not spread over several cores.
     """
     threads = min(cpu_threads(), most)
     waiting: deque[Future[Result]] = deque()
-    pool = ThreadPoolExecutor(threads, thread_name_prefix="amiwarp-io")
+
+    def begin() -> None:
+        _of_thread.one_core = fill_cores and threads == cores()
+
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="amiwarp-io", initializer=begin)
     try:
         for job in jobs:
             waiting.append(pool.submit(job))

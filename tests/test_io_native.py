@@ -35,7 +35,8 @@ from amiwarp import (
 )
 from amiwarp.io.hdf5_files import CHUNK, StoredColumn, camera_attributes, checksum, decode, encode, read_camera
 from amiwarp.kernels.checksum import Checksums
-from amiwarp.tasks import in_order
+from amiwarp.kernels.launch import run_together
+from amiwarp.tasks import cores, cpu_threads, in_order
 
 SIZE = (320, 240)
 
@@ -499,6 +500,25 @@ def test_jobs_run_a_bounded_number_ahead_and_stop_with_the_first_error():
     assert results == list(range(40))
     assert len(begun) < 100
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("amiwarp-io")]
+
+
+@pytest.mark.parametrize("fill_cores", [False, True])
+def test_jobs_that_fill_the_cores_keep_to_one_each(*, fill_cores: bool) -> None:
+    """Only where there is a thread for each core: elsewhere, cores would be idle."""
+    most = cores()
+
+    def job() -> tuple[int, bool]:
+        threads: list[int] = []
+        run_together([lambda: threads.append(threading.get_ident())] * 3)
+        return cpu_threads(), set(threads) == {threading.get_ident()}
+
+    for threads in {most, most + 1}:
+        found = set(in_order([job] * 4, threads, fill_cores=fill_cores))
+        assert found == {(1, True)} if fill_cores else {count for count, _ in found} == {most}
+    if most > 1:
+        found = set(in_order([job] * 4, most - 1, fill_cores=fill_cores))
+        assert {count for count, _ in found} == {most}
+    assert cpu_threads() == most
 
 
 def test_filled_files_are_those_of_append(tmp_path):

@@ -295,7 +295,8 @@ class EventTable:
         times.middle, times.longest, times.shortest = middle_us, longest_gap_us, shortest_gap_us
         times.late_first, times.late_second = sensor.refractory_us - sensor.latency_us, -sensor.latency_us
         m, device = self.arrays.count, self.device
-        ends, base = (0, m) if window is None else (m, 3 * m)
+        kinds = 1 if window is None else 3
+        ends, base = (0, m) if window is None else (m, kinds * m)
         edges, at_least = (np.zeros(1, np.int64), 0) if quiet is None else quiet
         spans = (len(edges) - 1) * self.arrays.places
         flag = wp.empty(base + spans, dtype=int, device=device)
@@ -313,8 +314,8 @@ class EventTable:
         angles = encoder_params(encoder, *span, device)
         launch(
             pair_kernels.write_pairs,
-            base,
-            [self.arrays, times, angles, self.tile_of, flag, place],
+            m,
+            [self.arrays, times, angles, self.tile_of, flag, place, kinds],
             [out],
             device=device,
         )

@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.tasks import cpu_threads
+from amiwarp.tasks import cores, cpu_threads, works_on_one_core
 
 # Kernel launches: a single launch on CUDA, slices on a thread pool on the CPU.
 #
@@ -40,7 +40,7 @@ SMALLEST_SLICE = 1 << 15  # fewest threads per slice: launching a smaller slice 
 @cache
 def pool() -> ThreadPoolExecutor:
     """Return the shared thread pool for CPU launches, with one thread per core."""
-    return ThreadPoolExecutor(cpu_threads(), thread_name_prefix="amiwarp")
+    return ThreadPoolExecutor(cores(), thread_name_prefix="amiwarp")
 
 
 class _Helpers:
@@ -79,8 +79,12 @@ _helpers = cache(_Helpers)
 def run_together(jobs: Sequence[Callable[[], object]]) -> None:
     """Run jobs at the same time, the first one in this thread, and wait for all of them.
 
-    A job must not call this function.
+    A job must not call this function. In a thread that works on one core, they run one after the other.
     """
+    if works_on_one_core():
+        for job in jobs:
+            job()
+        return
     done: SimpleQueue[BaseException | None] = SimpleQueue()
     if len(jobs) > 1:
         _helpers().put([(job, done) for job in jobs[1:]])

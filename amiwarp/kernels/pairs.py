@@ -220,29 +220,29 @@ def store_pair(encoder: EncoderParams, window: Window, pairs: Pairs, i: int, fir
 @wp.kernel
 def write_pairs(
     s: Sorted, window: Window, encoder: EncoderParams, tile_of: wp.array2d(dtype=int), flag: wp.array(dtype=int),
-    place: wp.array(dtype=int), start: int, pairs: Pairs,
+    place: wp.array(dtype=int), kinds: int, start: int, pairs: Pairs,
 ):  # fmt: skip
-    """Write the marked pairs that include an event."""
-    candidate = start + wp.tid()
-    if flag[candidate] == 0:
-        return
-    kind = candidate / s.count
-    at = candidate % s.count
+    """Write the marked pairs that include an event: those with the next event, and with ``kinds`` = 3 open ends."""
+    at = start + wp.tid()
     event = s.order[at]
-    i = place[candidate] - 1
     row, column = pixel_at(s.key[at] % s.places, s.columns)
-    pairs.x[i] = wp.uint16(column)
-    pairs.y[i] = wp.uint16(row)
-    pairs.tile[i] = tile_of[row, column]
-    if kind == 0:
-        pairs.on[i] = s.p[s.order[at + 1]]
-        store_pair(encoder, window, pairs, i, s.t[event], s.t[s.order[at + 1]])
-    elif kind == 1:
-        pairs.on[i] = s.p[event] | wp.uint8(4)
-        store_pair(encoder, window, pairs, i, window.start, s.t[event])
-    else:
-        pairs.on[i] = wp.uint8(2)
-        store_pair(encoder, window, pairs, i, s.t[event], window.stop)
+    for kind in range(kinds):
+        candidate = kind * s.count + at
+        if flag[candidate] == 0:
+            continue
+        i = place[candidate] - 1
+        pairs.x[i] = wp.uint16(column)
+        pairs.y[i] = wp.uint16(row)
+        pairs.tile[i] = tile_of[row, column]
+        if kind == 0:
+            pairs.on[i] = s.p[s.order[at + 1]]
+            store_pair(encoder, window, pairs, i, s.t[event], s.t[s.order[at + 1]])
+        elif kind == 1:
+            pairs.on[i] = s.p[event] | wp.uint8(4)
+            store_pair(encoder, window, pairs, i, window.start, s.t[event])
+        else:
+            pairs.on[i] = wp.uint8(2)
+            store_pair(encoder, window, pairs, i, s.t[event], window.stop)
 
 
 @wp.kernel

@@ -608,8 +608,7 @@ the comparison is repeated about its answer: the maps are biased to the index of
 PLACES = 63
 """Number of pixels at which displacements are compared."""
 AT_ONCE = 2
-"""Largest number of poses that are worked on at the same time on a CPU. Two fill the cores, as the kernels of each use
-them all, and more would take more memory."""
+"""Largest number of poses that are worked on at the same time on a CPU. More would take more memory."""
 
 
 class JointPrism:
@@ -829,7 +828,7 @@ def for_each_pose(jobs: Iterable[Callable[[], Result]], device: Any) -> Iterator
     if not wp.get_device(device).is_cpu:
         yield from (job() for job in jobs)
         return
-    with contextlib.closing(in_order(jobs, AT_ONCE)) as results:
+    with contextlib.closing(in_order(jobs, AT_ONCE, fill_cores=True)) as results:
         yield from results
 
 
