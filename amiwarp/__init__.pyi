@@ -84,6 +84,7 @@ from .optics.camera import CameraRotation as CameraRotation
 from .optics.camera import Distortion as Distortion
 from .optics.camera import Fisheye as Fisheye
 from .optics.camera import RadialTangential as RadialTangential
+from .optics.mirror import MirrorModel as MirrorModel
 from .optics.models import CircleModel as CircleModel
 from .optics.models import EllipseModel as EllipseModel
 from .optics.models import ExactModel as ExactModel
@@ -110,6 +111,7 @@ from .reconstruction.pixels import pixel_thresholds as pixel_thresholds
 from .simulation.description import CameraMotion as CameraMotion
 from .simulation.description import EncoderModel as EncoderModel
 from .simulation.description import Frames as Frames
+from .simulation.description import Mirror as Mirror
 from .simulation.description import PrismMotion as PrismMotion
 from .simulation.description import Scene as Scene
 from .simulation.description import SensorModel as SensorModel

@@ -2,7 +2,7 @@
 
 import enum
 
-OPTICAL_MODELS = ("circle", "exact", "radial", "ellipse", "risley", "plate", "vibration")
+OPTICAL_MODELS = ("circle", "exact", "radial", "ellipse", "risley", "plate", "mirror", "vibration")
 """Names of the optical models, for programs that do not load them."""
 
 
@@ -21,6 +21,8 @@ class Optic(enum.StrEnum):
     """Rotating tilted plane-parallel plate, which moves near points only."""
     VIBRATION = "vibration"
     """No glass: the camera itself vibrates. Its recording has no encoder."""
+    MIRROR = "mirror"
+    """Mirror with two tilts; an encoder records the angles of its two commands."""
 
 
 # Choices for images of warped events: how to vote, what to do with polarity, which sharpness to measure.

@@ -238,6 +238,7 @@ OWN: dict[str, dict[str, Any]] = {
     "Encoder.with_clock_offset": {"clock_offset_us": 1.0},
     "Encoder.with_harmonics": {"harmonics": [0.1, 0.0, 0.0, 0.0]},
     "Encoder.with_second": {"second": -0.5},
+    "Encoder.from_command": {"t_us": np.arange(20) * 1000, "command": np.sin(np.arange(20))},
     "Encoder.with_index": {"index_t_us": [500]},
     "EncoderStream.append": {"t_us": [2000, 3000]},
     "EncoderStream.guessed": {"t": np.array([0, 5])},
@@ -314,8 +315,8 @@ OWN: dict[str, dict[str, Any]] = {
     **{
         f"{name}.{method}": given
         for name in (
-            "CircleModel", "EllipseModel", "ExactModel", "PlateModel", "RadialCircleModel", "RisleyModel",
-            "VibrationModel",
+            "CircleModel", "EllipseModel", "ExactModel", "MirrorModel", "PlateModel", "RadialCircleModel",
+            "RisleyModel", "VibrationModel",
         )
         for method, given in (("apex_from_size", {"size": 0.02}), ("size_from_apex", {"apex": 0.02}))
     },
@@ -324,9 +325,10 @@ OWN: dict[str, dict[str, Any]] = {
         for name, size in (
             ("CircleModel", "deflection"), ("EllipseModel", "apex"), ("ExactModel", "apex"),
             ("PlateModel", "inverse_depth"), ("RadialCircleModel", "deflection"), ("RisleyModel", "apex"),
-            ("VibrationModel", "amplitude"),
+            ("MirrorModel", "amplitude"), ("VibrationModel", "amplitude"),
         )
         for method, given in (
+            ("twin_values", {"values": {size: 0.01, "phase": 0.0, "second_phase": 0.1, "fold": 0.2}}),
             ("turned_values", {"values": {size: 0.01, "phase": 0.0}, "angle": 0.1}),
             ("reversed_values", {"values": {size: 0.01, "phase": 0.0}}),
             ("default_bounds", {"name": size, "value": 0.01}),
@@ -334,6 +336,10 @@ OWN: dict[str, dict[str, Any]] = {
     },
     "CircleModel": {"deflection": 0.01},
     "VibrationModel": {"amplitude": 0.01},
+    "MirrorModel": {"amplitude": 0.01},
+    "MirrorModel.from_values": {"values": {"amplitude": 0.01, "phase": 0.0}},
+    "MirrorModel.rotations": {"theta": np.zeros((20, 2))},
+    "Mirror": {"hz": (60.0, 77.0), "amplitude": (0.01, 0.01)},
     "VibrationModel.from_values": {"values": {"amplitude": 0.01, "phase": 0.0}},
     "VibrationModel.rotations": {"theta": np.linspace(0, 6, 20)},
     "Vibration": {"hz": 100.0, "amplitude": 0.01},
@@ -438,6 +444,8 @@ OBJECTS: dict[str, Any] = {
     "RisleyModel": aw.RisleyModel(CAMERA, PAIR),
     "VibrationModel": aw.VibrationModel(CAMERA, 0.01),
     "Vibration": aw.Vibration(100.0, 0.01),
+    "MirrorModel": aw.MirrorModel(CAMERA, 0.01),
+    "Mirror": aw.Mirror((60.0, 77.0), (0.01, 0.01)),
     "UnsizedPrism": aw.UnsizedPrism(),
     "Picture": PICTURE,
     "PixelMap": PIXELS,

@@ -428,7 +428,9 @@ class Calibrator:
         encoder, name = self.recording.encoder, self.recording.name
         assert encoder is not None
         rival = None if tried.camera_turned else tried  # a slow rotation hardly blurs the image
-        repetition, span = first_guess.calmest_span(self.recording, encoder)
+        repetition, span = 1.0, None
+        if MODELS[self.settings.model].ANGLES == 1:  # with two angles, a still scene does not repeat every turn
+            repetition, span = first_guess.calmest_span(self.recording, encoder)
         restless = repetition < first_guess.LEAST_REPETITION
         again = self._turning(rival) if span is None else self._turning_in(span)
         if not again.accepted or again.cost > stage.LARGEST_COST_RATIO * tried.cost:
@@ -456,7 +458,9 @@ class Calibrator:
 
     def _turning(self, rival: Attempt | None) -> Attempt:
         """Return the attempt with a free camera rotation, in the middle of the recording."""
-        free = (MODELS[self.settings.model].SIZE, "phase", "motion")
+        encoder = self.recording.encoder
+        assert encoder is not None
+        free = (*MODELS[self.settings.model].freed(encoder.ratio), "motion")
         return replace(self, settings=replace(self.settings, free=free)).attempt(rival)
 
     def _turning_in(self, span: tuple[int, int]) -> Attempt:
@@ -654,8 +658,8 @@ def _encoders(recording: Recording, settings: Settings, path: Encoder | None) ->
     Without an encoder these are the known path, or constant speeds: the given one, or the one found in the events with
     either sign. If the events show that the speed varies much, they are paths with either sense of rotation.
     """
-    kind = MODELS[settings.model]
-    free = kind.FREED if settings.free is None else settings.free
+    kind, encoder = MODELS[settings.model], recording.encoder
+    free = kind.freed(None if encoder is None else encoder.ratio) if settings.free is None else settings.free
     free = tuple(n for n in free if n not in LINEAR_UNKNOWNS)
     if not {*size_names(), "phase"} & set(free) and settings.start.get(kind.SIZE) == 0.0:
         return [constant_speed(0.0, recording.events.t_first, recording.events.t_last, middle_time(recording))], free

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics import vibration  # noqa: F401  # a model in a file of its own, which enters itself in MODELS
+from amiwarp.optics import mirror, vibration  # noqa: F401  # models in files of their own, which enter themselves in MODELS
 from amiwarp.optics.camera import LENS, Camera, CameraRotation, given_lens
 from amiwarp.optics.models import (
     MODELS,
@@ -74,7 +74,7 @@ def of_orbit(space: ParameterSpace, k: int, at: Mapping[str, float]) -> Paramete
     Prisms before it have the values ``at``, later ones the size 0.
     """
     orbits = MODELS[space.model].ORBITS
-    others = tuple({*space.names} - {*orbits[k]})
+    others = tuple({*space.names} - {*MODELS[space.model].TOGETHER[k]})
     return space.holding({**at, **{size: 0.0 for size, _ in orbits[k + 1 :]}}).without(others)
 
 

@@ -414,7 +414,8 @@ class Search:
                 objective, first = self._coarse_objective(self.calibration_events, one), one.to_vector(one.start)
                 stage = self._maximise(objective, s.global_algorithm, first, s.global_evaluations, step=1.0)
                 found = [one.to_values(v) for v in distinct_optima(stage, CANDIDATES)]
-            starts = [space.to_vector(values) for values in found]
+            twins = [twin for values in found if (twin := MODELS[space.model].twin_values(values)) is not None]
+            starts = [space.to_vector(values) for values in (*found, *twins)]
         if space.moving:
             starts = [self._track_rotation(each) for each in starts]
         runs: list[SearchStage] = []

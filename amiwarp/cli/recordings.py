@@ -279,8 +279,9 @@ def _listed(names: list[str]) -> str:
 def _degrees(parameters: dict[str, float]) -> dict[str, float]:
     """Return the true parameters of the optic with angles in degrees, under names that end in ``_deg``."""
     pairs = ("tilt", "cylinder", "wobble", "backward", "roll", "second", "second_backward")
-    single = ("apex", "amplitude", "phase", "plate_tilt", "second_apex", "second_phase")
-    angles = (*single, *(f"{name}_{axis}" for name in pairs for axis in "xy"))
+    single = ("apex", "amplitude", "phase", "plate_tilt", "direction", "fold", "incidence")
+    second = (f"second_{name}" for name in ("apex", "amplitude", "phase", "direction"))
+    angles = (*single, *second, *(f"{name}_{axis}" for name in pairs for axis in "xy"))
     return {f"{n}_deg" if n in angles else n: math.degrees(v) if n in angles else v for n, v in parameters.items()}
 
 

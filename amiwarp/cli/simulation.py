@@ -32,7 +32,16 @@ from amiwarp.io.formats import check_ending
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Plate, Prism
-from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel, Vibration
+from amiwarp.simulation.description import (
+    CameraMotion,
+    EncoderModel,
+    Mirror,
+    Moved,
+    PrismMotion,
+    Scene,
+    SensorModel,
+    Vibration,
+)
 from amiwarp.simulation.worlds.world import WorldScene
 
 if TYPE_CHECKING:
@@ -67,8 +76,8 @@ class RigOptions:
     optic: Annotated[
         Optic,
         in_prism(
-            help="What moves the image: wedge, plate (tilted and plane-parallel; needs --world), or vibration (the "
-            "camera itself, without glass and encoder)."
+            help="What moves the image: wedge, plate (tilted and plane-parallel; needs --world), mirror (with two "
+            "tilts), or vibration (the camera itself, without glass and encoder)."
         ),
     ] = Optic.WEDGE
     thickness_mm: Annotated[float, in_prism(help="Thickness of the plate (mm).")] = 10.0
@@ -208,14 +217,8 @@ class VibrationOptions:
         ),
     ] = None
 
-    def build(self, rig: RigOptions) -> Prism | Plate | Vibration:
-        """Return what moves the image. Raises :class:`AmiwarpError` for options of a vibration with other optics."""
-        given = [name for name, value in vars(self).items() if value is not None]
-        if rig.optic is not Optic.VIBRATION:
-            if given:
-                option = f"--{given[0].replace('_', '-')}"
-                raise AmiwarpError(f"{option} applies to a vibration; give --optic vibration, or remove {option}")
-            return rig.build_optic()
+    def build(self, rig: RigOptions) -> Vibration:
+        """Return the vibration."""
         backward = numbers(self.backward_deg or "0,0", 2, "--backward-deg")
         roll = numbers(self.roll_deg or "0,0", 2, "--roll-deg")
         second = numbers(self.second_deg or "0,0,0,0", 4, "--second-deg")
@@ -223,6 +226,67 @@ class VibrationOptions:
         amplitude = math.radians(0.4 if self.amplitude_deg is None else self.amplitude_deg)
         hz = 100.0 if self.hz is None else self.hz
         return Vibration(hz, amplitude, math.radians(rig.phase_deg), (bx, by), (rc, rs), (fx, fy), (sx, sy))
+
+
+_in_mirror = partial(typer.Option, rich_help_panel="Mirror")
+
+
+@dataclass(frozen=True)
+class MirrorOptions:
+    """Options for a mirror with two tilts in front of the camera."""
+
+    mirror_hz: Annotated[
+        str | None, _in_mirror(help="Frequencies of both tilts (Hz). Default: 60,77.", metavar="F1,F2")
+    ] = None
+    mirror_deg: Annotated[
+        str | None,
+        _in_mirror(
+            help="Amplitudes of both tilts, seen along the optical axis (deg). Default: 0.5,0.5.", metavar="A1,A2"
+        ),
+    ] = None
+    mirror_phase_deg: Annotated[
+        str | None, _in_mirror(help="Phases of both tilts at the start (deg). Default: 0,0.", metavar="P1,P2")
+    ] = None
+    mirror_direction_deg: Annotated[
+        str | None,
+        _in_mirror(
+            help="Directions in the image along which both tilts move it, from x towards y (deg). Default: 0,90.",
+            metavar="D1,D2",
+        ),
+    ] = None
+    fold_deg: Annotated[
+        float | None,
+        _in_mirror(help="Direction in the image in which the mirror folds the optical axis (deg). Default: 0, x."),
+    ] = None
+    incidence_deg: Annotated[
+        float | None, _in_mirror(help="Angle of incidence of the optical axis on the mirror (deg). Default: 45.")
+    ] = None
+
+    def build(self) -> Mirror:
+        """Return the mirror."""
+        pairs = {"mirror_deg": "0.5,0.5", "mirror_phase_deg": "0,0", "mirror_direction_deg": "0,90"}
+        amplitude, phase, direction = (
+            [math.radians(x) for x in numbers(getattr(self, name) or default, 2, f"--{name.replace('_', '-')}")]
+            for name, default in pairs.items()
+        )
+        first, second = numbers(self.mirror_hz or "60,77", 2, "--mirror-hz")
+        fold = math.radians(self.fold_deg or 0.0)
+        incidence = math.radians(45.0 if self.incidence_deg is None else self.incidence_deg)
+        return Mirror((first, second), (amplitude[0], amplitude[1]), (phase[0], phase[1]), (direction[0], direction[1]),
+                      fold, incidence)  # fmt: skip
+
+
+def build_optic(rig: RigOptions, vibration: VibrationOptions, mirror: MirrorOptions) -> Prism | Plate | Moved:
+    """Return what moves the image. Raises :class:`AmiwarpError` for options of another optic."""
+    for optic, options in ((Optic.VIBRATION, vibration), (Optic.MIRROR, mirror)):
+        given = [f"--{name.replace('_', '-')}" for name, value in vars(options).items() if value is not None]
+        if given and rig.optic is not optic:
+            raise AmiwarpError(
+                f"{given[0]} applies to a {optic.value}; give --optic {optic.value}, or remove {given[0]}"
+            )
+    if rig.optic is Optic.VIBRATION:
+        return vibration.build(rig)
+    return mirror.build() if rig.optic is Optic.MIRROR else rig.build_optic()
 
 
 @dataclass(frozen=True)
@@ -454,6 +518,7 @@ def run_simulate(
     world: WorldOptions,
     scene: SceneOptions,
     vibration: VibrationOptions,
+    mirror: MirrorOptions,
     rig: RigOptions,
     sensor: SensorOptions,
     pixels: Annotated[
@@ -466,7 +531,7 @@ def run_simulate(
     """Simulate the recording of a picture or a world by an event camera behind the prism, with its ground truth.
 
     A picture lies at infinity. A world is three-dimensional, and the camera moves through it: give --world room.
-    With --optic vibration, the camera vibrates in place of the prism.
+    With --optic vibration, the camera vibrates in place of the prism; with --optic mirror, it looks at a mirror.
     """
     from amiwarp.simulation.simulator import Simulation
 
@@ -477,7 +542,7 @@ def run_simulate(
     simulation = Simulation(
         _scene(picture, world, scene, duration, common.seed),
         rig.build_camera(),
-        vibration.build(rig),
+        build_optic(rig, vibration, mirror),
         duration,
         motion=rig.build_motion(),
         camera_motion=CameraMotion(scene.rates),

@@ -324,6 +324,9 @@ MOST_SAMPLES = 1 << 28
 """Largest number of samples that :meth:`Encoder.constant_speed` makes: three days at one sample per millisecond."""
 LONGEST_BENT_STEP = TWO_PI / 64.0
 """Longest step between samples of an encoder whose error within a turn is corrected [rad]."""
+LONGEST_TURN = 0.35
+"""Longest step of the angle of a command at the end of a swing that is taken for the way through its largest magnitude
+[rad]; longer ones are jumps."""
 LARGEST_ANGLE = 1e10
 """Largest accepted magnitude of a prism angle [rad]: 1.6e9 turns. Up to this angle float64 resolves 2e-6 rad."""
 
@@ -477,6 +480,65 @@ class Encoder:
         counts = unwrap_counts(t, array(count, "encoder count").astype(np.float64), counts_per_turn, counter_bits)
         encoder = cls(t, counts * (direction * TWO_PI / counts_per_turn), clock_offset_us)
         return encoder if index_t_us is None else encoder.with_index(index_t_us)
+
+    @classmethod
+    def from_command(cls, t_us: ArrayLike, command: ArrayLike, *, clock_offset_us: float = 0.0) -> Encoder:
+        """Create an encoder from a command signal that swings to and fro, such as one of a mirror.
+
+        The command is described as the cosine of an angle, times its largest magnitude. The angle grows by half a turn
+        at each swing; where a swing does not reach the largest magnitude, it jumps within a microsecond.
+
+        Parameters
+        ----------
+        t_us : array_like
+            Sample times on the encoder's clock [us], shape (m,), strictly increasing. Twenty samples in each swing or
+            more describe it well.
+        command : array_like
+            Command in any unit, or a measured tilt, shape (m,): zero where the mirror is at rest.
+        clock_offset_us : float, default 0.0
+            Encoder time minus event time [us].
+
+        Returns
+        -------
+        Encoder
+            The encoder, whose angle's cosine is the command relative to its largest magnitude.
+
+        Raises
+        ------
+        AmiwarpError
+            If the samples are unusable, or the command never changes.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> t = np.arange(0, 100_000, 500)
+        >>> first, second = np.sin(4e-4 * t), 0.3 * np.cos(5e-4 * t)
+        >>> encoder = amiwarp.Encoder.from_command(t, first).with_second(amiwarp.Encoder.from_command(t, second))
+        >>> np.cos(encoder.angles_at([50_000])).round(3)  # sin(20), cos(25)
+        array([[0.913, 0.991]])
+        """
+        t, u = as_times(t_us), array(command, "command").astype(np.float64)
+        if u.shape != t.shape or t.ndim != 1:
+            raise AmiwarpError(f"command has shape {u.shape}, its times {t.shape}; give one value for each time")
+        if not np.isfinite(u).all() or len(u) < 2 or not np.ptp(u) > 0.0:
+            raise AmiwarpError("command never changes or is not finite; give the samples of a signal that moves")
+        check_ascending(t, "encoder sample")
+        rises = np.sign(np.diff(u))
+        moved = np.maximum.accumulate(np.where(rises != 0.0, np.arange(len(rises)), 0))
+        rising = rises[moved] > 0.0  # a command that pauses keeps its direction
+        turns = np.concatenate([[0], np.cumsum(rising[:-1] & ~rising[1:])])
+        angle = np.arccos(u / np.abs(u).max())
+
+        def at(interval: NDArray[np.int64]) -> NDArray[np.float64]:
+            return TWO_PI * turns[interval] + np.where(rising[interval], TWO_PI - angle, angle)
+
+        last = len(rising) - 1
+        before, after = (at(np.clip(np.arange(len(u)) - k, 0, last)) for k in (1, 0))
+        jumps = after - before > LONGEST_TURN
+        both = np.where(jumps, before, (before + after) / 2.0)
+        times = np.concatenate([t, t[jumps] + 1])
+        order = np.argsort(times, kind="stable")
+        return cls(times[order], np.concatenate([both, after[jumps]])[order], clock_offset_us)
 
     @classmethod
     def constant_speed(

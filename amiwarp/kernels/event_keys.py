@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from amiwarp.kernels.camera import CameraParams, pixel_to_ray, ray_to_pixel
+from amiwarp.kernels.mirror import MirrorParams
 from amiwarp.kernels.pixels import LAG_ZERO, LARGEST_LAG, LOW_BITS, LOW_MASK, TICKS, Sink
 from amiwarp.kernels.prism_view import Steps, View, ray_without_prisms
 from amiwarp.kernels.refraction import compensate
@@ -29,14 +30,33 @@ class Block:
 
 
 @wp.func
+def true_angle(steps: Steps, angle: wp.array(dtype=float), turn: wp.array(dtype=float), at: int) -> float:
+    """Return one of the true angles of ``steps`` at a time since the first instant of the table [ticks]."""
+    k = wp.clamp(at / steps.ticks, 0, steps.margin + steps.count)
+    return angle[k] + turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
+
+
+@wp.func
 def azimuth_at(steps: Steps, angle: wp.array(dtype=float), turn: wp.array(dtype=float), at: int) -> wp.vec2:
     """Return (cos, sin) of the true azimuth of a prism at a time since the first instant of the table [ticks].
 
     ``angle`` and ``turn`` are those of one prism in ``steps``.
     """
-    k = wp.clamp(at / steps.ticks, 0, steps.margin + steps.count)
-    azimuth = angle[k] + turn[k] * float(at - k * steps.ticks) / float(steps.ticks)
+    azimuth = true_angle(steps, angle, turn, at)
     return wp.vec2(wp.cos(azimuth), wp.sin(azimuth))
+
+
+@wp.func
+def true_state(model: Any, steps: Steps, at: int) -> wp.vec2:
+    """Return the true state of an optic without glass at a time since the first instant of the table [ticks]."""
+    return azimuth_at(steps, steps.angle, steps.turn, at)
+
+
+@wp.func
+def true_state(model: MirrorParams, steps: Steps, at: int) -> wp.vec2:
+    """Return the true state of a mirror: the angles of both commands, phases included [rad]."""
+    first = true_angle(steps, steps.angle, steps.turn, at)
+    return wp.vec2(first, true_angle(steps, steps.second_angle, steps.second_turn, at))
 
 
 @wp.kernel
@@ -67,10 +87,9 @@ def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.
 def find_points_at_rest(
     model: Any, camera: CameraParams, steps: Steps, block: Block, start: int, points: wp.array(dtype=wp.vec2)
 ):
-    """Find the pixel that each event's scene point has if the camera does not vibrate as ``model`` says."""
+    """Find the pixel that each event's scene point has if camera or mirror do not move as ``model`` says."""
     i = start + wp.tid()
-    w = azimuth_at(steps, steps.angle, steps.turn, block.ticks[i])
-    points[i] = compensate(model, camera, block.points[i], w)
+    points[i] = compensate(model, camera, block.points[i], true_state(model, steps, block.ticks[i]))
 
 
 @wp.kernel

@@ -122,6 +122,9 @@ class Model:
     """Number of angles of its state: one prism has one, a pair has two."""
     ORBITS: ClassVar[tuple[tuple[str, str], ...]]
     """Names of size and phase of each prism."""
+    TOGETHER: ClassVar[tuple[tuple[str, ...], ...]]
+    """Names of the parameters that each step of a global search finds; by default those of one prism after the other.
+    """
 
     camera: Camera
     """Camera intrinsics."""
@@ -134,6 +137,8 @@ class Model:
         cls.SIZE = cls.FREE[0]
         if "ORBITS" not in vars(cls):
             cls.ORBITS = ((cls.SIZE, cls.FREE[1]),)
+        if "TOGETHER" not in vars(cls):
+            cls.TOGETHER = cls.ORBITS
         if "FREED" not in vars(cls):
             cls.FREED = tuple(name for orbit in cls.ORBITS for name in orbit)
 
@@ -263,6 +268,38 @@ class Model:
         -------
         dict or None
             The values, others unchanged; None if the sense of rotation tells one motion from another, as for a prism.
+        """
+        return None
+
+    @classmethod
+    def freed(cls, ratio: float | None) -> tuple[str, ...]:
+        """Return the names of the parameters that a calibration finds unless settings name others.
+
+        Parameters
+        ----------
+        ratio : float or None
+            Speed of the second angle relative to the first; None for one angle.
+
+        Returns
+        -------
+        tuple of str
+            The names: here :attr:`FREED`.
+        """
+        return cls.FREED
+
+    @classmethod
+    def twin_values(cls, values: Mapping[str, float]) -> dict[str, float] | None:
+        """Return values whose motion is nearly that of other ones, so that a local search starts from both.
+
+        Parameters
+        ----------
+        values : mapping of str to float
+            Values by name, in their units.
+
+        Returns
+        -------
+        dict or None
+            The values, others unchanged; None if the global search tells all motions apart.
         """
         return None
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,7 @@ from amiwarp.events.encoder import TWO_PI, Encoder, periodic
 from amiwarp.events.recording import MetadataValue
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.optics.camera import Camera
+from amiwarp.optics.mirror import INCIDENCE, MirrorModel
 from amiwarp.optics.models import ExactModel, Model, PlateModel, RisleyModel
 from amiwarp.optics.prism import Plate, Prism, check_angles, check_phase
 from amiwarp.optics.vibration import VibrationModel
@@ -237,6 +238,77 @@ class Vibration:
         pairs = {f"{name}_{axis}": float(x) for name, pair in parts.items() for axis, x in zip("xy", pair, strict=True)}
         speed = {"rpm": 60.0 * float(self.hz)} if isinstance(self.hz, int | float) else {}
         return {"amplitude": float(self.amplitude), "phase": float(self.phase), **pairs, **speed}
+
+
+@guarded
+@dataclass(frozen=True, slots=True, eq=False)
+class Mirror:
+    """Mirror with two tilts, to simulate in place of a prism. It shows the scene mirrored.
+
+    Each tilt follows the cosine of an angle that grows with its frequency; an encoder records both angles.
+
+    Examples
+    --------
+    >>> mirror = amiwarp.Mirror(hz=(60.0, 77.0), amplitude=(0.008, 0.006))
+    >>> mirror.motion.angles([0.0, 5_000.0]).round(4).tolist()
+    [[0.0, 0.0], [1.885, 2.419]]
+    """
+
+    hz: tuple[float, float]
+    """Frequencies of the first and of the second tilt [Hz]."""
+    amplitude: tuple[float, float]
+    """Amplitudes of both tilts [rad], as in :class:`amiwarp.MirrorModel`."""
+    phase: tuple[float, float] = (0.0, 0.0)
+    """Phases of both tilts [rad]."""
+    direction: tuple[float, float] = (0.0, 0.5 * math.pi)
+    """Directions in the image along which both tilts move it, from x towards y [rad]."""
+    fold: float = 0.0
+    """Direction in the image in which the mirror folds the optical axis [rad]."""
+    incidence: float = INCIDENCE
+    """Angle of incidence of the optical axis on the mirror at rest [rad]."""
+
+    def __post_init__(self) -> None:
+        for name in ("hz", "amplitude", "phase", "direction"):
+            object.__setattr__(self, name, tuple(vector(getattr(self, name), 2, f"mirror {name}", real)))
+        _ = self.motion, self.model(Camera.from_fov(8, 8, 1.0))  # their checks
+
+    @property
+    def motion(self) -> PrismMotion:
+        """Angles of both commands over time."""
+        first, second = (60.0 * real(hz, "mirror hz", -1e5, 1e5, " Hz") for hz in self.hz)
+        return PrismMotion(first, self.phase[0], second=PrismMotion(second, self.phase[1]))
+
+    def model(self, camera: Camera) -> MirrorModel:
+        """Return the model of the mirror.
+
+        Parameters
+        ----------
+        camera : Camera
+            The camera.
+
+        Returns
+        -------
+        MirrorModel
+            The model.
+        """
+        return MirrorModel.from_values(camera, Prism(0.0), self.parameters())
+
+    def parameters(self) -> dict[str, float]:
+        """Return the true values by the names that calibration uses.
+
+        Returns
+        -------
+        dict
+            Values in their units.
+        """
+        pairs = {"amplitude": self.amplitude, "phase": self.phase, "direction": self.direction}
+        both = {f"{k * 'second_'}{name}": pair[k] for name, pair in pairs.items() for k in (0, 1)}
+        ratio = self.hz[1] / self.hz[0] if self.hz[0] else 0.0
+        return {**both, "ratio": ratio, "fold": self.fold, "incidence": self.incidence}
+
+
+Moved = Vibration | Mirror
+"""What rotates the view without glass."""
 
 
 @guarded
@@ -732,13 +804,13 @@ class SimulationValues:
     """Scene in front of the camera: pictures at infinity, or a world."""
     camera: Camera
     """Camera intrinsics, of at most 4194304 pixels."""
-    prism: Prism | Plate | Vibration
-    """Prism or plate in front of the camera, with its true parameters, or vibration of a camera without glass. A plate
-    needs a world, which is seen by rays."""
+    prism: Prism | Plate | Vibration | Mirror
+    """Prism, plate or mirror in front of the camera, with its true parameters, or vibration of a camera without glass.
+    A plate needs a world, which is seen by rays."""
     duration_s: float
     """Duration of the recording [s]."""
     motion: PrismMotion = field(default_factory=PrismMotion)
-    """Motion of the prism: speed, phase, tilt, cylinder power and wobble. A vibration has its own."""
+    """Motion of the prism: speed, phase, tilt, cylinder power and wobble. Vibrations and mirrors have their own."""
     camera_motion: CameraMotion = field(default_factory=CameraMotion)
     """Rotation of the camera; by default none."""
     sensor: SensorModel = field(default_factory=SensorModel)
@@ -760,13 +832,14 @@ class SimulationValues:
     def __post_init__(self) -> None:
         if not isinstance(self.scene, WorldScene):
             instance(self.scene, Scene, "simulation's scene")
-        if isinstance(self.prism, Vibration):
+        if isinstance(self.prism, Moved):
             object.__setattr__(self, "motion", self.prism.motion)
+        if isinstance(self.prism, Vibration):
             object.__setattr__(self, "encoder_model", None)
         kinds: dict[str, type] = {
             "camera": Camera, "motion": PrismMotion, "sensor": SensorModel, "camera_motion": CameraMotion,
         }  # fmt: skip
-        if not isinstance(self.prism, Plate | Vibration):
+        if not isinstance(self.prism, Plate | Moved):
             kinds["prism"] = Prism
         if self.encoder_model is not None:
             kinds["encoder_model"] = EncoderModel
@@ -783,7 +856,7 @@ class SimulationValues:
             given, expected = (f"{width}x{height}" for width, height in (self.pixels.size, size))
             raise AmiwarpError(f"the pixel map has {given} pixels, the camera {expected}; give the map of this camera")
         whole(self.seed, "seed", 0, (1 << 31) - 1)
-        if (self.glass.second is None) != (self.motion.second is None):
+        if not isinstance(self.prism, Mirror) and (self.glass.second is None) != (self.motion.second is None):
             has, lacks = ("prism", "motion") if self.motion.second is None else ("motion", "prism")
             raise AmiwarpError(f"the {has} has a second prism, the {lacks} has none; give both or neither")
 
@@ -807,14 +880,22 @@ class SimulationValues:
 
     @property
     def glass(self) -> Prism:
-        """The prism; one with an apex angle of 0 for a plate or a vibrating camera."""
+        """The prism; one with an apex angle of 0 for a plate, a mirror or a vibrating camera."""
         return self.prism if isinstance(self.prism, Prism) else Prism(0.0)
 
     @property
+    def at_rest(self) -> Self:
+        """The same values with a prism that bends no ray, or a mirror that is not tilted."""
+        if isinstance(self.prism, Mirror):
+            return replace(self, prism=replace(self.prism, amplitude=(0.0, 0.0)))
+        motion = replace(self.motion, cylinder=(0.0, 0.0), second=None)
+        return replace(self, prism=replace(self.glass, apex=0.0, second=None), motion=motion)
+
+    @property
     def bending(self) -> ExactModel | RisleyModel:
-        """True model of how the glass changes the direction of rays; plate and vibration do not change it."""
+        """True model of how glass changes the direction of rays; plates do not, and there is none else."""
         motion, second, prism = self.motion, self.motion.second, self.glass
-        if second is None:
+        if second is None or prism.second is None:
             return ExactModel(self.camera, prism, motion.phase, motion.tilt, motion.cylinder, motion.wobble)
         turned, by = second.angle([1e6 * self.duration_s])[0], motion.angle([1e6 * self.duration_s])[0]
         return RisleyModel(self.camera, prism, motion.phase, second.phase, turned / by if by else 0.0)
@@ -826,5 +907,5 @@ class SimulationValues:
 
     @property
     def moving_model(self) -> Model:
-        """True model of what changes the direction of rays: the prisms, or the vibration."""
-        return self.prism.model(self.camera) if isinstance(self.prism, Vibration) else self.bending
+        """True model of what changes the direction of rays: the prisms, the mirror or the vibration."""
+        return self.prism.model(self.camera) if isinstance(self.prism, Moved) else self.bending

@@ -17,7 +17,7 @@ from amiwarp.kernels.launch import launch
 from amiwarp.kernels.plate import PlateParams
 from amiwarp.optics.camera import Camera, camera_params
 from amiwarp.optics.models import LARGEST_INVERSE_DEPTH, Model, PlateModel
-from amiwarp.simulation.description import Scene, SimulationValues, Vibration
+from amiwarp.simulation.description import Mirror, Moved, Scene, SimulationValues
 from amiwarp.simulation.pictures import DARK, Placement, log_map, place_picture
 from amiwarp.simulation.worlds.world import Body, Material, Trajectory, World, WorldScene
 
@@ -118,13 +118,21 @@ def step_us(
 
 
 def shake(simulation: SimulationValues, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation of a vibrating camera from its orientation at rest at times [us], shape (n, 3, 3).
+    """Return what vibration or mirror do at times [us] to directions of the camera, shape (n, 3, 3).
 
-    Without a vibration it is the identity, shape (3, 3).
+    Those are the directions in which the camera at rest would see the same points, mirrored by a mirror. Without both
+    it is the identity, shape (3, 3).
     """
-    if not isinstance(simulation.prism, Vibration):
+    if not isinstance(simulation.prism, Moved):
         return np.eye(3)
-    return simulation.prism.model(simulation.camera).rotations(simulation.motion.angle(t_us))
+    model = simulation.prism.model(simulation.camera)
+    return mirrored(simulation) @ model.rotations(simulation.motion.angles(t_us))
+
+
+def mirrored(simulation: SimulationValues) -> NDArray[np.float64]:
+    """Return what a mirror at rest does to directions of the camera, shape (3, 3); without one the identity."""
+    mirror = simulation.prism
+    return mirror.model(simulation.camera).reflection if isinstance(mirror, Mirror) else np.eye(3)
 
 
 def image_motion(simulation: SimulationValues, inverse_depth: float = 0.0) -> ImageMotion:
@@ -142,8 +150,8 @@ def image_motion(simulation: SimulationValues, inverse_depth: float = 0.0) -> Im
     angles = wp.array(np.tile(theta, len(grid)).astype(np.float32), dtype=float, device=device)
     arc = (theta[1] / 2.0) / math.sin(theta[1] / 2.0)  # a step along a circle is longer than its chord
     prisms, bends = [], []
-    shakes = isinstance(simulation.prism, Vibration)
-    models: list[Model] = [simulation.moving_model] if shakes else [*simulation.bending.singles()]
+    shakes = isinstance(simulation.prism, Moved)
+    models: list[Model] = [*(simulation.moving_model if shakes else simulation.bending).singles()]
     if simulation.plate is not None:
         models = [replace(simulation.plate, inverse_depth=min(inverse_depth, LARGEST_INVERSE_DEPTH))]
     for model in models:
@@ -198,13 +206,14 @@ def seen_bearings(simulation: SimulationValues) -> NDArray[np.float64]:
     )
     border = np.round(border)
     turn = np.arange(24) * (2.0 * np.pi / 24)
-    if isinstance(simulation.prism, Vibration):
-        rays = np.asarray(camera.pixels_to_rays(border), np.float64)
-        rays = rays[np.isfinite(rays).all(axis=1)]
-        shakes = simulation.prism.model(camera).rotations(np.asarray(turn, np.float64))
-        return np.concatenate([rays @ turned.T for turned in shakes])
     others = turn if simulation.motion.second is not None else np.zeros(1)
     theta = np.stack([m.ravel() for m in np.meshgrid(turn, others)], axis=1)
+    if isinstance(simulation.prism, Moved):
+        rays = np.asarray(camera.pixels_to_rays(border), np.float64)
+        rays = rays[np.isfinite(rays).all(axis=1)]
+        model = simulation.prism.model(camera)
+        shakes = mirrored(simulation) @ model.rotations(theta if model.ANGLES > 1 else np.asarray(turn, np.float64))
+        return np.concatenate([rays @ turned.T for turned in shakes])
     xy = wp.array(np.repeat(border, len(theta), axis=0).astype(np.float32), dtype=wp.vec2, device=device)
     angles = wp.array(np.tile(theta.astype(np.float32), (len(border), 1)), dtype=wp.vec2, device=device)
     out = wp.empty(len(xy), dtype=wp.vec3, device=device)
@@ -327,7 +336,8 @@ def log_view(simulation: SimulationValues) -> NDArray[np.float32]:
     view.camera, view.maps = camera_params(camera, str(device)), ring.maps
     view.width, view.height = placement.width, placement.height
     out = wp.empty(camera.width * camera.height, dtype=float, device=device)
-    inputs = [view, wp.mat33(*placement.to_texel().ravel().tolist())]
+    to_texel = placement.to_texel() @ mirrored(simulation)
+    inputs = [view, wp.mat33(*to_texel.ravel().tolist())]
     launch(prism_view.see_without_prism, len(out), inputs, [out], device=device)
     return np.asarray(out.numpy().reshape(camera.height, camera.width))
 

@@ -30,6 +30,8 @@ from amiwarp.simulation import scenery
 from amiwarp.simulation.description import (
     CameraMotion,
     EncoderModel,
+    Mirror,
+    Moved,
     PrismMotion,
     Scene,
     SensorModel,
@@ -83,8 +85,8 @@ class TruthRenderer:
         self._simulation, self._scene = simulation, simulation.scene
         self._world = DeviceWorld(self._scene.world, simulation.device)
         self._sight = self._sight_at_rest = WorldSight(simulation, self._scene, self._world)
-        if isinstance(simulation.prism, Vibration):
-            self._sight_at_rest = WorldSight(replace(simulation, prism=simulation.glass), self._scene, self._world)
+        if isinstance(simulation.prism, Moved):
+            self._sight_at_rest = WorldSight(simulation.at_rest, self._scene, self._world)
         self._rays = scenery.pixel_rays(simulation.camera)
 
     def at(self, t_us: int) -> FrameTruth:
@@ -103,7 +105,7 @@ class TruthRenderer:
         """
         t = t_us * 1e-6
         scene, camera, model = self._scene, self._simulation.camera, self._simulation.moving_model
-        (rotation,), (position,) = scene.trajectory.poses([t])
+        (rotation,), (position,) = self._poses([t])
         self._world.set_instants(np.array([t]))
         pixels = camera.rays_to_pixels(self._rays)
         theta = np.repeat(wrap_angle(self._simulation.motion.angles([t_us])), len(pixels), axis=0)
@@ -125,10 +127,15 @@ class TruthRenderer:
             prism_flow.astype(np.float32).reshape(*size, 2),
             self._intensity(t_us, prism=False).reshape(size),
             self._intensity(t_us, prism=True).reshape(size),
-            rotation,
+            rotation @ scenery.mirrored(self._simulation).T,
             position,
             {name: path.poses([t])[1][0] for name, path in scene.world.joints.items()},
         )
+
+    def _poses(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return how directions of the camera at rest look in the world at times [s], (n, 3, 3), and its places."""
+        rotation, position = self._scene.trajectory.poses(t)
+        return rotation @ scenery.mirrored(self._simulation), position
 
     def _flow(self, seen: scenery.SurfaceView, pixels: NDArray[np.float64], t: float) -> NDArray[np.float64]:
         """Return the optical flow [px/s] of the points that pixels see at time ``t`` [s], shape (n, 2).
@@ -151,7 +158,7 @@ class TruthRenderer:
 
         The rays are in the camera's frame, shape (n, 3).
         """
-        (r0, r1), (p0, p1) = self._scene.trajectory.poses([t, later])
+        (r0, r1), (p0, p1) = self._poses([t, later])
         rays = self._simulation.camera.pixels_to_rays(pixels).astype(np.float64)
         distance = seen.depth.astype(np.float64) / rays[:, 2]
         sky = ~np.isfinite(distance)
@@ -806,7 +813,7 @@ class Engine:
         if stamps is not None:
             block.t = stamps
         at_rest = None
-        if isinstance(self._simulation.prism, Vibration):
+        if isinstance(self._simulation.prism, Moved):
             at_rest = wp.empty_like(block.points)
             model = self._simulation.moving_model
             inputs = [model.params(self._device), model_camera(model, self._device), steps, block]
@@ -876,8 +883,8 @@ def true_parameters(simulation: SimulationValues) -> dict[str, float]:
     clock = {} if simulation.encoder_model is None else {"clock_offset_us": simulation.encoder_model.clock_offset_us}
     moving = {name: value for name, value in omega.items() if math.isfinite(value)}
     glass = simulation.prism
-    if isinstance(glass, Vibration):
-        return {**glass.parameters(), **moving, **asdict(simulation.sensor)}
+    if isinstance(glass, Moved):
+        return {**glass.parameters(), **clock, **moving, **asdict(simulation.sensor)}
     uneven = {
         f"{name}_{axis}": angle
         for name in ("tilt", "cylinder", "wobble")
@@ -964,11 +971,10 @@ class Simulation(SimulationValues):
         Returns
         -------
         Simulation
-            The same scene, sensor and seed with an apex angle of 0. Its recording has neither encoder nor prism.
+            The same scene, sensor and seed with an apex angle of 0, or a mirror at rest. Its recording has neither
+            encoder nor prism.
         """
-        prism = replace(self.glass, apex=0.0, second=None)
-        motion = replace(self.motion, cylinder=(0.0, 0.0), second=None)
-        return replace(self, prism=prism, motion=motion, nominal_prism=None, encoder_model=None)
+        return replace(self.at_rest, nominal_prism=None, encoder_model=None)
 
     def encoder(self) -> Encoder | None:
         """Sample the prism's encoder.
@@ -1123,7 +1129,8 @@ class Simulation(SimulationValues):
     def _stored_prism(self) -> Prism | Plate | None:
         """Nominal prism or plate to store with the recording, or None for a camera without glass."""
         glass = self.prism if isinstance(self.prism, Plate) else self.glass
-        return None if self.encoder_model is None else self.nominal_prism or glass
+        moved = self.encoder_model is None or isinstance(self.prism, Moved)
+        return None if moved else self.nominal_prism or glass
 
     def write(
         self,
@@ -1184,7 +1191,7 @@ class Simulation(SimulationValues):
 def simulate(
     scene: Scene | WorldScene | str | Path | NDArray[Any],
     camera: Camera,
-    prism: Prism | Plate | Vibration,
+    prism: Prism | Plate | Vibration | Mirror,
     *,
     duration_s: float,
     motion: PrismMotion | float = 720.0,
@@ -1210,13 +1217,13 @@ def simulate(
         Scene, world, picture file, or pixel values (see :meth:`Scene.from_picture`).
     camera : Camera
         The camera.
-    prism : Prism, Plate or Vibration
-        The true prism; or a plate, in a world; or the vibration of a camera without glass, whose recording has neither
-        encoder nor prism.
+    prism : Prism, Plate, Vibration or Mirror
+        The true prism; or a plate, in a world; or a mirror; or the vibration of a camera without glass, whose recording
+        has neither encoder nor prism.
     duration_s : float
         Duration [s].
     motion : PrismMotion or float, optional
-        Motion of the prism, or its constant speed [turns/min]. A vibration has its own frequency.
+        Motion of the prism, or its constant speed [turns/min]. Vibrations and mirrors have their own.
     camera_motion : CameraMotion, optional
         Rotation of the camera; by default none.
     sensor : SensorModel, optional
