@@ -25,6 +25,8 @@ MIRROR = amiwarp.Mirror(
 """Up to 9 px at 200 × 150. A search starts with a fold of 0 and an incidence of 45 deg."""
 PROMPT = amiwarp.SensorModel(refractory_us=0.0, latency_us=0.0, latency_jitter_us=0.0)
 
+FEW = amiwarp.PhotometricSettings(pairs=60_000)
+
 
 def reflected(rays: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Return rays that a plane mirror with these unit normals reflects, shape (n, 3)."""
@@ -232,7 +234,30 @@ def test_commands_that_nothing_follows_are_refused(recording: amiwarp.Recording)
     other = amiwarp.Encoder.constant_speed(-2111.0, -1000, 300_000)
     wrong = replace(recording, encoder=other.with_second(amiwarp.Encoder.constant_speed(1377.0, -1000, 300_000)))
     with pytest.raises(amiwarp.AmiwarpError, match="no motion of a mirror"):
-        amiwarp.calibrate(wrong, model="mirror", events=60_000)
+        amiwarp.calibrate(wrong, model="mirror", events=30_000, stages=("sharpness",))
+
+
+def test_motion_too_fast_for_the_sensor_is_refused(texture: np.ndarray) -> None:
+    camera = amiwarp.Camera.from_fov(96, 72, math.radians(50.0))
+    fast = amiwarp.Mirror((140.0, 120.0), (0.04, 0.04))
+    shown = amiwarp.simulate(texture, camera, fast, duration_s=0.1, seed=1)
+    with pytest.raises(
+        amiwarp.AmiwarpError, match=r"px within the sensor's refractory period.* let the image move less"
+    ):
+        amiwarp.calibrate(shown, model="mirror", events=20_000, free=amiwarp.MirrorModel.FREED, photometric=FEW)
+
+
+def test_a_turning_camera_leaves_all_parameters_of_two_angles_free(texture: np.ndarray) -> None:
+    camera, pair = amiwarp.Camera.from_fov(96, 72, math.radians(50.0)), amiwarp.Prism(0.03, second=amiwarp.Prism(0.025))
+    motion = amiwarp.PrismMotion(1500.0, 0.3, second=amiwarp.PrismMotion(-2100.0, -0.7))
+    turns = amiwarp.CameraMotion((0.3, 0.2, 0.1))
+    made = amiwarp.simulate(
+        texture, camera, pair, duration_s=0.2, motion=motion, sensor=PROMPT, camera_motion=turns, seed=2
+    )
+    found = amiwarp.calibrate(made, events=15_000, photometric=FEW)
+    assert any("the camera turned at" in said for said in found.warnings)
+    assert found.parameters["apex"] == pytest.approx(0.03, rel=0.02)
+    assert found.parameters["second_apex"] == pytest.approx(0.025, rel=0.02)
 
 
 # Commands.

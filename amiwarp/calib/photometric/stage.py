@@ -82,15 +82,17 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
             time_constant = turn / rad_per_us
         if len(v) == len(answer.stage.x):
             found.answers.timing = answer.stage.x - v
-        if not MODELS[found.answers.cost.space.model].PRISM:
-            found.answers.cost.converge(answer.stage.x)
+    kind = MODELS[found.answers.cost.space.model]
+    if not kind.PRISM and (examined or kind.ANGLES > 1):  # it moves so fast that pixels miss events
+        found.answers.cost.converge(answer.stage.x)
+        if recording.encoder is None:
             answer = answer.judged(*judge_speed(consistency.change_of_speed_px(found.answers.cost, answer.stage.x)))
-            doubt = consistency.by_refractory(found.answers.cost, answer.stage.x)
-            found.answers.doubt = direction * rad_per_us * refractory_doubt_us(sensor) * doubt
-            blind_rad = rad_per_us * (sensor.refractory_us or REFRACTORY_DOUBT_US)
-            answer = answer.judged(
-                *judge_blindness(fastest_px_per_rad(found.answers.cost.space, answer.stage.x) * blind_rad)
-            )
+        doubt = consistency.by_refractory(found.answers.cost, answer.stage.x)
+        found.answers.doubt = direction * rad_per_us * refractory_doubt_us(sensor) * doubt
+        blind_rad = rad_per_us * (sensor.refractory_us or REFRACTORY_DOUBT_US)
+        answer = answer.judged(
+            *judge_blindness(fastest_px_per_rad(found.answers.cost.space, answer.stage.x) * blind_rad)
+        )
     answers = found.answers
     answer = checked(answers, answer).judged(*judge_lag(time_constant * rad_per_us))
     doubt_px = answers.doubt_px(answer.stage.x)
@@ -594,7 +596,7 @@ def judge_blindness(moved_px: float) -> tuple[bool, str]:
         return True, ""
     return False, (
         f"the image moves by up to {moved_px:.2f} px within the sensor's refractory period, over {LARGEST_BLIND_PX:g} "
-        "px, so that events are lost: let the camera vibrate less or more slowly"
+        "px, so that events are lost: let the image move less, or more slowly"
     )
 
 
@@ -1090,7 +1092,7 @@ def doubt_in_words(px: float, sensor: SensorTiming) -> str:
     """Return by how much the doubt about the refractory period changes an answer [px]."""
     known = sensor.refractory_us
     given = f"given as {known:.0f} us" if known else "which is not given"
-    remedy = "let the camera vibrate less" if known else "give it by --refractory-us"
+    remedy = "let the image move less" if known else "give it by --refractory-us"
     return (
         f"the image moves fast for the sensor: an error of {refractory_doubt_us(sensor):.0f} us in its refractory "
         f"period, {given}, changes the answer by {px:.2f} px; {remedy}"
