@@ -105,6 +105,14 @@ def test_the_twin_moves_the_image_nearly_alike() -> None:
     assert np.abs(at_centre).max() < 0.2  # px
     assert np.abs(one.compensate_points(xy, theta) - other.compensate_points(xy, theta)).max() > 1.0
     assert amiwarp.ExactModel.twin_values({"apex": 0.03, "phase": 0.1}) is None
+    assert amiwarp.MirrorModel.twin_values({"amplitude": 0.01, "phase": 0.1}) is None
+
+
+def test_what_is_not_given_is_usual() -> None:
+    camera = amiwarp.Camera.from_fov(320, 240, 1.0)
+    model = amiwarp.MirrorModel.from_values(camera, NO_PRISM, {"amplitude": 0.01, "phase": 0.2})
+    assert model == amiwarp.MirrorModel(camera, 0.01, 0.2)
+    assert (model.second_amplitude, model.second_direction) == (0.0, 0.5 * math.pi)
 
 
 def test_amplitudes_in_degrees_are_refused() -> None:
@@ -212,6 +220,21 @@ def test_it_is_calibrated_without_start_values(calibrated: amiwarp.Calibration) 
     for name in ("amplitude", "second_amplitude", "fold", "incidence"):
         assert abs(calibrated.parameters[name] - true[name]) < 6.0 * calibrated.uncertainty[name]
     assert set(calibrated.free) == set(amiwarp.MirrorModel.FREED) == set(calibrated.uncertainty)
+
+
+def test_a_known_mount_need_not_be_found(recording: amiwarp.Recording) -> None:
+    true = MIRROR.parameters()
+    known = {name: true[name] for name in ("direction", "second_direction", "fold", "incidence")}
+    free = ("amplitude", "phase", "second_amplitude", "second_phase")
+    found = amiwarp.calibrate(recording, model="mirror", start=known, free=free, events=30_000, stages=("sharpness",))
+    assert set(found.free) == set(free)
+    assert distance(found, MIRROR) < 0.3  # px
+    same = amiwarp.MirrorModel.from_values(found.camera, NO_PRISM, found.parameters)
+    assert same == found.model
+    known |= {name: true[name] for name in free[2:]}
+    one = amiwarp.calibrate(recording, model="mirror", start=known, free=free[:2], events=30_000, stages=("sharpness",))
+    assert one.parameters["second_amplitude"] == true["second_amplitude"]
+    assert distance(one, MIRROR) < 0.3  # px
 
 
 def test_a_file_keeps_it(calibrated: amiwarp.Calibration, recording: amiwarp.Recording, tmp_path: Path) -> None:

@@ -71,11 +71,11 @@ def units() -> dict[str, str]:
 def of_orbit(space: ParameterSpace, k: int, at: Mapping[str, float]) -> ParameterSpace:
     """Return the space of the ``k``-th prism's size and phase.
 
-    Prisms before it have the values ``at``, later ones the size 0.
+    Prisms before it have the values ``at``, later ones the size 0 if theirs is free.
     """
-    orbits = MODELS[space.model].ORBITS
-    others = tuple({*space.names} - {*MODELS[space.model].TOGETHER[k]})
-    return space.holding({**at, **{size: 0.0 for size, _ in orbits[k + 1 :]}}).without(others)
+    kind = MODELS[space.model]
+    later = {size: 0.0 for size, _ in kind.ORBITS[k + 1 :] if size in space.names}
+    return space.holding({**at, **later}).without(tuple({*space.names} - {*kind.TOGETHER[k]}))
 
 
 def phase_names() -> set[str]:

@@ -430,8 +430,10 @@ class Search:
 
         The prisms of a pair are searched one after the other: each removes its part of the blur.
         """
-        count = len(MODELS[space.model].ORBITS)
-        return [lambda _: space] if count == 1 else [partial(of_orbit, space, k) for k in range(count)]
+        together = MODELS[space.model].TOGETHER
+        if len(together) == 1:
+            return [lambda _: space]
+        return [partial(of_orbit, space, k) for k, names in enumerate(together) if {*names} & {*space.names}]
 
     def _coarse_objective(self, events: CalibrationEvents, space: ParameterSpace) -> Objective:
         step = max(1, len(events.events) // (self.settings.events // 3 + 1))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.mirror import MirrorParams
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, PHASE, Model, Parameter, RisleyModel, check_given, struct_of
+from amiwarp.optics.models import MODELS, PHASE, Model, Parameter, RisleyModel, struct_of
 from amiwarp.optics.prism import (
     NominalPrism,
     Plate,
@@ -39,8 +39,6 @@ ONE_FREQUENCY = 1e-3
 """Relative difference of the frequencies of both tilts up to which they count as equal."""
 INCIDENCE = math.radians(45.0)
 """Usual angle of incidence of the optical axis on the mirror [rad]."""
-
-
 LARGEST_INCIDENCE = math.radians(80.0)
 """Upper limit of the angle of incidence [rad]."""
 
@@ -124,7 +122,7 @@ class MirrorModel(Model):
 
     @classmethod
     def _of_values(cls, camera: Camera, prism: Prism | Plate, values: Mapping[str, float]) -> Self:
-        return cls(camera, **{**cls.start_values(prism), **{n: x for n, x in values.items() if n in cls.FREE}})
+        return cls(camera, **{name: value for name, value in values.items() if name in cls.FREE})
 
     @classmethod
     def start_values(cls, prism: Prism | Plate) -> dict[str, float]:
@@ -154,8 +152,9 @@ class MirrorModel(Model):
         return tuple(name for name in cls.FREED if not (alike and name in ("direction", "second_direction")))
 
     @classmethod
-    def twin_values(cls, values: Mapping[str, float]) -> dict[str, float]:
-        check_given(values, ("fold",))
+    def twin_values(cls, values: Mapping[str, float]) -> dict[str, float] | None:
+        if "fold" not in values:
+            return None
         # the opposite fold turns the image about its middle in the other sense
         return {**values, "fold": math.remainder(values["fold"] + math.pi, math.tau)}
 
