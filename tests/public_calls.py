@@ -328,6 +328,7 @@ OWN: dict[str, dict[str, Any]] = {
             ("MirrorModel", "amplitude"), ("VibrationModel", "amplitude"),
         )
         for method, given in (
+            ("freed", {"ratio": 1.0}),
             ("twin_values", {"values": {size: 0.01, "phase": 0.0, "second_phase": 0.1, "fold": 0.2}}),
             ("turned_values", {"values": {size: 0.01, "phase": 0.0}, "angle": 0.1}),
             ("reversed_values", {"values": {size: 0.01, "phase": 0.0}}),

@@ -148,7 +148,7 @@ class MirrorModel(Model):
     @classmethod
     def freed(cls, ratio: float | None) -> tuple[str, ...]:
         # at one frequency the tilts make one ellipse, which other directions describe by other amplitudes and phases
-        alike = ratio is not None and abs(abs(ratio) - 1.0) < ONE_FREQUENCY
+        alike = ratio is not None and abs(abs(real(ratio, "ratio")) - 1.0) < ONE_FREQUENCY
         return tuple(name for name in cls.FREED if not (alike and name in ("direction", "second_direction")))
 
     @classmethod
