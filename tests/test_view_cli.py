@@ -76,8 +76,12 @@ def test_an_interrupt_waits_until_vtk_has_drawn(files: Path, tmp_path: Path, mon
     close = drawing.Scene.close
     monkeypatch.setattr(drawing.Scene, "close", lambda scene: closed.append(close(scene)))
     inspector = Inspector(open_recording(files / "recording.h5"))
-    with pytest.raises(KeyboardInterrupt):
-        drawing.save_screenshot(inspector, tmp_path / "out.png", size=(400, 200))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore the signal
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            drawing.save_screenshot(inspector, tmp_path / "out.png", size=(400, 200))
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert closed == [None]
     assert np.asarray(Image.open(tmp_path / "out.png")).shape[:2] == (200, 400)
 
