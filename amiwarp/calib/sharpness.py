@@ -414,8 +414,9 @@ class Search:
                 objective, first = self._coarse_objective(self.calibration_events, one), one.to_vector(one.start)
                 stage = self._maximise(objective, s.global_algorithm, first, s.global_evaluations, step=1.0)
                 found = [one.to_values(v) for v in distinct_optima(stage, CANDIDATES)]
-            twins = [twin for values in found if (twin := MODELS[space.model].twin_values(values)) is not None]
-            starts = [space.to_vector(values) for values in (*found, *twins)]
+            free = [{name: values[name] for name in space.names} for values in found]
+            twins = [twin for values in free if (twin := MODELS[space.model].twin_values(values)) is not None]
+            starts = [space.to_vector(values) for values in (*free, *twins)]
         if space.moving:
             starts = [self._track_rotation(each) for each in starts]
         runs: list[SearchStage] = []

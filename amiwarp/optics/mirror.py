@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.mirror import MirrorParams
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, PHASE, Model, Parameter, RisleyModel, struct_of
+from amiwarp.optics.models import MODELS, PHASE, Model, Parameter, RisleyModel, both_angles, struct_of
 from amiwarp.optics.prism import (
     NominalPrism,
     Plate,
@@ -162,8 +162,7 @@ class MirrorModel(Model):
         return replace(self, second_amplitude=0.0), replace(self, amplitude=0.0, ratio=1.0)
 
     def all_angles(self, theta: NDArray[Any]) -> NDArray[np.float64]:
-        first = np.asarray(theta, np.float64)
-        return np.stack([first, self.ratio * first], axis=-1)
+        return both_angles(theta, self.ratio)
 
     @property
     def axes(self) -> NDArray[np.float64]:

@@ -921,8 +921,13 @@ class RisleyModel(Model):
         return first, ExactModel(self.camera, cast("Prism", self.prism.second), self.second_phase)
 
     def all_angles(self, theta: NDArray[Any]) -> NDArray[np.float64]:
-        first = np.asarray(theta, np.float64)
-        return np.stack([first, self.ratio * first], axis=-1)
+        return both_angles(theta, self.ratio)
+
+
+def both_angles(theta: NDArray[Any], ratio: float) -> NDArray[np.float64]:
+    """Return two angles [rad], shape (..., 2): those of the first, and the same times the ratio of their speeds."""
+    first = np.asarray(theta, np.float64)
+    return np.stack([first, ratio * first], axis=-1)
 
 
 def axis_rotation(tilt_x: float, tilt_y: float) -> NDArray[np.float64]:

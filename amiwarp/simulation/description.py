@@ -893,7 +893,7 @@ class SimulationValues:
 
     @property
     def bending(self) -> ExactModel | RisleyModel:
-        """True model of how glass changes the direction of rays; plates do not, and there is none else."""
+        """True model of how a prism changes the direction of rays; with other optics, of one that does not."""
         motion, second, prism = self.motion, self.motion.second, self.glass
         if second is None or prism.second is None:
             return ExactModel(self.camera, prism, motion.phase, motion.tilt, motion.cylinder, motion.wobble)

@@ -212,7 +212,7 @@ def seen_bearings(simulation: SimulationValues) -> NDArray[np.float64]:
         rays = np.asarray(camera.pixels_to_rays(border), np.float64)
         rays = rays[np.isfinite(rays).all(axis=1)]
         model = simulation.prism.model(camera)
-        shakes = mirrored(simulation) @ model.rotations(theta if model.ANGLES > 1 else np.asarray(turn, np.float64))
+        shakes = mirrored(simulation) @ model.rotations(theta if model.ANGLES > 1 else theta[:, 0])
         return np.concatenate([rays @ turned.T for turned in shakes])
     xy = wp.array(np.repeat(border, len(theta), axis=0).astype(np.float32), dtype=wp.vec2, device=device)
     angles = wp.array(np.tile(theta.astype(np.float32), (len(border), 1)), dtype=wp.vec2, device=device)
