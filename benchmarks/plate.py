@@ -1,10 +1,12 @@
 """Depth at rest behind a rotating tilted plate: errors in simulated worlds, and what noise and wrong glass do to them.
 
-    python -m benchmarks.plate --out FILE.json [--device cuda:0] [--size 640 480] [--seeds 20] [--desk]
+    python -m benchmarks.plate --out FILE.json [--device cuda:0] [--size 640 480] [--seeds 20] [--desk] [--no-atlas]
+        [--processes 1]
 
 Plate: 10 mm, 45 deg, N-BK7; 720 turns/min; camera at rest, 60 deg. The panels are twelve textured rectangles at 0.3 to
-1 m; the desk is the named world. Depths are compared with the depth map of the simulator at known pixels, which all are
-at edges. Times are those of calibration and depths.
+1 m; the desk is the named world. The atlas is a grid of noise, duration, contrast and what the recording states of the
+plate. Depths are compared with the depth map of the simulator at known pixels, which all are at edges. Times are those
+of calibration and depths.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import json
 import math
 import time
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,7 @@ import numpy as np
 
 import amiwarp
 from amiwarp.brightness.depths import orbit_px
+from benchmarks.moving_optics import rows_of
 
 PLATE = amiwarp.Plate(0.01, math.radians(45.0))
 PHASE = math.radians(40.0)
@@ -44,11 +48,11 @@ def panels(seed: int, contrast: float = 0.8) -> amiwarp.WorldScene:
 
 
 def measure(
-    name: str, scene: amiwarp.WorldScene, seed: int, size: list[int], device: str, **changes: Any
+    name: str, scene: amiwarp.WorldScene, seed: int, size: list[int], device: str, changes: dict[str, Any]
 ) -> dict[str, Any]:
     """Return the errors of phase and depth of one simulation. ``nominal``: plate that the recording states."""
-    nominal = changes.pop("nominal", PLATE)
-    values = {"duration_s": 0.42, "sensor": amiwarp.SensorModel()} | changes
+    values = {"duration_s": 0.42, "sensor": amiwarp.SensorModel(), "nominal": PLATE} | changes
+    nominal = values.pop("nominal")
     camera = amiwarp.Camera.from_fov(*size, math.radians(60.0))
     simulation = amiwarp.Simulation(
         scene, camera, PLATE, motion=amiwarp.PrismMotion(720.0, PHASE), nominal_prism=nominal, seed=seed,
@@ -82,36 +86,47 @@ def measure(
     }  # fmt: skip
 
 
-def cases(desk: bool, seeds: int) -> list[tuple[str, amiwarp.WorldScene, int, dict[str, Any]]]:
-    """Return name, scene, seed and changes of each simulation."""
+Call = tuple[str, amiwarp.WorldScene, int, list[int], str, dict[str, Any]]
+"""Name, scene, seed, size, device and changes of a simulation."""
+
+
+def atlas() -> list[tuple[str, float, dict[str, Any]]]:
+    """Return name, contrast and changes of each cell of the grid."""
     noisy = replace(amiwarp.SensorModel(), shot_noise_hz=20.0, leak_hz=1.0, mismatch=0.1)
-    listed: list[tuple[str, amiwarp.WorldScene, int, dict[str, Any]]] = [
-        *(("panels", panels(seed), seed, {}) for seed in range(seeds)),
-        ("panels, noise", panels(0), 0, {"sensor": noisy}),
-        ("panels, 2 turns", panels(0), 0, {"duration_s": 0.17}),
-        ("panels, low contrast", panels(0, 0.2), 0, {}),
-        ("panels, thickness 10 % off", panels(0), 0, {"nominal": replace(PLATE, thickness=0.011)}),
-        ("panels, tilt 10 % off", panels(0), 0, {"nominal": replace(PLATE, tilt=1.1 * PLATE.tilt)}),
+    noises: dict[str, Any] = {"usual noise": {}, "20 Hz": {"sensor": noisy}}
+    turns = {"5 turns": {}, "2 turns": {"duration_s": 0.17}}
+    stated: dict[str, Any] = {
+        "plate known": {}, "thickness 10 % off": {"nominal": replace(PLATE, thickness=0.011)},
+        "tilt 10 % off": {"nominal": replace(PLATE, tilt=1.1 * PLATE.tilt)},
+    }  # fmt: skip
+    return [
+        (", ".join((a, b, f"contrast {contrast}", d)), contrast, noise | duration | plate)
+        for (a, noise), (b, duration), contrast, (d, plate) in product(
+            noises.items(), turns.items(), (0.8, 0.2), stated.items()
+        )
     ]
-    if desk:
-        listed.append(("desk", amiwarp.WorldScene(*amiwarp.named_world("desk", "still")), 0, {}))
-    return listed
 
 
 def main() -> None:
-    """Measure all cases and write them to a file after each."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Measure all cases and write them to a file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--desk", action="store_true", help="also simulate the desk, which takes minutes on a CPU")
+    parser.add_argument("--no-atlas", action="store_true")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--size", type=int, nargs=2, default=[320, 240])
+    parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
-    rows = []
-    for name, scene, seed, changes in cases(options.desk, options.seeds):
-        rows.append(measure(name, scene, seed, options.size, options.device, **changes))
-        print(rows[-1], flush=True)
-        options.out.write_text(json.dumps({"protocol": __doc__, "size": options.size, "rows": rows}, indent=1) + "\n")
+    where = options.size, options.device
+    calls: list[Call] = []
+    if options.desk:  # the longest
+        calls.append(("desk", amiwarp.WorldScene(*amiwarp.named_world("desk", "still")), 0, *where, {}))
+    calls += [("panels", panels(seed), seed, *where, {}) for seed in range(options.seeds)]
+    if not options.no_atlas:
+        calls += [(name, panels(0, contrast), 0, *where, changes) for name, contrast, changes in atlas()]
+    rows = rows_of(measure, calls, options.processes)
+    options.out.write_text(json.dumps({"protocol": __doc__, "size": options.size, "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

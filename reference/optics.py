@@ -7,10 +7,12 @@ Every function takes and returns float64; a point or ray that does not exist is 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from amiwarp import Camera, Fisheye, FlatSide, Plate, Prism, RadialTangential
 
@@ -228,6 +230,75 @@ def through_plate(plate: Plate, rays: Array, phi: Array) -> tuple[Array, Array]:
         place = place + (distance - np.sum(place * normal, axis=1, keepdims=True)) / along * bearing
         bearing = refract(bearing, normal, ratio)
     return place, bearing
+
+
+def through_pair(
+    camera: Camera, prism: Prism, phases: tuple[float, float], xy: Array, theta: Array, *, to_scene: bool
+) -> Array:
+    """Return pixels (n, 2) compensated (``to_scene``) or deflected by a prism and its second one at angles (n, 2)."""
+    assert prism.second is not None
+    rays, order = pixels_to_rays(camera, xy), [(prism, 0), (prism.second, 1)]
+    for one, k in order if to_scene else order[::-1]:
+        rays = through_prism(one, rays, theta[:, k] + phases[k], to_scene=to_scene)
+    return rays_to_pixels(camera, rays)
+
+
+def at_depth(camera: Camera, plate: Plate, phase: float, xy: Array, theta: Array, inverse_depth: Array) -> Array:
+    """Return the pixels (n, 2) that see without the plate what ``xy`` see through it, at inverse depths (n,) [1/m]."""
+    origin, direction = through_plate(plate, pixels_to_rays(camera, xy), theta + phase)
+    depth = 1.0 / np.maximum(inverse_depth, 1e-9)
+    point = origin + ((depth - origin[:, 2]) / direction[:, 2])[:, None] * direction
+    return rays_to_pixels(camera, point / np.linalg.norm(point, axis=1, keepdims=True))
+
+
+def reflected(rays: Array, normals: Array) -> Array:
+    """Return rays that a plane mirror with these unit normals reflects, shape (n, 3)."""
+    return rays - 2.0 * np.sum(rays * normals, axis=1, keepdims=True) * normals
+
+
+def mirror_normals(values: Mapping[str, float], theta: Array) -> tuple[Array, Array]:
+    """Return the normals of a mirror at rest and at angles of its commands (n, 2), each of shape (n, 3).
+
+    The normal at rest looks back to the camera. The axis of a tilt is perpendicular to it, and seen from the camera to
+    the direction in which the image moves. ``values`` are named as the parameters of amiwarp's model.
+    """
+    along = np.array([np.cos(values["fold"]), np.sin(values["fold"]), 0.0])
+    optical = np.array([0.0, 0.0, 1.0])
+    rest = np.sin(values["incidence"]) * along - np.cos(values["incidence"]) * optical
+    tilt = np.zeros((len(theta), 3))
+    for k, before in enumerate(("", "second_")):
+        swing = values[f"{before}amplitude"] * np.cos(theta[:, k] + values[f"{before}phase"])
+        to = values[f"{before}direction"]
+        across = np.array([-np.sin(to), np.cos(to), 0.0])
+        axis = across - (across @ rest) / (optical @ rest) * optical
+        tilt += swing[:, None] * axis
+    return np.tile(rest, (len(theta), 1)), Rotation.from_rotvec(tilt).apply(rest)
+
+
+def in_mirror(camera: Camera, values: Mapping[str, float], xy: Array, theta: Array) -> Array:
+    """Return the pixels that see in a mirror at rest what ``xy`` see in it at angles (n, 2) of its commands."""
+    rest, tilted = mirror_normals(values, theta)
+    return rays_to_pixels(camera, reflected(reflected(pixels_to_rays(camera, xy), tilted), rest))
+
+
+def vibration(values: Mapping[str, float], theta: Array) -> Rotation:
+    """Return a vibrating camera's rotation from rest at angles (n,) of the vibration.
+
+    ``values`` are named as the parameters of amiwarp's model.
+    """
+
+    def part(name: str, k: int) -> Array:
+        return complex(values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0)) * np.exp(1j * k * theta)
+
+    circle = values["amplitude"] * np.exp(1j * (theta + values["phase"]))
+    circle = circle + part("backward", -1) + part("second", 2) + part("second_backward", -2)
+    roll = values.get("roll_x", 0.0) * np.cos(theta) + values.get("roll_y", 0.0) * np.sin(theta)
+    return Rotation.from_rotvec(np.stack([circle.real, circle.imag, roll], axis=1))
+
+
+def turned(camera: Camera, rotation: Rotation, xy: Array) -> Array:
+    """Return the pixels (n, 2) whose rays are those of ``xy``, rotated."""
+    return rays_to_pixels(camera, rotation.apply(pixels_to_rays(camera, xy)))
 
 
 def move(

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import amiwarp
@@ -28,37 +27,6 @@ PROMPT = amiwarp.SensorModel(refractory_us=0.0, latency_us=0.0, latency_jitter_u
 FEW = amiwarp.PhotometricSettings(pairs=60_000)
 
 
-def reflected(rays: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return rays that a plane mirror with these unit normals reflects, shape (n, 3)."""
-    return rays - 2.0 * np.sum(rays * normals, axis=1, keepdims=True) * normals
-
-
-def normals_of(values: dict[str, float], theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the normals of the mirror at rest and at angles of its commands (n, 2), each of shape (n, 3).
-
-    The normal at rest looks back to the camera. The axis of a tilt is perpendicular to it, and seen from the camera to
-    the direction in which the image moves.
-    """
-    along = np.array([math.cos(values["fold"]), math.sin(values["fold"]), 0.0])
-    optical = np.array([0.0, 0.0, 1.0])
-    rest = math.sin(values["incidence"]) * along - math.cos(values["incidence"]) * optical
-    tilt = np.zeros((len(theta), 3))
-    for k, before in enumerate(("", "second_")):
-        swing = values[f"{before}amplitude"] * np.cos(theta[:, k] + values[f"{before}phase"])
-        to = values[f"{before}direction"]
-        across = np.array([-math.sin(to), math.cos(to), 0.0])
-        axis = across - (across @ rest) / (optical @ rest) * optical
-        tilt += swing[:, None] * axis
-    return np.tile(rest, (len(theta), 1)), Rotation.from_rotvec(tilt).apply(rest)
-
-
-def oracle(camera: amiwarp.Camera, values: dict[str, float], xy: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """Return the pixels that see in the mirror at rest what ``xy`` see in the tilted one."""
-    rest, tilted = normals_of(values, theta)
-    seen = reflected(reference.pixels_to_rays(camera, xy), tilted)
-    return reference.rays_to_pixels(camera, reflected(seen, rest))
-
-
 @pytest.mark.parametrize("scale", [1.0, 8.0])
 def test_device_functions_agree_with_float64_reflections(device: str, scale: float) -> None:
     import warp as wp
@@ -70,7 +38,7 @@ def test_device_functions_agree_with_float64_reflections(device: str, scale: flo
     model = amiwarp.MirrorModel.from_values(camera, NO_PRISM, values)
     points = wp.array(xy.astype(np.float32), dtype=wp.vec2, device=device)
     angles = wp.array(theta.astype(np.float32), dtype=float, device=device)
-    expected = oracle(camera, values, xy, theta)
+    expected = reference.in_mirror(camera, values, xy, theta)
     assert np.nanmax(np.linalg.norm(expected - xy, axis=1)) > 6.0 * scale
     inside = np.isfinite(expected).all(axis=1) & (np.abs(expected) < 600.0).all(axis=1)
     assert inside.mean() > 0.9
@@ -144,7 +112,7 @@ def test_simulated_events_know_their_point_at_rest(recording: amiwarp.Recording)
     points = recording.truth.points(0, 20_000)
     assert points is not None
     xy = np.stack([events.x, events.y], axis=1).astype(np.float64)
-    away = oracle(recording.camera, MIRROR.parameters(), xy, MIRROR.motion.angles(events.t)) - points
+    away = reference.in_mirror(recording.camera, MIRROR.parameters(), xy, MIRROR.motion.angles(events.t)) - points
     assert np.abs(np.median(away, axis=0)).max() < 0.01  # px
     assert np.std(away) < 0.02  # px: times in microseconds
     assert np.std(xy - points) > 1.5
@@ -205,7 +173,7 @@ def distance(found: amiwarp.Calibration, mirror: amiwarp.Mirror) -> float:
     at = [np.linspace(0, camera.width - 1, 6), np.linspace(0, camera.height - 1, 5), *[np.arange(8) * math.pi / 4] * 2]
     grid = np.stack(np.meshgrid(*at), axis=-1).reshape(-1, 4)
     moved = found.model.compensate_points(grid[:, :2], grid[:, 2:])
-    expected = oracle(camera, mirror.parameters(), grid[:, :2], grid[:, 2:])
+    expected = reference.in_mirror(camera, mirror.parameters(), grid[:, :2], grid[:, 2:])
     return float(np.sqrt(np.mean(np.sum((moved - expected) ** 2, axis=1))))
 
 

@@ -34,14 +34,8 @@ def test_model_agrees_with_a_trace_of_rays(distortion: amiwarp.Distortion | None
     plate = amiwarp.Plate(0.01, math.radians(tilt_deg), 1.6)
     model = amiwarp.PlateModel(camera, plate, PHASE)
     xy, theta, rho = random_points(camera)
-    origin, direction = reference.through_plate(plate, reference.pixels_to_rays(camera, xy), theta + PHASE)
-    # the scene point at depth 1 / rho on the ray behind the plate, seen from the camera's resting centre
-    depth = 1.0 / np.maximum(rho, 1e-9)
-    point = origin + ((depth - origin[:, 2]) / direction[:, 2])[:, None] * direction
-    rays = point / np.linalg.norm(point, axis=1, keepdims=True)
-    np.testing.assert_allclose(
-        model.compensate_at(xy, theta, rho), reference.rays_to_pixels(camera, rays), rtol=0, atol=2e-3  # px
-    )  # fmt: skip
+    expected = reference.at_depth(camera, plate, PHASE, xy, theta, rho)
+    np.testing.assert_allclose(model.compensate_at(xy, theta, rho), expected, rtol=0, atol=2e-3)  # px
 
 
 def test_one_depth_for_all_pixels_is_a_map_of_equal_depths(device: str) -> None:

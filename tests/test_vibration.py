@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import amiwarp
@@ -22,23 +21,6 @@ VALUES = {
 NO_PRISM = amiwarp.Prism(0.0)
 
 
-def rotations(values: dict[str, float], theta: np.ndarray) -> Any:
-    """Return the camera's rotation from rest at angles of the vibration, in float64."""
-
-    def part(name: str, k: int) -> np.ndarray:
-        return complex(values.get(f"{name}_x", 0.0), values.get(f"{name}_y", 0.0)) * np.exp(1j * k * theta)
-
-    circle = values["amplitude"] * np.exp(1j * (theta + values["phase"]))
-    circle = circle + part("backward", -1) + part("second", 2) + part("second_backward", -2)
-    roll = values.get("roll_x", 0.0) * np.cos(theta) + values.get("roll_y", 0.0) * np.sin(theta)
-    return Rotation.from_rotvec(np.stack([circle.real, circle.imag, roll], axis=1))
-
-
-def oracle(camera: amiwarp.Camera, xy: np.ndarray, turned: Any) -> np.ndarray:
-    """Return the pixels whose rays are those of other pixels, rotated."""
-    return reference.rays_to_pixels(camera, turned.apply(reference.pixels_to_rays(camera, xy)))
-
-
 @pytest.mark.parametrize("scale", [1.0, 8.0])
 def test_device_functions_agree_with_float64(device: str, scale: float) -> None:
     import warp as wp
@@ -51,12 +33,12 @@ def test_device_functions_agree_with_float64(device: str, scale: float) -> None:
     model = amiwarp.VibrationModel.from_values(camera, NO_PRISM, values)
     points = wp.array(xy.astype(np.float32), dtype=wp.vec2, device=device)
     angles = wp.array(theta.astype(np.float32), dtype=float, device=device)
-    turned = rotations(values, theta)
+    turned = reference.vibration(values, theta)
     tolerance = {"rtol": 0.0, "atol": 2e-3 if scale == 1.0 else 6e-3}  # px; float32 angles up to 9 rad
-    expected = oracle(camera, xy, turned)
+    expected = reference.turned(camera, turned, xy)
     assert np.linalg.norm(expected - xy, axis=1).max() > 3.0 * scale
     np.testing.assert_allclose(model.compensate_points(points, angles).numpy(), expected, **tolerance)
-    expected = oracle(camera, xy, turned.inv())
+    expected = reference.turned(camera, turned.inv(), xy)
     np.testing.assert_allclose(model.deflect_points(points, angles).numpy(), expected, **tolerance)
 
 
@@ -125,7 +107,7 @@ def test_simulated_events_know_their_point_at_rest(shaken: amiwarp.Recording) ->
     values = SHAKE.parameters()
     assert values.pop("rpm") == shaken.truth.parameters["rpm"] == 5400.0
     xy = np.stack([events.x, events.y], axis=1).astype(np.float64)
-    away = oracle(shaken.camera, xy, rotations(values, theta)) - points
+    away = reference.turned(shaken.camera, reference.vibration(values, theta), xy) - points
     assert np.abs(np.median(away, axis=0)).max() < 0.01  # px
     assert np.std(away) < 0.1  # px; latency jitter of 30 us at up to 2000 px/s
     assert np.std(xy - points) > 1.5
