@@ -465,8 +465,9 @@ def _columns(cost: Cost, best: Vector) -> dict[str, Any]:
     space, pairs = cost.space, cost.brightness.pairs
     columns = slopes(cost, space, best, space.names)
     late, long = pairs.split_by_time()
-    for name in _orbit(space):
+    for name in _path(space):
         columns[f"long {name}"] = masked(columns[name], long)
+    for name in _orbit(space):
         if not (set(DRIFTS) & set(space.names) or space.moving):
             columns[f"late {name}"] = masked(columns[name], late)
     return columns
@@ -477,9 +478,15 @@ def _orbit(space: ParameterSpace) -> list[str]:
     return [n for n in space.names if n in orbit_names(MODELS[space.model])]
 
 
+def _path(space: ParameterSpace) -> list[str]:
+    """Return the names of the free parameters that shape the path of the image: those of :func:`_orbit` for glass."""
+    kind = MODELS[space.model]
+    return _orbit(space) if kind.PRISM else [n for n in space.names if n in kind.FREE]
+
+
 def _systematic(space: ParameterSpace, fit: LinearFit) -> Vector:
     """Return the covariance of errors that pairs with long and with short gaps do not share [px²]."""
-    names = _orbit(space)
+    names = _path(space)
     which = [space.names.index(n) for n in names]
     change = np.zeros(len(space.names))
     change[which] = fit.fit((*space.names, *(f"long {n}" for n in names))).change[len(space.names) :]
@@ -494,8 +501,11 @@ def map_errors(space: ParameterSpace, best: Vector, fit: LinearFit, pairs: int, 
     An error of brightness that all pairs share moves the answer by at most its size times the root of their number, in
     standard deviations for independent errors of one threshold.
     """
-    along = np.array(size_and_phase_directions(space, best)).reshape(-1, len(best))
-    error = np.array([MAP_ERROR["phase" if n in phase_names() else "size"] / density**2 for n in _orbit(space)])
+    others = [n for n in _path(space) if n not in _orbit(space)]
+    units = [np.eye(len(best))[space.names.index(n)] for n in others]
+    along = np.array([*size_and_phase_directions(space, best), *units]).reshape(-1, len(best))
+    names = (*_orbit(space), *others)
+    error = np.array([MAP_ERROR["phase" if n in phase_names() else "size"] / density**2 for n in names])
     variances = error**2 * pairs * np.einsum("ki,ij,kj->k", along, fit.fit(space.names).inverse, along)
     return np.asarray(along.T * variances @ along)
 
@@ -596,6 +606,14 @@ def _untold(space: ParameterSpace, best: Vector, fit: LinearFit) -> float:
     values = space.to_values(best)
     away = distance(other_side(space).build(turned(space, values)), space.build(values))
     return away if away >= LEAST_MOVE_PX else 0.0
+
+
+def stated_px(space: ParameterSpace, v: Vector, covariance: Vector) -> float:
+    """Return the error of the model at ``v`` that its covariance states, constant lag removed [px rms]."""
+    variances, axes = np.linalg.eigh(covariance)
+    at = space.build(space.to_values(v))
+    ends = (v + math.sqrt(max(0.0, x)) * axis for x, axis in zip(variances, axes.T, strict=True))
+    return math.hypot(*(distance(space.build(space.to_values(end)), at) for end in ends))
 
 
 def distance(model: Model, other: Model) -> float:
