@@ -57,6 +57,16 @@ from .imaging.metrics import edge_blur as edge_blur
 from .imaging.metrics import model_error as model_error
 from .imaging.metrics import sharpness as sharpness
 from .imaging.metrics import truth_model as truth_model
+from .imaging.tensors import ToTensor as ToTensor
+from .imaging.tensors import Windows as Windows
+from .imaging.tensors import collate as collate
+from .imaging.tensors import event_count as event_count
+from .imaging.tensors import latest_times as latest_times
+from .imaging.tensors import polarity_histogram as polarity_histogram
+from .imaging.tensors import stacked_histogram as stacked_histogram
+from .imaging.tensors import time_surface as time_surface
+from .imaging.tensors import voxel_grid as voxel_grid
+from .imaging.tensors import windows as windows
 from .io.camera_files import load_camera as load_camera
 from .io.camera_files import save_camera as save_camera
 from .io.depth_map import DepthMap as DepthMap

@@ -39,6 +39,7 @@ PLATE = aw.Plate(0.01, 0.7)
 EVENTS = aw.Events.from_arrays([1, 2, 1], [0, 1, 2], [0, 400, 900], [1, 0, 1])
 ON_DEVICE = aw.DeviceEvents.from_arrays(EVENTS.x, EVENTS.y, EVENTS.t, EVENTS.p)
 SOURCE = aw.MemoryEvents(EVENTS, 4, 3)
+WINDOWS = aw.windows(EVENTS, count=1)
 ENCODER = aw.Encoder(np.array([0, 1000], np.int64), np.array([0.0, 0.1]))
 PRISM = aw.Prism(0.02)
 MODEL = aw.ExactModel(CAMERA, PRISM)
@@ -279,6 +280,13 @@ OWN: dict[str, dict[str, Any]] = {
     "BoardPose": _all(BOARD_POSE),
     "LensCalibration": _all(LENS),
     "calibrate_lens": {"recordings": [RECORDING], "board": BOARD},
+    "Windows": _all(WINDOWS),
+    "windows": {"duration_us": 300},
+    "collate": {"blocks": [EVENTS, EVENTS[2:]]},
+    "voxel_grid": {"bins": 2},
+    "stacked_histogram": {"bins": 2},
+    "time_surface": {"tau_us": 100.0},
+    "ToTensor": {"representation": aw.event_count},
     "load_camera": {"path": "none.json"},
     "save_camera": {"path": _new(".json"), "camera": CAMERA},
     "PixelMap": _all(PIXELS),

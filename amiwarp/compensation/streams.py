@@ -15,12 +15,12 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.compensation.recordings import LaunchPlan
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, check_sensor, encoder_pieces, limits, wait
 from amiwarp.events.encoder import Encoder, EncoderStream
 from amiwarp.events.recording import Events, held_bytes
 from amiwarp.imaging.iwe import CanvasShape, Votes
+from amiwarp.imaging.positions import LaunchPlan
 from amiwarp.kernels.compensation import Columns
 from amiwarp.kernels.events import flag_events
 from amiwarp.kernels.launch import PageLockedPool, RecordedLaunch, background_worker, launch, pool

@@ -172,3 +172,30 @@ def mark_background(
         near = latest_nearby(latest, pixel, stride)
         background[i] = near == NEVER or t[i] - near > window_us
         latest[pixel] = t[i]
+
+
+# Times of events on a device.
+
+
+@wp.kernel
+def take_times(
+    t: wp.array(dtype=wp.int64), indices: wp.array(dtype=wp.int64), start: int, out: wp.array(dtype=wp.int64)
+):
+    """Take the times at indices."""
+    i = start + wp.tid()
+    out[i] = t[int(indices[i])]
+
+
+@wp.kernel
+def find_times(t: wp.array(dtype=wp.int64), times: wp.array(dtype=wp.int64), start: int, out: wp.array(dtype=wp.int64)):
+    """Find the index of the first event at or after each time, by bisection."""
+    i = start + wp.tid()
+    low = int(0)
+    high = int(t.shape[0])
+    while low < high:
+        middle = low + (high - low) / 2
+        if t[middle] < times[i]:
+            low = middle + 1
+        else:
+            high = middle
+    out[i] = wp.int64(low)

@@ -42,6 +42,11 @@ def load_word(values: wp.array(dtype=wp.uint64), i: int) -> wp.uint64:
     """Load element ``i`` of a contiguous array of uint64."""
 
 
+@wp.func_native("((int64_t*)values.data)[i] = value;")
+def store_int64(values: wp.array(dtype=wp.int64), i: int, value: wp.int64):
+    """Store ``value`` as element ``i`` of a contiguous array of int64."""
+
+
 @wp.func_native("((float*)values.data)[i] = value;")
 def store_float(values: wp.array(dtype=float), i: int, value: float):
     """Store ``value`` as element ``i`` of a contiguous array of float32."""
@@ -70,6 +75,26 @@ def copy_floats(out: wp.array(dtype=float), values: wp.array(dtype=float), first
 @wp.func_native("for (int k = 0; k < n; ++k) ((uint8_t*)out.data)[k] = ((const uint8_t*)values.data)[first + k];")
 def copy_bytes(out: wp.array(dtype=wp.uint8), values: wp.array(dtype=wp.uint8), first: int, n: int):
     """Copy ``values[first : first + n]`` of contiguous arrays of uint8."""
+
+
+@wp.func_native("for (int k = 0; k < n; ++k) ((int64_t*)out.data)[k] = ((const int64_t*)values.data)[first + k];")
+def copy_int64s(out: wp.array(dtype=wp.int64), values: wp.array(dtype=wp.int64), first: int, n: int):
+    """Copy ``values[first : first + n]`` of contiguous arrays of int64."""
+
+
+@wp.func_native("for (int k = 0; k < n; ++k) ((int*)out.data)[k] = ((const uint16_t*)values.data)[first + k];")
+def copy_uint16s(out: wp.array(dtype=int), values: wp.array(dtype=wp.uint16), first: int, n: int):
+    """Copy ``values[first : first + n]`` of a contiguous array of uint16 to one of int32."""
+
+
+@wp.func_native("""
+    const int64_t* value = (const int64_t*)values.data;
+    int fall = 0;
+    for (int k = first; k < stop; ++k) fall |= value[k] < value[k - 1];
+    return fall;
+""")
+def descends(values: wp.array(dtype=wp.int64), first: int, stop: int) -> bool:
+    """Return whether any of ``values[first : stop]`` is less than the value before it."""
 
 
 @wp.func_native("""
@@ -118,6 +143,79 @@ def add_word_pairs(
     prefetched, because an image is larger than a core's cache. The loop of additions is not unrolled: with more loads
     and stores, the same code took up to twice as long at some addresses on an AMD EPYC.
     """
+
+
+@wp.func_native("""
+    const int* place = (const int*)places.data;
+    const uint64_t* word = (const uint64_t*)words.data;
+    uint64_t* sum = (uint64_t*)sums.data;
+#ifndef __CUDACC__
+    for (int k = 0; k < n; ++k) __builtin_prefetch(sum + place[k], 1);
+#endif
+#pragma clang loop unroll(disable)
+    for (int k = 0; k < n; ++k) sum[place[k]] += word[k];
+""")
+def add_words(sums: wp.array(dtype=wp.int64), places: wp.array(dtype=int), words: wp.array(dtype=wp.int64), n: int):
+    """Add a word to the sum at each of ``n`` places, modulo 2**64. For CPUs, if no other thread adds there."""
+
+
+@wp.func_native("""
+    const uint64_t *first = (const uint64_t*)words.data + start, *second = (const uint64_t*)words.data + end;
+    float* to = (float*)out.data + at;
+    const int above = 64 - low, fraction = 2 * low - 64;
+    const double unit = 1.0 / (double)(1 << fraction);
+    for (int k = 0; k < n; ++k) {
+        const uint64_t a = start < 0 ? 0 : first[k], b = end < 0 ? 0 : second[k];
+        const int64_t shares = (int64_t)(a << above) >> above, signs = (int64_t)(a - (uint64_t)shares) >> low;
+        const int64_t total = signs * (1 << fraction) - shares + ((int64_t)(b << above) >> above);
+        to[k] = (float)((double)total * unit);
+    }
+""")
+def read_words(
+    out: wp.array(dtype=float), at: int, words: wp.array(dtype=wp.int64), low: int, start: int, end: int, n: int
+):
+    """Compute ``n`` elements of a voxel grid from the words of :mod:`amiwarp.kernels.tensors`.
+
+    ``low`` is the number of bits of the lower field. ``start`` and ``end`` are the first words of the intervals that
+    start and end at the bin, or negative.
+    """
+
+
+@wp.func_native("""
+    typedef int64_t several __attribute__((vector_size(32), aligned(8)));
+    const int* place = (const int*)places.data;
+    const int64_t* share = (const int64_t*)shares.data;
+    int64_t* sum = (int64_t*)sums.data;
+#ifndef __CUDACC__
+    for (int k = 0; k < n; ++k) {
+        __builtin_prefetch(sum + place[k], 1);
+        __builtin_prefetch(sum + place[k] + stride, 1);
+    }
+#endif
+#pragma clang loop unroll(disable)
+    for (int k = 0; k < n; ++k) {
+        several *above = (several*)(sum + place[k]), *below = (several*)(sum + place[k] + stride);
+        *above += *(const several*)(share + 8 * k);
+        *below += *(const several*)(share + 8 * k + 4);
+    }
+""")
+def add_squares(
+    sums: wp.array(dtype=wp.int64), places: wp.array(dtype=int), shares: wp.array(dtype=wp.int64), stride: int, n: int
+):
+    """Add four shares to the sums at each of ``n`` places, and four more ``stride`` sums further. For CPUs."""
+
+
+@wp.func_native("""
+    const int* place = (const int*)places.data;
+    int* sum = (int*)sums.data;
+#ifndef __CUDACC__
+    for (int k = 0; k < n; ++k) __builtin_prefetch(sum + place[k], 1);
+#endif
+#pragma clang loop unroll(disable)
+    for (int k = 0; k < n; ++k) ++sum[place[k]];
+""")
+def count_places(sums: wp.array(dtype=int), places: wp.array(dtype=int), n: int):
+    """Add 1 to the count at each of ``n`` places. For CPUs, if no other thread adds there."""
 
 
 # Sums over neighbouring threads of a CUDA warp, in fixed order.

@@ -1,0 +1,1034 @@
+"""Events as tensors for networks: counts, voxel grids, histograms, time surfaces; windows, batches and transforms."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeAlias
+
+import numpy as np
+import warp as wp
+from numpy.typing import ArrayLike, NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events import device_events
+from amiwarp.events.device_events import DeviceEvents, check_sensor, device_for, encoder_params, limits, wait
+from amiwarp.events.encoder import Encoder, check_prisms
+from amiwarp.events.recording import Events, Recording, check_order
+from amiwarp.imaging.positions import LaunchPlan
+from amiwarp.kernels import tensors as kernels
+from amiwarp.kernels.events import NEVER, find_times, take_times
+from amiwarp.kernels.launch import launch, load, run_together, slices
+from amiwarp.kernels.tensors import BLOCK
+from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.optics.models import Model
+from amiwarp.tasks import cpu_threads
+from amiwarp.validation import array as as_numbers
+from amiwarp.validation import check_names, guarded, instance, real, shown, whole
+
+# Windows of events.
+
+
+@guarded
+@dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """Windows of events: ranges of their indices, with the times at which each window starts and ends.
+
+    :func:`windows` and :func:`collate` make them. Windows may overlap, and need not be in order.
+
+    Raises
+    ------
+    AmiwarpError
+        If the arrays are not int64 of one length, or a window ends before it starts.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> ends = np.array([0, 3, 5])
+    >>> len(amiwarp.Windows(start=ends[:-1], stop=ends[1:], t_start=10 * ends[:-1], t_end=10 * ends[1:]))
+    2
+    """
+
+    start: NDArray[np.int64]
+    """Index of each window's first event, shape ``(n,)``."""
+    stop: NDArray[np.int64]
+    """Index after each window's last event, shape ``(n,)``."""
+    t_start: NDArray[np.int64]
+    """Time at which each window starts [us], shape ``(n,)``. Bins and decays refer to it."""
+    t_end: NDArray[np.int64]
+    """Time at which each window ends [us], shape ``(n,)``."""
+
+    def __post_init__(self) -> None:
+        for name in ("start", "stop", "t_start", "t_end"):
+            values = instance(getattr(self, name), np.ndarray, f"windows' {name}")
+            if values.dtype != np.int64 or values.shape != (len(self.start),):
+                raise AmiwarpError(
+                    f"windows' {name} is {values.dtype} of shape {values.shape}; expected int64, one for each window"
+                )
+        bad = (self.stop < self.start) | (self.t_end < self.t_start) | (self.start < 0)
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise AmiwarpError(
+                f"window {k} has events {self.start[k]} .. {self.stop[k]} and times {self.t_start[k]} .. "
+                f"{self.t_end[k]} us; expected 0 <= start <= stop and t_start <= t_end"
+            )
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+    def __getitem__(self, which: slice | NDArray[Any]) -> Windows:
+        """Return the windows of a slice, or at an index or boolean array."""
+        return Windows(self.start[which], self.stop[which], self.t_start[which], self.t_end[which])
+
+
+@guarded
+def windows(
+    events: Events | DeviceEvents,
+    *,
+    duration_us: int | None = None,
+    count: int | None = None,
+    ranges: ArrayLike | None = None,
+    encoder: Encoder | None = None,
+    turns: float = 1.0,
+    incomplete: bool = False,
+) -> Windows:
+    """Cut events into windows: of equal duration, of equal count, at given indices, or of turns of the prism.
+
+    Give one of ``duration_us``, ``count``, ``ranges`` and ``encoder``.
+
+    Parameters
+    ----------
+    events : Events or DeviceEvents
+        Events, sorted by time.
+    duration_us : int, optional
+        Length of a window [us]. Windows start at the first event. They hold the events with ``t_start <= t < t_end``.
+    count : int, optional
+        Number of events in a window. It starts at the time of its first event and ends at that of its last one.
+    ranges : array_like, optional
+        First index, and index after the last, of each window, shape ``(n, 2)``. Times are as for ``count``.
+    encoder : Encoder, optional
+        Encoder that covers the events. Windows start at the first event, and last until the prism has turned by
+        ``turns`` since their start.
+    turns : float, default 1.0
+        Turns of the prism in a window, in either direction, with ``encoder``.
+    incomplete : bool, default False
+        Keep the last window if it is shorter than the others. Its end is then that of a whole window for a duration,
+        else the last event's time.
+
+    Returns
+    -------
+    Windows
+        The windows, in order of time.
+
+    Raises
+    ------
+    AmiwarpError
+        If not exactly one way to cut is given, a range lies outside the events, or the encoder does not cover them.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays([1, 1, 2], [0, 0, 1], [0, 10, 25], [0, 1, 1])
+    >>> found = amiwarp.windows(events, duration_us=10, incomplete=True)
+    >>> found.start.tolist(), found.stop.tolist(), found.t_end.tolist()
+    ([0, 1, 2], [1, 2, 3], [10, 20, 30])
+    """
+    given = {"duration_us": duration_us, "count": count, "ranges": ranges, "encoder": encoder}
+    if sum(value is not None for value in given.values()) != 1:
+        raise AmiwarpError("windows are cut in one way: give one of duration_us, count, ranges and encoder")
+    n = len(events)
+    if ranges is not None:
+        pairs = as_numbers(ranges, "ranges", "iu").astype(np.int64)
+        if pairs.size and (pairs.ndim != 2 or pairs.shape[1] != 2 or pairs.min() < 0 or pairs.max() > n):
+            raise AmiwarpError(f"ranges have shape {pairs.shape}; expected (n, 2), with indices in 0 .. {n}")
+        pairs = pairs.reshape(-1, 2)
+        return _at_indices(events, pairs[:, 0].copy(), pairs[:, 1].copy())
+    if count is not None:
+        count = whole(count, "count", 1, 1 << 62, " events in a window")
+        edges = np.arange(0, n + count if incomplete and n % count else n + 1, count, dtype=np.int64)
+        return _at_indices(events, edges[:-1], np.minimum(edges[1:], n))
+    if not n:
+        return _at_indices(events, np.zeros(0, np.int64), np.zeros(0, np.int64))
+    first, last = _times_at(events, np.array([0, n - 1]))
+    if duration_us is not None:
+        duration_us = whole(duration_us, "duration_us", 1, 1 << 62, " us in a window")
+        number = (last - first) // duration_us + (1 if incomplete else 0)
+        edges = first + np.arange(number + 1, dtype=np.int64) * duration_us
+    else:
+        edges = _turn_edges(encoder, first, last, real(turns, "turns", 1e-6), incomplete)
+    found = _find(events, edges)
+    if incomplete:
+        found[-1] = n
+    return Windows(found[:-1], found[1:], edges[:-1], edges[1:])
+
+
+def _turn_edges(encoder: Any, first: int, last: int, turns: float, incomplete: bool) -> NDArray[np.int64]:
+    """Return the times at which the prism has turned by multiples of ``turns`` since the first event [us]."""
+    inside = encoder.t[(encoder.t > first + encoder.clock_offset_us) & (encoder.t < last + encoder.clock_offset_us)]
+    times = np.unique(np.concatenate([[first], np.rint(inside - encoder.clock_offset_us).astype(np.int64), [last]]))
+    turned = np.maximum.accumulate(np.abs(encoder.angle_at(times) - encoder.angle_at([first])) / (2.0 * math.pi))
+    number = int(turned[-1] / turns)
+    keep = np.concatenate([[True], np.diff(turned) > 0.0])
+    inner = np.interp(np.arange(1, number + 1) * turns, turned[keep], (times[keep] - first).astype(np.float64))
+    edges = np.concatenate([[first], first + np.rint(inner).astype(np.int64)])
+    return np.append(edges, last) if incomplete and edges[-1] < last else edges
+
+
+def _at_indices(events: Events | DeviceEvents, start: NDArray[np.int64], stop: NDArray[np.int64]) -> Windows:
+    """Return windows at indices, which start and end at the times of their first and last events."""
+    filled = stop > start
+    t_start, t_end = np.zeros(len(start), np.int64), np.zeros(len(start), np.int64)
+    times = _times_at(events, np.concatenate([start[filled], stop[filled] - 1]))
+    t_start[filled], t_end[filled] = np.split(times, 2)
+    return Windows(start, stop, t_start, t_end)
+
+
+def _times_at(events: Events | DeviceEvents, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the times of a few events [us]."""
+    if isinstance(events, Events) or events.device.is_cpu:
+        return (events.t if isinstance(events, Events) else events.t.numpy())[indices]
+    return _look_up(take_times, events.t, indices)
+
+
+def _find(events: Events | DeviceEvents, times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the index of the first event at or after each time."""
+    if isinstance(events, Events) or events.device.is_cpu:
+        return np.searchsorted(events.t if isinstance(events, Events) else events.t.numpy(), times).astype(np.int64)
+    return _look_up(find_times, events.t, times)
+
+
+def _look_up(kernel: Any, t: wp.array, given: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return what a kernel finds in the times of events on a device for each given number."""
+    asked = wp.array(given, dtype=wp.int64, device=t.device)
+    found = wp.empty_like(asked)
+    launch(kernel, len(asked), [t, asked], [found], device=t.device)
+    return np.asarray(found.numpy())
+
+
+# Batches of recordings.
+
+
+@guarded
+def collate(blocks: Sequence[Events] | Sequence[DeviceEvents], *, device: Any = None) -> tuple[Any, Windows]:
+    """Join the events of several recordings, with one window for each.
+
+    Parameters
+    ----------
+    blocks : sequence of Events, or of DeviceEvents
+        Events of each recording, sorted by time; at least one recording. A recording may be empty.
+    device : str or warp.Device, optional
+        Device to copy :class:`Events` to. Without it, they stay in NumPy arrays.
+
+    Returns
+    -------
+    Events or DeviceEvents
+        All events, in the order of the recordings. Their times start anew with each recording.
+    Windows
+        One window for each recording, from its first to its last event.
+
+    Raises
+    ------
+    AmiwarpError
+        If there are no blocks, or they differ in type or device.
+
+    Examples
+    --------
+    >>> first = amiwarp.Events.from_arrays([1, 1], [0, 0], [0, 10], [0, 1])
+    >>> second = amiwarp.Events.from_arrays([2], [1], [5], [1])
+    >>> events, found = amiwarp.collate([first, second])
+    >>> amiwarp.event_count(events, 4, 2, windows=found).sum(axis=(1, 2)).tolist()
+    [2, 1]
+    """
+    kinds: set[Any] = {type(block) for block in blocks}
+    if len(kinds) != 1 or not kinds <= {Events, DeviceEvents}:
+        raise AmiwarpError("a batch needs at least one block, and all blocks Events or all DeviceEvents")
+    ends = np.concatenate([[0], np.cumsum([len(block) for block in blocks])]).astype(np.int64)
+    joined = kinds.pop().concatenate(blocks)
+    if isinstance(joined, Events) and device is not None:
+        joined = _on_device(joined, wp.get_device(device))
+        wait(joined.device)
+    elif isinstance(joined, DeviceEvents):
+        device_for(joined, device)
+    return joined, _at_indices(joined, ends[:-1], ends[1:])
+
+
+def _on_device(events: Events | DeviceEvents, device: Any) -> DeviceEvents:
+    """Return events in Warp arrays on the device. On a CPU they are not copied."""
+    if isinstance(events, DeviceEvents):
+        return events
+    columns = (np.require(getattr(events, name), requirements=["C", "A"]) for name in device_events.NAMES)
+    return DeviceEvents(
+        *(wp.array(v, dtype=wp.dtype_from_numpy(v.dtype), device=device, copy=not device.is_cpu) for v in columns)
+    )
+
+
+# Images of windows: sums, counts or times, computed by kernels.
+
+MOST_BYTES = {"cpu": 1 << 27, "cuda": 1 << 30}
+"""Memory for the images of the windows that are processed in one launch [bytes]; at least one window is processed."""
+MOST_BINS = 1 << 20
+"""Largest number of time bins."""
+MOST_EVENTS = (1 << 31) - 1
+"""Largest number of events, and of pixels in all images of a window, that kernels can address."""
+SMALLEST = 256
+"""Fewest blocks of a slice on a CPU."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Batch:
+    """Events on a device and their windows, as the kernels take them."""
+
+    events: DeviceEvents
+    windows: Windows
+    single: bool
+    """Whether the result has no axis of windows."""
+    on_host: bool
+    """Whether the result is a NumPy array."""
+
+    @property
+    def device(self) -> Any:
+        return self.events.device
+
+    def empty(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
+        """Return an array for the result, shape (windows, *shape)."""
+        if math.prod(shape) > MOST_EVENTS:
+            raise AmiwarpError(f"a tensor has shape {shape}, more than {MOST_EVENTS} elements; give fewer bins")
+        return wp.empty((len(self.windows), *shape), dtype=dtype, device=self.device)
+
+    def finish(self, out: wp.array) -> Any:
+        """Return the result of a public function."""
+        wait(self.device)
+        found = out.numpy() if self.on_host else out
+        return found[0] if self.single else found
+
+
+def _batch(
+    events: Any, cut: Windows | None, t_start: int | None, t_end: int | None, model: Model | None,
+    encoder: Encoder | None, device: Any,
+) -> _Batch:  # fmt: skip
+    """Return the events and windows of a public function's arguments, compensated if there is a model."""
+    if (model is None) != (encoder is None):
+        raise AmiwarpError("only one of model and encoder is given; give both a model and an encoder, or neither")
+    single = cut is None and not isinstance(events, list | tuple)
+    on_host = isinstance(events[0] if isinstance(events, list | tuple) and events else events, Events)
+    if isinstance(events, list | tuple):
+        if cut is not None:
+            raise AmiwarpError("events are a batch of recordings and windows are given; join them by amiwarp.collate")
+        events, cut = collate(events, device=device)
+    if cut is not None and not (t_start is None and t_end is None):
+        raise AmiwarpError("t_start or t_end is given for several windows; the windows have times of their own")
+    n, there = len(events), device_for(events, device)
+    if n > MOST_EVENTS:
+        raise AmiwarpError(f"there are {n} events; give at most {MOST_EVENTS} at a time")
+    cut = _window(events, t_start, t_end) if cut is None else cut
+    if len(cut) and int(cut.stop.max()) > n:
+        raise AmiwarpError(f"windows reach to event {int(cut.stop.max())} of {n}; give the events that were cut")
+    found = _on_device(events, there)
+    if model is not None and encoder is not None:
+        found = _compensated(found, model, encoder)
+    return _Batch(found, cut, single, on_host)
+
+
+def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | None) -> Windows:
+    """Return one window, from ``t_start`` to ``t_end``, both included [us]; None for the first or the last event."""
+    first, last = _times_at(events, np.array([0, len(events) - 1])).tolist() if len(events) else (0, 0)
+    low, high = first if t_start is None else t_start, last if t_end is None else t_end
+    if high < low:
+        if t_start is not None and t_end is not None:
+            raise AmiwarpError(f"t_end is {t_end} us, before t_start, {t_start} us; give t_start <= t_end")
+        low = high = t_start if t_end is None else t_end
+    start, stop = 0, len(events)
+    if t_start is not None or t_end is not None:
+        start, stop = _find(events, np.array([low, high + 1])).tolist() if len(events) else (0, 0)
+    return Windows(*(np.array([value], np.int64) for value in (start, stop, low, high)))
+
+
+def _compensated(events: DeviceEvents, model: Model, encoder: Encoder) -> DeviceEvents:
+    """Return events at their positions without the optic."""
+    check_sensor(events)
+    check_prisms(encoder, model.ANGLES)
+    if not len(events):
+        return events
+    if events.device.is_cpu:
+        x, y, t = (getattr(events, name).numpy() for name in ("x", "y", "t"))
+        span, largest = (int(t.min()), int(t.max())), (int(x.max()), int(y.max()))
+    else:
+        t_first, t_last, right, bottom, _, _ = limits(events)
+        span, largest = (t_first, t_last), (right, bottom)
+    plan = LaunchPlan(model, events.device)
+    params = encoder_params(encoder, *span, str(events.device))
+    columns = plan.run(plan.device_columns(events), params, *largest)
+    return DeviceEvents(columns.out_x[: len(events)], columns.out_y[: len(events)], events.t, events.p)
+
+
+def _grid(width: int, height: int, *, steps: int = 1, rate: int = 0, layers: int = 1, border: int = 0) -> Any:
+    """Return the struct of the images of each window. ``rate``: see :class:`amiwarp.kernels.tensors.Grid`."""
+    grid = kernels.Grid()
+    grid.width = whole(width, "width", 1, LARGEST_SIZE, " pixels")
+    grid.height = whole(height, "height", 1, LARGEST_SIZE, " pixels")
+    grid.steps, grid.rate, grid.layers, grid.border, grid.off = steps, rate, layers, border, 1
+    return grid
+
+
+def _images(
+    batch: _Batch, grid: Any, kernel: Any, on_cpu: Any, dtype: Any, *, sums: int = 1, empty: int = 0
+) -> Iterator[tuple[int, int, wp.array]]:
+    """Compute the images of all windows by a kernel. Yield the first window, the number of windows, and their images.
+
+    ``on_cpu``: kernel for blocks of events. ``sums``: numbers of type ``dtype`` in each pixel, ``empty`` at first. The
+    images are overwritten by the next ones. Raises :class:`AmiwarpError` if times decrease in a window.
+    """
+    cut, device = batch.windows, batch.device
+    group = grid.layers * (grid.height + 2 * grid.border) * (grid.width + 2 * grid.border)
+    trash = 2 * (grid.width + 16)
+    threads = cpu_threads() if device.is_cpu else 0
+    extra = max(threads - 1, 0) * group + threads * trash
+    if (grid.steps * group + extra) * sums > MOST_EVENTS:
+        raise AmiwarpError(f"a window has {grid.steps * group} pixels in all its images; give fewer bins")
+    span = cut.t_end - cut.t_start
+    if grid.rate and len(cut) and int(span.max()) >= (1 << 53) // grid.rate:
+        raise AmiwarpError(f"a window lasts {int(span.max())} us; give one below {(1 << 53) // grid.rate} us")
+    columns = kernels.Columns()
+    columns.t, columns.p = batch.events.t, batch.events.p
+    columns.unsorted = wp.zeros(1, dtype=int, device=device)
+    size = wp.types.type_size_in_bytes(dtype)
+    most = max(MOST_BYTES["cpu" if device.is_cpu else "cuda"] // (grid.steps * group * sums * size), 1)
+    images = None
+    for first in range(0, len(cut), most):
+        number = min(most, len(cut) - first)
+        pixels = number * grid.steps * group
+        if images is None:
+            images = wp.empty((pixels + extra) * sums, dtype=dtype, device=device)
+        images.fill_(empty)
+        arrays, blocks = _window_arrays(cut[first : first + number], device)
+        inputs = [batch.events.x, batch.events.y, columns, arrays, grid]
+        if device.is_cpu:
+            _add_on_cpu(on_cpu, inputs, blocks, images, number * grid.steps, group, trash, sums)
+        elif blocks:
+            wp.launch(kernel, blocks * int(BLOCK), [*inputs, kernels.Part()], [images], device=device)
+        yield first, number, images
+    if columns.unsorted.numpy()[0]:
+        host = batch.events.to_host()
+        for start, stop in zip(cut.start.tolist(), cut.stop.tolist(), strict=True):
+            check_order(host[start:stop], where="events", first_index=start)
+
+
+def _window_arrays(cut: Windows, device: Any) -> tuple[Any, int]:
+    """Return windows as the struct that kernels take, and the number of their blocks."""
+    blocks = np.cumsum(-(-(cut.stop - cut.start) // int(BLOCK)))
+    first = np.concatenate([[0], blocks[:-1]])
+    span = np.maximum(cut.t_end - cut.t_start, 1).astype(np.float64)
+    columns = np.stack([cut.start, cut.stop, first, cut.t_start, span.view(np.int64)])
+    rows = wp.array(columns, dtype=wp.int64, device=device)  # one copy to the device instead of five
+    arrays = kernels.WindowArrays()
+    arrays.start, arrays.stop, arrays.block, arrays.t_start = rows[0], rows[1], rows[2], rows[3]
+    arrays.span = rows[4].view(wp.float64)
+    return arrays, int(blocks[-1])
+
+
+def _add_on_cpu(
+    kernel: Any, inputs: list[Any], blocks: int, images: wp.array, groups: int, group: int, trash: int, sums: int
+) -> None:
+    """Run a kernel on slices of the blocks, and add the spare groups of all slices but the first."""
+    load(kernel, images.device)
+    threads = cpu_threads()
+    parts = []
+    for k, (first, stop) in enumerate(slices(blocks, threads, SMALLEST)):
+        part = kernels.Part()
+        part.block, part.spare = first, groups + k - 1 if k else -1
+        part.trash = (groups + threads - 1) * group + k * trash
+        parts.append((part, stop - first))
+
+    def run(part: Any, n: int) -> None:
+        wp.launch(kernel, n, [*inputs, part], [images], device=images.device)
+
+    if not blocks:
+        return
+    run_together([partial(run, *part) for part in parts])
+    own = wp.zeros(1, dtype=int, device=images.device)
+    values = images.numpy()[: (groups + threads - 1) * group * sums].reshape(-1, group * sums)
+    for part, _ in parts[1:]:
+        wp.launch(kernels.find_own, 1, [inputs[2], inputs[3], inputs[4], part], [own], device=images.device)
+        to = values[own.numpy()[0]]
+        join = np.maximum if kernel.key == kernels.keep_latest_blocks.key else np.add
+        join(to, values[part.spare], out=to)
+
+
+def _counts(batch: _Batch, grid: Any) -> Iterator[tuple[int, int, wp.array]]:
+    """Count the events at the nearest pixels, see :func:`_images`."""
+    return _images(batch, grid, kernels.count_events, kernels.count_event_blocks, wp.int32)
+
+
+def _latest(batch: _Batch, grid: Any, *, carry: bool) -> Iterator[tuple[int, int, wp.array]]:
+    """Find the latest times at the nearest pixels, see :func:`_images`. With ``carry``, also of earlier windows."""
+    size = grid.layers * grid.height * grid.width
+    before = None
+    for first, number, images in _images(
+        batch, grid, kernels.keep_latest, kernels.keep_latest_blocks, wp.int64, empty=int(NEVER)
+    ):
+        if carry:
+            launch(kernels.carry_latest, size, [images, number, size, before or images], [], device=batch.device)
+            before = wp.clone(images[(number - 1) * size : number * size])
+        yield first, number, images
+
+
+def _shares(batch: _Batch, grid: Any, bins: int) -> wp.array:
+    """Return the bins of all windows, shape (windows, layers * bins, height, width)."""
+    out = batch.empty((grid.layers * bins, grid.height, grid.width), wp.float32)
+    fullest = _fullest(batch, grid)
+    kernel, on_cpu, read, sums = kernels.share_events, kernels.share_event_blocks, kernels.read_shares, 2
+    if not batch.events.whole_pixels or fullest >= CAPACITY:
+        grid.border = 1
+    else:
+        grid.low = 63 - max(fullest.bit_length(), LEAST_BITS)
+        kernel, on_cpu, read, sums = kernels.add_event_words, kernels.add_event_word_blocks, kernels.read_bins, 1
+    length = grid.width if batch.device.is_cpu else 1
+    for first, number, images in _images(batch, grid, kernel, on_cpu, wp.int64, sums=sums):
+        part = out[first : first + number].flatten()
+        inputs = [images, grid, bins, length]
+        launch(read, part.size // length, inputs, [part], device=batch.device, smallest=SMALLEST)
+    return out
+
+
+CAPACITY, LEAST_BITS = 1 << 21, 16
+"""Number of events in a time interval from which words are not used. Fewer events leave more bits for their shares, up
+to ``2**LEAST_BITS`` events. Then shares have 30 bits, and 20 bits for the most events."""
+
+
+def _fullest(batch: _Batch, grid: Any) -> int:
+    """Return an upper bound for the number of events in a time interval of a window; exact if there are many."""
+    cut = batch.windows
+    most = int((cut.stop - cut.start).max(initial=0))
+    if most < CAPACITY or not grid.rate:
+        return most
+    edges = [-(-k * (cut.t_end - cut.t_start) // grid.rate) for k in range(1, grid.rate)]
+    inside = np.clip(_find(batch.events, (cut.t_start + np.reshape(edges, (-1, len(cut)))).ravel()), 0, None)
+    found = np.stack([cut.start, *np.clip(inside.reshape(-1, len(cut)), cut.start, cut.stop), cut.stop])
+    return int(np.diff(found, axis=0).max())
+
+
+def _normalise(values: wp.array) -> None:
+    """Bring the values of each row that are not zero to a mean of 0 and a standard deviation of 1."""
+    device = values.device
+    parts = -(-values.shape[1] // ROW)
+    moments = wp.empty((values.shape[0], parts), dtype=wp.vec3d, device=device)
+    wp.launch(kernels.sum_moments, moments.shape, [values, ROW], [moments], device=device)
+    while parts > 1:
+        parts = -(-parts // ROW)
+        fewer = wp.empty((values.shape[0], parts), dtype=wp.vec3d, device=device)
+        wp.launch(kernels.add_moments, fewer.shape, [moments, ROW], [fewer], device=device)
+        moments = fewer
+    wp.launch(kernels.normalise, values.shape, [moments, values], device=device)
+
+
+ROW = 64
+"""Number of values that a thread adds up."""
+
+
+# Public representations.
+
+EventsLike: TypeAlias = Events | DeviceEvents | Sequence[Events] | Sequence[DeviceEvents]
+"""Events of one recording, or of several."""
+
+
+@guarded
+def event_count(
+    events: EventsLike,
+    width: int,
+    height: int,
+    *,
+    windows: Windows | None = None,
+    t_start: int | None = None,
+    t_end: int | None = None,
+    model: Model | None = None,
+    encoder: Encoder | None = None,
+    device: Any = None,
+) -> NDArray[Any] | wp.array:
+    """Count the events at each pixel.
+
+    Parameters
+    ----------
+    events : Events or DeviceEvents, or a list of them
+        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
+        out.
+    width, height : int
+        Size of the image [px].
+    windows : Windows, optional
+        Windows of the events. The result then has one more axis, in front. A list of events has one window for each.
+    t_start, t_end : int, optional
+        First and last time of the only window [us], both included. By default, those of the first and last event.
+    model : Model, optional
+        Optical model. Events are first moved to their positions without the optic. Requires ``encoder``.
+    encoder : Encoder, optional
+        Encoder that covers the events. Requires ``model``.
+    device : str or warp.Device, optional
+        Device to compute on, by default the CPU. Events on a device stay there.
+
+    Returns
+    -------
+    ndarray or warp.array
+        Events per pixel, shape ``(height, width)``, int32. Compensated events are shared among the four nearest
+        pixels by bilinear weights, as float32. A Warp array on the same device for :class:`DeviceEvents`.
+
+    Raises
+    ------
+    AmiwarpError
+        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
+        given, or the events are on another device than ``device``.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays([1, 1, 2], [0, 0, 1], [0, 10, 20], [0, 1, 1])
+    >>> amiwarp.event_count(events, 3, 2)
+    array([[0, 2, 0],
+           [0, 0, 1]], dtype=int32)
+    """
+    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
+    return batch.finish(_counted(batch, _grid(width, height)).reshape((-1, height, width)))
+
+
+@guarded
+def polarity_histogram(
+    events: EventsLike,
+    width: int,
+    height: int,
+    *,
+    windows: Windows | None = None,
+    t_start: int | None = None,
+    t_end: int | None = None,
+    model: Model | None = None,
+    encoder: Encoder | None = None,
+    device: Any = None,
+) -> NDArray[Any] | wp.array:
+    """Count the OFF and the ON events at each pixel.
+
+    Parameters
+    ----------
+    events : Events or DeviceEvents, or a list of them
+        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
+        out.
+    width, height : int
+        Size of the image [px].
+    windows : Windows, optional
+        Windows of the events. The result then has one more axis, in front. A list of events has one window for each.
+    t_start, t_end : int, optional
+        First and last time of the only window [us], both included. By default, those of the first and last event.
+    model : Model, optional
+        Optical model. Events are first moved to their positions without the optic. Requires ``encoder``.
+    encoder : Encoder, optional
+        Encoder that covers the events. Requires ``model``.
+    device : str or warp.Device, optional
+        Device to compute on, by default the CPU. Events on a device stay there.
+
+    Returns
+    -------
+    ndarray or warp.array
+        OFF, then ON events per pixel, shape ``(2, height, width)``, int32. Compensated events are shared among the
+        four nearest pixels by bilinear weights, as float32. A Warp array on the same device for
+        :class:`DeviceEvents`.
+
+    Raises
+    ------
+    AmiwarpError
+        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
+        given, or the events are on another device than ``device``.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays([1, 1, 2], [0, 0, 1], [0, 10, 20], [0, 1, 1])
+    >>> amiwarp.polarity_histogram(events, 3, 2)[1]
+    array([[0, 1, 0],
+           [0, 0, 1]], dtype=int32)
+    """
+    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
+    return batch.finish(_counted(batch, _grid(width, height, layers=2)))
+
+
+def _counted(batch: _Batch, grid: Any) -> wp.array:
+    """Return the counts of all windows, shape (windows, layers, height, width)."""
+    if not batch.events.whole_pixels:
+        return _shares(batch, grid, 1)
+    shape = grid.layers, grid.height, grid.width
+    out = batch.empty(shape, wp.int32)
+    for first, number, images in _counts(batch, grid):
+        wp.copy(out[first : first + number].flatten(), images, count=number * math.prod(shape))
+    return out
+
+
+@guarded
+def voxel_grid(
+    events: EventsLike,
+    width: int,
+    height: int,
+    bins: int,
+    *,
+    end_bin: bool = True,
+    normalize: bool = False,
+    windows: Windows | None = None,
+    t_start: int | None = None,
+    t_end: int | None = None,
+    model: Model | None = None,
+    encoder: Encoder | None = None,
+    device: Any = None,
+) -> NDArray[np.float32] | wp.array:
+    """Compute the voxel grid: the polarities of the events, shared linearly between time bins.
+
+    Parameters
+    ----------
+    events : Events or DeviceEvents, or a list of them
+        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
+        out.
+    width, height : int
+        Size of the image [px].
+    bins : int
+        Number of time bins.
+    end_bin : bool, default True
+        Put the first bin at the start and the last bin at the end of the window, so that there are ``bins - 1``
+        intervals. Without it, there are ``bins`` intervals, and what belongs to the window's end is left out.
+    normalize : bool, default False
+        Shift and scale the elements of each window that are not 0 to a mean of 0 and a standard deviation of 1.
+    windows : Windows, optional
+        Windows of the events. The result then has one more axis, in front. A list of events has one window for each.
+    t_start, t_end : int, optional
+        First and last time of the only window [us], both included. By default, those of the first and last event.
+    model : Model, optional
+        Optical model. Events are first moved to their positions without the optic. Requires ``encoder``.
+    encoder : Encoder, optional
+        Encoder that covers the events. Requires ``model``.
+    device : str or warp.Device, optional
+        Device to compute on, by default the CPU. Events on a device stay there.
+
+    Returns
+    -------
+    ndarray or warp.array
+        Voxel grid, float32, shape ``(bins, height, width)``. A Warp array on the same device for
+        :class:`DeviceEvents`.
+
+    Raises
+    ------
+    AmiwarpError
+        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
+        given, or the events are on another device than ``device``.
+
+    Notes
+    -----
+    An event of polarity p (1 for ON, -1 for OFF) at time t adds ``p * max(0, 1 - abs(b - s))`` to bin b, with
+    ``s = (bins - 1) * (t - t_start) / (t_end - t_start)`` [1]_. Compensated events are shared among the four nearest
+    pixels, too. Each event is exact to 2**-21, and the sums do not depend on the device or the number of threads.
+
+    References
+    ----------
+    .. [1] Zhu et al., "Unsupervised event-based learning of optical flow, depth, and egomotion", CVPR 2019.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays([1, 1, 2], [0, 0, 1], [0, 10, 20], [0, 1, 1])
+    >>> amiwarp.voxel_grid(events, 3, 2, bins=2)[:, 0, 1]
+    array([-0.5,  0.5], dtype=float32)
+    """
+    bins = whole(bins, "bins", 1, MOST_BINS)
+    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
+    intervals = bins - 1 if end_bin else bins
+    grid = _grid(width, height, steps=max(intervals, 1), rate=intervals)
+    grid.off = -1
+    out = _shares(batch, grid, bins)
+    if normalize:
+        _normalise(out.reshape((len(batch.windows), -1)))
+    return batch.finish(out)
+
+
+@guarded
+def stacked_histogram(
+    events: EventsLike,
+    width: int,
+    height: int,
+    bins: int,
+    *,
+    limit: int = 255,
+    windows: Windows | None = None,
+    t_start: int | None = None,
+    t_end: int | None = None,
+    model: Model | None = None,
+    encoder: Encoder | None = None,
+    device: Any = None,
+) -> NDArray[np.uint8] | wp.array:
+    """Count the OFF and the ON events at each pixel in time bins, as bytes.
+
+    Parameters
+    ----------
+    events : Events or DeviceEvents, or a list of them
+        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
+        out.
+    width, height : int
+        Size of the image [px].
+    bins : int
+        Number of time bins of equal length.
+    limit : int, default 255
+        Largest count. Larger ones are clipped.
+    windows : Windows, optional
+        Windows of the events. The result then has one more axis, in front. A list of events has one window for each.
+    t_start, t_end : int, optional
+        First and last time of the only window [us], both included. By default, those of the first and last event.
+    model : Model, optional
+        Optical model. Events are first moved to their positions without the optic. Requires ``encoder``.
+    encoder : Encoder, optional
+        Encoder that covers the events. Requires ``model``.
+    device : str or warp.Device, optional
+        Device to compute on, by default the CPU. Events on a device stay there.
+
+    Returns
+    -------
+    ndarray or warp.array
+        Counts of the OFF events in each bin, then of the ON events, uint8, shape ``(2 * bins, height, width)``. A
+        compensated event counts at its nearest pixel. A Warp array on the same device for :class:`DeviceEvents`.
+
+    Raises
+    ------
+    AmiwarpError
+        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
+        given, or the events are on another device than ``device``.
+
+    Notes
+    -----
+    An event at time t is in bin ``floor(bins * (t - t_start) / (t_end - t_start))``; those at ``t_end`` are in the last
+    bin. This is the input of RVT [1]_.
+
+    References
+    ----------
+    .. [1] Gehrig and Scaramuzza, "Recurrent vision transformers for object detection with event cameras", CVPR 2023.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays([1, 1, 2], [0, 0, 1], [0, 10, 20], [0, 1, 1])
+    >>> amiwarp.stacked_histogram(events, 3, 2, bins=2)[:, 0, 1]
+    array([1, 0, 0, 1], dtype=uint8)
+    """
+    bins = whole(bins, "bins", 1, MOST_BINS)
+    limit = whole(limit, "limit", 1, 255)
+    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
+    grid = _grid(width, height, steps=bins, rate=bins, layers=2)
+    out = batch.empty((2 * bins, height, width), wp.uint8)
+    length = width if batch.device.is_cpu else 1
+    for first, number, images in _counts(batch, grid):
+        part = out[first : first + number].flatten()
+        inputs = [images, grid, limit, length]
+        launch(kernels.clip_counts, part.size // length, inputs, [part], device=batch.device, smallest=SMALLEST)
+    return batch.finish(out)
+
+
+@guarded
+def time_surface(
+    events: EventsLike,
+    width: int,
+    height: int,
+    tau_us: float,
+    *,
+    linear: bool = False,
+    per_polarity: bool = True,
+    carry: bool = False,
+    windows: Windows | None = None,
+    t_start: int | None = None,
+    t_end: int | None = None,
+    model: Model | None = None,
+    encoder: Encoder | None = None,
+    device: Any = None,
+) -> NDArray[np.float32] | wp.array:
+    """Compute the time surface: how long ago the latest event was at each pixel, as a decay from 1 to 0.
+
+    Parameters
+    ----------
+    events : Events or DeviceEvents, or a list of them
+        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
+        out.
+    width, height : int
+        Size of the image [px].
+    tau_us : float
+        Time constant of the decay [us].
+    linear : bool, default False
+        Decay linearly to 0 within ``tau_us``, not exponentially.
+    per_polarity : bool, default True
+        Return separate images for OFF and ON.
+    carry : bool, default False
+        Use the latest times of earlier windows, too. The windows must then be of one recording and in order.
+    windows : Windows, optional
+        Windows of the events. The result then has one more axis, in front. A list of events has one window for each.
+    t_start, t_end : int, optional
+        First and last time of the only window [us], both included. By default, those of the first and last event.
+    model : Model, optional
+        Optical model. Events are first moved to their positions without the optic. Requires ``encoder``.
+    encoder : Encoder, optional
+        Encoder that covers the events. Requires ``model``.
+    device : str or warp.Device, optional
+        Device to compute on, by default the CPU. Events on a device stay there.
+
+    Returns
+    -------
+    ndarray or warp.array
+        Time surface, float32, shape ``(2, height, width)``: OFF, then ON. Without ``per_polarity``, shape
+        ``(height, width)``. A compensated event is at its nearest pixel. A Warp array on the same device for
+        :class:`DeviceEvents`.
+
+    Raises
+    ------
+    AmiwarpError
+        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
+        given, or the events are on another device than ``device``.
+
+    Notes
+    -----
+    With the latest event at time t, a pixel is ``exp(-(t_end - t) / tau_us)`` [1]_, or
+    ``max(0, 1 - (t_end - t) / tau_us)``; without events, it is 0.
+
+    References
+    ----------
+    .. [1] Lagorce et al., "HOTS: a hierarchy of event-based time-surfaces for pattern recognition", TPAMI 2017.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays([1, 1, 2], [0, 0, 1], [0, 10, 20], [0, 1, 1])
+    >>> amiwarp.time_surface(events, 3, 2, tau_us=20, linear=True, per_polarity=False)[:, 1:]
+    array([[0.5, 0. ],
+           [0. , 1. ]], dtype=float32)
+    """
+    tau = real(tau_us, "tau_us", 1e-6, hint=" us")
+    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
+    grid = _grid(width, height, layers=2 if per_polarity else 1)
+    size = grid.layers * height * width
+    out = batch.empty((grid.layers, height, width), wp.float32)
+    for first, number, images in _latest(batch, grid, carry=carry):
+        part = out[first : first + number].flatten()
+        ends = wp.array(batch.windows.t_end[first : first + number], dtype=wp.int64, device=batch.device)
+        launch(kernels.decay_times, part.size, [images, ends, size, tau, int(linear)], [part], device=batch.device)
+    return batch.finish(out if per_polarity else out.reshape((-1, height, width)))
+
+
+@guarded
+def latest_times(
+    events: EventsLike,
+    width: int,
+    height: int,
+    *,
+    per_polarity: bool = True,
+    carry: bool = False,
+    windows: Windows | None = None,
+    t_start: int | None = None,
+    t_end: int | None = None,
+    model: Model | None = None,
+    encoder: Encoder | None = None,
+    device: Any = None,
+) -> NDArray[np.int64] | wp.array:
+    """Return the time of the latest event at each pixel: the surface of active events (SAE).
+
+    Parameters
+    ----------
+    events : Events or DeviceEvents, or a list of them
+        Events, raw or compensated, sorted by time; or those of several recordings. Events outside the image are left
+        out.
+    width, height : int
+        Size of the image [px].
+    per_polarity : bool, default True
+        Return separate images for OFF and ON.
+    carry : bool, default False
+        Use the latest times of earlier windows, too. The windows must then be of one recording and in order.
+    windows : Windows, optional
+        Windows of the events. The result then has one more axis, in front. A list of events has one window for each.
+    t_start, t_end : int, optional
+        First and last time of the only window [us], both included. By default, those of the first and last event.
+    model : Model, optional
+        Optical model. Events are first moved to their positions without the optic. Requires ``encoder``.
+    encoder : Encoder, optional
+        Encoder that covers the events. Requires ``model``.
+    device : str or warp.Device, optional
+        Device to compute on, by default the CPU. Events on a device stay there.
+
+    Returns
+    -------
+    ndarray or warp.array
+        Times [us], int64, shape ``(2, height, width)``: OFF, then ON. Without ``per_polarity``, shape
+        ``(height, width)``. Pixels without events have the lowest value of int64. A compensated event is at its
+        nearest pixel. A Warp array on the same device for :class:`DeviceEvents`.
+
+    Raises
+    ------
+    AmiwarpError
+        If the times of a window decrease, the windows do not fit the events, only one of ``model`` and ``encoder`` is
+        given, or the events are on another device than ``device``.
+
+    Examples
+    --------
+    >>> events = amiwarp.Events.from_arrays([1, 1, 2], [0, 0, 1], [0, 10, 20], [0, 1, 1])
+    >>> amiwarp.latest_times(events, 3, 2, per_polarity=False)[0, 1]
+    np.int64(10)
+    """
+    batch = _batch(events, windows, t_start, t_end, model, encoder, device)
+    grid = _grid(width, height, layers=2 if per_polarity else 1)
+    out = batch.empty((grid.layers, height, width), wp.int64)
+    for first, number, images in _latest(batch, grid, carry=carry):
+        size = number * grid.layers * height * width
+        wp.copy(out[first : first + number].flatten(), images, count=size)
+    return batch.finish(out if per_polarity else out.reshape((-1, height, width)))
+
+
+# Transforms with the call of other libraries.
+
+
+class ToTensor:
+    """Transform of events to a tensor, which calls one of the representations with fixed options.
+
+    It is called with events, as the transforms of tonic are, or with a recording and its labels, as
+    :class:`RecordedDataset` does. It can be pickled, for the worker processes of a ``DataLoader``.
+
+    Parameters
+    ----------
+    representation : callable
+        Function such as :func:`voxel_grid`.
+    **options : object
+        Arguments of the function by name. ``width`` and ``height`` may be left out for recordings. ``windows`` may also
+        be a function that is called with the events, such as ``functools.partial(amiwarp.windows, count=10_000)``.
+
+    Raises
+    ------
+    AmiwarpError
+        If the function has no parameter of that name.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> to_grid = amiwarp.ToTensor(amiwarp.voxel_grid, width=4, height=3, bins=5)
+    >>> rows = [(0, 1, 2, 1), (10, 3, 0, 0)]
+    >>> events = np.array(rows, dtype=[("t", "i8"), ("x", "i2"), ("y", "i2"), ("p", "i1")])
+    >>> to_grid(events).shape
+    (5, 3, 4)
+    """
+
+    def __init__(self, representation: Callable[..., Any], **options: Any) -> None:
+        if not callable(representation):
+            raise AmiwarpError(f"representation is {shown(representation)}; give a function, such as voxel_grid")
+        check_names(options, inspect.signature(representation).parameters, "option ")
+        self.representation = representation
+        self.options = options
+
+    def __call__(self, events: Any, labels: Any = None) -> Any:
+        """Return the tensor of events, or the tensor of a recording's events and the labels."""
+        options = dict(self.options)
+        if isinstance(events, Recording):
+            source = events.events
+            options = dict(zip(("width", "height"), source.size, strict=True)) | options
+            events = source.slice(0, len(source))
+        elif isinstance(events, np.ndarray) and events.dtype.names is not None:
+            missing = {"x", "y", "t", "p"} - set(events.dtype.names)
+            if missing:
+                raise AmiwarpError(
+                    f"structured array has fields {events.dtype.names}; field {sorted(missing)[0]} is missing"
+                )
+            events = Events.from_arrays(events["x"], events["y"], events["t"], events["p"])
+        if callable(options.get("windows")):
+            options["windows"] = options["windows"](events)
+        found = self.representation(events, **options)
+        return found if labels is None else (found, labels)
+
+    def __repr__(self) -> str:
+        options = "".join(f", {name}={value!r}" for name, value in self.options.items())
+        return f"ToTensor({getattr(self.representation, '__name__', self.representation)}{options})"
