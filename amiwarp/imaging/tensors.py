@@ -266,7 +266,7 @@ def _on_device(events: Events | DeviceEvents, device: Any) -> DeviceEvents:
 
 # Images of windows: sums, counts or times, computed by kernels.
 
-MOST_BYTES = {"cpu": 1 << 27, "cuda": 1 << 30}
+MOST_BYTES = {"cpu": 1 << 25, "cuda": 1 << 30}
 """Memory for the images of the windows that are processed in one launch [bytes]; at least one window is processed."""
 MOST_BINS = 1 << 20
 """Largest number of time bins."""
@@ -372,43 +372,62 @@ def _grid(width: int, height: int, *, steps: int = 1, rate: int = 0, layers: int
     return grid
 
 
+_zeros: list[wp.array] = []
+"""Memory of words on the CPU, all zero, which the next call uses again: new memory takes longer than many events."""
+
+
+def _take_zeros(n: int) -> wp.array:
+    """Return at least ``n`` words on the CPU, all zero."""
+    while _zeros:
+        found = _zeros.pop()
+        if len(found) >= n:
+            return found
+    return wp.zeros(n, dtype=wp.int64, device="cpu")
+
+
 def _images(
     batch: _Batch, grid: Any, kernel: Any, on_cpu: Any, dtype: Any, *, sums: int = 1, empty: int = 0
 ) -> Iterator[tuple[int, int, wp.array]]:
     """Compute the images of all windows by a kernel. Yield the first window, the number of windows, and their images.
 
     ``on_cpu``: kernel for blocks of events. ``sums``: numbers of type ``dtype`` in each pixel, ``empty`` at first. The
-    images are overwritten by the next ones. Raises :class:`AmiwarpError` if times decrease in a window.
+    images are overwritten by the next ones; on a CPU, the caller clears images of words. Raises :class:`AmiwarpError`
+    if times decrease in a window.
     """
     cut, device = batch.windows, batch.device
     group = grid.layers * (grid.height + 2 * grid.border) * (grid.width + 2 * grid.border)
-    trash = 2 * (grid.width + 16)
-    threads = cpu_threads() if device.is_cpu else 0
-    extra = max(threads - 1, 0) * group + threads * trash
-    if (grid.steps * group + extra) * sums > MOST_EVENTS:
-        raise AmiwarpError(f"a window has {grid.steps * group} pixels in all its images; give fewer bins")
     span = cut.t_end - cut.t_start
     if grid.rate and len(cut) and int(span.max()) >= (1 << 53) // grid.rate:
         raise AmiwarpError(f"a window lasts {int(span.max())} us; give one below {(1 << 53) // grid.rate} us")
     columns = kernels.Columns()
     columns.t, columns.p = batch.events.t, batch.events.p
     columns.unsorted = wp.zeros(1, dtype=int, device=device)
-    size = wp.types.type_size_in_bytes(dtype)
-    most = max(MOST_BYTES["cpu" if device.is_cpu else "cuda"] // (grid.steps * group * sums * size), 1)
-    images = None
-    for first in range(0, len(cut), most):
+    bytes_each = grid.steps * group * sums * wp.types.type_size_in_bytes(dtype)
+    most = min(max(MOST_BYTES["cpu" if device.is_cpu else "cuda"] // bytes_each, 1), len(cut))
+    # behind the images there are the spare groups of the slices, and places for the events outside the image
+    threads = cpu_threads() if device.is_cpu else 1
+    spare = most * grid.steps
+    trash = (spare + threads - 1) * group
+    size = (trash + threads * 2 * (grid.width + 16)) * sums
+    if size > MOST_EVENTS:
+        raise AmiwarpError(f"a window has {grid.steps * group} pixels in all its images; give fewer bins")
+    in_words = device.is_cpu and on_cpu is kernels.add_event_word_blocks
+    images = _take_zeros(size) if in_words else wp.empty(size, dtype=dtype, device=device)
+    for first in range(0, len(cut), most or 1):
         number = min(most, len(cut) - first)
-        pixels = number * grid.steps * group
-        if images is None:
-            images = wp.empty((pixels + extra) * sums, dtype=dtype, device=device)
-        images.fill_(empty)
+        if not in_words:
+            images.fill_(empty)
         arrays, blocks = _window_arrays(cut[first : first + number], device)
         inputs = [batch.events.x, batch.events.y, columns, arrays, grid]
         if device.is_cpu:
-            _add_on_cpu(on_cpu, inputs, blocks, images, number * grid.steps, group, trash, sums)
+            _add_on_cpu(on_cpu, inputs, blocks, images, spare, group * sums, trash)
         elif blocks:
             wp.launch(kernel, blocks * int(BLOCK), [*inputs, kernels.Part()], [images], device=device)
         yield first, number, images
+    if in_words:
+        images.numpy()[trash:size] = 0
+        if images.size * 8 <= 2 * MOST_BYTES["cpu"]:
+            _zeros[:] = [images]
     if columns.unsorted.numpy()[0]:
         host = batch.events.to_host()
         for start, stop in zip(cut.start.tolist(), cut.stop.tolist(), strict=True):
@@ -429,31 +448,32 @@ def _window_arrays(cut: Windows, device: Any) -> tuple[Any, int]:
 
 
 def _add_on_cpu(
-    kernel: Any, inputs: list[Any], blocks: int, images: wp.array, groups: int, group: int, trash: int, sums: int
+    kernel: Any, inputs: list[Any], blocks: int, images: wp.array, spare: int, group: int, trash: int
 ) -> None:
-    """Run a kernel on slices of the blocks, and add the spare groups of all slices but the first."""
+    """Run a kernel on slices of the blocks. Add the spare groups of all slices but the first, and clear them.
+
+    ``spare``: number of the first spare group. ``group``: numbers in a group. ``trash``: first pixel after all groups.
+    """
     load(kernel, images.device)
-    threads = cpu_threads()
+    if not blocks:
+        return
     parts = []
-    for k, (first, stop) in enumerate(slices(blocks, threads, SMALLEST)):
+    for k, (first, stop) in enumerate(slices(blocks, cpu_threads(), SMALLEST)):
         part = kernels.Part()
-        part.block, part.spare = first, groups + k - 1 if k else -1
-        part.trash = (groups + threads - 1) * group + k * trash
+        part.block, part.spare = first, spare + k - 1 if k else -1
+        part.trash = trash + k * 2 * (inputs[4].width + 16)
         parts.append((part, stop - first))
 
     def run(part: Any, n: int) -> None:
         wp.launch(kernel, n, [*inputs, part], [images], device=images.device)
 
-    if not blocks:
-        return
     run_together([partial(run, *part) for part in parts])
-    own = wp.zeros(1, dtype=int, device=images.device)
-    values = images.numpy()[: (groups + threads - 1) * group * sums].reshape(-1, group * sums)
+    own, values = wp.zeros(1, dtype=int, device=images.device), images.numpy()
     for part, _ in parts[1:]:
-        wp.launch(kernels.find_own, 1, [inputs[2], inputs[3], inputs[4], part], [own], device=images.device)
-        to = values[own.numpy()[0]]
-        join = np.maximum if kernel.key == kernels.keep_latest_blocks.key else np.add
-        join(to, values[part.spare], out=to)
+        wp.launch(kernels.find_own, 1, [*inputs[2:], part], [own], device=images.device)
+        to, added = (values[k * group : (k + 1) * group] for k in (int(own.numpy()[0]), part.spare))
+        (np.maximum if kernel is kernels.keep_latest_blocks else np.add)(to, added, out=to)
+        added[:] = 0
 
 
 def _counts(batch: _Batch, grid: Any) -> Iterator[tuple[int, int, wp.array]]:
@@ -478,17 +498,16 @@ def _shares(batch: _Batch, grid: Any, bins: int) -> wp.array:
     """Return the bins of all windows, shape (windows, layers * bins, height, width)."""
     out = batch.empty((grid.layers * bins, grid.height, grid.width), wp.float32)
     fullest = _fullest(batch, grid)
+    in_words = batch.events.whole_pixels and fullest < CAPACITY
+    grid.border, grid.low = int(not in_words), 63 - max(fullest.bit_length(), LEAST_BITS)
     kernel, on_cpu, read, sums = kernels.share_events, kernels.share_event_blocks, kernels.read_shares, 2
-    if not batch.events.whole_pixels or fullest >= CAPACITY:
-        grid.border = 1
-    else:
-        grid.low = 63 - max(fullest.bit_length(), LEAST_BITS)
+    if in_words:
         kernel, on_cpu, read, sums = kernels.add_event_words, kernels.add_event_word_blocks, kernels.read_bins, 1
     length = grid.width if batch.device.is_cpu else 1
     for first, number, images in _images(batch, grid, kernel, on_cpu, wp.int64, sums=sums):
         part = out[first : first + number].flatten()
-        inputs = [images, grid, bins, length]
-        launch(read, part.size // length, inputs, [part], device=batch.device, smallest=SMALLEST)
+        threads = part.size // (length * (bins if in_words else 1))
+        launch(read, threads, [images, grid, bins, length], [part], device=batch.device, smallest=SMALLEST // 4)
     return out
 
 

@@ -160,24 +160,32 @@ def add_words(sums: wp.array(dtype=wp.int64), places: wp.array(dtype=int), words
 
 
 @wp.func_native("""
-    const uint64_t *first = (const uint64_t*)words.data + start, *second = (const uint64_t*)words.data + end;
-    float* to = (float*)out.data + at;
     const int above = 64 - low, fraction = 2 * low - 64;
     const double unit = 1.0 / (double)(1 << fraction);
-    for (int k = 0; k < n; ++k) {
-        const uint64_t a = start < 0 ? 0 : first[k], b = end < 0 ? 0 : second[k];
-        const int64_t shares = (int64_t)(a << above) >> above, signs = (int64_t)(a - (uint64_t)shares) >> low;
-        const int64_t total = signs * (1 << fraction) - shares + ((int64_t)(b << above) >> above);
-        to[k] = (float)((double)total * unit);
+    for (int bin = bins - 1; bin >= 0; --bin) {
+        uint64_t* first = (uint64_t*)words.data + start + bin * size;
+        const uint64_t* second = first - size;
+        float* to = (float*)out.data + at + bin * size;
+        const bool starts = bin < steps, ends = bin > 0;
+        for (int k = 0; k < n; ++k) {
+            const uint64_t a = starts ? first[k] : 0, b = ends ? second[k] : 0;
+            const int64_t shares = (int64_t)(a << above) >> above, signs = (int64_t)(a - (uint64_t)shares) >> low;
+            const int64_t total = signs * (1 << fraction) - shares + ((int64_t)(b << above) >> above);
+            to[k] = (float)((double)total * unit);
+        }
+#ifndef __CUDACC__
+        if (starts) memset(first, 0, 8 * n);
+#endif
     }
 """)
 def read_words(
-    out: wp.array(dtype=float), at: int, words: wp.array(dtype=wp.int64), low: int, start: int, end: int, n: int
-):
-    """Compute ``n`` elements of a voxel grid from the words of :mod:`amiwarp.kernels.tensors`.
+    out: wp.array(dtype=float), at: int, words: wp.array(dtype=wp.int64), low: int, start: int, size: int, steps: int,
+    bins: int, n: int,
+):  # fmt: skip
+    """Compute all bins of ``n`` pixels of a voxel grid from the words of :mod:`amiwarp.kernels.tensors`.
 
-    ``low`` is the number of bits of the lower field. ``start`` and ``end`` are the first words of the intervals that
-    start and end at the bin, or negative.
+    ``low`` is the number of bits of the lower field, ``size`` the number of pixels of an image. On CPUs, the words are
+    cleared.
     """
 
 

@@ -544,14 +544,12 @@ def read_shares(
 def read_bins(
     words: wp.array(dtype=wp.int64), grid: Grid, bins: int, length: int, start: int, out: wp.array(dtype=float)
 ):
-    """Compute the bins of windows from their words. ``length`` pixels of an image."""
+    """Compute all bins of ``length`` pixels of a window from their words, which are cleared on CPUs."""
     first = (start + wp.tid()) * length
     size = grid.width * grid.height
-    group = first / size / bins * grid.steps + (first / size) % bins
-    bin_of = (first / size) % bins
-    at = wp.where(bin_of < grid.steps, group * size + first % size, -1)
-    before = wp.where(bin_of > 0, (group - 1) * size + first % size, -1)
-    read_words(out, first, words, grid.low, at, before, length)
+    window, pixel = first / size, first % size
+    start_of = window * grid.steps * size + pixel
+    read_words(out, window * bins * size + pixel, words, grid.low, start_of, size, grid.steps, bins, length)
 
 
 @wp.kernel
