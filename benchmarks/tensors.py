@@ -1,6 +1,6 @@
 """Speed of event representations for networks, compared with other libraries in the same run, with the error of each.
 
-    python -m benchmarks.tensors [--events 5000000] [--device cuda:0] [--repeats 9] [--out FILE.json]
+    python -m benchmarks.tensors [--events 4000000] [--device cuda:0] [--repeats 9] [--out FILE.json]
 
 The main task is one voxel grid of 5 bins at 640 x 480 pixels, of events at random pixels and at 20,000 edge points. On
 a GPU, the events lie there as each library takes them, and ours are checked for their order in every call. Programs run
@@ -40,8 +40,8 @@ RESULTS = Path(__file__).parent / "results"
 WIDTH, HEIGHT, BINS = 640, 480, 5
 SPAN_US = 100_000
 WINDOWS = 32
-EVENTS = {"cpu": 5_000_000, "cuda": 100_000_000}
-PEER_EVENTS = 5_000_000
+EVENTS = {"cpu": 4_000_000, "cuda": 100_000_000}
+PEER_EVENTS = 4_000_000
 """Most events for programs on the CPU."""
 DV_EVENTS = 500_000
 """Most events for dv-processing, which takes them one by one from Python."""

@@ -220,6 +220,18 @@ def test_surfaces(device: str) -> None:
     assert (expected == 0.0).any()
 
 
+def test_latest_times_of_dv_processing() -> None:
+    dv = pytest.importorskip("dv_processing")
+    events = some_events(300)
+    store, latest = dv.EventStore(), dv.TimeSurface((WIDTH, HEIGHT))
+    for x, y, t, p in zip(*(v.tolist() for v in (events.x, events.y, events.t, events.p)), strict=True):
+        store.push_back(t, x, y, bool(p))
+    latest.accept(store)
+    expected = np.array([[latest.at(y, x) for x in range(WIDTH)] for y in range(HEIGHT)])
+    found = amiwarp.latest_times(events, WIDTH, HEIGHT, per_polarity=False)
+    assert np.array_equal(np.where(found == NEVER, 0, found), expected)
+
+
 def test_start_and_end_of_the_window(device: str) -> None:
     events = some_events()
     low, high = int(events.t[0]) + 5_000, int(events.t[0]) + 12_345
@@ -234,9 +246,9 @@ def test_start_and_end_of_the_window(device: str) -> None:
 def test_events_outside_the_image_are_left_out(device: str) -> None:
     events = some_events()
     inside = events[(events.x < 10) & (events.y < 8)]
-    for function in (amiwarp.event_count, partial(amiwarp.latest_times), partial(amiwarp.voxel_grid, bins=1)):
-        found = [host(function(put(e, device), 10, 8)) for e in (events, inside)]
-        assert np.array_equal(*found)
+    for function in (amiwarp.event_count, amiwarp.latest_times, partial(amiwarp.voxel_grid, bins=1)):
+        all_events, only_inside = (host(function(put(e, device), 10, 8)) for e in (events, inside))
+        assert np.array_equal(all_events, only_inside)
     far = Events(np.full(3, 1e9, np.float32), np.full(3, -np.inf, np.float32), np.arange(3), np.ones(3, np.uint8))
     assert host(amiwarp.event_count(put(far[:0], device), 4, 4)).sum() == 0
     assert amiwarp.event_count(far, 4, 4).sum() == 0

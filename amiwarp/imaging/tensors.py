@@ -511,9 +511,10 @@ def _shares(batch: _Batch, grid: Any, bins: int) -> wp.array:
     return out
 
 
-CAPACITY, LEAST_BITS = 1 << 21, 16
-"""Number of events in a time interval from which words are not used. Fewer events leave more bits for their shares, up
-to ``2**LEAST_BITS`` events. Then shares have 30 bits, and 20 bits for the most events."""
+CAPACITY, LEAST_BITS = 1 << 20, 16
+"""Number of events in a time interval from which words are not used. Fewer events leave more bits for their shares: 22
+bits just below the capacity, and 30 bits below ``2**LEAST_BITS`` events. With 22 bits, the sum of a thousand shares is
+exact to 1e-5."""
 
 
 def _fullest(batch: _Batch, grid: Any) -> int:
@@ -735,7 +736,7 @@ def voxel_grid(
     -----
     An event of polarity p (1 for ON, -1 for OFF) at time t adds ``p * max(0, 1 - abs(b - s))`` to bin b, with
     ``s = (bins - 1) * (t - t_start) / (t_end - t_start)`` [1]_. Compensated events are shared among the four nearest
-    pixels, too. Each event is exact to 2**-21, and the sums do not depend on the device or the number of threads.
+    pixels, too. Each event is exact to 2**-23, and the sums do not depend on the device or the number of threads.
 
     References
     ----------

@@ -19,7 +19,6 @@ from typing import Any
 
 import warp as wp
 
-from amiwarp.kernels.events import NEVER
 from amiwarp.kernels.native_code import (
     add_squares,
     add_words,
@@ -44,6 +43,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BLOCK = wp.constant(64)  # number of events of a block
 WHOLE = wp.constant(1 << 30)  # share of a whole event
+EARLIEST = wp.constant(wp.int64(-(2**62)))  # limit of the times of events [us]; without events, a pixel holds less
 
 
 @wp.struct
@@ -76,7 +76,7 @@ class Grid:
     steps: int  # number of time intervals
     rate: int  # the same, or 0 if all events lie at the start of the only interval
     layers: int  # images of a time interval: 2 to separate OFF (first) and ON events, else 1
-    low: int  # bits of the lower field of a word, 42 to 47
+    low: int  # bits of the lower field of a word, 43 to 47
     off: int  # what an OFF event counts: -1 or 1; an ON event counts 1
 
 
@@ -587,7 +587,7 @@ def decay_times(
     i = start + wp.tid()
     age = wp.float64(t_end[i / size] - latest[i]) / tau
     value = wp.where(linear == 1, wp.max(wp.float64(1.0) - age, wp.float64(0.0)), wp.exp(-age))
-    out[i] = wp.where(latest[i] == NEVER, 0.0, float(value))
+    out[i] = wp.where(latest[i] < EARLIEST, 0.0, float(value))
 
 
 # Mean and standard deviation of the cells that are not zero.
