@@ -1234,7 +1234,7 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
         if px >= LEAST_RIVAL_PX
     ]
     notes = [*_corrections(given, search.cost.space, answer), *notes, *check.warnings()]
-    return replace(answer, result=replace(answer.result, warnings=tuple(notes)))
+    return replace(answer, result=replace(answer.result, warnings=(*notes, *answer.result.warnings)))
 
 
 def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Consistency) -> _Corrected | None:
