@@ -1,7 +1,7 @@
 """Optics beside the wedge: error of the calibrated model over seeds and a grid of difficulties, and speed of each.
 
     python -m benchmarks.moving_optics pair|mirror|vibration PICTURES --out FILE.json [--device cuda:0] [--seeds 20]
-        [--first 0] [--no-atlas] [--every 1] [--processes 1]
+        [--first 0] [--no-atlas] [--every 1] [--processes 1] [--pairs N]
     python -m benchmarks.moving_optics speed --out FILE.json [--device cuda:0] [--events 10000000]
 
 The first form simulates each case, calibrates it without start values, and writes a row for it. A pair's nominal
@@ -162,7 +162,7 @@ def specials(optic: str, usual: Case) -> list[Case]:
     ]
 
 
-def measure(case: Case, pictures: Path, device: str) -> dict[str, Any]:
+def measure(case: Case, pictures: Path, device: str, pairs: int | None = None) -> dict[str, Any]:
     """Return the row of a case."""
     optic, seed, sensor = case.optic, case.seed, amiwarp.SensorModel(**case.sensor)
     given: dict[str, Any] = {"motion": case.motion} if case.motion else {}
@@ -189,7 +189,7 @@ def measure(case: Case, pictures: Path, device: str) -> dict[str, Any]:
     try:
         found = amiwarp.calibrate(
             recording, model=model, start=case.start, device=device,
-            photometric=amiwarp.PhotometricSettings(sensor=known),
+            photometric=amiwarp.PhotometricSettings(sensor=known, **({"pairs": pairs} if pairs else {})),
         )  # fmt: skip
     except amiwarp.AmiwarpError as refusal:
         return {**row, "seconds": time.perf_counter() - began, "refused": str(refusal)}
@@ -327,6 +327,7 @@ def main() -> None:
     parser.add_argument("--no-atlas", action="store_true")
     parser.add_argument("--every", type=int, default=1, help="only each N-th case")
     parser.add_argument("--processes", type=int, default=1)
+    parser.add_argument("--pairs", type=int, help="pairs of events for the photometric stage")
     parser.add_argument("--events", type=int, default=10_000_000)
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
@@ -334,7 +335,7 @@ def main() -> None:
         options.out.write_text(json.dumps(speed(options.device, options.events), indent=1) + "\n")
         return
     cases = seeds(options.what, options.first, options.seeds) + ([] if options.no_atlas else atlas(options.what))
-    calls = [(case, options.pictures, options.device) for case in cases[:: options.every]]
+    calls = [(case, options.pictures, options.device, options.pairs) for case in cases[:: options.every]]
     options.out.write_text(json.dumps(rows_of(measure, calls, options.processes), indent=1) + "\n")
 
 

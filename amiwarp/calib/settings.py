@@ -41,7 +41,8 @@ class PhotometricSettings:
     """
 
     pairs: int = 300_000
-    """Approximate largest number of pairs of events, from whole turns spread over the recording."""
+    """Approximate largest number of pairs of events, from whole turns spread over the recording. Mirrors and vibrating
+    cameras, which have more parameters, get three times as many."""
     algorithm: str = GAUSS_NEWTON
     """Algorithm: ``gauss-newton`` or one of NLopt's derivative-free local algorithms."""
     evaluations: int = 80

@@ -615,7 +615,7 @@ def stated_in_words(px: float) -> str:
     """Return how well the events determine a motion [px rms]."""
     return (
         f"the events determine the motion of the image within {px:.2f} px only: show a scene with more texture, record "
-        "for longer, or use more pairs of events (PhotometricSettings.pairs, 1,000,000 for example)"
+        "for longer, or use more pairs of events (PhotometricSettings.pairs)"
     )
 
 
