@@ -242,6 +242,7 @@ OWN: dict[str, dict[str, Any]] = {
     "Encoder.from_command": {"t_us": np.arange(20) * 1000, "command": np.sin(np.arange(20))},
     "Encoder.with_index": {"index_t_us": [500]},
     "EncoderStream.append": {"t_us": [2000, 3000]},
+    "EncoderStream.append_command": {"t_us": [2000, 3000], "command": [0.0, 0.5], "largest": 1.0},
     "EncoderStream.guessed": {"t": np.array([0, 5])},
     "Recording": {"events": SOURCE},
     "ImuSamples": _all(IMU),

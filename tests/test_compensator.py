@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 import pytest
@@ -17,8 +19,11 @@ from amiwarp import (
     EncoderStream,
     Events,
     ExactModel,
+    MirrorModel,
+    Model,
     Prism,
     RadialTangential,
+    RisleyModel,
     compensate_events,
     iwe,
 )
@@ -376,3 +381,155 @@ def test_what_is_put_stays_as_it_is() -> None:
     compensator.take(0)
     for name in ("x", "y", "t", "p"):
         np.testing.assert_array_equal(getattr(events, name), getattr(kept, name))
+
+
+# Two angles: a pair of prisms, and a mirror.
+
+PAIR = RisleyModel(CAMERA, Prism(math.radians(1.2), second=Prism(math.radians(0.9), 1.6)), 0.3, -0.7)
+MIRROR = MirrorModel.from_values(CAMERA, Prism(0.0), {
+    "amplitude": 0.02, "second_amplitude": 0.015, "phase": 0.4, "second_phase": -0.9, "direction": 0.1,
+    "second_direction": 1.6, "fold": 0.3, "incidence": 0.8,
+})  # fmt: skip
+FIRST_T, SECOND_T = np.arange(-3000, 112_000, 1000), np.arange(-2500, 113_000, 1300)
+"""Sample times of two encoders, of which the second starts later [us]."""
+LARGEST = 7.0
+
+
+def commands(t: np.ndarray) -> np.ndarray:
+    """Return a command of two frequencies, which seldom reaches its largest magnitude."""
+    return np.asarray(LARGEST * (0.7 * np.sin(6e-4 * t) + 0.3 * np.cos(1.7e-3 * t)))
+
+
+Fed: TypeAlias = tuple[EncoderStream, Encoder, list[Callable[[int], object]]]
+"""A stream, the encoder of all its samples, and functions that append the k-th samples of each encoder."""
+
+
+def measured(offset: float = 0.0) -> tuple[Encoder, Encoder]:
+    first = Encoder(FIRST_T, FIRST_T * 75e-6 + 0.02 * np.sin(FIRST_T * 1e-4), offset)
+    return first, Encoder(SECOND_T, SECOND_T * -52e-6, offset)
+
+
+def samples_of(into: EncoderStream, encoder: Encoder) -> Callable[[int], object]:
+    return lambda k: into.append(encoder.t[4 * k : 4 * k + 4], encoder.angle[4 * k : 4 * k + 4])
+
+
+def two_encoders(offset: float) -> Fed:
+    first, second = measured(offset)
+    other = EncoderStream(offset)
+    stream = EncoderStream(offset, second=other)
+    return stream, first.with_second(second), [samples_of(stream, first), samples_of(other, second)]
+
+
+def geared(offset: float) -> Fed:
+    first, _ = measured(offset)
+    stream = EncoderStream(offset, second=-0.7)
+    return stream, first.with_second(-0.7), [samples_of(stream, first)]
+
+
+def commanded(offset: float) -> Fed:
+    other = EncoderStream(offset)
+    stream = EncoderStream(offset, second=other)
+    first, second = commands(FIRST_T), commands(0.7 * SECOND_T)
+    encoder = Encoder.from_command(FIRST_T, first, largest=LARGEST, clock_offset_us=offset)
+
+    def feed(into: EncoderStream, t: np.ndarray, u: np.ndarray) -> Callable[[int], object]:
+        return lambda k: into.append_command(t[4 * k : 4 * k + 4], u[4 * k : 4 * k + 4], largest=LARGEST)
+
+    feeds = [feed(stream, FIRST_T, first), feed(other, SECOND_T, second)]
+    return stream, encoder.with_second(Encoder.from_command(SECOND_T, second, largest=LARGEST)), feeds
+
+
+TWO_ANGLES = [
+    pytest.param(PAIR, two_encoders, id="pair"),
+    pytest.param(PAIR, geared, id="geared pair"),
+    pytest.param(MIRROR, two_encoders, id="mirror"),
+    pytest.param(MIRROR, commanded, id="mirror by commands"),
+]
+
+
+@pytest.mark.parametrize("on_device", [False, True], ids=["take", "take_on_device"])
+@pytest.mark.parametrize(("model", "make"), TWO_ANGLES)
+def test_a_stream_of_two_angles_comes_out_as_its_recording_does(
+    model: Model, make: Callable[[float], Fed], on_device: bool, device: str
+) -> None:
+    """Equal bit for bit, for packets of any size, while samples of both encoders come in turn."""
+    stream, encoder, feeds = make(123.4)
+    events = random_events(30_000)
+    compensator = Compensator(model, stream, batch=6000, device=device)
+    out: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def take(now: int) -> None:
+        if on_device:
+            found = [(p.events.to_host(), p.flags.numpy()) for p in compensator.take_on_device(now)]
+        else:
+            found = [(p.events, p.flags) for p in compensator.take(now)]
+        out.extend((np.stack([e.x, e.y], axis=1), flags) for e, flags in found)
+
+    start = 0
+    for k in range(40):
+        n = (1, 700, 63, 64, 65, 1500, 777)[k % 7]
+        compensator.put(events[start : start + n], 0)
+        start += n
+        for feed in feeds:
+            feed(k)
+            take(0)
+    assert sum(len(flags) for _, flags in out) > 10_000
+    compensator.put(events[start:], 0)
+    for _ in range(3):  # a GPU returns its last batches later
+        take(0)
+    xy, flags = (np.concatenate(column) for column in zip(*out, strict=True))
+    np.testing.assert_array_equal(xy, compensate_events(events, model, encoder, device=device))
+    inside = (xy >= -0.5).all(axis=1) & (xy < np.array([WIDTH, HEIGHT]) - 0.5).all(axis=1)
+    np.testing.assert_array_equal(flags, np.where(inside, 0, OUTSIDE))
+    assert np.linalg.norm(xy - np.stack([events.x, events.y], axis=1), axis=1).max() > 1.0
+    image = compensator.image_on_device().numpy() if on_device else compensator.image()
+    assert image.sum() == pytest.approx(inside.sum(), rel=0.02)
+
+
+def test_a_packet_waits_for_both_encoders(device: str) -> None:
+    """Angles that one of the encoders has not measured are marked, and no event is compensated without both."""
+    events, (stream, encoder, _) = random_events(10_000), two_encoders(0.0)
+    assert encoder.second is not None
+    other = stream.second
+    assert isinstance(other, EncoderStream)
+    compensator = Compensator(PAIR, stream, wait_us=10_000, start_us=500_000, device=device)
+    compensator.put(events, 0)
+    stream.append(encoder.t, encoder.angle)
+    assert compensator.take(499_999) == []  # the second encoder has sent nothing
+    known = (encoder.second.t >= 20_000) & (encoder.second.t <= 60_000)
+    other.append(encoder.second.t[known], encoder.second.angle[known])
+    assert (stream.first, stream.last) == (int(encoder.second.t[known][0]) - 1300, int(encoder.second.t[known][-1]))
+    assert compensator.take(9_999) == []
+    found, flags = joined(compensator.take(10_000) + compensator.flush())
+    begin, end = (int(encoder.second.t[known][k]) for k in (0, -1))
+    np.testing.assert_array_equal((flags & NO_ANGLE) > 0, events.t < begin - 1300)
+    estimated = (events.t >= begin - 1300) & ((events.t < begin) | (events.t > end))
+    np.testing.assert_array_equal((flags & EXTRAPOLATED) > 0, estimated)
+    xy, expected = np.stack([found.x, found.y], axis=1), compensate_events(events, PAIR, encoder, device=device)
+    sure = flags & (NO_ANGLE | EXTRAPOLATED) == 0
+    assert sure.sum() > 3000
+    np.testing.assert_array_equal(xy[sure], expected[sure])
+    np.testing.assert_allclose(xy[estimated], expected[estimated], rtol=0, atol=2e-3)  # px; its speed is constant
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_hole_in_the_samples_of_either_encoder_is_marked(which: int) -> None:
+    events, (stream, encoder, _) = random_events(10_000), two_encoders(0.0)
+    assert encoder.second is not None
+    assert isinstance(stream.second, EncoderStream)
+    for k, (into, samples) in enumerate(((stream, encoder), (stream.second, encoder.second))):
+        kept = (samples.t <= 30_000) | (samples.t >= 60_000) if k == which else np.ones(samples.t.size, bool)
+        into.append(samples.t[kept], samples.angle[kept])
+    holed = (encoder, encoder.second)[which].t
+    begin, end = holed[holed <= 30_000][-1], holed[holed >= 60_000][0]
+    compensator = Compensator(PAIR, stream)
+    compensator.put(events, 0)
+    flags = joined(compensator.take(0))[1]
+    np.testing.assert_array_equal((flags & EXTRAPOLATED) > 0, (events.t > begin) & (events.t < end))
+
+
+def test_the_streams_encoders_must_suit_the_model() -> None:
+    with pytest.raises(AmiwarpError, match=r"two prisms, .* \(EncoderStream\(second=EncoderStream\(\)\) or"):
+        Compensator(MIRROR, EncoderStream())
+    with pytest.raises(AmiwarpError, match="the model has one prism; use the model 'risley', or 'mirror'"):
+        Compensator(MODEL, EncoderStream(second=-0.5))

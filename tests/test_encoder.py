@@ -1,5 +1,6 @@
 """The encoder: angle at a time, unwrapping, index pulses, gaps, coverage, and logs in text files."""
 
+import itertools
 import math
 
 import numpy as np
@@ -276,6 +277,110 @@ def test_a_stream_refuses_what_is_no_angle():
         stream.over(0, 1)
     with pytest.raises(AmiwarpError, match="capacity = 3 is not a whole number in 16"):
         EncoderStream(capacity=3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.integers(0, 30), min_size=1, max_size=12), st.sampled_from(["sines", "steps", "noise"]),
+    st.integers(0, 99),
+)  # fmt: skip
+def test_a_command_in_parts_has_the_angles_of_the_whole(sizes, shape, seed):
+    """All but the last sample, whose direction the next one would show."""
+    rng, n = np.random.default_rng(seed), sum(sizes) + 2
+    t = np.cumsum(rng.integers(2, 700, n))
+    u = {
+        "sines": np.sin(4e-4 * t) + 0.4 * np.sin(1.1e-3 * t),
+        "steps": rng.integers(-2, 3, n).astype(float),
+        "noise": rng.normal(size=n),
+    }[shape]
+    u[-1] = u[-2] + 0.1
+    largest = float(np.abs(u).max()) * 1.1
+    whole, stream, got = Encoder.from_command(t, u, largest=largest), EncoderStream(), []
+    for start, stop in itertools.pairwise(np.cumsum([0, *sizes, 2])):
+        got.append(stream.append_command(t[start:stop], u[start:stop], largest=largest))
+    found_t, found = (np.concatenate(column) for column in zip(*got, strict=True))
+    kept = whole.t < t[-1]
+    np.testing.assert_array_equal(found_t, whole.t[kept])
+    np.testing.assert_array_equal(found, whole.angle[kept])
+    np.testing.assert_allclose(largest * np.cos(whole.angle_at(t[1:-1])), u[1:-1], rtol=0, atol=0.2 * largest)
+
+
+def test_a_stream_refuses_commands_that_it_cannot_describe():
+    stream = EncoderStream()
+    stream.append_command([0, 1000, 2000], [0.0, 1.0, 1.5], largest=2.0)
+    for t, u, largest, said in (
+        ([3000], [2.1], 2.0, "command is 2.1, larger than the largest, 2"),
+        ([3000], [np.nan], 2.0, "not finite"),
+        ([3000, 4000], [1.0], 2.0, "one value for each time"),
+        ([3000], [0.0], 0.0, "largest command is 0; give a number above 0"),
+    ):
+        with pytest.raises(AmiwarpError, match=said):
+            stream.append_command(t, u, largest=largest)
+    assert (len(stream), stream.dropped) == (2, 0)
+    stream.append_command([1500, 2000, 3000], [0.0, 0.0, 1.8], largest=2.0)
+    assert (len(stream), stream.dropped) == (3, 2)
+    with pytest.raises(AmiwarpError, match="larger than the largest, 1"):
+        Encoder.from_command([0, 1000], [0.0, 2.0], largest=1.0)
+
+
+def test_after_a_restart_a_command_begins_anew():
+    stream, t = EncoderStream(), np.arange(0, 40_000, 500)
+    u = np.sin(4e-4 * t)
+    stream.append_command(t[:40], u[:40], largest=1.0)
+    stream.restart()
+    stream.append_command(t[40:], u[40:], largest=1.0)
+    assert stream.guessed(np.array([10_000, 19_600, 30_000])).tolist() == [False, True, False]
+    np.testing.assert_allclose(np.cos(stream.over(21_000, 39_000).angle_at(t[44:78])), u[44:78], rtol=0, atol=5e-3)
+
+
+def test_a_stream_of_two_encoders_is_covered_where_both_are():
+    second = EncoderStream(250.0)
+    stream = EncoderStream(250.0, second=second)
+    t = np.arange(0, 100_000, 1000)
+    stream.append(t, SPEED * t)
+    assert (stream.first, stream.last, stream.knows(0, 10)) == (None, None, False)
+    assert stream.guessed(np.arange(3)).all()
+    with pytest.raises(AmiwarpError, match="fewer than two samples"):
+        stream.over(0, 1)
+    later = np.concatenate([np.arange(20_000, 40_000, 700), np.arange(62_000, 80_000, 700)])
+    second.append(later, -0.5 * SPEED * later)
+    assert (stream.first, stream.last) == (19_300 - 250, int(later[-1]) - 250)
+    assert stream.knows(20_000 - 250, 39_000)
+    for begin, end in ((19_749, 19_800), (39_000, 61_000), (79_000, int(later[-1]) - 249)):
+        assert not stream.knows(begin, end)
+        assert stream.guessed(np.arange(begin, end + 1))[[0, -1]].any()
+    asked = np.array([21_000, 35_000])
+    encoder = stream.over(21_000, 35_000)
+    np.testing.assert_allclose(encoder.angles_at(asked), SPEED * np.outer(asked + 250, [1.0, -0.5]), rtol=1e-12)
+    assert encoder.clock_offset_us == 250.0
+    stream.restart()
+    assert (stream.append([101_000], [0.0])[0].size, second.append([101_000], [0.0])[0].size) == (2, 2)
+
+
+def test_a_geared_stream_has_the_angles_of_its_encoder_times_the_ratio():
+    stream, t = EncoderStream(second=-0.5), np.arange(0, 10_000, 1000)
+    stream.append(t, SPEED * t)
+    assert (stream.first, stream.last, stream.knows(0, 9000)) == (-1000, 9000, True)
+    expected = Encoder(t, SPEED * t).with_second(-0.5).angles_at([1500, 7777])
+    np.testing.assert_array_equal(stream.over(1000, 8000).angles_at([1500, 7777]), expected)
+
+
+@pytest.mark.parametrize(
+    ("second", "said"),
+    [
+        (
+            EncoderStream(5.0),
+            "the second encoder has a clock offset of 5 us, the first one of 0 us; give both the same",
+        ),
+        (EncoderStream(second=-0.5), "a pair has two prisms"),
+        (np.nan, "speed of the second prism"),
+        (1e7, "speed of the second prism"),
+        ("x", "speed of the second prism"),
+    ],
+)
+def test_a_second_encoder_that_is_none(second, said):
+    with pytest.raises(AmiwarpError, match=said):
+        EncoderStream(second=second)
 
 
 def test_one_count_a_turn_is_taken():

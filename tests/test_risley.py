@@ -109,8 +109,6 @@ def test_encoders_must_suit_the_model() -> None:
         amiwarp.compensate_events(events, pair, one)
     with pytest.raises(AmiwarpError, match="the encoder is that of a pair of prisms, the model has one prism"):
         amiwarp.compensate_events(events, amiwarp.ExactModel(CAMERA, FIRST), one.with_second(-0.5))
-    with pytest.raises(AmiwarpError, match="a stream carries the angle of one prism"):
-        amiwarp.Compensator(pair, amiwarp.EncoderStream())
     with pytest.raises(AmiwarpError, match="a pair has two prisms"):
         Prism(0.02, second=PAIR)
     with pytest.raises(AmiwarpError, match="a pair has two prisms"):

@@ -16,12 +16,19 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, check_sensor, encoder_pieces, limits, wait
-from amiwarp.events.encoder import Encoder, EncoderStream
+from amiwarp.events.device_events import (
+    DeviceEvents,
+    check_sensor,
+    encoder_pieces,
+    limits,
+    second_pieces,
+    wait,
+)
+from amiwarp.events.encoder import Encoder, EncoderStream, check_prisms
 from amiwarp.events.recording import Events, held_bytes
 from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.positions import LaunchPlan
-from amiwarp.kernels.compensation import Columns
+from amiwarp.kernels.compensation import BLOCK, Columns
 from amiwarp.kernels.events import flag_events
 from amiwarp.kernels.launch import PageLockedPool, RecordedLaunch, background_worker, launch, pool
 from amiwarp.kernels.packet_copy import FOUND, ROW, gather_parts
@@ -206,8 +213,8 @@ class BatchPipeline:
         self._unvoted: list[tuple[int, int]] = []  # ranges of the buffers
         self._voting: deque[tuple[int, int, Future[None]]] = deque()
         self._plan = LaunchPlan(model, device)
-        self._block = self._plan.block
-        self._room = ROUNDS * self._plan.padded(batch)
+        self._block = int(BLOCK) if device.is_cpu else 1  # number of events that are voted together
+        self._room = ROUNDS * self._padded(batch)
         dtypes = {"x": wp.uint16, "y": wp.uint16, "t": wp.int64, "out_x": float, "out_y": float, "inside": wp.uint8}
         columns = self._columns = Columns()
         for name, dtype in dtypes.items():
@@ -228,28 +235,41 @@ class BatchPipeline:
             self._pool.fill(batch, [wp.int64] * 2 * ROUNDS + [wp.float32, wp.uint8] * 4 * ROUNDS)
 
     def set_encoder(self, encoder: Encoder, first: int, last: int) -> None:
-        """Copy the encoder's pieces over a span of event times [us] to the device.
+        """Copy the encoder's pieces over a span of event times [us] to the device, and those of a second encoder.
 
         All pieces go into one bucket, which the kernel searches for an event's piece, because they are few.
         """
         origin, *pieces = encoder_pieces(encoder, first, last)
-        n, p = len(pieces[0]), self._encoder
-        if p is None or n > len(p.start):
+        p = self._encoder
+        if p is None:
             p = self._encoder = EncoderParams()
-            p.shift, p.first = 62, wp.zeros(2, dtype=int, device=self._device)
-            p.start, p.angle, p.slope = (
-                wp.zeros(max(2 * n, 64), dtype=dtype, device=self._device) for dtype in (wp.int64, wp.uint64, wp.uint64)
-            )
+            p.shift = 62
         p.origin = origin
-        for to, values in zip(
-            (p.first, p.start, p.angle, p.slope), (np.array([0, n - 1], np.int32), *pieces), strict=True
-        ):
+        self._set_pieces("", pieces)
+        if encoder.second is not None:
+            self._set_pieces("second_", second_pieces(encoder.second, first, last, origin))
+        for command in self._recorded.values():
+            command.set(3, p)
+
+    def _set_pieces(self, prefix: str, pieces: Iterable[NDArray[Any]]) -> None:
+        """Copy starts, angles and slopes to the arrays of the encoder whose names have a prefix."""
+        start, angle, slope = pieces
+        n, p = len(start), self._encoder
+        if n > len(getattr(p, f"{prefix}start") or ()):
+            setattr(p, f"{prefix}first", wp.zeros(2, dtype=int, device=self._device))
+            for name, dtype in (("start", wp.int64), ("angle", wp.uint64), ("slope", wp.uint64)):
+                setattr(p, prefix + name, wp.zeros(max(2 * n, 64), dtype=dtype, device=self._device))
+        given = {"first": np.array([0, n - 1], np.int32), "start": start, "angle": angle, "slope": slope}
+        for name, values in given.items():
+            to = getattr(p, prefix + name)
             if self._device.is_cpu:
                 to.numpy()[: len(values)] = values
             else:
                 wp.copy(to, wp.array(values, dtype=to.dtype, device="cpu", copy=False), count=len(values))
-        for command in self._recorded.values():
-            command.set(3, p)
+
+    def _padded(self, n: int) -> int:
+        """Return the length of the range of the buffers that ``n`` events take."""
+        return -(-n // self._block) * self._block
 
     def stage(self, parts: list[Events], arrived_us: int) -> StagedBatch:
         """Start to copy packets into the buffers; long packets are copied by several threads."""
@@ -270,7 +290,7 @@ class BatchPipeline:
 
     def _reserve(self, n: int) -> tuple[int, int]:
         """Return start and end of a free range of ``n`` events of the buffers; wait for votes that still use it."""
-        padded = self._plan.padded(n)
+        padded = self._padded(n)
         if self._at + padded > self._room:
             self._at = 0
         at = self._at
@@ -295,13 +315,13 @@ class BatchPipeline:
             self._copy(self._columns, self._host_columns, "xyt" if s.locked_t is None else "xy", at, end)
             if s.locked_t is not None:
                 wp.copy(self._columns.t, s.locked_t, dest_offset=at, count=n)
-        padded = self._plan.padded(n)
+        padded = self._padded(n)
         if unknown < n:
             # the kernel also compensates the padding of the last block, so that must hold valid events
             for name, value in (("x", 0), ("y", 0), ("t", s.t[-1])):
                 self._host[name][end : at + padded] = value
             outside = self._plan.any_outside(check.max_x, check.max_y)
-            self._launch(at // self._block, padded // self._block, outside)
+            self._launch(at // self._plan.block, padded // self._plan.block, outside)
         self._invalidate(at, at + unknown)
         self._invalidate(end, at + padded)
         self._unvoted.append((at, at + padded))
@@ -506,7 +526,8 @@ class Compensator:
     model : Model
         Optical model of the prism.
     encoder : EncoderStream
-        Encoder samples; the caller appends to it.
+        Encoder samples; the caller appends to it. A pair of prisms and a mirror need a second encoder, or the ratio of
+        the speeds.
     wait_us : int, optional
         Longest wait of a packet, by the caller's clock [us].
     start_us : int, optional
@@ -519,6 +540,11 @@ class Compensator:
         Largest number of events compensated at a time. By default 65,536 on a CPU and 1,048,576 on CUDA.
     device : str or warp.Device, optional
         Device to compute on.
+
+    Raises
+    ------
+    AmiwarpError
+        If a number is out of range, or the encoder is not that of a model with as many angles.
 
     Examples
     --------
@@ -547,13 +573,12 @@ class Compensator:
         batch: int | None = None,
         device: Any = "cpu",
     ) -> None:
+        check_prisms(encoder, model.ANGLES)
         self.encoder = encoder
         self.wait_us = whole(wait_us, "wait_us", 0, TIME_LIMIT, " us")
         self.start_us = whole(start_us, "start_us", 0, TIME_LIMIT, " us")
         self.most_waiting = whole(most_waiting, "most_waiting", 0, TIME_LIMIT, " events")
         self.most_bytes = whole(most_bytes, "most_bytes", 0, TIME_LIMIT, " bytes")
-        if model.ANGLES > 1:
-            raise AmiwarpError("a stream carries the angle of one prism; record it, and compensate the recording")
         self._device = wp.get_device(device)
         batch = (1 << 16 if self._device.is_cpu else 1 << 20) if batch is None else batch
         self.batch = whole(batch, "batch", 1, 1 << 28, " events")

@@ -160,10 +160,7 @@ def encoder_params(encoder: Encoder, t_first: int, t_last: int, device: Any) -> 
     p.first, p.start, p.angle, p.slope = _on_device(start, angle, slope, shift, device)
     if encoder.second is None:
         return p
-    origin, start, angle, slope = encoder_pieces(encoder.second, t_first, t_last)
-    start, behind = start + (origin - p.origin), int(origin - p.origin)
-    if behind > 0:  # the first piece reaches back to the origin
-        start[:1], angle[:1] = 0, angle[:1] - slope[:1] * np.uint64(behind)
+    start, angle, slope = second_pieces(encoder.second, t_first, t_last, p.origin)
     p.second_first, p.second_start, p.second_angle, p.second_slope = _on_device(start, angle, slope, shift, device)
     return p
 
@@ -196,6 +193,18 @@ def encoder_pieces(encoder: Encoder, t_first: int, t_last: int) -> tuple[int, An
     origin = int(begins[low])
     angle = _wrapped(turns[:-1] + slope * (encoder.clock_offset_us - whole))
     return origin, begins[low:high] - origin, angle, _wrapped(slope)
+
+
+def second_pieces(second: Encoder, t_first: int, t_last: int, origin: int) -> tuple[Any, Any, Any]:
+    """Return starts, angles and slopes of :class:`EncoderParams` for the second encoder.
+
+    ``origin``: event time from which the starts count, that of the first encoder [us].
+    """
+    own, start, angle, slope = encoder_pieces(second, t_first, t_last)
+    start, behind = start + (own - origin), own - origin
+    if behind > 0:  # the first piece reaches back to the origin
+        start[:1], angle[:1] = 0, angle[:1] - slope[:1] * np.uint64(behind)
+    return start, angle, slope
 
 
 def _wrapped(turns: Any) -> Any:

@@ -482,7 +482,9 @@ class Encoder:
         return encoder if index_t_us is None else encoder.with_index(index_t_us)
 
     @classmethod
-    def from_command(cls, t_us: ArrayLike, command: ArrayLike, *, clock_offset_us: float = 0.0) -> Encoder:
+    def from_command(
+        cls, t_us: ArrayLike, command: ArrayLike, *, largest: float | None = None, clock_offset_us: float = 0.0
+    ) -> Encoder:
         """Create an encoder from a command signal that swings to and fro, such as one of a mirror.
 
         The command is described as the cosine of an angle, times its largest magnitude. The angle grows by half a turn
@@ -495,6 +497,9 @@ class Encoder:
             more describe it well.
         command : array_like
             Command in any unit, or a measured tilt, shape (m,): zero where the mirror is at rest.
+        largest : float, optional
+            Largest magnitude of the command, in its unit; by default that of the samples. Give the same one for all
+            recordings and streams that share a calibration, because its amplitudes are those of this command.
         clock_offset_us : float, default 0.0
             Encoder time minus event time [us].
 
@@ -506,7 +511,7 @@ class Encoder:
         Raises
         ------
         AmiwarpError
-            If the samples are unusable, or the command never changes.
+            If the samples are unusable, or the command never changes or exceeds ``largest``.
 
         Examples
         --------
@@ -517,28 +522,12 @@ class Encoder:
         >>> np.cos(encoder.angles_at([50_000])).round(3)  # sin(20), cos(25)
         array([[0.913, 0.991]])
         """
-        t, u = as_times(t_us), array(command, "command").astype(np.float64)
-        if u.shape != t.shape or t.ndim != 1:
-            raise AmiwarpError(f"command has shape {u.shape}, its times {t.shape}; give one value for each time")
-        if not np.isfinite(u).all() or len(u) < 2 or not np.ptp(u) > 0.0:
-            raise AmiwarpError("command never changes or is not finite; give the samples of a signal that moves")
+        t, u = _command_samples(t_us, command)
+        if len(u) < 2 or not np.ptp(u) > 0.0:
+            raise AmiwarpError("command never changes; give the samples of a signal that moves")
         check_ascending(t, "encoder sample")
-        rises = np.sign(np.diff(u))
-        moved = np.maximum.accumulate(np.where(rises != 0.0, np.arange(len(rises)), 0))
-        rising = rises[moved] > 0.0  # a command that pauses keeps its direction
-        turns = np.concatenate([[0], np.cumsum(rising[:-1] & ~rising[1:])])
-        angle = np.arccos(u / np.abs(u).max())
-
-        def at(interval: NDArray[np.int64]) -> NDArray[np.float64]:
-            return TWO_PI * turns[interval] + np.where(rising[interval], TWO_PI - angle, angle)
-
-        last = len(rising) - 1
-        before, after = (at(np.clip(np.arange(len(u)) - k, 0, last)) for k in (1, 0))
-        jumps = after - before > LONGEST_TURN
-        both = np.where(jumps, before, (before + after) / 2.0)
-        times = np.concatenate([t, t[jumps] + 1])
-        order = np.argsort(times, kind="stable")
-        return cls(times[order], np.concatenate([both, after[jumps]])[order], clock_offset_us)
+        return cls(*CommandAngles().take(t, u, float(np.abs(u).max()) if largest is None else largest, end=True),
+                   clock_offset_us)  # fmt: skip
 
     @classmethod
     def constant_speed(
@@ -872,15 +861,102 @@ def _wrap(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(angle - TWO_PI * np.round(angle / TWO_PI))
 
 
-def check_prisms(encoder: Encoder, angles: int) -> None:
-    """Raise :class:`AmiwarpError` if an encoder is not that of a model with this number of prisms."""
+def check_prisms(encoder: Encoder | EncoderStream, angles: int) -> None:
+    """Raise :class:`AmiwarpError` if an encoder is not that of a model with this number of angles."""
     if angles == 1 and encoder.second is not None:
-        raise AmiwarpError("the encoder is that of a pair of prisms, the model has one prism; use the model 'risley'")
+        raise AmiwarpError(
+            "the encoder is that of a pair of prisms, the model has one prism; use the model 'risley', or 'mirror'"
+        )
     if angles == 2 and encoder.second is None:
+        how = "Encoder.with_second, --second-encoder or --second-ratio of 'amiwarp convert'"
+        if isinstance(encoder, EncoderStream):
+            how = "EncoderStream(second=EncoderStream()) or EncoderStream(second=-0.5)"
         raise AmiwarpError(
             "the model has two prisms, the encoder measures one; add the other one's encoder, or its speed relative to "
-            "the first (Encoder.with_second, --second-encoder or --second-ratio of 'amiwarp convert')"
+            f"the first ({how})"
         )
+
+
+# Angles of a command signal, for example of a mirror.
+
+
+def _command_samples(t_us: ArrayLike, command: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return times and commands, of one length; raise :class:`AmiwarpError` for others, and if they are not finite."""
+    t, u = as_times(t_us), array(command, "command").astype(np.float64)
+    if u.shape != t.shape or t.ndim != 1:
+        raise AmiwarpError(f"command has shape {u.shape}, its times {t.shape}; give one value for each time")
+    if not np.isfinite(u).all():
+        raise AmiwarpError(f"command is {u[~np.isfinite(u)][0]}, which is not finite; leave that sample out")
+    return t, u
+
+
+class CommandAngles:
+    """Makes the angles of :meth:`Encoder.from_command` of a command that comes in parts.
+
+    The angle of a sample depends on the direction of the command before and after it. The last sample of each part
+    therefore waits for the next part.
+    """
+
+    def __init__(self) -> None:
+        self._t, self._command = np.zeros(0, np.int64), np.zeros(0)
+        """Time [us] and command of the sample that waits, if any."""
+        self._before: tuple[int, bool] | None = None
+        """Number of swings up to the interval before that sample, and whether the command rose in it."""
+
+    @property
+    def last(self) -> int | None:
+        """Time of the latest sample [us]; None before the first."""
+        return int(self._t[0]) if self._t.size else None
+
+    def take(
+        self, t: NDArray[np.int64], command: NDArray[np.float64], largest: float, *, end: bool = False
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Take samples with ascending times [us], shape (n,); return times and angles [rad] of those that are ready.
+
+        ``largest``: largest magnitude of the command. ``end``: whether no part follows. Raises :class:`AmiwarpError`
+        for a command beyond ``largest``.
+        """
+        largest = real(largest, "largest command")
+        if not largest > 0.0:
+            raise AmiwarpError(f"largest command is {largest:g}; give a number above 0")
+        beyond = np.abs(command) > largest
+        if beyond.any():
+            raise AmiwarpError(
+                f"command is {command[beyond][0]:g}, larger than the largest, {largest:g}; give the largest magnitude "
+                "that the command ever takes"
+            )
+        t, u = np.concatenate([self._t, t]), np.concatenate([self._command, command])
+        if t.size < 2:
+            self._t, self._command = t, u
+            return t[:0], u[:0]
+        turns, rising = self._swings(u)
+        first = self._before or (int(turns[0]), bool(rising[0]))
+        kept = t.size if end else t.size - 1
+        self._t, self._command, self._before = t[kept:], u[kept:], (int(turns[-1]), bool(rising[-1]))
+        turns, rising = np.append(first[0], turns), np.append(first[1], rising)
+        angle = np.arccos(u / largest)[:kept]
+
+        def at(interval: slice) -> NDArray[np.float64]:
+            turned = np.where(rising[interval][:kept], TWO_PI - angle, angle)
+            return np.asarray(TWO_PI * turns[interval][:kept] + turned, np.float64)
+
+        if end:
+            turns, rising = np.append(turns, turns[-1]), np.append(rising, rising[-1])
+        before, after = at(slice(None)), at(slice(1, None))
+        jumps = after - before > LONGEST_TURN
+        both = np.where(jumps, before, (before + after) / 2.0)
+        times = np.concatenate([t[:kept], t[:kept][jumps] + 1])
+        order = np.argsort(times, kind="stable")
+        return times[order], np.concatenate([both, after[jumps]])[order]
+
+    def _swings(self, command: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return for each interval between samples the number of swings so far, and whether the command rises in it."""
+        turns, rose = self._before or (0, False)
+        rises = np.sign(np.diff(command))
+        moved = np.maximum.accumulate(np.where(rises != 0.0, np.arange(len(rises)), -1))
+        rising = np.where(moved < 0, rose, rises[moved] > 0.0)  # a command that pauses keeps its direction
+        peaks = np.append(rose, rising[:-1]) & ~rising
+        return turns + np.cumsum(peaks), rising
 
 
 # Speed of the prism during the events. It differs from the mean of all samples if the motor starts or stops.
@@ -917,12 +993,16 @@ RESTART_US = 1
 class EncoderStream:
     """Buffer of the latest samples of a live encoder. Angles after the last sample are extrapolated.
 
-    The buffer is allocated once.
+    The buffer is allocated once. The stream of a pair of prisms, or of a mirror with two tilts, has a second encoder,
+    whose samples may have other times.
 
     Parameters
     ----------
     clock_offset_us : float, default 0.0
         Encoder time minus event time [us].
+    second : EncoderStream or float, optional
+        Stream of the second encoder, with the same clock offset; the caller appends to both. Or the speed of the second
+        prism relative to the first, as in :meth:`Encoder.with_second`.
     harmonics : array_like, optional
         Correction of the angles by an error that repeats every turn, as in :meth:`Encoder.with_harmonics`.
     capacity : int, default 65536
@@ -931,7 +1011,7 @@ class EncoderStream:
     Raises
     ------
     AmiwarpError
-        If the capacity is below 16.
+        If the capacity is below 16, or ``second`` has another clock offset or a second encoder itself.
 
     Examples
     --------
@@ -941,6 +1021,15 @@ class EncoderStream:
     array([0.15, 0.3 ])
     >>> stream.knows(0, 2000), stream.knows(0, 3000)
     (True, False)
+
+    Two encoders cover the times that both cover:
+
+    >>> second = amiwarp.EncoderStream()
+    >>> stream = amiwarp.EncoderStream(second=second)
+    >>> _ = stream.append([0, 1000, 2000], [0.0, 0.1, 0.2])
+    >>> _ = second.append([0, 700, 1400], [0.0, -0.07, -0.14])
+    >>> stream.last, stream.over(0, 1400).angles_at([700]).round(3)
+    (1400, array([[ 0.07, -0.07]]))
     """
 
     SPEED_WINDOW_US = 50_000
@@ -951,39 +1040,66 @@ class EncoderStream:
     """Number of latest gaps that are remembered."""
 
     def __init__(
-        self, clock_offset_us: float = 0.0, *, harmonics: ArrayLike | None = None, capacity: int = 1 << 16
+        self,
+        clock_offset_us: float = 0.0,
+        *,
+        second: EncoderStream | float | None = None,
+        harmonics: ArrayLike | None = None,
+        capacity: int = 1 << 16,
     ) -> None:
         capacity = whole(capacity, "capacity", 16, 1 << 28, " samples")
         self._harmonics = None if harmonics is None else vector(harmonics, 4, "harmonics", real)
         self.clock_offset_us = real(clock_offset_us, "clock_offset_us")
+        self.second = _second_stream(second, self.clock_offset_us)
+        """Stream of the second encoder, or the speed of the second prism relative to the first; None for one prism."""
         self.dropped = 0
         """Number of samples that were dropped because they were not later than the sample before them."""
         self._t, self._angle = np.zeros(2 * capacity, np.int64), np.zeros(2 * capacity, np.float64)
         self._stop = 0
         self._gaps: list[tuple[int, int]] = []
         self._restarted = False
+        self._commands = CommandAngles()
 
     def __len__(self) -> int:
         return self._stop
 
     @property
+    def _encoders(self) -> tuple[EncoderStream, ...]:
+        """This stream, and that of the second encoder if there is one."""
+        return (self, self.second) if isinstance(self.second, EncoderStream) else (self,)
+
+    @property
+    def _started(self) -> bool:
+        """Whether each encoder has at least two samples."""
+        return len(self) >= 2 and (not isinstance(self.second, EncoderStream) or len(self.second) >= 2)
+
+    @property
     def first(self) -> int | None:
         """First event time with an angle [us]: one sample interval before the first sample.
 
-        None with fewer than two samples.
+        With two encoders, the first time with both angles. None while an encoder has fewer than two samples.
         """
-        if len(self) < 2:
+        if not self._started:
             return None
-        return math.ceil(int(2 * self._t[0] - self._t[1]) - self.clock_offset_us)
+        return max(math.ceil(int(2 * e._t[0] - e._t[1]) - self.clock_offset_us) for e in self._encoders)
 
     @property
     def last(self) -> int | None:
-        """Last event time that samples cover [us]; None with fewer than two samples."""
-        return None if len(self) < 2 else math.floor(int(self._t[self._stop - 1]) - self.clock_offset_us)
+        """Last event time that the samples of all encoders cover [us].
+
+        None while an encoder has fewer than two samples.
+        """
+        if not self._started:
+            return None
+        return min(math.floor(int(e._t[e._stop - 1]) - self.clock_offset_us) for e in self._encoders)
 
     def restart(self) -> None:
-        """Mark that later samples do not continue earlier samples, for example after a reset of the controller."""
-        self._restarted = len(self) > 0
+        """Mark that later samples do not continue earlier samples, for example after a reset of the controller.
+
+        It applies to the second encoder too.
+        """
+        for each in self._encoders:
+            each._restarted, each._commands = len(each) > 0, CommandAngles()
 
     def append(self, t_us: ArrayLike, angle: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Append samples. Samples that are not later than the sample before them are dropped.
@@ -1014,7 +1130,7 @@ class EncoderStream:
         if not np.isfinite(angles).all():
             raise AmiwarpError(f"encoder angle is {angles[~np.isfinite(angles)][0]}; expected finite numbers")
         before = int(self._t[self._stop - 1]) if len(self) else -(2**62)
-        later = t > np.maximum.accumulate(np.concatenate([[before], t]))[:-1]
+        later = _later(t, before)
         if not later.all():
             self.dropped += int(np.count_nonzero(~later))
             t, angles = t[later], angles[later]
@@ -1032,6 +1148,48 @@ class EncoderStream:
         self._gaps = [*self._gaps, *gaps][-self.MAX_GAPS :]
         return t, angles
 
+    def append_command(
+        self, t_us: ArrayLike, command: ArrayLike, *, largest: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Append samples of a command signal, such as one of a mirror, as :meth:`Encoder.from_command` takes them.
+
+        The last sample is kept back until the next one shows in which direction the command goes on. Samples that are
+        not later than the sample before them are dropped.
+
+        Parameters
+        ----------
+        t_us : array_like
+            Sample times on the encoder's clock [us], shape (n,).
+        command : array_like
+            Command in any unit, shape (n,).
+        largest : float
+            Largest magnitude of the command, the same as for the recording that was calibrated.
+
+        Returns
+        -------
+        tuple of numpy.ndarray
+            Times and angles of the samples that were stored, as :meth:`append` returns them.
+
+        Raises
+        ------
+        AmiwarpError
+            If the shapes differ, or a command is not finite or beyond ``largest``. Nothing is stored then.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> t, stream = np.arange(0, 100_000, 500), amiwarp.EncoderStream()
+        >>> for part in (slice(0, 120), slice(120, None)):
+        ...     _ = stream.append_command(t[part], 5.0 * np.sin(4e-4 * t[part]), largest=5.0)
+        >>> np.cos(stream.over(50_000, 50_000).angle_at([50_000])).round(3)  # sin(20)
+        array([0.913])
+        """
+        t, u = _command_samples(t_us, command)
+        later = _later(t, self._commands.last)
+        t, angle = self._commands.take(t[later], u[later], largest)
+        self.dropped += int(np.count_nonzero(~later))
+        return self.append(t, angle)
+
     def _store(self, t: NDArray[np.int64], angle: NDArray[np.float64]) -> None:
         capacity = self._t.size // 2
         t, angle = t[-capacity:], angle[-capacity:]
@@ -1047,7 +1205,7 @@ class EncoderStream:
 
     @property
     def rpm(self) -> float | None:
-        """Speed of the prism over the latest samples [turns/min], negative if the angle decreases.
+        """Speed of the first prism over the latest samples [turns/min], negative if the angle decreases.
 
         None with fewer than two samples.
         """
@@ -1076,12 +1234,13 @@ class EncoderStream:
         Returns
         -------
         Encoder
-            The encoder. If no sample is later than ``t_last``, an extrapolated sample is added.
+            The encoder, with the second one if there is one. If no sample is later than ``t_last``, an extrapolated
+            sample is added.
 
         Raises
         ------
         AmiwarpError
-            If there are fewer than two samples.
+            If an encoder has fewer than two samples.
         """
         if len(self) < 2:
             raise AmiwarpError(
@@ -1096,6 +1255,9 @@ class EncoderStream:
         if end > t[-1]:
             t, angle = np.append(t, end + 1), np.append(angle, self._extrapolate(end + 1))
         encoder = Encoder(t, angle, self.clock_offset_us)
+        if self.second is not None:
+            second = self.second
+            encoder = encoder.with_second(second.over(t_first, t_last) if isinstance(second, EncoderStream) else second)
         return encoder if self._harmonics is None else encoder.with_harmonics(self._harmonics)
 
     def knows(self, t_first: int, t_last: int) -> bool:
@@ -1109,16 +1271,17 @@ class EncoderStream:
         Returns
         -------
         bool
-            False if an angle would be extrapolated, or would lie in a gap.
+            False if an angle of any prism would be extrapolated, or would lie in a gap.
         """
-        return len(self) >= 2 and not any(low < t_last and t_first < high for low, high in self._estimated_spans())
+        return self._started and not any(low < t_last and t_first < high for low, high in self._estimated_spans())
 
     def _estimated_spans(self) -> Iterator[tuple[int, int]]:
-        """Yield the spans of event times [us], ends excluded, in which angles are extrapolated or in a gap."""
-        yield -(2**62), math.ceil(int(self._t[0]) - self.clock_offset_us)
-        for begin, end in self._gaps:
-            yield math.floor(begin - self.clock_offset_us), math.ceil(end - self.clock_offset_us)
-        yield math.floor(int(self._t[self._stop - 1]) - self.clock_offset_us), 2**62
+        """Yield the spans of event times [us], ends excluded, in which an angle is extrapolated or in a gap."""
+        for e in self._encoders:
+            yield -(2**62), math.ceil(int(e._t[0]) - self.clock_offset_us)
+            for begin, end in e._gaps:
+                yield math.floor(begin - self.clock_offset_us), math.ceil(end - self.clock_offset_us)
+            yield math.floor(int(e._t[e._stop - 1]) - self.clock_offset_us), 2**62
 
     def guessed(self, t: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which event times have an estimated angle.
@@ -1137,12 +1300,33 @@ class EncoderStream:
         if t.ndim != 1:
             raise AmiwarpError(f"t has shape {t.shape}; give shape (n,)")
         out = np.zeros(t.size, np.bool_)
-        if len(self) < 2 or not t.size:
+        if not self._started or not t.size:
             return ~out
         for low, high in self._estimated_spans():
             if low < t[-1] and t[0] < high:
                 out[int(np.searchsorted(t, low, side="right")) : int(np.searchsorted(t, high))] = True
         return out
+
+
+def _later(t: NDArray[np.int64], before: int | None) -> NDArray[np.bool_]:
+    """Return which times are later than ``before`` and than all times before them, shape (n,)."""
+    return np.asarray(t > np.maximum.accumulate(np.append(-(2**62) if before is None else before, t))[:-1])
+
+
+def _second_stream(second: EncoderStream | float | None, clock_offset_us: float) -> EncoderStream | float | None:
+    """Return what describes the second angle of a stream; raise :class:`AmiwarpError` if it is unusable."""
+    if second is None:
+        return None
+    if not isinstance(second, EncoderStream):
+        return real(second, "speed of the second prism relative to the first", -1e6, 1e6)
+    if second.second is not None:
+        raise AmiwarpError("the second encoder has a second one itself; a pair has two prisms")
+    if second.clock_offset_us != clock_offset_us:
+        raise AmiwarpError(
+            f"the second encoder has a clock offset of {second.clock_offset_us:g} us, the first one of "
+            f"{clock_offset_us:g} us; give both the same"
+        )
+    return second
 
 
 def start_of_last_run(t: NDArray[np.int64]) -> int:
