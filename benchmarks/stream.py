@@ -45,7 +45,7 @@ from amiwarp import (
 )
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE
 from amiwarp.live.link.clocks import monotonic_us
-from amiwarp.live.stream.packets import Packet
+from amiwarp.live.stream.packets import Packet, make_packet
 from amiwarp.live.stream.session import IMAGE_US, Session, SessionStatus
 from amiwarp.studies.cluster import machine
 
@@ -201,17 +201,17 @@ def latency(device: str, pool: Events, model: Model, seconds: float = 10.0) -> d
 class Hour:
     """Source of an hour of stream (for memory use), with encoder samples."""
 
-    camera, prism, name, size, has_encoder = CAMERA, PRISM, "an hour", (CAMERA.width, CAMERA.height), True
+    camera, prism, name, size, encoders = CAMERA, PRISM, "an hour", (CAMERA.width, CAMERA.height), 1
 
     def __init__(self, pool: Events) -> None:
         self._stream = Stream(pool, HOUR_MEV_S)
         self.count = round(HOUR_S * 1e6 / self._stream.span_us)
 
     def packets(self) -> Iterator[Packet]:
-        none = np.zeros(0, np.int64)
         for k in range(self.count):
             events = self._stream.packet(k)
-            yield Packet(events, none, *self._stream.samples(int(events.t[-1])), monotonic_us())
+            t, angle = self._stream.samples(int(events.t[-1]))
+            yield make_packet(monotonic_us(), events, encoder_t=t, encoder_angle=angle)
 
     def close(self) -> None:
         pass

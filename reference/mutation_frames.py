@@ -31,7 +31,7 @@ from amiwarp.live.link.protocol import (
     Sync,
     encode,
 )
-from amiwarp.live.stream.packets import COLUMNS, END, EVENTS, HEADER, HELLO, MAGIC, PacketDecoder
+from amiwarp.live.stream.packets import COLUMNS, END, EVENTS, HEADER, HELLO, MAGIC, SECOND_ENCODER, PacketDecoder
 from amiwarp.live.stream.sources import StreamSource
 
 WIDTH, HEIGHT = 64, 48
@@ -65,14 +65,16 @@ def packed(kind: int, count: int, payload: bytes, **wrong: int) -> bytes:
     )
 
 
-def hello(rng: random.Random) -> bytes:
+def hello(rng: random.Random, encoders: int) -> bytes:
     """Return a hello packet, invalid in a quarter of the cases."""
     camera = {**CAMERA, "distortion_model": "none"}
     fields = {"width": WIDTH, "height": HEIGHT, "camera": camera, "prism": {"apex": 0.03, "index": 1.5}}
+    if encoders == 2 or rng.random() < 0.5:
+        fields["encoders"] = encoders
     text = json.dumps(fields)
     what = rng.randrange(20)
     if what == 0:
-        name = rng.choice(["width", "height", "fx", "cy", "apex", "index"])
+        name = rng.choice(["width", "height", "fx", "cy", "apex", "index", *["encoders"] * ("encoders" in fields)])
         start = text.index(f'"{name}": ') + len(name) + 4
         stop = start + next(k for k, c in enumerate(text[start:]) if c in ",}")
         text = text[:start] + rng.choice(NUMBERS) + text[stop:]
@@ -80,9 +82,9 @@ def hello(rng: random.Random) -> bytes:
         depth = rng.choice([10, 500, 3000, 30_000])
         text = rng.choice(['{"a":' * (depth // 3), "[" * depth, "[" * depth + "]" * depth, '{"width":' + "[" * depth])
     elif what == 2:
-        part = rng.choice(["camera", "prism", "distortion", "distortion_model", "flat_side"])
+        part = rng.choice(["camera", "prism", "encoders", "distortion", "distortion_model", "flat_side"])
         value = rng.choice([5, [], [1, "a"], [math.inf] * 9, "x" * 5000, "a\nb", True, {"width": {}}, [[]] * 4, None])
-        place = fields if part in fields else camera if part.startswith("dist") else fields["prism"]
+        place = fields if part in (*fields, "encoders") else camera if part.startswith("dist") else fields["prism"]
         place[part] = value  # type: ignore[index]
         text = json.dumps(fields)
     elif what == 3:
@@ -132,11 +134,13 @@ def wild_header(rng: random.Random) -> bytes:
 def mutated_stream(seed: int) -> bytes:
     """Return a mostly valid packet stream, then changed in its packets, in its bytes, or not at all."""
     rng = random.Random(f"stream {seed}")
-    parts, at = [hello(rng)], rng.choice([0, 5_000_000, 1 << 50])
+    encoders, at = rng.choice([1, 2]), rng.choice([0, 5_000_000, 1 << 50])
+    parts = [hello(rng, encoders)]
     for _ in range(rng.choice([1, 5, 20])):
         if rng.random() < 0.01:
             parts.append(wild_header(rng))
-        parts.append(rows(rng.choice([EVENTS, EVENTS, 4, 5, 5, 3 if rng.random() < 0.05 else 5]), rng, at))
+        second = SECOND_ENCODER if encoders == 2 or rng.random() < 0.02 else 5
+        parts.append(rows(rng.choice([EVENTS, EVENTS, 4, 5, second, 3 if rng.random() < 0.05 else 5]), rng, at))
         at += rng.choice([3000, 3000, 3000, -20_000, 10_000_000])
     if rng.random() < 0.7:
         parts.append(packed(END, 0, b""))

@@ -74,7 +74,7 @@ class Counted:
     def __init__(self, source: Source) -> None:
         self._source, self.triggers = source, 0
         self.size, self.camera, self.prism = source.size, source.camera, source.prism
-        self.name, self.has_encoder = source.name, source.has_encoder
+        self.name, self.encoders = source.name, source.encoders
 
     def packets(self) -> Iterator[Packet]:
         for packet in self._source.packets():

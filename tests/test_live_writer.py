@@ -423,6 +423,61 @@ def test_writer_refuses_its_path_and_options(tmp_path):
     assert len(recording.events) == 1
 
 
+def test_a_second_encoder_is_written_beside_the_first(tmp_path):
+    t, second_t = np.arange(0, 500_000, 1000), np.arange(300, 500_000, 1300)
+    with live(tmp_path / "a.h5", encoders=2, clock_offset_us=12.0) as writer:
+        writer.append(make(10))
+        for k in range(5):
+            part, second = t[100 * k : 100 * k + 100], second_t[80 * k : 80 * k + 80]
+            writer.append_encoder(part, part * 1e-4, part[:1])
+            writer.append_encoder(second, second * -3e-5, second=True)
+    encoder = open_recording(tmp_path / "a.h5").encoder
+    expected = Encoder(t + 12, t * 1e-4, 12.0, t[::100] + 12, Encoder(second_t + 12, second_t * -3e-5, 12.0))
+    for got, given in ((encoder, expected), (encoder.second, expected.second)):
+        for name in ("t", "angle", "clock_offset_us", "index_t"):
+            np.testing.assert_array_equal(getattr(got, name), getattr(given, name))
+
+
+def test_an_unfinished_recording_may_lack_the_last_angles_of_the_second_encoder(tmp_path):
+    with live(tmp_path / "a.h5", encoders=2, flush_s=0.0) as writer:
+        writer.append_encoder([1, 2, 3], [0.0, 0.1, 0.2])
+        writer.append(make(10))
+        assert open_recording(writer.part).encoder.second is None
+        writer.append_encoder([2, 4, 9], [0.0, 0.1, 0.2], second=True)
+        writer._small["encoder/second_t"].add(np.array([11, 12]))  # whose angles were not written yet
+        writer.append(make(10, start=6_000_000))
+        second = open_recording(writer.part).encoder.second
+        writer._small["encoder/second_angle"].add(np.array([0.3, 0.4]))
+    assert (second.t.tolist(), second.angle.tolist()) == ([2, 4, 9], [0.0, 0.1, 0.2])
+
+
+def test_a_single_sample_is_no_encoder(tmp_path):
+    for name, first, second in (("a.h5", 1, 3), ("b.h5", 3, 1), ("c.h5", 0, 3), ("d.h5", 3, 0)):
+        with live(tmp_path / name, encoders=2) as writer:
+            writer.append(make(10))
+            writer.append_encoder(np.arange(first), np.arange(first) * 0.1)
+            writer.append_encoder(np.arange(second), np.arange(second) * 0.1, second=True)
+        encoder = open_recording(tmp_path / name).encoder
+        if first < 2:
+            assert encoder is None
+        else:
+            assert (encoder.t.tolist(), encoder.second) == ([0, 1, 2], None)
+
+
+def test_an_encoder_with_another_number_of_prisms_is_not_set(tmp_path):
+    encoder = Encoder.constant_speed(720.0, 0, 5000)
+    for encoders, given, said in ((1, encoder.with_second(-0.5), "encoders=2"), (2, encoder, "encoders=1")):
+        with live(tmp_path / f"{encoders}.h5", encoders=encoders) as writer:
+            writer.append(make(10))
+            with pytest.raises(AmiwarpError, match=f"make the writer with {said}"):
+                writer.set_encoder(given)
+    with live(tmp_path / "pair.h5", encoders=2) as writer:
+        writer.append(make(10))
+        writer.set_encoder(encoder.with_second(-0.5))
+    got = open_recording(tmp_path / "pair.h5").encoder
+    np.testing.assert_array_equal(got.angles_at([0, 700]), encoder.with_second(-0.5).angles_at([0, 700]))
+
+
 @pytest.mark.parametrize("samples", [2, 20_000])
 def test_an_encoder_set_takes_the_place_of_samples(tmp_path, samples):
     t = np.arange(samples) * 1000

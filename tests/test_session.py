@@ -31,7 +31,7 @@ from amiwarp import (
     open_recording,
     save_recording,
 )
-from amiwarp.compensation.streams import OUTSIDE
+from amiwarp.compensation.streams import EXTRAPOLATED, OUTSIDE
 from amiwarp.io.native_writer import LiveWriter
 from amiwarp.live.link.clocks import monotonic_us
 from amiwarp.live.queues import BackgroundWorker, Policy
@@ -230,7 +230,7 @@ def test_an_emulated_camera_loses_nothing_where_its_client_is_slow(tmp_path: Pat
 class Made:
     """A source of given packets."""
 
-    camera, prism, size, name, has_encoder = CAMERA, PRISM, (64, 48), "made", True
+    camera, prism, size, name, encoders = CAMERA, PRISM, (64, 48), "made", 1
 
     def __init__(self, packets: list[Packet], error: Exception | None = None) -> None:
         self._packets, self._error, self.closed = packets, error, False
@@ -253,6 +253,92 @@ def packets_of(recording: Recording, size: int = 500) -> list[Packet]:
         out.append(make_packet(0, events, encoder_t=encoder.t[sent:until], encoder_angle=encoder.angle[sent:until]))
         sent = until
     return out
+
+
+PAIR = replace(PRISM, second=Prism(math.radians(1.4)))
+PAIR_VALUES = {"apex": PAIR.apex, "second_apex": math.radians(1.4), "phase": 0.4, "second_phase": -0.3}
+KNOWN_PAIR = replace(exact_calibration(CAMERA, PAIR, PAIR_VALUES), model_name="risley")
+
+
+def of_pair(recording: Recording, ratio: float | None = None) -> Recording:
+    """The recording with a second encoder: by a ratio of speeds, or with sample times of its own."""
+    t = np.arange(-4000, 510_000, 1300)
+    assert recording.encoder is not None
+    second = Encoder(t, t * -5e-5 + 0.1 * np.sin(t * 1e-5)) if ratio is None else ratio
+    return replace(recording, prism=PAIR, encoder=recording.encoder.with_second(second))
+
+
+@pytest.mark.parametrize("ratio", [None, -0.7])
+def test_a_pair_is_compensated_and_recorded_as_its_recording_is(tmp_path: Path, ratio: float | None) -> None:
+    """With the samples of two encoders, and with those of one and the ratio of the speeds."""
+    recording = of_pair(points(20_000, 0.5), ratio)
+    encoder = recording.encoder
+    assert encoder is not None
+    save_recording(tmp_path / "file.h5", recording if ratio is None else replace(recording, encoder=replace(
+        encoder, second=None)))  # fmt: skip
+    source, out = open_source(str(tmp_path / "file.h5"), pace=None), list[Compensated]()
+    with LiveWriter(tmp_path / "raw.h5", width=64, height=48, encoders=2) as raw:
+        session = Session(source, KNOWN_PAIR, raw=[raw], sinks=(out.append,), second_ratio=ratio)
+        status = session.run(threading.Event(), lambda _: None)
+    assert (status.done, status.guessed, status.unknown) == (20_000, 0, 0)
+    found, given = Events.concatenate([p.events for p in out]), recording.events.slice(0, 20_000)
+    expected = compensate_events(given, KNOWN_PAIR.model, encoder)
+    np.testing.assert_array_equal(np.stack([found.x, found.y], axis=1), expected)
+    again = open_recording(tmp_path / "raw.h5").encoder
+    assert again is not None
+    assert again.second is not None
+    assert encoder.second is not None
+    for one, other in ((again, encoder), (again.second, encoder.second)):
+        np.testing.assert_array_equal(one.t, other.t)
+        np.testing.assert_array_equal(one.angle, other.angle)
+
+
+def test_a_second_encoder_that_is_late_is_waited_for() -> None:
+    """Its samples follow the last events, in packets of their own."""
+    recording = of_pair(points(20_000, 0.5))
+    assert recording.encoder is not None
+    second = recording.encoder.second
+    assert second is not None
+    late = [make_packet(0, second_t=second.t[k : k + 50], second_angle=second.angle[k : k + 50])
+            for k in range(0, len(second.t), 50)]  # fmt: skip
+    source, out = Made([*packets_of(recording), *late]), list[Compensated]()
+    source.encoders = 2
+    Session(source, KNOWN_PAIR, sinks=(out.append,), wait_us=10**9).run(threading.Event(), lambda _: None)
+    found, flags = Events.concatenate([p.events for p in out]), np.concatenate([p.flags for p in out])
+    expected = compensate_events(recording.events.slice(0, 20_000), KNOWN_PAIR.model, recording.encoder)
+    np.testing.assert_array_equal(np.stack([found.x, found.y], axis=1), expected)
+    assert set(flags.tolist()) <= {0, OUTSIDE}
+
+
+def test_a_sender_that_returns_continues_neither_encoder() -> None:
+    """The angles between the two parts are estimates, and the encoders may have other zeros after it."""
+    recording = of_pair(points(20_000, 0.5))
+    assert recording.encoder is not None
+    second = recording.encoder.second
+    assert second is not None
+    parts = []
+    for low, high, turn in ((-5000, 200_000, 0.0), (205_000, 520_000, 1.0)):
+        a, b = ((e.t >= low) & (e.t < high) for e in (recording.encoder, second))
+        samples = make_packet(0, encoder_t=recording.encoder.t[a], encoder_angle=recording.encoder.angle[a] + turn,
+                              second_t=second.t[b], second_angle=second.angle[b] - turn)  # fmt: skip
+        parts.append(replace(samples, returned=low > 0))
+    source = Made([parts[0], parts[1], make_packet(0, recording.events.slice(0, 20_000))])
+    source.encoders = 2
+    out: list[Compensated] = []
+    Session(source, KNOWN_PAIR, sinks=(out.append,)).run(threading.Event(), lambda _: None)
+    flags, t = np.concatenate([p.flags for p in out]), np.concatenate([p.events.t for p in out])
+    estimated = (flags & EXTRAPOLATED) > 0
+    assert estimated[(t > 200_000) & (t < 204_000)].all()
+    assert not estimated[(t < 198_000) | (t > 207_000)].any()
+
+
+def test_a_source_of_one_encoder_does_not_suit_a_pair() -> None:
+    source = Made(packets_of(points(2000, 0.5)))
+    with pytest.raises(AmiwarpError, match="the model has two prisms, the encoder measures one"):
+        Session(source, KNOWN_PAIR)
+    source.encoders = 2
+    with pytest.raises(AmiwarpError, match="the model has one prism"):
+        Session(source, KNOWN)
 
 
 def through(source: Made, **given: object) -> tuple[list[Compensated], SessionStatus]:
@@ -327,7 +413,7 @@ def test_a_taker_that_fails_takes_nothing_from_the_others(tmp_path: Path) -> Non
             if self.calls == 3:
                 raise AmiwarpError("no space left")
 
-        def append_encoder(self, *_: object) -> None: ...
+        def append_encoder(self, *_: object, second: bool) -> None: ...
 
         def tick(self) -> None: ...
 

@@ -141,7 +141,7 @@ class Slow:
     def append(self, events: Events) -> None:
         self.jobs += 1
 
-    def append_encoder(self, t_us: np.ndarray, angle: np.ndarray, index_t_us: np.ndarray) -> None:
+    def append_encoder(self, t_us: np.ndarray, angle: np.ndarray, index_t_us: np.ndarray, *, second: bool) -> None:
         assert self.go.wait(LONG_S)
         self.samples += len(t_us)
 
@@ -209,7 +209,7 @@ def test_a_second_interrupt_drops_what_waits() -> None:
     jobs: list[int] = []
 
     class Counting(Slow):
-        def append_encoder(self, t_us: np.ndarray, angle: np.ndarray, index_t_us: np.ndarray) -> None:
+        def append_encoder(self, t_us: np.ndarray, angle: np.ndarray, index_t_us: np.ndarray, *, second: bool) -> None:
             jobs.append(len(t_us))
             time.sleep(0.05)
 

@@ -70,6 +70,165 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+PAIR_SENT = 50_000
+TWO_ANGLES = {
+    "pair": ("risley", {"apex": PRISM.apex, "second_apex": 0.02, "phase": 0.4, "second_phase": -0.3}),
+    "mirror": ("mirror", {
+        "amplitude": 0.02, "second_amplitude": 0.015, "phase": 0.4, "second_phase": -0.9, "direction": 0.1,
+        "second_direction": 1.6, "fold": 0.3, "incidence": 0.8,
+    }),
+}  # fmt: skip
+"""Models with two angles and their parameters, by the names of their files."""
+
+
+@pytest.fixture(scope="module")
+def two_angles(folder: Path) -> Path:
+    """The folder, with recordings of a pair and of a mirror, each with its calibration, and of the first encoder alone.
+
+    The mirror's angles are those of its commands. The encoders have other sample times, and a clock offset.
+    """
+    recording = open_recording(folder / "recording.h5")
+    events = MemoryEvents(recording.events.slice(0, PAIR_SENT), 64, 48)
+    t, other = np.arange(-5000, 520_000, 1000), np.arange(-5100, 520_000, 1300)
+    first, second = Encoder(t, t * 7.5e-5, 250.0), Encoder(other, other * -5e-5)
+    commands = [Encoder.from_command(s, np.sin(3e-4 * s) + 0.4 * np.cos(f * s)) for s, f in ((t, 7e-4), (other, 5e-4))]
+    for name, encoder, prism in (
+        ("pair", first.with_second(second), replace(PRISM, second=Prism(0.02))),
+        ("mirror", commands[0].with_second(commands[1]), None),
+        ("single", first, PRISM),
+    ):
+        save_recording(folder / f"{name}.h5", Recording(events, CAMERA, encoder, prism))
+    for name, (model, values) in TWO_ANGLES.items():
+        nominal = Prism(0.0) if name == "mirror" else replace(PRISM, second=Prism(0.02))
+        replace(exact_calibration(CAMERA, nominal, values), model_name=model).save(folder / f"{name}.json")
+    return folder
+
+
+def assert_same_recording(path: Path, expected: Path) -> None:
+    """Assert that two files have the same sensor's events, samples of both encoders, camera and prism."""
+    found, given = open_recording(path), open_recording(expected)
+    n = len(given.events)
+    for name in ("x", "y", "t", "p"):
+        np.testing.assert_array_equal(
+            getattr(found.events.slice(0, n + 1), name), getattr(given.events.slice(0, n), name)
+        )
+    assert (found.camera, found.prism) == (given.camera, given.prism)
+    assert found.encoder is not None
+    assert given.encoder is not None
+    assert found.encoder.second is not None
+    assert given.encoder.second is not None
+    for one, other in ((found.encoder, given.encoder), (found.encoder.second, given.encoder.second)):
+        shift = round(other.clock_offset_us - one.clock_offset_us)  # samples of a stream are on the events' clock
+        np.testing.assert_array_equal(one.t + shift, other.t)
+        np.testing.assert_array_equal(one.angle, other.angle)
+
+
+@pytest.mark.parametrize("name", list(TWO_ANGLES))
+def test_a_replay_of_two_encoders_is_compensated_and_recorded_again(
+    two_angles: Path, tmp_path: Path, name: str
+) -> None:
+    """``live`` replays the file, and passes its packets on to ``record``; both files are the recording."""
+    source, calibration = two_angles / f"{name}.h5", two_angles / f"{name}.json"
+    words = [sys.executable, "-c", "from amiwarp.__main__ import main; main()"]
+    files = ["--out", tmp_path / "o.h5", "--record", tmp_path / "r.h5", "--raw-to", "-"]
+    args = ["live", source, "--fast", "--calibration", calibration, "--device", "cpu", *files]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    with subprocess.Popen(
+        [*words, *map(str, args)], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as live:
+        subprocess.run([*words, "record", "-", str(tmp_path / "h.h5")], env=environment, stdin=live.stdout, check=True)
+        assert live.stderr is not None
+        error = live.stderr.read().decode()
+    assert live.returncode == 0, error
+    assert f"{PAIR_SENT:,} events" in error
+    for copy in ("r.h5", "h.h5"):
+        assert_same_recording(tmp_path / copy, source)
+    compensate(open_recording(source), Calibration.load(calibration), tmp_path / "offline.h5")
+    with h5py.File(tmp_path / "o.h5") as file:
+        assert not file["events/extrapolated"][:].any()
+    found, offline = (open_recording(tmp_path / n) for n in ("o.h5", "offline.h5"))
+    for column in ("x", "y", "t", "p"):
+        columns = (getattr(each.events.slice(0, PAIR_SENT), column) for each in (found, offline))
+        np.testing.assert_array_equal(*columns)
+    assert found.encoder is not None
+    assert found.encoder.second is not None
+
+
+def test_geared_prisms_are_recorded_with_both_angles(two_angles: Path, tmp_path: Path) -> None:
+    run = CliRunner().invoke
+    done = run(
+        app, ["record", str(two_angles / "single.h5"), str(tmp_path / "r.h5"), "--fast", "--second-ratio", "-0.5"]
+    )
+    assert done.exit_code == 0, done.stderr
+    found, given = (open_recording(path).encoder for path in (tmp_path / "r.h5", two_angles / "single.h5"))
+    assert found is not None
+    assert given is not None
+    t = np.arange(0, 500_000, 777)
+    np.testing.assert_array_equal(found.angles_at(t), given.with_second(-0.5).angles_at(t))
+    args = ["live", str(two_angles / "single.h5"), "--fast", "--calibration", str(two_angles / "pair.json")]
+    done = run(app, [*args, "--second-ratio", "-0.5", "--out", str(tmp_path / "o.h5"), "--device", "cpu"])
+    assert done.exit_code == 0, done.stderr
+    pair = Calibration.load(two_angles / "pair.json")
+    compensate(open_recording(tmp_path / "r.h5"), pair, tmp_path / "offline.h5")
+    live, offline = (open_recording(tmp_path / n).events.slice(0, PAIR_SENT) for n in ("o.h5", "offline.h5"))
+    np.testing.assert_array_equal(live.x, offline.x)
+    np.testing.assert_array_equal(live.y, offline.y)
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        ("live single.h5 --calibration pair.json", "single.h5: there are samples of one encoder, but the calibration "
+         "is that of a pair of prisms, which has two angles; give a source with the samples of both encoders"),
+        ("live single.h5 --calibration mirror.json", "or --second-ratio if both are geared"),
+        ("live pair.h5 --calibration c.json", "give a calibration of a pair of prisms or of a mirror"),
+        ("live single.h5 --calibration c.json --second-ratio 1", "there are two prism angles"),
+        ("live pair.h5 --calibration pair.json --second-ratio 1", "both encoders; leave --second-ratio out"),
+        ("record pair.h5 o.h5 --second-ratio 1", "both encoders; leave --second-ratio out"),
+        ("record single.h5 o.h5 --second-ratio nan", "--second-ratio = nan"),
+        ("emulate --recording pair.h5 --camera unix:none", "two encoders, the emulated controller one"),
+        ("lens pair.h5 camera.json --live", "a lens is calibrated with one prism"),
+    ],
+)  # fmt: skip
+def test_two_encoders_where_they_do_not_fit_are_one_line(
+    two_angles: Path, monkeypatch: pytest.MonkeyPatch, args: str, says: str
+) -> None:
+    monkeypatch.chdir(two_angles)
+    before = set(two_angles.iterdir())
+    done = CliRunner().invoke(app, args.split())
+    assert (done.exit_code, done.stderr.count("\n")) == (1, 1), done.output
+    assert says in done.stderr
+    assert set(two_angles.iterdir()) == before
+
+
+def test_a_controller_measures_one_prism(two_angles: Path, tmp_path: Path) -> None:
+    """Its encoder replaces those of the source. The second angle then follows by the ratio of the speeds."""
+    from amiwarp.live.link.emulator import Controller, Motor, PseudoTerminal
+
+    run = CliRunner().invoke
+    with PseudoTerminal(Controller(Motor(720.0)), tmp_path / "prism") as port:
+        args = [
+            "live",
+            str(two_angles / "pair.h5"),
+            "--port",
+            port.name,
+            "--calibration",
+            str(two_angles / "pair.json"),
+        ]
+        refused = run(app, args)
+        adaptive = run(app, [*args, "--second-ratio", "-0.7", "--adaptive"])
+        done = run(app, ["record", str(two_angles / "pair.h5"), str(tmp_path / "r.h5"), "--port", port.name,
+                         "--second-ratio", "-0.7"])  # fmt: skip
+    assert "leave --port out to take the samples of the source, or --second-ratio" in refused.stderr
+    assert "--adaptive sets the speed of one prism" in adaptive.stderr
+    assert done.exit_code == 0, done.stderr
+    encoder = open_recording(tmp_path / "r.h5").encoder
+    assert encoder is not None
+    assert encoder.second is not None
+    np.testing.assert_array_equal(encoder.second.t, encoder.t)
+    np.testing.assert_array_equal(encoder.second.angle, -0.7 * encoder.angle)
+
+
 PATIENT = "import amiwarp.live.stream.sockets as sockets; sockets.DRAIN_S = 120.0; "
 """Code placed before a command that serves packets: at the end it waits longer for slow receivers."""
 

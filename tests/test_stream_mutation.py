@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import tracemalloc
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +13,7 @@ from amiwarp import AmiwarpError
 from amiwarp.live.link.link import MOST_UPDATES, Follower
 from amiwarp.live.link.protocol import LONGEST, ControllerStatus, FrameDecoder, Samples, Sync, encode
 from amiwarp.live.stream.packets import HEADER, HELLO, LONGEST_HELLO, MAGIC, Hello, PacketDecoder
+from amiwarp.live.stream.sources import StreamSource
 from reference.mutation_frames import CAMERA, mutated_serial, mutated_stream, packed, read_serial, read_stream
 
 SEEDS = 300
@@ -31,6 +34,19 @@ def test_streams_are_read_or_refused_in_one_line() -> None:
     assert all("\n" not in line and len(line) < 400 for line in refusals)
 
 
+def test_some_mutated_streams_bring_samples_of_two_encoders(tmp_path: Path) -> None:
+    """Read as they are, they would otherwise test nothing of the second encoder."""
+    seconds = 0
+    for seed in range(SEEDS // 3):
+        (tmp_path / "s").write_bytes(mutated_stream(seed))
+        with open(tmp_path / "s", "rb", buffering=0) as file, contextlib.suppress(AmiwarpError):
+            source = StreamSource("the stream", file)
+            for packet in source.packets():
+                assert source.encoders == 2 or not packet.second_t.size
+                seconds += len(packet.second_t) > 0
+    assert seconds > SEEDS // 10
+
+
 def test_any_bytes_of_a_serial_port_are_taken() -> None:
     assert sum(read_serial(mutated_serial(seed)) > 0 for seed in range(SEEDS)) > SEEDS // 3
 
@@ -45,6 +61,14 @@ def test_a_whole_hello_is_understood() -> None:
     text = json.dumps({"width": 64, "height": 48, "camera": CAMERA, "prism": None, "driver": {"any": [1, 2]}})
     assert hello(text).width == 64
     assert hello('{"width": 64, "height": 48, "camera": null}').camera is None
+    for encoders, count in ((1, 1), (2, 2), (None, 1)):
+        assert hello(json.dumps({"width": 64, "height": 48, "encoders": encoders})).encoders == count
+
+
+@pytest.mark.parametrize("value", ["0", "3", "2.0", "true", '"2"', "[2]", "-1", "9" * 400, "{}"])
+def test_a_number_of_encoders_is_one_or_two(value: str) -> None:
+    with pytest.raises(AmiwarpError, match=r"its hello attribute 'encoders' is .*; expected 1 or 2"):
+        hello(f'{{"width":64,"height":48,"encoders":{value}}}')
 
 
 @pytest.mark.parametrize(
@@ -98,7 +122,7 @@ def test_a_part_of_a_hello_is_an_object(part: str, value: str) -> None:
         hello(f'{{"width":64,"height":48,"{part}":{value}}}')
 
 
-@pytest.mark.parametrize("kind", [*range(1, 7), 0, 7, 255])
+@pytest.mark.parametrize("kind", [*range(1, 8), 0, 8, 255])
 @pytest.mark.parametrize("length", [(1 << 32) - 1, 1 << 31, 5_000_000])
 def test_a_length_is_bounded_before_anything_is_held(kind: int, length: int) -> None:
     tracemalloc.start()

@@ -53,14 +53,16 @@ def stream() -> tuple[list[object], bytes]:
     moved.x[7] = np.nan
     flags = (np.arange(500) % 8).astype(np.uint8)
     t, angle = np.arange(100) * 1000, np.linspace(-1.0, 9.0, 100)
-    hello = Hello(640, 480, CAMERAS[2], Prism(0.04, 1.5, FlatSide.CAMERA))
-    messages = [hello, events, Compensated(moved, flags), Triggers(t), EncoderSamples(t, angle), End()]
+    hello = Hello(640, 480, CAMERAS[2], Prism(0.04, 1.5, FlatSide.CAMERA), 2)
+    messages = [hello, events, Compensated(moved, flags), Triggers(t), EncoderSamples(t, angle),
+                EncoderSamples(t[::2] + 7, -angle[::2], True), End()]  # fmt: skip
     parts = [
-        encode_hello(640, 480, hello.camera, hello.prism),
+        encode_hello(640, 480, hello.camera, hello.prism, 2),
         encode_events(events),
         encode_compensated(moved, flags),
         encode_triggers(t),
         encode_encoder(t, angle),
+        encode_encoder(t[::2] + 7, -angle[::2], second=True),
         encode_end(),
     ]
     return messages, b"".join(parts)
@@ -92,10 +94,21 @@ def test_all_kinds_come_back_from_pieces_of_any_size(cuts):
 
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_a_hello_tells_camera_and_prism(camera):
-    for prism in (None, Prism(0.03)):
-        assert list(PacketDecoder("here").feed(encode_hello(640, 480, camera, prism))) == [
-            Hello(640, 480, camera, prism)
+    for prism, encoders in ((None, 1), (Prism(0.03), 1), (Prism(0.03, second=Prism(0.02, 1.6, FlatSide.CAMERA)), 2)):
+        assert list(PacketDecoder("here").feed(encode_hello(640, 480, camera, prism, encoders))) == [
+            Hello(640, 480, camera, prism, encoders)
         ]
+
+
+def test_a_stream_of_one_prism_is_that_of_earlier_versions():
+    """Its bytes are those that programs without the second encoder write and read."""
+    hello = encode_hello(64, 48, None, Prism(0.03))
+    assert b"encoders" not in hello
+    assert (
+        hello[HEADER.size :]
+        == b'{"width": 64, "height": 48, "prism": {"apex": 0.03, "index": 1.5168, "flat_side": "scene"}}'
+    )
+    assert encode_encoder(np.array([5]), np.array([1.0])) == packet(5, 1, b"\5" + bytes(13) + b"\xf0\x3f")
 
 
 def test_many_events_become_packets_of_bounded_size():

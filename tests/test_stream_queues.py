@@ -9,13 +9,14 @@ import pytest
 
 from amiwarp import AmiwarpError, Events
 from amiwarp.live.queues import PacketQueue, Policy
-from amiwarp.live.stream.packets import Packet
+from amiwarp.live.stream.packets import Packet, make_packet
 
 
 def packet(first: int, n: int) -> Packet:
     t = np.arange(first, first + n)
     zero = np.zeros(n, np.int64)
-    return Packet(Events.from_arrays(zero, zero, t, zero), np.array([first]), np.array([first]), np.array([0.5]), 0)
+    events = Events.from_arrays(zero, zero, t, zero)
+    return make_packet(0, events, np.array([first]), np.array([first]), np.array([0.5]))
 
 
 def drained(queue: PacketQueue) -> tuple[np.ndarray, list[Packet]]:

@@ -141,7 +141,8 @@ def test_a_sender_that_returns_is_gone_on_with(tmp_path: Path, calibration: Path
     [
         (HELLO + part(100_000) + END, "its clock restarted"),
         (encode_hello(32, 24) + END, "is back with a camera of 32x24 pixels, before it had 64x48"),
-        (encode_hello(64, 48) + END, "is back with another camera or prism"),
+        (encode_hello(64, 48) + END, "is back with another camera, prism or number of encoders"),
+        (encode_hello(64, 48, CAMERA, PRISM, 2) + END, "is back with another camera, prism or number of encoders"),
         (b"GET / HTTP/1.1\r\n\r\n    ", "it begins with b'GET '"),
     ],
 )

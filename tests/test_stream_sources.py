@@ -84,7 +84,7 @@ def test_a_file_is_replayed_at_its_pace(tmp_path):
     path = record(tmp_path / "a.h5", events)
     source = FileSource(path, pace=0.5, packet_us=2000, clock=lambda: host.now, sleep=host.sleep)
     assert (source.size, source.camera, source.prism) == (SIZE, CAMERA, Prism(0.04))
-    assert (source.has_encoder, source.name) == (False, str(path))
+    assert (source.encoders, source.name) == (0, str(path))
     got = []
     for packet in source.packets():
         got.append(packet)
@@ -114,7 +114,7 @@ def test_encoder_samples_come_in_step_and_one_ahead(tmp_path):
     t = np.arange(4_990_000, 5_050_000, 700)
     encoder = Encoder(t + 300, np.linspace(0.0, 9.0, t.size), 300.25)
     source = open_source(str(record(tmp_path / "a.h5", make(10_000), encoder)), pace=None, packet_us=1000)
-    assert source.has_encoder
+    assert source.encoders == 1
     got, seen = list(source.packets()), 0
     for packet in got[:-1]:
         end = int(packet.events.t[0] - got[0].events.t[0]) // 1000 * 1000 + 1000 + int(got[0].events.t[0])
@@ -124,6 +124,24 @@ def test_encoder_samples_come_in_step_and_one_ahead(tmp_path):
     assert not len(got[-1].events)
     np.testing.assert_array_equal(np.concatenate([packet.encoder_t for packet in got]), t)
     np.testing.assert_array_equal(np.concatenate([packet.encoder_angle for packet in got]), encoder.angle)
+
+
+def test_samples_of_two_encoders_come_in_step(tmp_path):
+    t, second_t = np.arange(4_990_000, 5_050_000, 700), np.arange(4_995_000, 5_060_000, 1900)
+    encoder = Encoder(t, t * 1e-5, second=Encoder(second_t, second_t * -3e-6))
+    source = open_source(str(record(tmp_path / "a.h5", make(10_000), encoder)), pace=None, packet_us=1000)
+    assert source.encoders == 2
+    for _ in range(2):  # the source can be played again
+        got, sent = list(source.packets()), [0, 0]
+        first = int(got[0].events.t[0])
+        for packet in got[:-1]:
+            end = first + ((int(packet.events.t[0]) - first) // 1000 + 1) * 1000
+            sent = [sent[0] + len(packet.encoder_t), sent[1] + len(packet.second_t)]
+            for times, count in ((t, sent[0]), (second_t, sent[1])):
+                assert times[count - 2] < end <= times[count - 1]
+        for name, values in (("encoder_t", t), ("encoder_angle", encoder.angle), ("second_t", second_t),
+                             ("second_angle", encoder.second.angle)):  # fmt: skip
+            np.testing.assert_array_equal(np.concatenate([getattr(packet, name) for packet in got]), values)
 
 
 def test_files_that_cannot_be_replayed(tmp_path):
@@ -168,6 +186,20 @@ def test_a_stream_brings_events_triggers_and_encoder():
     source.close()
 
 
+def test_a_stream_brings_the_samples_of_two_encoders():
+    t, angle = np.arange(7), np.arange(7.0)
+    parts = [encode_hello(*SIZE, encoders=2), encode_encoder(t, angle), encode_encoder(t + 3, -angle, second=True)]
+    source = pipe(b"".join([*parts, encode_end()]))
+    assert source.encoders == 2
+    first, second = source.packets()
+    for packet, given in ((first, (t, angle, (), ())), (second, ((), (), t + 3, -angle))):
+        for name, values in zip(("encoder_t", "encoder_angle", "second_t", "second_angle"), given, strict=True):
+            np.testing.assert_array_equal(getattr(packet, name), values)
+        assert not packet.empty
+        assert packet.held_bytes > 2 * t.nbytes
+    source.close()
+
+
 @pytest.mark.parametrize(
     ("tail", "problem"),
     [
@@ -190,6 +222,7 @@ def test_a_stream_that_breaks_off_is_used_up_to_there(tail, problem):
         (encode_compensated(Events.from_arrays([0.5], [0.5], [1], [1]), np.zeros(1, np.uint8)), "sends compensated"),
         (encode_events(Events.from_arrays([320], [0], [1], [1])), "outside the 320x240 frame"),
         (encode_encoder(np.arange(1), np.array([np.nan])), "not finite"),
+        (encode_encoder(np.arange(1), np.array([0.0]), second=True), "a second encoder come without 'encoders': 2"),
     ],
 )
 def test_a_wrong_stream_is_an_error_after_all_before_it(tail, message):
@@ -443,7 +476,7 @@ def test_a_camera_by_dv_processing(monkeypatch):
     fake = FakeDv([events[:900], None, events[900:]], [[(5, "rising"), (6, "falling")], [], [(9, "rising")]])
     monkeypatch.setitem(sys.modules, "dv_processing", fake.module)
     source = open_source("dv", packet_us=500)
-    assert (source.size, source.camera, source.prism, source.has_encoder) == (SIZE, None, None, False)
+    assert (source.size, source.camera, source.prism, source.encoders) == (SIZE, None, None, 0)
     assert fake.calls == ["DX0", 500, "rising", "running"]
     got = []
     with pytest.raises(AmiwarpError, match="dv: the camera stopped"):  # noqa: PT012

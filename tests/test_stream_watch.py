@@ -21,9 +21,11 @@ from amiwarp import (
     Camera,
     Compensated,
     Compensator,
+    Encoder,
     EncoderStream,
     Events,
     Prism,
+    PrismMotion,
     Recording,
     SensorModel,
     save_recording,
@@ -90,6 +92,85 @@ def test_a_watch_sees_that_the_phase_has_moved(recording: Recording) -> None:
     assert len(said) == 1
     assert re.search(r"moved by \+(3\.[5-9]|4\.[0-5]) deg", said[0])
     watch.close()
+
+
+@pytest.fixture(scope="module")
+def pair(texture: np.ndarray) -> tuple[Recording, Calibration]:
+    """A recording of a pair of prisms, and its true calibration."""
+    both = replace(PRISM, second=Prism(math.radians(1.5)))
+    motion = PrismMotion(720.0, 0.3, second=PrismMotion(-500.0, -0.7))
+    made = simulate(texture, CAMERA, both, motion=motion, duration_s=0.2, seed=1, sensor=SensorModel.ideal())
+    values = {"apex": PRISM.apex, "second_apex": math.radians(1.5), "phase": 0.3, "second_phase": -0.7}
+    return made, replace(exact_calibration(CAMERA, both, values), model_name="risley")
+
+
+def test_a_watch_sees_which_prism_of_a_pair_has_moved(pair: tuple[Recording, Calibration]) -> None:
+    recording, calibration = pair
+    said: list[str] = []
+    watch = PhaseCheck(calibration, 0.0, said.append)
+    watch.put(recording.events.slice(0, len(recording.events)))
+    assert recording.encoder is not None
+    first, other = recording.encoder, recording.encoder.second
+    assert other is not None
+
+    def samples(slip_deg: float) -> EncoderStream:
+        second = EncoderStream()
+        stream = EncoderStream(second=second)
+        stream.append(first.t, first.angle)
+        second.append(other.t, other.angle - math.radians(slip_deg))
+        return stream
+
+    assert abs(looked(watch, samples(0.0))) < BIAS_DEG
+    assert said == []
+    end = time.monotonic() + 120.0
+    while not said:
+        looked(watch, samples(4.0))
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert re.match(
+        r"the second phase (has moved by \+(3\.[5-9]|4\.[0-5])|differs from the calibrated one by \+)", said[0]
+    )
+    watch.close()
+    assert len(said) == 1
+
+
+def test_a_ring_of_a_pair_holds_both_encoders(pair: tuple[Recording, Calibration], tmp_path: Path) -> None:
+    recording, _ = pair
+    assert recording.encoder is not None
+    assert recording.encoder.second is not None
+    save_recording(tmp_path / "r.h5", replace(recording, truth=None))
+    ring = RecentEvents(FileSource(tmp_path / "r.h5"))
+    ring.append(recording.events.slice(0, len(recording.events)))
+    ring.append_encoder(recording.encoder.t, recording.encoder.angle)
+    assert ring.recording() is None  # the second encoder has sent nothing
+    second = recording.encoder.second
+    late = second.t > 30_000
+    ring.append_encoder(second.t[late], second.angle[late], second=True)
+    found = ring.recording()
+    assert found is not None
+    assert found.encoder is not None
+    assert found.events.t_first >= 29_000
+    t = np.array([40_000, 90_000, 140_000])
+    np.testing.assert_allclose(found.encoder.angles_at(t), recording.encoder.angles_at(t), rtol=0, atol=1e-9)
+    assert Inspector(found).knobs.model == "risley"
+    ring.restart()
+    assert ring.recording() is None
+
+
+def test_a_jump_of_a_command_is_no_restart() -> None:
+    """The ring holds the events of many swings, most of which do not reach the largest command."""
+    source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": None, "name": "made", "encoders": 2})()
+    ring, t = RecentEvents(source), np.arange(0, 200_000, 250)
+    jumps = 0
+    for second, speed in ((False, 7e-4), (True, 5e-4)):
+        encoder = Encoder.from_command(t, np.sin(3e-4 * t) + 0.4 * np.cos(speed * t))
+        ring.append_encoder(encoder.t, encoder.angle, second=second)
+        jumps += len(encoder.t) - len(t)
+    assert jumps > 10
+    ring.append(Events.from_arrays(np.full(t.size, 5), np.full(t.size, 5), t, np.zeros(t.size)))
+    found = ring.recording()
+    assert found is not None
+    assert len(found.events) == len(t)
 
 
 def test_a_watch_tells_a_phase_that_is_far_off(recording: Recording) -> None:
@@ -189,7 +270,7 @@ def test_a_keeper_passes_over_what_the_samples_do_not_cover(recording: Recording
 
 
 def test_a_ring_holds_the_last_seconds(recording: Recording) -> None:
-    source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made"})()
+    source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made", "encoders": 1})()
     ring = RecentEvents(source)
     assert ring.recording() is None
     rng = np.random.default_rng(0)
@@ -209,7 +290,7 @@ def test_a_ring_holds_the_last_seconds(recording: Recording) -> None:
 
 def test_the_speed_is_that_of_the_first_turn() -> None:
     """The motor was at rest for a second before the first events."""
-    source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made"})()
+    source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made", "encoders": 1})()
     ring, speed = RecentEvents(source), 720.0 * math.tau / 60e6
     samples = np.arange(0, 1_090_000, 1000)
     ring.append_encoder(samples, np.maximum(samples - 1_000_000, 0) * speed)
@@ -229,7 +310,7 @@ def test_the_speed_is_that_of_the_first_turn() -> None:
 
 def test_lost_angles_are_said_and_no_extrapolated_speed_is_shown() -> None:
     """The controller's port is gone from 0.2 s on. At 0.5 s it is back, after a reset: its angles start at 0."""
-    source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made"})()
+    source = type("Source", (), {"size": (120, 90), "camera": CAMERA, "prism": PRISM, "name": "made", "encoders": 1})()
     ring, stream, speed = RecentEvents(source), EncoderStream(), 720.0 * math.tau / 60e6
     ring.link = type("Link", (), {"connected": True, "name": "COM3"})()
 
@@ -324,9 +405,11 @@ def test_what_is_handed_on_is_what_came(recording: Recording) -> None:
     forward, events = Forward(sink), recording.events.slice(0, 500)
     forward.append(events)
     forward.append_encoder(np.array([1, 2]), np.array([0.5, 0.6]))
+    forward.append_encoder(np.array([3]), np.array([0.7]), second=True)
     forward.tick()
     assert sent.pop() == b""
-    first, second = [message for data in sent for message in PacketDecoder("here").feed(data)]
+    first, second, third = [message for data in sent for message in PacketDecoder("here").feed(data)]
+    assert (third.second, third.t.tolist(), third.angle.tolist()) == (True, [3], [0.7])
     assert isinstance(first, Events)
     np.testing.assert_array_equal(first.t, events.t)
     assert isinstance(second, EncoderSamples)

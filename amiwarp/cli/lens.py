@@ -155,7 +155,8 @@ def _watch(
     policy = Policy.BLOCK if stream.fast else Policy.DROP_OLDEST  # a late message would tell of a pose long gone
     with StatusLine(stop, stream.seconds) as line, stream.link() as link:
         opened = stream.open(source, line.say)
-        check_angles(opened, link)
+        if check_angles(opened, link) == 2:
+            raise AmiwarpError(f"{source}: a lens is calibrated with one prism, the stream is that of a pair of them")
         poses = LiveLens(board, first_camera(opened.size, opened.camera, fov, fisheye=fisheye), device, line.say)
         spans = StillSpans(opened.name, opened.size, prism.build(opened.prism), poses.add)
 

@@ -23,6 +23,7 @@ from rich.text import Text
 from amiwarp.cli import say
 from amiwarp.cli.common import NO_FILE, OUTPUT, CameraOptions, Common, NominalPrismOptions, choose_device, report, table
 from amiwarp.errors import AmiwarpError, printable
+from amiwarp.events.encoder import LARGEST_RATIO
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
 from amiwarp.io.native_writer import LiveWriter
@@ -32,6 +33,7 @@ from amiwarp.live.link.link import Link
 from amiwarp.live.link.protocol import FAULTS, STATES
 from amiwarp.live.queues import Policy
 from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orbit
+from amiwarp.validation import real
 
 if TYPE_CHECKING:
     from amiwarp.calib import Calibration
@@ -41,10 +43,20 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.sockets import PipeSink, SocketSink
     from amiwarp.live.stream.sources import EmulatedCamera
     from amiwarp.optics.models import Model
+    from amiwarp.optics.prism import NominalPrism
 
 # Functions that ``record`` and ``live`` share: event source, link to the controller, status line, end of session.
 
 _in_source = partial(typer.Option, rich_help_panel="Source")
+SecondRatio = Annotated[
+    float | None,
+    _in_source(
+        "--second-ratio",
+        help="Speed of the second prism of a Risley pair relative to the first, if both are geared and only the first "
+        "has an encoder.",
+    ),
+]
+"""Option ``--second-ratio``."""
 
 
 @dataclass(frozen=True)
@@ -165,10 +177,44 @@ def describe(s: SessionStatus, width: int = 80) -> str:
     return ", ".join(parts)
 
 
-def check_angles(source: Source, link: Link | None) -> None:
-    """Raise :class:`AmiwarpError` if neither the source nor a controller provides prism angles."""
-    if link is None and not source.has_encoder:
+def check_angles(source: Source, link: Link | None, second_ratio: float | None = None) -> int:
+    """Return the number of prism angles that the source, or the controller, and a ratio of speeds provide: 1 or 2.
+
+    Raises :class:`AmiwarpError` if there is none, or if the ratio contradicts the source's second encoder.
+    """
+    from amiwarp.live.stream.session import encoder_count
+
+    count = encoder_count(source, link)
+    if not count:
         raise AmiwarpError(f"{source.name}: contains no encoder samples; give the controller's --port")
+    if second_ratio is None:
+        return count
+    if count == 2:
+        raise AmiwarpError(f"{source.name}: contains the samples of both encoders; leave --second-ratio out")
+    real(second_ratio, "--second-ratio", -LARGEST_RATIO, LARGEST_RATIO)
+    return 2
+
+
+def check_model(source: Source, link: Link | None, angles: int, found: Calibration) -> None:
+    """Raise :class:`AmiwarpError` unless the number of angles that a session has is that of the calibrated model."""
+    needed, what = found.model.ANGLES, f"the calibration is that of a {found.model.TEXT}"
+    if angles == needed:
+        return
+    if needed == 1:
+        raise AmiwarpError(
+            f"{source.name}: there are two prism angles, but {what}, which has one; give a calibration of a pair of "
+            "prisms or of a mirror, made from a recording with both encoders"
+        )
+    other = (
+        "leave --port out to take the samples of the source"
+        if source.encoders == 2
+        else ("give a source with the samples of both encoders ('encoders' in docs/reference/stream-format.md)")
+    )
+    name = source.name if link is None else link.name
+    raise AmiwarpError(
+        f"{name}: there are samples of one encoder, but {what}, which has two angles; {other}, or --second-ratio if "
+        "both are geared"
+    )
 
 
 def check_whole(source: Source, status: SessionStatus) -> None:
@@ -218,6 +264,8 @@ class AdaptiveOptions:
 
         if not self.adaptive:
             return None
+        if model.ANGLES > 1:
+            raise AmiwarpError(f"--adaptive sets the speed of one prism, the calibration is that of a {model.TEXT}")
         if link is None:
             raise AmiwarpError("--adaptive sets the motor's speed; give the controller's --port")
         rpm = min(max(START_RPM, self.least_rpm), self.limit_rpm)
@@ -292,6 +340,7 @@ def run_live(
     calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
     outputs: OutputOptions,
     stream: SourceOptions,
+    second_ratio: SecondRatio = None,
     processing: ProcessingOptions,
     adaptive: AdaptiveOptions,
     common: Common,
@@ -313,14 +362,17 @@ def run_live(
         line = resources.enter_context(StatusLine(stop, stream.seconds))
         link = resources.enter_context(stream.link())
         opened = stream.open(source, line.say)
-        check_angles(opened, link)
+        angles = check_angles(opened, link, second_ratio)
         check_size(found, opened.size, opened.name)
+        check_model(opened, link, angles, found)
         resources.enter_context(stopped_by_interrupt(stop))  # before the files: Ctrl-C leaves none unfinished
         receivers = _Receivers(
-            outputs, opened, found, offset_us=clock_offset(opened, link), resources=resources, stop=stop, say=line.say
-        )
+            outputs, opened, found, encoders=angles, offset_us=clock_offset(opened, link), resources=resources,
+            stop=stop, say=line.say,
+        )  # fmt: skip
         keeper = adaptive.build(found.model, link, line.say)
-        session = _session(opened, found, receivers, processing, link=link, keeper=keeper, device=device, say=line.say)
+        session = _session(opened, found, receivers, processing, link=link, second_ratio=second_ratio, keeper=keeper,
+                           device=device, say=line.say)  # fmt: skip
         status = _follow(session, stop, line, receivers)
     data: dict[str, Any] = {
         "files": outputs.files,
@@ -338,24 +390,25 @@ class _Receivers:
     """Writers and sinks that receive the events of a session. ``resources`` closes them at the end."""
 
     def __init__(
-        self, options: OutputOptions, source: Source, found: Calibration, *, offset_us: float,
+        self, options: OutputOptions, source: Source, found: Calibration, *, encoders: int, offset_us: float,
         resources: contextlib.ExitStack, stop: threading.Event, say: Callable[[str], None],
     ) -> None:  # fmt: skip
         from amiwarp.live.stream.sockets import Forward
 
-        def sink(address: str | None) -> SocketSink | PipeSink | None:
-            return None if address is None else _open_sink(address, found, resources, stop=stop, say=say)
+        def sink(address: str | None, encoders: int = 1) -> SocketSink | PipeSink | None:
+            return None if address is None else _open_sink(address, found, encoders, resources, stop=stop, say=say)
 
         self.raw: list[RawConsumer] = []
         if options.record is not None:
-            writer = _writer(options.record, source, found, compensated=False, offset_us=offset_us)
+            writer = _writer(options.record, source, found, compensated=False, encoders=encoders, offset_us=offset_us)
             self.raw.append(resources.enter_context(writer))
-        self.raw_sink = sink(options.raw_to)
+        self.raw_sink = sink(options.raw_to, encoders)
         if self.raw_sink is not None:
             self.raw.append(Forward(self.raw_sink))
         self.out = None
         if options.out is not None:
-            self.out = resources.enter_context(_writer(options.out, source, found, compensated=True))
+            writer = _writer(options.out, source, found, compensated=True, encoders=encoders)
+            self.out = resources.enter_context(writer)
         self.sink = sink(options.to)
 
     @property
@@ -366,14 +419,14 @@ class _Receivers:
 
 def _session(
     source: Source, found: Calibration, receivers: _Receivers, options: ProcessingOptions, *, link: Link | None,
-    keeper: SpeedKeeper | None, device: str, say: Callable[[str], None],
+    second_ratio: float | None, keeper: SpeedKeeper | None, device: str, say: Callable[[str], None],
 ) -> Session:  # fmt: skip
     from amiwarp.live.stream.session import Session
 
     return Session(
-        source, found, link=link, raw=receivers.raw, out=receivers.out, sinks=receivers.sinks,
-        watch_s=options.watch_s or None, keeper=keeper, wait_us=round(1e3 * options.wait_ms), policy=options.policy,
-        device=device, say=say,
+        source, found, link=link, second_ratio=second_ratio, raw=receivers.raw, out=receivers.out,
+        sinks=receivers.sinks, watch_s=options.watch_s or None, keeper=keeper, wait_us=round(1e3 * options.wait_ms),
+        policy=options.policy, device=device, say=say,
     )  # fmt: skip
 
 
@@ -400,16 +453,21 @@ def _print_result(data: dict[str, Any], common: Common, *, to_stderr: bool) -> N
 
 
 def _open_sink(
-    address: str, found: Calibration, resources: contextlib.ExitStack, *, stop: threading.Event,
+    address: str, found: Calibration, encoders: int, resources: contextlib.ExitStack, *, stop: threading.Event,
     say: Callable[[str], None],
 ) -> SocketSink | PipeSink:  # fmt: skip
     from amiwarp.live.stream.packets import encode_hello
     from amiwarp.live.stream.sockets import open_sink
 
-    hello = encode_hello(found.camera.width, found.camera.height, found.camera, found.prism)
+    hello = encode_hello(found.camera.width, found.camera.height, found.camera, _prism(found), encoders)
     sink = open_sink(address, hello, stop=stop, say=say)
     resources.push(sink)
     return sink
+
+
+def _prism(found: Calibration) -> NominalPrism | None:
+    """Return the nominal prism of a calibration; None if its optic has no prism, as a mirror."""
+    return found.prism if found.model.PRISM else None
 
 
 def _send_to(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
@@ -418,13 +476,16 @@ def _send_to(sink: SocketSink | PipeSink) -> Callable[[Compensated], None]:
     return lambda packet: sink.send(encode_compensated(packet.events, packet.flags))
 
 
-def _writer(path: Path, source: Source, found: Calibration, *, compensated: bool, offset_us: float = 0.0) -> LiveWriter:
+def _writer(
+    path: Path, source: Source, found: Calibration, *, compensated: bool, encoders: int, offset_us: float = 0.0
+) -> LiveWriter:
     width, height = source.size
     metadata: dict[str, Any] = {"recorded_from": source.name}
     if compensated:
         metadata["compensated_with"] = found.model_name
-    return LiveWriter(path, width=width, height=height, camera=found.camera, prism=source.prism or found.prism,
-                      metadata=metadata, compensated=compensated, clock_offset_us=offset_us)  # fmt: skip
+    return LiveWriter(path, width=width, height=height, camera=found.camera, prism=source.prism or _prism(found),
+                      metadata=metadata, compensated=compensated, encoders=encoders,
+                      clock_offset_us=offset_us)  # fmt: skip
 
 
 def _live_lines(d: dict[str, Any]) -> list[str]:
@@ -452,6 +513,7 @@ def run_record(
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
     stream: SourceOptions,
+    second_ratio: SecondRatio = None,
     camera: CameraOptions,
     prism: NominalPrismOptions,
     common: Common,
@@ -468,15 +530,16 @@ def run_record(
     stop = threading.Event()
     with StatusLine(stop, stream.seconds) as line, stream.link() as link:
         opened = stream.open(source, line.say)
-        check_angles(opened, link)
+        encoders = check_angles(opened, link, second_ratio)
         width, height = opened.size
         writer = LiveWriter(
             out, width=width, height=height, camera=camera.build(width, height) or opened.camera,
-            prism=prism.build(opened.prism), metadata={"recorded_from": opened.name},
+            prism=prism.build(opened.prism), metadata={"recorded_from": opened.name}, encoders=encoders,
             clock_offset_us=clock_offset(opened, link),
         )  # fmt: skip
         with stopped_by_interrupt(stop), writer:  # in this order, so that Ctrl-C leaves no unfinished file
-            status = Session(opened, link=link, raw=[writer], say=line.say).run(stop, line.update)
+            session = Session(opened, link=link, second_ratio=second_ratio, raw=[writer], say=line.say)
+            status = session.run(stop, line.update)
     data = {"file": str(out), **session_summary(status, opened), "messages": list(line.messages)}
     text = f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s"
     report(
@@ -668,6 +731,11 @@ class PlaybackOptions:
         recording = open_recording(self.recording)
         if recording.encoder is None:
             raise AmiwarpError(f"{self.recording}: has no encoder samples; give a recording with an encoder")
+        if recording.encoder.second is not None:
+            raise AmiwarpError(
+                f"{self.recording}: has two encoders, the emulated controller one; replay it with 'amiwarp live' or "
+                "'amiwarp record', which take the file's own samples"
+            )
         return _Playback(recording, Played(recording.encoder), self.camera)
 
 

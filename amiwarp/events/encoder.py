@@ -327,6 +327,8 @@ LONGEST_BENT_STEP = TWO_PI / 64.0
 LONGEST_TURN = 0.35
 """Longest step of the angle of a command at the end of a swing that is taken for the way through its largest magnitude
 [rad]; longer ones are jumps."""
+LARGEST_RATIO = 1e6
+"""Largest accepted magnitude of a stream's speed of the second prism relative to the first."""
 LARGEST_ANGLE = 1e10
 """Largest accepted magnitude of a prism angle [rad]: 1.6e9 turns. Up to this angle float64 resolves 2e-6 rad."""
 
@@ -985,6 +987,8 @@ def turn_between(encoder: Encoder, t_first: int, t_last: int) -> float | None:
 
 # Encoder samples of a live rig: a buffer of the latest samples, with extrapolation after the last one.
 
+SAME_COMMAND = 1e-6
+"""Largest change of the cosine of an angle, that is of the command, at a jump of a command's angle."""
 RESTART_US = 1
 """Time between the extrapolated sample that ends the samples before a restart and the first sample after it [us]."""
 
@@ -1318,7 +1322,7 @@ def _second_stream(second: EncoderStream | float | None, clock_offset_us: float)
     if second is None:
         return None
     if not isinstance(second, EncoderStream):
-        return real(second, "speed of the second prism relative to the first", -1e6, 1e6)
+        return real(second, "speed of the second prism relative to the first", -LARGEST_RATIO, LARGEST_RATIO)
     if second.second is not None:
         raise AmiwarpError("the second encoder has a second one itself; a pair has two prisms")
     if second.clock_offset_us != clock_offset_us:
@@ -1329,12 +1333,15 @@ def _second_stream(second: EncoderStream | float | None, clock_offset_us: float)
     return second
 
 
-def start_of_last_run(t: NDArray[np.int64]) -> int:
+def start_of_last_run(t: NDArray[np.int64], angle: NDArray[np.float64]) -> int:
     """Return the index of the first sample after the last gap or restart in samples of an :class:`EncoderStream`.
 
     A gap is longer than :attr:`EncoderStream.GAP_US`, and than three usual intervals. ``t``: times [us], shape (n,).
+    ``angle``: angles [rad], shape (n,).
     """
-    steps = np.diff(t)
+    steps, turned = np.diff(t), np.diff(angle)
     longest = max(EncoderStream.GAP_US, 3.0 * float(np.median(steps))) if steps.size else 0.0
-    breaks = np.flatnonzero((steps > longest) | (steps <= RESTART_US))
+    # the angle of a command jumps as fast as at a restart, but forwards, and its cosine stays
+    jumps = (turned > LONGEST_TURN) & (turned <= TWO_PI) & (np.abs(np.diff(np.cos(angle))) < SAME_COMMAND)
+    breaks = np.flatnonzero((steps > longest) | ((steps <= RESTART_US) & ~jumps))
     return int(breaks[-1]) + 1 if breaks.size else 0

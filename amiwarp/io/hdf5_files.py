@@ -719,29 +719,31 @@ def _needed(file: Hdf5File, name: str) -> Column:
 
 
 def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
-    second = _read_second_encoder(file)
-    columns = {name: _needed(file, f"encoder/{name}") for name in ("t", "angle")}
-    t, angle = (column.read(0, len(column)) for column in columns.values())
-    t, angle = rounded_times(t), angle.astype(np.float64)
+    samples = _read_samples(file, "encoder/")
+    if samples is None:
+        return None
+    t, angle = samples
     pulses = file.columns.get("encoder/index_t")
     index_t = None if pulses is None else rounded_times(pulses.read(0, len(pulses)))
+    if file.unfinished and index_t is not None:
+        index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])]
+    second = _read_samples(file, "encoder/second_") if "encoder/second_t" in file.columns else None
+    offset = attribute(_attributes(file, "encoder"), f"{path}: /encoder", "clock_offset_us", float, 0.0)
+    return Encoder(t, angle, offset, index_t, None if second is None else Encoder(*second))
+
+
+def _read_samples(file: Hdf5File, name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+    """Return times [us] and angles [rad] of an encoder whose datasets begin with ``name``; None without samples."""
+    columns = [_needed(file, name + column) for column in ("t", "angle")]
+    t, angle = (column.read(0, len(column)) for column in columns)
+    t, angle = rounded_times(t), angle.astype(np.float64)
     if file.unfinished:
         count = min(t.size, angle.size)
         t, angle = t[:count], angle[:count]
-        index_t = index_t[(index_t >= t[0]) & (index_t <= t[-1])] if index_t is not None and count else None
     # A live recording has datasets for an encoder before it is known whether an encoder is connected.
     if t.size < 2 and (file.unfinished or t.size == angle.size == 0):
         return None
-    offset = attribute(_attributes(file, "encoder"), f"{path}: /encoder", "clock_offset_us", float, 0.0)
-    return Encoder(t, angle, offset, index_t, second)
-
-
-def _read_second_encoder(file: Hdf5File) -> Encoder | None:
-    """Return the encoder of the second prism of a pair; None for one prism."""
-    if "encoder/second_t" not in file.columns:
-        return None
-    t, angle = (_needed(file, f"encoder/second_{name}") for name in ("t", "angle"))
-    return Encoder(rounded_times(t.read(0, len(t))), angle.read(0, len(angle)).astype(np.float64))
+    return t, angle
 
 
 # Camera and prism as attributes of an HDF5 group, or of a JSON object in a stream.

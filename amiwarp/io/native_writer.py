@@ -836,9 +836,9 @@ class LiveWriter:
     """Writer that streams a live recording into ``NAME.part.h5`` next to ``path``, and renames it to ``path``.
 
     The file is finished and renamed in every case: after an exception and on a full disk it keeps the events appended
-    so far, and the error gives their number. ``compensated`` recordings hold float32 coordinates and flags. All events
-    are in the file after ``flush_s`` [s] at the latest, if :meth:`append` or :meth:`tick` is called that often. Use it
-    in one thread.
+    so far, and the error gives their number. ``compensated`` recordings hold float32 coordinates and flags. Recordings
+    of a pair of prisms or of a mirror have two ``encoders``. All events are in the file after ``flush_s`` [s] at the
+    latest, if :meth:`append` or :meth:`tick` is called that often. Use it in one thread.
 
     Raises :class:`AmiwarpError` for a path that does not end in .h5 or .hdf5, cannot be written or exists (unless
     ``overwrite``), for an existing part file, and for events that are unsorted or outside the frame. After bad events
@@ -855,6 +855,7 @@ class LiveWriter:
         prism: NominalPrism | None = None,
         metadata: Mapping[str, MetadataValue] | None = None,
         compensated: bool = False,
+        encoders: int = 1,
         clock_offset_us: float = 0.0,
         flush_s: float = 0.5,
         overwrite: bool = False,
@@ -879,7 +880,8 @@ class LiveWriter:
         self._t_offset = 0
         self._t_last: int | None = None
         self._next_ms = 0
-        self._encoder_span: tuple[int, int] | None = None  # times of the first and the last encoder sample [us]
+        self._names = ("encoder/", "encoder/second_")[:encoders]  # beginnings of the names of an encoder's datasets
+        self._spans: dict[str, tuple[int, int]] = {}  # times of the first and the last sample of each encoder [us]
         self._pulses = np.zeros(0, np.int64)  # index pulses later than the last encoder sample
         self._encoder: Encoder | None = None
 
@@ -933,7 +935,9 @@ class LiveWriter:
             f"events/{name}": hdf5_files.make_dataset(file, f"events/{name}", dtype) for name, dtype in dtypes.items()
         }
         file["t_offset"] = np.int64(0)
-        small = {"ms_to_idx": np.int64, "encoder/t": np.int64, "encoder/angle": np.float64, "encoder/index_t": np.int64}
+        small: dict[str, Any] = {"ms_to_idx": np.int64, "encoder/index_t": np.int64}
+        for name in self._names:
+            small |= {f"{name}t": np.int64, f"{name}angle": np.float64}
         for name, kind in small.items():
             dataset = file.create_dataset(name, shape=(0,), maxshape=(None,), chunks=(SMALL_CHUNK,), dtype=kind)
             self._small[name] = _GrowingDataset(dataset)
@@ -978,13 +982,17 @@ class LiveWriter:
         if self._pending_count == CHUNK:
             self._write()
 
-    def append_encoder(self, t_us: ArrayLike, angle: ArrayLike, index_t_us: ArrayLike = ()) -> None:
+    def append_encoder(
+        self, t_us: ArrayLike, angle: ArrayLike, index_t_us: ArrayLike = (), *, second: bool = False
+    ) -> None:
         """Append encoder samples: times on the events' clock [us], unwrapped angles [rad], and index pulses [us].
 
-        Pulses before the first sample are dropped. Raises :class:`AmiwarpError` for samples that are not later than
-        those before, or not finite.
+        ``second``: whether the samples are those of the second encoder, whose index pulses are not stored. Pulses
+        before the first sample are dropped. Raises :class:`AmiwarpError` for samples that are not later than those
+        before, or not finite.
         """
         self._check_open("append_encoder")
+        name = self._names[second]
         offset = round(self._clock_offset_us)
         t, angles = np.atleast_1d(as_times(t_us)) + offset, np.atleast_1d(np.asarray(angle, np.float64))
         if t.shape != angles.shape or t.ndim != 1 or not np.isfinite(angles).all():
@@ -993,18 +1001,18 @@ class LiveWriter:
                 f"{self.path}: encoder samples have shapes {shapes}; expected one length and finite angles"
             )
         if t.size:
-            first, last = self._encoder_span or (int(t[0]), int(t[0]) - 1)
+            first, last = self._spans.get(name, (int(t[0]), int(t[0]) - 1))
             if t[0] <= last or (t[1:] <= t[:-1]).any():
                 raise AmiwarpError(
                     f"{self.path}: encoder samples {t[0]} .. {t[-1]} us do not follow {last} us; append samples in "
                     "order of time"
                 )
             self._reserve(2 * t.nbytes)
-            self._small["encoder/t"].add(t)
-            self._small["encoder/angle"].add(angles)
-            self._encoder_span = first, int(t[-1])
-        if self._encoder_span is not None:
-            first, last = self._encoder_span
+            self._small[f"{name}t"].add(t)
+            self._small[f"{name}angle"].add(angles)
+            self._spans[name] = first, int(t[-1])
+        if not second and name in self._spans:
+            first, last = self._spans[name]
             pulses = np.append(self._pulses, as_times(index_t_us) + offset)
             self._small["encoder/index_t"].add(pulses[(pulses >= first) & (pulses <= last)])
             self._pulses = pulses[pulses > last][-MOST_PULSES:]
@@ -1014,7 +1022,13 @@ class LiveWriter:
         self.tick()
 
     def set_encoder(self, encoder: Encoder) -> None:
-        """Set the encoder data that the finished file holds instead of the appended encoder samples."""
+        """Set the encoder data that the finished file holds instead of the appended encoder samples.
+
+        Raises :class:`AmiwarpError` if it has another number of encoders than the writer.
+        """
+        given = 1 if encoder.second is None else 2
+        if given != len(self._names):
+            raise AmiwarpError(f"{self.path}: the encoder has {given} prisms; make the writer with encoders={given}")
         self._encoder = encoder
 
     def tick(self) -> None:
@@ -1102,6 +1116,10 @@ class LiveWriter:
         If the part file has many superseded chunks, it is copied to ``path`` without them instead.
         """
         with errors_name(self.path, lambda: f"finishing after {len(self)} events; {self.part} holds all but the last"):
+            for name, (first, last) in self._spans.items():
+                if first == last:  # a single sample, which gives no angle, and which readers refuse
+                    for column in ("t", "angle"):
+                        self._small[name + column].replace(np.zeros(0))
             if tidy and self._encoder is not None:
                 self._replace_encoder(self._encoder)
             self._small["ms_to_idx"].add(np.array([len(self)], np.int64))
@@ -1121,11 +1139,14 @@ class LiveWriter:
             put_in_place(self.part, self.path, overwrite=self._overwrite)
 
     def _replace_encoder(self, encoder: Encoder) -> None:
-        self._reserve(2 * (encoder.t.nbytes + encoder.angle.nbytes))
+        both = (encoder,) if encoder.second is None else (encoder, encoder.second)
+        self._reserve(2 * sum(each.t.nbytes + each.angle.nbytes for each in both))
         self._file["encoder"].attrs["clock_offset_us"] = float(encoder.clock_offset_us)
-        for name in ("t", "angle", "index_t"):
-            values = getattr(encoder, name)
-            self._small[f"encoder/{name}"].replace(np.zeros(0, np.int64) if values is None else values)
+        pulses = encoder.index_t
+        self._small["encoder/index_t"].replace(np.zeros(0, np.int64) if pulses is None else pulses)
+        for name, each in zip(self._names, both, strict=True):
+            for column in ("t", "angle"):
+                self._small[name + column].replace(getattr(each, column))
 
     def _close(self) -> None:
         file, self._file = self._file, None

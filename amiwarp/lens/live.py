@@ -56,11 +56,16 @@ class StillSpans:
         self._last_us = int(events.t[-1])
         self._advance()
 
-    def append_encoder(self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None) -> None:
-        """Take samples of the prism's angle on the events' clock. A gap between samples ends a span."""
+    def append_encoder(
+        self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None, *, second: bool = False
+    ) -> None:
+        """Take samples of the prism's angle on the events' clock. A gap between samples ends a span.
+
+        There is no ``second`` encoder: a lens is calibrated with one prism.
+        """
         self.samples += len(t_us)
         self._t, self._angle = np.concatenate([self._t, t_us]), np.concatenate([self._angle, angle])
-        if first := start_of_last_run(self._t):
+        if first := start_of_last_run(self._t, self._angle):
             self._restart(first)
         self._advance()
 

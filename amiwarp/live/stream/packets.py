@@ -44,9 +44,11 @@ def read_fields(payload: bytes | bytearray) -> dict[str, Any]:
         raise AmiwarpError(f"its hello message is not JSON: {error}; send one JSON object") from error
     _check_object("its hello", fields)
     _check_size("its hello", fields)
-    for name in ("camera", "prism"):
+    for name in ("camera", "prism", "encoders"):
         if fields.get(name) is None:
             fields.pop(name, None)
+    if fields.get("encoders", 1) not in (1, 2) or isinstance(fields.get("encoders"), bool | float):
+        _raise_wrong("its hello", "encoders", fields["encoders"], "1 or 2, the number of encoders")
     if "camera" in fields:
         _check_camera("its hello's camera", fields["camera"])
     if "prism" in fields:
@@ -132,13 +134,14 @@ LONGEST_HELLO = 1 << 16
 """Largest payload of a hello packet [bytes]."""
 HEADER = struct.Struct("<4sBBHIII")
 """Header of an encoded packet: magic, version, kind, 0, number of rows, payload size [bytes], CRC-32 of the payload."""
-HELLO, EVENTS, COMPENSATED, TRIGGERS, ENCODER, END = range(1, 7)
+HELLO, EVENTS, COMPENSATED, TRIGGERS, ENCODER, END, SECOND_ENCODER = range(1, 8)
 """Kinds of encoded packets, as numbers in the header."""
 COLUMNS: Mapping[int, tuple[str, ...]] = {
     EVENTS: ("<i8", "<u2", "<u2", "u1"),
     COMPENSATED: ("<i8", "<f4", "<f4", "u1", "u1"),
     TRIGGERS: ("<i8",),
     ENCODER: ("<i8", "<f8"),
+    SECOND_ENCODER: ("<i8", "<f8"),
 }
 """Data types of the columns of an encoded packet, by the packet's kind."""
 
@@ -155,6 +158,10 @@ class Packet:
     """Times of encoder samples that came in a file or stream, on the events' clock [us], shape ``(m,)``."""
     encoder_angle: NDArray[np.float64]
     """Unwrapped prism angles of the encoder samples [rad], shape ``(m,)``."""
+    second_t: NDArray[np.int64]
+    """The same times of the second encoder, of the second prism of a pair or the second tilt of a mirror [us]."""
+    second_angle: NDArray[np.float64]
+    """The angles of these samples [rad]."""
     arrived_us: int
     """Time at which the packet arrived, on the host's monotonic clock [us]."""
     returned: bool = False
@@ -163,13 +170,14 @@ class Packet:
     @property
     def held_bytes(self) -> int:
         """Memory of the packet [bytes], see :func:`~amiwarp.events.recording.held_bytes`."""
-        samples = self.triggers.nbytes + self.encoder_t.nbytes + self.encoder_angle.nbytes
-        return held_bytes(self.events) + samples
+        samples = (self.triggers, self.encoder_t, self.encoder_angle, self.second_t, self.second_angle)
+        return held_bytes(self.events) + sum(column.nbytes for column in samples)
 
     @property
     def empty(self) -> bool:
         """Whether the packet carries no events, triggers or samples."""
-        return not (len(self.events) or self.triggers.size or self.encoder_t.size or self.returned)
+        samples = self.triggers.size or self.encoder_t.size or self.second_t.size
+        return not (len(self.events) or samples or self.returned)
 
 
 NO_TIMES = np.zeros(0, np.int64)
@@ -184,9 +192,12 @@ def make_packet(
     triggers: NDArray[np.int64] = NO_TIMES,
     encoder_t: NDArray[np.int64] = NO_TIMES,
     encoder_angle: NDArray[np.float64] = NO_ANGLES,
+    second_t: NDArray[np.int64] = NO_TIMES,
+    second_angle: NDArray[np.float64] = NO_ANGLES,
 ) -> Packet:
     """Build a packet from the given parts; parts that are not given are empty."""
-    return Packet(Events.empty() if events is None else events, triggers, encoder_t, encoder_angle, arrived_us)
+    events = Events.empty() if events is None else events
+    return Packet(events, triggers, encoder_t, encoder_angle, second_t, second_angle, arrived_us)
 
 
 class Source(Protocol):
@@ -198,8 +209,8 @@ class Source(Protocol):
     """Camera intrinsics; None if the source does not know them."""
     prism: NominalPrism | None
     """Prism of the camera; None if the source does not know it."""
-    has_encoder: bool
-    """Whether the source may deliver encoder samples."""
+    encoders: int
+    """Number of encoders whose samples the source may deliver: 0, 1, or 2 for a pair of prisms and for a mirror."""
     name: str
     """Name of the source in messages."""
 
@@ -212,12 +223,13 @@ class Source(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """First message of a stream: size of the sensor [px], and optionally camera and prism."""
+    """First message of a stream: size of the sensor [px], optionally camera and prism, and the number of encoders."""
 
     width: int
     height: int
     camera: Camera | None = None
     prism: NominalPrism | None = None
+    encoders: int = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -236,6 +248,8 @@ class EncoderSamples:
     """Times of the samples [us], shape ``(n,)``."""
     angle: NDArray[np.float64]
     """Unwrapped prism angles [rad], shape ``(n,)``."""
+    second: bool = False
+    """Whether the samples are those of the second encoder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,13 +260,17 @@ class End:
 Message: TypeAlias = Hello | Events | Compensated | Triggers | EncoderSamples | End
 
 
-def encode_hello(width: int, height: int, camera: Camera | None = None, prism: NominalPrism | None = None) -> bytes:
-    """Encode the first packet of a stream."""
+def encode_hello(
+    width: int, height: int, camera: Camera | None = None, prism: NominalPrism | None = None, encoders: int = 1
+) -> bytes:
+    """Encode the first packet of a stream. ``encoders``: number of encoders whose samples the stream carries."""
     fields: dict[str, Any] = {"width": width, "height": height}
     if camera is not None:
         fields["camera"] = camera_attributes(camera)
     if prism is not None:
         fields["prism"] = prism_attributes(prism)
+    if encoders == 2:
+        fields["encoders"] = 2
     return _pack(HELLO, 0, json.dumps(fields).encode())
 
 
@@ -271,9 +289,9 @@ def encode_triggers(t_us: NDArray[np.int64]) -> bytes:
     return _pack_columns(TRIGGERS, t_us)
 
 
-def encode_encoder(t_us: NDArray[np.int64], angle: NDArray[np.float64]) -> bytes:
-    """Encode encoder samples: times on the events' clock [us], unwrapped angles [rad]."""
-    return _pack_columns(ENCODER, t_us, angle)
+def encode_encoder(t_us: NDArray[np.int64], angle: NDArray[np.float64], *, second: bool = False) -> bytes:
+    """Encode samples of the first or second encoder: times on the events' clock [us], unwrapped angles [rad]."""
+    return _pack_columns(SECOND_ENCODER if second else ENCODER, t_us, angle)
 
 
 def encode_end() -> bytes:
@@ -379,8 +397,8 @@ class PacketDecoder:
         t = columns[0].astype(np.int64, copy=False)
         if kind == TRIGGERS:
             return Triggers(t)
-        if kind == ENCODER:
-            return EncoderSamples(t, columns[1].astype(np.float64, copy=False))
+        if kind in (ENCODER, SECOND_ENCODER):
+            return EncoderSamples(t, columns[1].astype(np.float64, copy=False), kind == SECOND_ENCODER)
         _, x, y, p, *flags = columns
         pixel_type = np.float32 if flags else np.uint16
         events = Events(x.astype(pixel_type, copy=False), y.astype(pixel_type, copy=False), t, p)
@@ -396,7 +414,7 @@ class PacketDecoder:
             raise self._error(f"{error}") from error
         if camera is not None and (camera.width, camera.height) != (width, height):
             raise self._error(f"its hello has a camera of {camera.width}x{camera.height} for {width}x{height} pixels")
-        return Hello(width, height, camera, prism)
+        return Hello(width, height, camera, prism, fields.get("encoders", 1))
 
     def _error(self, what: str) -> AmiwarpError:
         return AmiwarpError(

@@ -50,13 +50,17 @@ FEWEST_EVENTS = 20_000
 MOST_CHECK_BYTES = 1 << 24
 """Memory limit of the latest events, from which the phase is estimated [bytes]: about a million events."""
 EVALUATIONS = 40
-"""Number of evaluations of the sharpness per estimate of the phase."""
+"""Number of evaluations of the sharpness per estimate of the phases."""
+PHASES = ("phase", "second_phase")
+"""Names of the phases of models with one and with two angles."""
 
 
 @dataclass(frozen=True, slots=True)
 class PhaseEstimate:
-    """Estimate of the prism's phase by sharpness."""
+    """Estimate of a prism's phase by sharpness."""
 
+    name: str
+    """Name of the phase, in :data:`PHASES`."""
     offset: float
     """Difference between the estimated and the calibrated phase [rad]."""
     std: float
@@ -66,8 +70,9 @@ class PhaseEstimate:
 class PhaseCheck:
     """Estimates the prism's phase repeatedly by sharpness, on the CPU in a background thread.
 
-    The check needs the events that the compensator gets. The sharpness has a bias that depends on the sensor. Therefore
-    the change since the first estimate is judged.
+    For a pair of prisms and for a mirror, both phases are estimated together. The check needs the events that the
+    compensator gets. The sharpness has a bias that depends on the sensor. Therefore the change since the first estimate
+    is judged.
     """
 
     def __init__(self, calibration: Calibration, every_s: float, say: Callable[[str], None]) -> None:
@@ -81,36 +86,42 @@ class PhaseCheck:
         self.held_bytes = 0
         """Memory of the latest events that are kept for an estimate [bytes]."""
         self._thread: threading.Thread | None = None  # a daemon: the process may end while an estimate runs
-        self._estimated: PhaseEstimate | None = None
-        self._first_estimate: PhaseEstimate | None = None
+        self._names = PHASES[: calibration.model.ANGLES]
+        self._estimated: list[PhaseEstimate] = []
+        self._first_estimate: list[PhaseEstimate] = []
         self._offset: float | None = None
-        self._reported: float | None = None
+        self._reported: dict[str, float] = {}
 
     def update(self, encoder: EncoderStream) -> float | None:
-        """Start an estimate if one is due; return the latest offset from the calibrated phase [rad], at first None."""
-        estimate = self.result()
-        if estimate is not None:
-            self._first_estimate = self._first_estimate or estimate
-            self._offset = estimate.offset
-            self._report(estimate, self._first_estimate)
+        """Start an estimate if one is due; return the latest offset from the calibrated phase [rad], at first None.
+
+        Of two phases, return the larger offset.
+        """
+        if estimates := self.result():
+            self._first_estimate = self._first_estimate or estimates
+            self._offset = max((estimate.offset for estimate in estimates), key=abs)
+            for estimate, first in zip(estimates, self._first_estimate, strict=True):
+                self._report(estimate, first)
         if time.monotonic() >= self._due and self.start_check(encoder):
             self._due = time.monotonic() + self._every_s
         return self._offset
 
     def _report(self, estimate: PhaseEstimate, first: PhaseEstimate) -> None:
         """Report a large offset from the calibrated phase, or a significant change since the first estimate."""
-        changed = estimate.offset - first.offset
-        if self._reported is not None and abs(estimate.offset - self._reported) < CHANGE_RAD:
-            return
-        self._reported = None
-        if abs(estimate.offset) > OFFSET_RAD:
-            self._reported = estimate.offset
+        changed, phase = estimate.offset - first.offset, estimate.name.replace("_", " ")
+        reported = self._reported.pop(estimate.name, None)
+        if reported is not None and abs(estimate.offset - reported) < CHANGE_RAD:
+            self._reported[estimate.name] = reported
+        elif abs(estimate.offset) > OFFSET_RAD:
+            self._reported[estimate.name] = estimate.offset
             offset = f"{math.degrees(estimate.offset):+.1f} deg"
-            self._say(f"the phase differs from the calibrated one by {offset}: calibrate again")
+            self._say(f"the {phase} differs from the calibrated one by {offset}: calibrate again")
         elif abs(changed) > max(CHANGE_RAD, 4.0 * math.hypot(estimate.std, first.std)):
-            self._reported = estimate.offset
+            self._reported[estimate.name] = estimate.offset
             since = f"since the first check, to {math.degrees(estimate.offset):+.1f} deg from the calibrated one"
-            self._say(f"the phase has moved by {math.degrees(changed):+.1f} deg {since}: has the index pulse slipped?")
+            self._say(
+                f"the {phase} has moved by {math.degrees(changed):+.1f} deg {since}: has the index pulse slipped?"
+            )
 
     def put(self, events: Events) -> None:
         """Add events of the sensor, from which the next estimate is made."""
@@ -144,14 +155,14 @@ class PhaseCheck:
         self._thread.start()
         return True
 
-    def result(self) -> PhaseEstimate | None:
-        """Return each new estimate once; None if there is no new one."""
+    def result(self) -> list[PhaseEstimate]:
+        """Return the new estimate of each phase once; an empty list if there is none."""
         if self._thread is None or self._thread.is_alive():
-            return None
+            return []
         self._thread.join()
         self._thread = None
-        estimate, self._estimated = self._estimated, None
-        return estimate
+        estimated, self._estimated = self._estimated, []
+        return estimated
 
     def close(self) -> None:
         """Wait for a running estimate, and start no further one."""
@@ -160,21 +171,22 @@ class PhaseCheck:
             self._thread.join()
 
     def _estimate(self, events: Events, encoder: Encoder) -> None:
-        """Estimate the phase by a calibration in which all other parameters are fixed."""
-        known = self._calibration
-        phase = known.parameters["phase"]
+        """Estimate the phases by a calibration in which all other parameters are fixed."""
+        known, names = self._calibration, self._names
+        bounds = {n: (known.parameters[n] - SEARCH_RAD, known.parameters[n] + SEARCH_RAD) for n in names}
         recording = Recording(MemoryEvents(events, known.camera.width, known.camera.height), known.camera, encoder,
                               known.prism, name="the stream")  # fmt: skip
         start = {n: x for n, x in known.parameters.items() if n not in ("clock_offset", "rpm")}
         try:
             found = calibrate(
-                recording, model=known.model_name, free=("phase",), start=start, stages=("sharpness",), events=100_000,
-                bounds={"phase": (phase - SEARCH_RAD, phase + SEARCH_RAD)}, global_evaluations=EVALUATIONS,
-                local_algorithm="LN_SBPLX", device="cpu",
+                recording, model=known.model_name, free=names, start=start, stages=("sharpness",), events=100_000,
+                bounds=bounds, global_evaluations=EVALUATIONS, local_algorithm="LN_SBPLX", device="cpu",
             )  # fmt: skip
         except AmiwarpError:
             return  # for example without texture: a later estimate may succeed
-        self._estimated = PhaseEstimate(found.parameters["phase"] - phase, found.uncertainty["phase"])
+        self._estimated = [
+            PhaseEstimate(n, found.parameters[n] - known.parameters[n], found.uncertainty[n]) for n in names
+        ]
 
 
 # Consumers of a session's data: files and servers, each served by a background thread.
@@ -186,7 +198,7 @@ class RawConsumer(Protocol):
     def append(self, events: Events, /) -> None: ...
 
     def append_encoder(
-        self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: NDArray[np.int64], /
+        self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: NDArray[np.int64], /, *, second: bool
     ) -> None: ...
 
     def tick(self) -> None: ...
@@ -211,10 +223,12 @@ class Consumers:
         for served in list(self.raw):
             self._put(served, partial(served[0].append, events), held_bytes(events))
 
-    def append_encoder(self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64]) -> None:
-        """Pass encoder samples and index pulses to all consumers."""
+    def append_encoder(
+        self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64], second: bool
+    ) -> None:
+        """Pass samples and index pulses of the first or second encoder to all consumers."""
         for served in self._all():
-            append = partial(served[0].append_encoder, t, angle, index_t)
+            append = partial(served[0].append_encoder, t, angle, index_t, second=second)
             self._put(served, append, t.nbytes + angle.nbytes + index_t.nbytes)
 
     def append_compensated(self, packet: Compensated) -> None:
@@ -310,7 +324,8 @@ class SessionStatus:
     coverage: float | None = None
     """Share of the scene's edges that the last window showed, 0 to 1; None without adaptive speed."""
     phase_away: float | None = None
-    """Difference between the latest estimated and the calibrated phase [rad]; None without an estimate."""
+    """Difference between the latest estimated and the calibrated phase [rad], the larger of two; None without an
+    estimate."""
 
 
 class IntervalFigures:
@@ -383,7 +398,8 @@ class Session:
     """Takes events from a source, compensates them and distributes them until the source ends or a stop is requested.
 
     The caller opens and closes all objects that the session gets. ``calibration``: None to compensate nothing, for
-    example to record. ``link``: its encoder samples replace those of the source. The consumers ``raw`` get the sensor's
+    example to record. ``link``: its encoder samples replace those of the source. ``second_ratio``: speed of the second
+    prism of a pair relative to the first, if only the first has an encoder. The consumers ``raw`` get the sensor's
     events, ``out`` gets the compensated events, and both get encoder samples; ``sinks`` get compensated packets.
     ``watch_s``: interval between checks of the phase [s]; None: no checks. ``keeper``: adaptive speed. ``wait_us``:
     longest wait of an event for its encoder samples [us]. ``policy`` and ``queue_events``: for the queue before the
@@ -396,6 +412,7 @@ class Session:
         calibration: Calibration | None = None,
         *,
         link: Link | None = None,
+        second_ratio: float | None = None,
         raw: Sequence[RawConsumer] = (),
         out: LiveWriter | None = None,
         sinks: tuple[Callable[[Compensated], None], ...] = (),
@@ -412,7 +429,11 @@ class Session:
         own = clock_offset(source, link)
         known = {} if calibration is None else calibration.parameters
         harmonics = None if calibration is None else calibration.harmonics
-        self.encoder = EncoderStream(known.get("clock_offset", own) - own, harmonics=harmonics)
+        offset = known.get("clock_offset", own) - own
+        second: EncoderStream | float | None = second_ratio
+        if second is None and encoder_count(source, link) == 2:
+            second = EncoderStream(offset)
+        self.encoder = EncoderStream(offset, second=second, harmonics=harmonics)
         self._source, self._link, self._sinks, self._keeper = source, link, list(sinks), keeper
         self._stop, self._hasty = threading.Event(), False
         self._failure: BaseException | None = None
@@ -606,12 +627,13 @@ class EncoderFeed:
         self,
         link: Link | None,
         encoder: EncoderStream,
-        give: Callable[[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]], None],
+        give: Callable[[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64], bool], None],
         say: Callable[[str], None],
     ) -> None:
         """Set up the feed.
 
-        ``give`` is called with samples and index pulses on the events' clock, ``say`` with messages.
+        ``give`` is called with samples and index pulses on the events' clock and with whether they are those of the
+        second encoder, ``say`` with messages.
         """
         self.clock: ClockMap | None = None
         """Map from the controller's clock to the camera's; None while it is unknown."""
@@ -654,12 +676,18 @@ class EncoderFeed:
             self._camera_clock.packet(int(packet.events.t[-1]), packet.arrived_us)
         if self._link is not None:
             self._camera_clock.triggers(packet.triggers, packet.arrived_us)
-        elif len(packet.encoder_t):
+            return
+        if len(packet.encoder_t):
             self._append(packet.encoder_t, packet.encoder_angle, NO_TIMES)
+        second = self._encoder.second
+        if len(packet.second_t) and isinstance(second, EncoderStream):
+            self._give(*second.append(packet.second_t, packet.second_angle), NO_TIMES, True)
 
     def _append(self, t: NDArray[np.int64], angle: NDArray[np.float64], index_t: NDArray[np.int64]) -> None:
         t, angle = self._encoder.append(t, angle)
-        self._give(t, angle, index_t)
+        self._give(t, angle, index_t, False)
+        if isinstance(self._encoder.second, float):
+            self._give(t, self._encoder.second * angle, NO_TIMES, True)
 
     def _drop_oldest(self) -> None:
         """Drop the oldest waiting samples if there are too many; warn the user once."""
@@ -676,6 +704,11 @@ class EncoderFeed:
 
 def _size(update: LinkUpdate) -> int:
     return len(update.t_us) + len(update.index_t_us)
+
+
+def encoder_count(source: Source, link: Link | None) -> int:
+    """Return the number of encoders that a session takes samples from: that of a link, or those of the source."""
+    return source.encoders if link is None else 1
 
 
 def clock_offset(source: Source, link: Link | None) -> float:
@@ -705,7 +738,9 @@ class RecentEvents:
         self._size, self._name = source.size, source.name
         self._camera, self._prism = camera or source.camera, prism or source.prism
         self._events: deque[Events] = deque()
-        self._samples: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
+        self._samples = tuple(deque[tuple[NDArray[np.int64], NDArray[np.float64]]]() for _ in range(2))
+        """Times and angles of the samples of both encoders."""
+        self._encoders = source.encoders
         self.event_bytes = self.sample_bytes = 0
         """Memory of the kept events and of the kept encoder samples [bytes]."""
         self.turn_share = 0.0
@@ -731,26 +766,30 @@ class RecentEvents:
             while len(self._events) > 1 and (self.event_bytes > MOST_BYTES or self._events[0].t[-1] < since):
                 self.event_bytes -= held_bytes(self._events.popleft())
 
-    def append_encoder(self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None) -> None:
-        """Append encoder samples in order of time, on the events' clock.
+    def append_encoder(
+        self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None, *, second: bool = False
+    ) -> None:
+        """Append samples of the first or second encoder in order of time, on the events' clock.
 
         The angles already include the index pulses.
         """
         if len(t_us):
             with self._lock:
                 self._sampled_s = time.monotonic()
-                self._samples.append((t_us, angle))
+                samples = self._samples[second]
+                samples.append((t_us, angle))
                 self.sample_bytes += OVERHEAD + t_us.nbytes + angle.nbytes
                 since = int(t_us[-1]) - round(2e6 * SECONDS)
-                while len(self._samples) > 1 and (self.sample_bytes > MOST_BYTES or self._samples[0][0][-1] < since):
-                    t_us, angle = self._samples.popleft()
+                while len(samples) > 1 and (self.sample_bytes > MOST_BYTES or samples[0][0][-1] < since):
+                    t_us, angle = samples.popleft()
                     self.sample_bytes -= OVERHEAD + t_us.nbytes + angle.nbytes
 
     def restart(self) -> None:
         """Forget all events and encoder samples: those that follow may be on another clock."""
         with self._lock:
             self._events.clear()
-            self._samples.clear()
+            for samples in self._samples:
+                samples.clear()
             self.event_bytes = self.sample_bytes = 0
             self.ended, self.segment = "", self.segment + 1
             self._arrived_s = self._sampled_s = time.monotonic()
@@ -781,17 +820,15 @@ class RecentEvents:
         Events before a gap or a restart of the encoder samples are left out, because their angles do not continue.
         """
         with self._lock:
-            events, samples = list(self._events), list(self._samples)
-        if not samples or not events:
-            return None
-        t, angle = (np.concatenate(column) for column in zip(*samples, strict=True))
-        run = start_of_last_run(t)
-        t, angle = t[run:], angle[run:]
-        if len(t) < 2:
+            events, samples = list(self._events), [list(each) for each in self._samples]
+        if not events:
             return None
         joined = Events.concatenate(events)
-        since = max(min(int(np.searchsorted(t, joined.t[0])) - 2, len(t) - 2), 0)
-        encoder = Encoder(t[since:], angle[since:])
+        encoder, second = (_last_run(each, int(joined.t[0])) for each in samples)
+        pair = self._encoders == 2 and self.link is None
+        if encoder is None or (pair and second is None):
+            return None
+        encoder = replace(encoder, second=second)
         first, last = np.searchsorted(joined.t, encoder.coverage)
         covered = joined[first:last]
         self.turn_share = (
@@ -800,6 +837,19 @@ class RecentEvents:
         if self.turn_share < 1.0:
             return None
         return Recording(MemoryEvents(covered, *self._size), self._camera, encoder, self._prism, name=self._name)
+
+
+def _last_run(samples: list[tuple[NDArray[np.int64], NDArray[np.float64]]], t_first: int) -> Encoder | None:
+    """Return the encoder of samples since their last gap or restart, from shortly before ``t_first`` [us] on.
+
+    None with fewer than two samples.
+    """
+    if not samples:
+        return None
+    t, angle = (np.concatenate(column) for column in zip(*samples, strict=True))
+    run = start_of_last_run(t, angle)
+    since = run + max(min(int(np.searchsorted(t[run:], t_first)) - 2, len(t) - run - 2), 0)
+    return Encoder(t[since:], angle[since:]) if len(t) - since >= 2 else None
 
 
 def _silence(what: str, seconds: float) -> str:
@@ -849,14 +899,14 @@ def followed(
         if recent.recording() is None:
             return
         while not over.wait(REOPEN_S) and (part := reopen(over)) is not None:
-            if part.size == source.size:
+            if (part.size, part.encoders) == (source.size, source.encoders):
                 recent.restart()
                 say(f"{part.name}: the stream is back: segment {recent.segment}, its times count anew")
                 follow(part)
             else:
                 part.close()
-                sizes = f"{part.size[0]}x{part.size[1]} pixels, before it had {source.size[0]}x{source.size[1]}"
-                end(f"{part.name}: is back with a camera of {sizes}; start the command again")
+                now, before = (f"{s.size[0]}x{s.size[1]} pixels and {s.encoders} encoders" for s in (part, source))
+                end(f"{part.name}: is back with a camera of {now}, before it had {before}; start the command again")
 
     # No BackgroundLoop: the session has its own stop event, and its end is shown as text while the block runs.
     thread = threading.Thread(target=run, name="amiwarp-follow", daemon=True)

@@ -422,9 +422,11 @@ class Forward:
         """Send events of a sensor to the sink."""
         self._sink.send(encode_events(events))
 
-    def append_encoder(self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None) -> None:
+    def append_encoder(
+        self, t_us: NDArray[np.int64], angle: NDArray[np.float64], index_t_us: object = None, *, second: bool = False
+    ) -> None:
         """Send encoder samples on the events' clock to the sink. The angles already include the index pulses."""
-        self._sink.send(encode_encoder(t_us, angle))
+        self._sink.send(encode_encoder(t_us, angle, second=second))
 
     def tick(self) -> None:
         """Let the sink continue to send the waiting packets."""

@@ -85,20 +85,19 @@ class FileSource:
         if len(self._events) and self._events.slice(0, 1).x.dtype != np.uint16:
             raise AmiwarpError(f"{path}: is compensated already; give a recording with the sensor's events")
         self.size, self.camera, self.prism = self._events.size, recording.camera, recording.prism
-        self.has_encoder = encoder is not None
-        self._encoder_t, self._encoder_angle = np.zeros(0, np.int64), np.zeros(0)
         self.clock_offset_us = 0.0 if encoder is None else encoder.clock_offset_us
         """Clock offset subtracted from the times of the file's encoder to put them on the events' clock [us]."""
-        if encoder is not None:
-            # A rounding error of half a microsecond is less than 0.01 deg at 3000 rpm.
-            self._encoder_t, self._encoder_angle = encoder.t - round(encoder.clock_offset_us), encoder.angle
+        both = (encoder, None if encoder is None else encoder.second)
+        # A rounding error of half a microsecond is less than 0.01 deg at 3000 rpm.
+        self._samples = [(e.t - round(self.clock_offset_us), e.angle) for e in both if e is not None]
+        self.encoders = len(self._samples)
         self._pace, self._packet_us, self._clock, self._sleep = pace, packet_us, clock, sleep
-        self._samples_sent = 0
+        self._sent = [0] * self.encoders
 
     def packets(self) -> Iterator[Packet]:
         """Yield packets, see :meth:`Source.packets`."""
         began = self._clock()
-        self._samples_sent = 0
+        self._sent = [0] * self.encoders
         if len(self._events):
             first = self._events.t_first
             for block in self._events.blocks(duration_us=self._packet_us):
@@ -108,8 +107,8 @@ class FileSource:
                     due = began + round(window * self._packet_us / self._pace)
                     yield from self._wait(due)
                 yield self._packet(due, block, first + window * self._packet_us)
-        if self._samples_sent < len(self._encoder_t):
-            yield self._packet(self._clock(), Events.empty(), int(self._encoder_t[-1]))
+        if any(sent < len(t) for sent, (t, _) in zip(self._sent, self._samples, strict=True)):
+            yield self._packet(self._clock(), Events.empty(), max(int(t[-1]) for t, _ in self._samples))
 
     def close(self) -> None:
         """Do nothing: the file is closed with the last reference to it."""
@@ -121,12 +120,12 @@ class FileSource:
                 yield make_packet(self._clock())
 
     def _packet(self, arrived_us: int, events: Events, end_us: int) -> Packet:
-        start = self._samples_sent
-        self._samples_sent = max(start, min(int(np.searchsorted(self._encoder_t, end_us)) + 1, len(self._encoder_t)))
-        which = slice(start, self._samples_sent)
-        return make_packet(
-            arrived_us, events, encoder_t=self._encoder_t[which], encoder_angle=self._encoder_angle[which]
-        )
+        columns: list[NDArray[Any]] = []
+        for k, (t, angle) in enumerate(self._samples):
+            start = self._sent[k]
+            self._sent[k] = max(start, min(int(np.searchsorted(t, end_us)) + 1, len(t)))
+            columns += [t[start : self._sent[k]], angle[start : self._sent[k]]]
+        return make_packet(arrived_us, events, wire.NO_TIMES, *columns)
 
 
 class StreamSource:
@@ -148,7 +147,7 @@ class StreamSource:
             self.close()
             raise
         self.size, self.camera, self.prism = (hello.width, hello.height), hello.camera, hello.prism
-        self.has_encoder = True
+        self.encoders = hello.encoders
 
     def packets(self) -> Iterator[Packet]:
         """Yield packets, see :meth:`Source.packets`."""
@@ -218,7 +217,12 @@ class StreamSource:
             if not (np.abs(message.angle) <= LARGEST_RAD).all():
                 what = f"an encoder sample is not finite or beyond {LARGEST_RAD:g} rad"
                 raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
-            return make_packet(now, encoder_t=message.t, encoder_angle=message.angle)
+            if not message.second:
+                return make_packet(now, encoder_t=message.t, encoder_angle=message.angle)
+            if self.encoders < 2:
+                what = "samples of a second encoder come without 'encoders': 2 in its hello message"
+                raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
+            return make_packet(now, second_t=message.t, second_angle=message.angle)
         width, height = self.size
         if len(message) and (message.x.max() >= width or message.y.max() >= height or message.p.max() > 1):
             what = f"an event outside the {width}x{height} frame, or with a polarity that is neither 0 nor 1"
@@ -258,7 +262,7 @@ class ReturningSource:
         self._wait_s, self._say = wait_s, say
         source = self._source = open_stream(spec)
         self.name, self.size, self.camera, self.prism = spec, source.size, source.camera, source.prism
-        self.has_encoder = source.has_encoder
+        self.encoders = source.encoders
         self.problem: str | None = None
         """How the stream ended, in one line; None if it ended with its end message."""
         self.returns = 0
@@ -342,9 +346,12 @@ class ReturningSource:
             source.close()
             sizes = f"{source.size[0]}x{source.size[1]} pixels, before it had {self.size[0]}x{self.size[1]}"
             raise AmiwarpError(f"{self.name}: is back with a camera of {sizes}; record this camera to another file")
-        if (source.camera, source.prism) != (self.camera, self.prism):
+        if (source.camera, source.prism, source.encoders) != (self.camera, self.prism, self.encoders):
             source.close()
-            raise AmiwarpError(f"{self.name}: is back with another camera or prism; record this camera to another file")
+            raise AmiwarpError(
+                f"{self.name}: is back with another camera, prism or number of encoders; record this camera to another "
+                "file"
+            )
         self._source.close()
         self._source, self.problem = source, None
         self.returns += 1
@@ -387,7 +394,7 @@ class _CameraSource:
     camera: Camera | None = None
     """Camera intrinsics: None, because the device does not store its calibration."""
     prism: NominalPrism | None = None
-    has_encoder = False
+    encoders = 0
     size: tuple[int, int]
     name: str
 
