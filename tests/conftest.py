@@ -26,6 +26,7 @@ LONGEST_FIRST = (
     "test_io_mutation", "test_public_values", "test_reconstruct", "test_chart", "test_refusals", "test_cli",
     "test_dataset", "test_examples", "test_pixels", "test_compensate", "test_structure", "test_link", "test_demo",
     "test_sparse", "test_translate", "test_session", "test_stream_cli", "test_view_cli", "test_design",
+    "test_optics_comparison",
     "test_evaluate", "test_output", "test_optics_properties", "test_evaluate_motion", "test_stream_returning",
     "test_calibrate", "test_optics", "test_auto", "test_benchmarks_gpu", "test_adaptive", "test_pixel_map",
     "test_io_writers", "test_new_model",

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from amiwarp.studies.dataset.making import DatasetPlan, DatasetSummary
     from amiwarp.studies.design import Choice, Design, Limits, Timing
     from amiwarp.studies.evaluate.evaluation import EvaluationSummary
+    from amiwarp.studies.optics_comparison import Compared, Comparison
     from amiwarp.studies.stability.cells import Axis, Cell, Method, Store, Stored
     from amiwarp.studies.stability.report import Atlas
 
@@ -325,6 +326,11 @@ FOV_DEG = 60.0
 """Horizontal field of view that is assumed if no option describes the camera [deg]."""
 _in_limits = partial(typer.Option, rich_help_panel="Limits")
 _in_faults = partial(typer.Option, rich_help_panel="Faults")
+_in_optics = partial(typer.Option, rich_help_panel="Other optics")
+DESIGN_SHARE = 0.2
+"""Share of the study of wedges in the time of a comparison of optics, for the progress."""
+DEPTHS_M = "0.5,1,2"
+"""Depths of the scene for a plate, unless others are given [m]."""
 
 
 @dataclass(frozen=True)
@@ -391,6 +397,34 @@ class FaultOptions:
         return Timing(self.clock_us, math.radians(self.encoder_deg))
 
 
+@dataclass(frozen=True)
+class OpticsOptions:
+    """Options for the comparison with other optics."""
+
+    compare: Annotated[
+        bool,
+        _in_optics(
+            "--compare",
+            help="Compare the recommended wedge with a pair of wedges, a mirror with two tilts, a vibrating camera "
+            "and a rotating tilted plate that move the image as far.",
+        ),
+    ] = False
+    depth_m: Annotated[
+        str | None,
+        _in_optics(help=f"Depths of the scene for the plate (m). Default: {DEPTHS_M}.", metavar="A,B,..."),
+    ] = None
+
+    @property
+    def depths(self) -> list[float]:
+        """Depths of the scene for the plate [m]."""
+        return list(_list(self.depth_m or DEPTHS_M, "--depth-m"))
+
+    def check(self) -> None:
+        """Raise :class:`AmiwarpError` if the options contradict each other."""
+        if self.depth_m is not None and not self.compare:
+            raise AmiwarpError("--depth-m applies to the comparison of optics; give --compare, or remove --depth-m")
+
+
 def run_design(
     *,
     out: Annotated[Path, typer.Option(help="Folder for the chart and the tables."), OUTPUT_FOLDER] = Path(
@@ -406,14 +440,16 @@ def run_design(
     grid: GridOptions,
     limits: LimitOptions,
     faults: FaultOptions,
+    optics: OpticsOptions,
     picture: Annotated[Path | None, typer.Option(help="Picture of the scene. Default: a map of the earth.")] = None,
     common: Common,
 ) -> None:  # fmt: skip
     """Compare prisms and speeds for a camera, and recommend one with the reasons.
 
     Event rates are predicted from simulations of small parts of the image. Blur, window and models are predicted from
-    the optics.
+    the optics. With --compare, other optics are compared with the recommended wedge too.
     """
+    optics.check()
     seen = _camera_of_design(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
@@ -422,21 +458,41 @@ def run_design(
     from amiwarp.studies.design import design, draw
 
     make_folder(out)
-    files = {kind: str(out / f"design.{kind}") for kind in ("png", "svg", "json", "csv")}
+    kinds = ("png", "svg", "json", "csv")
+    files = {kind: str(out / f"design.{kind}") for kind in kinds}
+    if optics.compare:
+        files |= {f"optics_{kind}": str(out / f"optics.{kind}") for kind in kinds}
     for path in files.values():
         check_output(Path(path))
     sensor = SensorModel(contrast_on=faults.contrast, contrast_off=faults.contrast)
     scene = Scene.from_picture(picture or earth())
+    compared = None
     with progress("starting") as advance:
         made = design(
             seen, scene, glass, apexes=grid.apexes, rpms=grid.rpms, timing=faults.timing(), limits=limits.build(),
-            sensor=sensor, seed=common.seed, device=device, progress=advance,
+            sensor=sensor, seed=common.seed, device=device,
+            progress=part(advance, 0.0, DESIGN_SHARE if optics.compare else 1.0),
         )  # fmt: skip
+        if optics.compare:
+            from amiwarp.studies.optics_comparison import compare
+
+            compared = compare(made, scene, depths=optics.depths, sensor=sensor, seed=common.seed, device=device,
+                               progress=part(advance, DESIGN_SHARE, 1.0))  # fmt: skip
     data = design_summary(made)
     write_text(Path(files["json"]), json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
     write_text(Path(files["csv"]), _csv(data["choices"]))
     draw(out / "design", made)
-    report(common, {**data, "files": files, "device": device}, design_lines(made, files))
+    if compared is None:
+        report(common, {**data, "files": files, "device": device}, design_lines(made, files))
+        return
+    from amiwarp.studies import optics_comparison
+
+    optics_data = comparison_summary(compared)
+    write_text(Path(files["optics_json"]), json.dumps(plain(optics_data), indent=1, allow_nan=False) + "\n")
+    write_text(Path(files["optics_csv"]), _csv(optics_data["optics"]))
+    optics_comparison.draw(out / "optics", compared)
+    lines = [*design_lines(made, {}), *comparison_lines(compared), "", *files.values()]
+    report(common, {**data, "comparison": optics_data, "files": files, "device": device}, lines)
 
 
 def _camera_of_design(options: CameraOptions, size: str | None) -> Camera:
@@ -524,6 +580,85 @@ def design_lines(design: Design, files: dict[str, str]) -> list[Any]:
     shown = table(rows, "apex", "rpm", "events", "orbit", "error", "model", "window", "misses")
     said = [tuple(line.split(": ", 1)) for line in reasons(design)]
     return [shown, "", headline(design), table(said), "", *files.values()]
+
+
+def comparison_summary(comparison: Comparison) -> dict[str, Any]:
+    """Return all results of the comparison of optics for JSON, with angles in degrees."""
+    from amiwarp.studies.optics_comparison import reasons
+
+    return {
+        "format": "amiwarp-optics",
+        "version": 1,
+        "reference": {
+            "apex_deg": math.degrees(comparison.reference.orbit.apex),
+            "rpm": comparison.reference.rpm,
+            "misses": list(comparison.reference.misses),
+        },
+        "window_ms": comparison.design.limits.window_ms,
+        "optics": [_optic_fields(r) for r in comparison.results],
+        "recommended": {a.task: None if a.chosen is None else a.chosen.setting.name for a in comparison.advice},
+        "reasons": reasons(comparison),
+    }
+
+
+def _optic_fields(r: Compared) -> dict[str, Any]:
+    glass, drive, state = r.setting.NEEDS[r.setting.kind]
+    covered = r.coverage
+    return {
+        "optic": r.setting.name,
+        "size": r.setting.size,
+        "turns_per_s": r.setting.hz,
+        "radius_px": r.radius,
+        "smallest_radius_px": r.smallest,
+        "swing_px": covered.swing,
+        "complete_ms": r.complete_ms,
+        "left_out_share": covered.left_out,
+        "least_moved_edges_deg": math.degrees(covered.blind),
+        "clock_px": r.clock_px,
+        "angle_px": r.encoder_px,
+        "blur_px": r.blur_px,
+        "events_per_s": r.events_per_s,
+        "simulated_events_per_s": r.simulated_per_s,
+        "simulation_uncertainty": r.uncertainty,
+        "law_deviation": r.deviation,
+        "events_per_s_px": r.events_per_s_px,
+        "depth_m": 1.0 / r.setting.inverse_depth if r.setting.inverse_depth else None,
+        "depth_determined": r.depth_deviation is not None,
+        "depth_deviation": r.depth_deviation,
+        "glass": glass,
+        "drive": drive,
+        "state_from": state,
+        "misses": list(r.misses),
+    }
+
+
+def comparison_lines(comparison: Comparison) -> list[Any]:
+    """Return the comparison of optics as tables of text."""
+    from amiwarp.studies.design import rate
+    from amiwarp.studies.optics_comparison import reasons
+
+    rows = [
+        (r.setting.name, r.setting.size, f"{r.setting.hz:g}/s", f"{r.radius:.2f} px", f"{r.coverage.swing:.2f} px",
+         f"{r.complete_ms:.1f} ms" if math.isfinite(r.complete_ms) else "never", f"{r.blur_px:.3f} px",
+         rate(r.events_per_s), f"{100 * r.deviation:+.0f} ± {100 * r.uncertainty:.1g} %",
+         "not determined" if r.depth_deviation is None else f"± {100 * r.depth_deviation:.2g} %", ", ".join(r.misses))
+        for r in comparison.results
+    ]  # fmt: skip
+    heads = (
+        "optic",
+        "size",
+        "turns",
+        "motion",
+        "edges",
+        "all edges",
+        "blur",
+        "events",
+        "to simulation",
+        "depth",
+        "misses",
+    )
+    said = [tuple(line.split(": ", 1)) for line in reasons(comparison)]
+    return [table(rows, *heads), "", table(said)]
 
 
 # ``amiwarp stability``: limits and failures of the calibration, on simulated recordings with ground truth.

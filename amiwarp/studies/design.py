@@ -31,6 +31,10 @@ The minimum is over all edge directions and all start angles.
 """
 GRID = 12
 """Number of rows of the grid of pixels on which the circle models are fitted."""
+ACROSS_IMAGE, DOWN_IMAGE = 33, 25
+"""Number of columns and rows of the grid of pixels whose paths are followed."""
+TURN_ANGLES = 24
+"""Number of angles per turn at which these pixels are followed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,17 +72,33 @@ def orbit_radii(camera: Camera, prism: Prism) -> tuple[float, float]:
 
     Raises :class:`AmiwarpError` if no pixel has a ray during a whole turn.
     """
-    exact = ExactModel(camera, prism)
-    x, y = np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 25)
-    grid = np.stack([m.ravel() for m in np.meshgrid(x, y)], axis=1)
-    theta = np.arange(24) * (2.0 * np.pi / 24)
-    moved = exact.compensate_points(np.repeat(grid, 24, axis=0), np.tile(theta, len(grid))).reshape(len(grid), 24, 2)
-    radii = np.sqrt(np.mean(np.sum((moved - moved.mean(axis=1, keepdims=True)) ** 2, axis=2), axis=1))
-    radii = radii[np.isfinite(radii)]
+    moved = paths(ExactModel(camera, prism), image_grid(camera), TURN_ANGLES)
+    radii = radii_of(moved[np.isfinite(moved).all(axis=(1, 2))])
     if not len(radii):
         raise AmiwarpError(f"apex {math.degrees(prism.apex):.6g} deg: no pixel of this camera has a ray during a "
                            "whole turn; choose a smaller apex or a lens with a narrower view")  # fmt: skip
     return float(np.sqrt(np.mean(radii**2))), float(radii.min())
+
+
+def image_grid(camera: Camera, across: int = ACROSS_IMAGE, down: int = DOWN_IMAGE) -> NDArray[np.float64]:
+    """Return a grid of pixels over the whole image, row by row, shape ``(down * across, 2)``."""
+    x, y = np.linspace(0, camera.width - 1, across), np.linspace(0, camera.height - 1, down)
+    return np.stack([m.ravel() for m in np.meshgrid(x, y)], axis=1)
+
+
+def paths(model: Model, pixels: NDArray[np.float64], per_turn: int, turns: int = 1) -> NDArray[np.float64]:
+    """Return the path of what each pixel sees in the image at rest, over whole turns of the first angle.
+
+    The shape is (pixels, ``per_turn * turns``, 2). Positions are NaN where a pixel has no ray.
+    """
+    theta = np.arange(per_turn * turns) * (2.0 * np.pi / per_turn)
+    moved = model.compensate_points(np.repeat(pixels, len(theta), axis=0), np.tile(theta, len(pixels)))
+    return moved.reshape(len(pixels), len(theta), 2)
+
+
+def radii_of(moved: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rms distance of each path, shape (pixels, angles, 2), from its middle: of a circle, its radius."""
+    return np.asarray(np.sqrt(np.mean(np.sum((moved - moved.mean(axis=1, keepdims=True)) ** 2, axis=2), axis=1)))
 
 
 def _model_errors(exact: ExactModel, device: str) -> dict[str, float]:
@@ -124,7 +144,8 @@ NODES = 4
 class Volume:
     """Measured law of the event volume.
 
-    Events per turn and pixel are yield · 4 r ⟨|∇L|⟩ / C, where r is the radius of the orbits; sensor noise is added.
+    Events per turn and pixel are yield · Δ / C, where Δ is the mean distance by which the log intensity of a pixel
+    goes up and down in a turn; sensor noise is added. On orbits of radius r, Δ is 4 r ⟨|∇L|⟩.
     """
 
     apexes: NDArray[np.float64]
@@ -148,10 +169,14 @@ class Volume:
 
     def events_per_s(self, orbit: Orbit, rpm: float) -> float:
         """Return the event rate of the whole image [events/s]."""
-        per_turn = self._yield(orbit.apex, rpm) * 4.0 * orbit.radius * self.texture / self.contrast
-        return self.pixels * (per_turn * rpm / 60.0 + self.noise_hz)
+        per_turn = self.yield_at(orbit.apex, rpm) * 4.0 * orbit.radius * self.texture / self.contrast
+        return self.of_image(per_turn * rpm / 60.0)
 
-    def _yield(self, apex: float, rpm: float) -> float:
+    def of_image(self, per_pixel: float) -> float:
+        """Return the event rate of the whole image [events/s] for one per pixel without noise [events/s]."""
+        return self.pixels * (per_pixel + self.noise_hz)
+
+    def yield_at(self, apex: float, rpm: float) -> float:
         """Return the ratio of simulated to expected events at an apex angle [rad] and a speed [turns/min].
 
         It is a power law between simulated apexes; between speeds its reciprocal is linear, as for a dead time.
@@ -187,14 +212,13 @@ def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float]
     Raises :class:`AmiwarpError` for a scene without texture.
     """
     sensor, camera = template.sensor, template.camera
-    slopes: Any = np.gradient(template.log_view())
-    gradient = np.hypot(slopes[0], slopes[1])
+    gradient = np.hypot(*slopes_of(template.log_view()))
     if not gradient.mean() > 0.0:
         raise AmiwarpError("the scene has no texture, so it generates no events with any prism; choose another picture")
     nodes = np.geomspace(apexes[0], apexes[-1], min(NODES, len(apexes))) if len(apexes) > 1 else np.array(apexes)
     speeds = np.array(sorted({rpms[0], rpms[-1]}))
     contrast = 2.0 / (1.0 / sensor.contrast_on + 1.0 / sensor.contrast_off)
-    noise = sensor.shot_noise_hz + sensor.leak_hz + sensor.hot_fraction * sensor.hot_hz
+    noise = noise_hz(sensor)
     cameras = tiles(camera, template.seed)
     yields, spread = np.empty((len(nodes), len(speeds))), []
     for k, (i, j) in enumerate(np.ndindex(yields.shape)):
@@ -203,14 +227,37 @@ def measure(template: Simulation, apexes: Sequence[float], rpms: Sequence[float]
         prism = replace(template.glass, apex=float(nodes[i]))
         case = replace(template, prism=prism, motion=PrismMotion(rpm), duration_s=120.0 / rpm)
         radius = orbit_radii(camera, prism)[0]
-        found = np.array([_per_turn(case, tile, k) for k, tile in enumerate(cameras)]) - noise * 60.0 / rpm
-        likely = _texture_of(gradient, radius, camera, cameras) * 4.0 * radius / contrast
-        yields[i, j] = max(float(found.mean() / likely.mean()), 1e-6)
-        spread.append(float(np.std(found - yields[i, j] * likely)) / math.sqrt(len(cameras)) / abs(found.mean()))
+        likely = texture_of(gradient, radius, camera, cameras) * 4.0 * radius / contrast
+        yields[i, j], error = simulated_yield(case, cameras, likely, case.duration_us // 2, noise * 60.0 / rpm)
+        spread.append(error)
     pixels = camera.width * camera.height
     simulated = sum(tile.width * tile.height for tile in cameras)
     return Volume(nodes, speeds, yields, float(np.mean(spread)), float(gradient.mean()), contrast, pixels, noise,
                   simulated)  # fmt: skip
+
+
+def slopes_of(log: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the gradient of a picture's log intensity [1/px]: along y, and along x."""
+    down, across = np.gradient(log)
+    return down, across
+
+
+def noise_hz(sensor: SensorModel) -> float:
+    """Return the mean noise rate of a pixel [events/s]."""
+    return sensor.shot_noise_hz + sensor.leak_hz + sensor.hot_fraction * sensor.hot_hz
+
+
+def simulated_yield(
+    case: Simulation, cameras: Sequence[Camera], likely: NDArray[np.float64], start_us: int, noise: float
+) -> tuple[float, float]:
+    """Simulate tiles, and return the ratio of their events to the likely ones, with its relative standard error.
+
+    ``likely``: events per pixel that the scene's gradients let expect after ``start_us`` [us], shape ``(tiles,)``;
+    ``noise``: events per pixel by noise.
+    """
+    found = np.array([_events_after(case, tile, k, start_us) for k, tile in enumerate(cameras)]) - noise
+    ratio = max(float(found.mean() / likely.mean()), 1e-6)
+    return ratio, float(np.std(found - ratio * likely)) / math.sqrt(len(cameras)) / abs(found.mean())
 
 
 def tiles(camera: Camera, seed: int = 0) -> list[Camera]:
@@ -231,15 +278,14 @@ def tiles(camera: Camera, seed: int = 0) -> list[Camera]:
     ]
 
 
-def _per_turn(case: Simulation, tile: Camera, number: int) -> float:
-    """Simulate a tile and return its number of events per pixel in the second turn."""
-    half = case.duration_us // 2
+def _events_after(case: Simulation, tile: Camera, number: int, start_us: int) -> float:
+    """Simulate a tile and return its number of events per pixel from ``start_us`` [us] on."""
     seeded = replace(case, camera=tile, seed=(case.seed + number) % (1 << 31))
     blocks = seeded.blocks(chunk_us=case.duration_us)  # one chunk, because there are few pixels
-    return sum(int((events.t >= half).sum()) for events, _ in blocks) / (tile.width * tile.height)
+    return sum(int((events.t >= start_us).sum()) for events, _ in blocks) / (tile.width * tile.height)
 
 
-def _texture_of(gradient: NDArray[Any], radius: float, camera: Camera, parts: Sequence[Camera]) -> NDArray[np.float64]:
+def texture_of(gradient: NDArray[Any], radius: float, camera: Camera, parts: Sequence[Camera]) -> NDArray[np.float64]:
     """Return the mean gradient of log intensity along the orbits of each tile's pixels [1/px], shape ``(tiles,)``."""
     from scipy.ndimage import gaussian_filter
 
@@ -279,7 +325,11 @@ class Timing:
     def blur(self, radius: float, rpm: float) -> tuple[float, float]:
         """Return the blur across an edge [px] that clock and encoder each add, for an orbit of ``radius`` [px]."""
         speed = 2.0 * math.pi * rpm / 60.0
-        return ACROSS * radius * speed * self.clock_us * 1e-6, ACROSS * radius * self.encoder
+        return self.scaled(ACROSS * radius * speed, ACROSS * radius)
+
+    def scaled(self, per_second: float, per_radian: float) -> tuple[float, float]:
+        """Return the blur across an edge [px] by clock and encoder, for motions across it per second and per radian."""
+        return per_second * self.clock_us * 1e-6, per_radian * self.encoder
 
 
 @dataclass(frozen=True, slots=True)
