@@ -333,10 +333,3 @@ def test_programs(tmp_path: Path, texture: np.ndarray) -> None:
     )
     assert wrong.exit_code == 1
     assert "--fold-deg applies to a mirror" in wrong.stderr
-
-
-def test_its_size_follows_from_an_apex_as_a_wedges_does() -> None:
-    prism = amiwarp.Prism(math.radians(1.0))
-    size = amiwarp.MirrorModel.size_from_apex(prism.apex, prism)
-    assert 2.0 * size == amiwarp.deflection_from_apex(prism.apex, prism.index, prism.flat_side)
-    assert amiwarp.MirrorModel.apex_from_size(size, prism) == pytest.approx(prism.apex, rel=1e-12)

@@ -246,10 +246,3 @@ def test_programs(tmp_path: Path, texture: np.ndarray) -> None:
     wrong = runner.invoke(app, ["simulate", str(out), "--picture", str(tmp_path / "p.png"), "--hz", "80", "--force"])
     assert wrong.exit_code == 1
     assert "--hz applies to a vibration" in wrong.stderr
-
-
-def test_its_size_follows_from_an_apex_as_a_wedges_does() -> None:
-    prism = amiwarp.Prism(math.radians(1.0))
-    size = amiwarp.VibrationModel.size_from_apex(prism.apex, prism)
-    assert size == amiwarp.deflection_from_apex(prism.apex, prism.index, prism.flat_side)
-    assert amiwarp.VibrationModel.apex_from_size(size, prism) == pytest.approx(prism.apex, rel=1e-12)

@@ -20,11 +20,13 @@ from amiwarp import (
     Encoder,
     Events,
     MemoryEvents,
+    Plate,
     Prism,
     Recording,
     Settings,
     Sharpness,
     compensate_events,
+    deflection_from_apex,
     find_background_activity,
     open_recording,
     reconstruct,
@@ -34,6 +36,7 @@ from amiwarp import (
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.metrics import random_variance, relative_variance
+from amiwarp.optics.models import MODELS, Model
 from amiwarp.viewer import drawing, jobs
 from amiwarp.viewer import inspector as timeline
 from amiwarp.viewer import inspector as viewer
@@ -45,6 +48,7 @@ from amiwarp.viewer.inspector import (
     Selection,
     Source,
     foreign_names,
+    size_name,
     suggest_region,
 )
 from amiwarp.viewer.jobs import (
@@ -56,12 +60,16 @@ from amiwarp.viewer.jobs import (
     write_image,
 )
 from amiwarp.viewer.layout import (
+    SLIDERS,
+    UNITS,
     History,
     ViewState,
     apply_state,
     current_state,
     decode_state,
     encode_state,
+    knob_values,
+    orbit_text,
 )
 from amiwarp.viewer.panel import Panel
 
@@ -93,6 +101,50 @@ def every_other(recording: Recording) -> Recording:
     events = recording.events.slice(0, len(recording.events))
     kept = events[np.random.default_rng(3).random(len(events)) < 0.5]
     return replace(recording, events=MemoryEvents(kept, *recording.events.size), truth=None)
+
+
+# the slider of the size
+
+
+def size_of(model: Model) -> float:
+    """Return the size of a model: the apex of its prism, or its field."""
+    return float(getattr(model, "prism", model).apex if model.SIZE == "apex" else getattr(model, model.SIZE))
+
+
+@pytest.mark.parametrize(
+    ("model", "name", "label", "given", "size"),
+    [
+        ("exact", "apex", ("apex angle", "°"), 1.5, math.radians(1.5)),
+        ("circle", "apex", ("apex angle", "°"), 1.5, deflection_from_apex(math.radians(1.5), 1.5168)),
+        ("risley", "apex", ("apex angle", "°"), 1.5, math.radians(1.5)),
+        ("vibration", "amplitude", ("amplitude", "°"), 0.4, math.radians(0.4)),
+        ("mirror", "amplitude", ("amplitude", "°"), 0.4, math.radians(0.4)),
+        ("plate", "inverse_depth", ("inverse depth", "1/m"), 1.5, 1.5),
+    ],
+)
+def test_the_slider_of_the_size_has_name_and_unit_of_the_optic_s_own(
+    model: str, name: str, label: tuple[str, str], given: float, size: float
+) -> None:
+    kind, encoder = MODELS[model], Encoder.constant_speed(720.0, 0, 100_000)
+    recording = Recording(
+        MemoryEvents(random_events(2000, 40, 30), 40, 30), Camera.from_fov(40, 30, 1.0),
+        encoder.with_second(-0.5) if kind.ANGLES == 2 else encoder,
+        Plate(0.01, 0.8) if model == "plate" else TRUE if kind.PRISM else None,
+    )  # fmt: skip
+    inspector = Inspector(recording)
+    inspector.use_model(model)
+    assert size_name(model) == name
+    assert SLIDERS[name][:2] == label
+    sizes = [each for each in ("apex", "amplitude", "inverse_depth") if f"model === '{model}'" in SLIDERS[each][3]]
+    assert sizes == [name]  # the others are not shown
+    assert size_of(inspector.model) > 0.0  # a typical value, at first
+    assert inspector.sources[name] is not Source.HAND
+    inspector.set(inspector.knobs.with_values({name: given * UNITS[name]}))
+    assert size_of(inspector.model) == pytest.approx(size, rel=1e-9)
+    assert inspector.sources[name] is Source.HAND
+    again = Inspector(recording, inspector.as_calibration())
+    assert knob_values(again)[name] == pytest.approx(given, abs=1e-4)
+    assert orbit_text(model, again.knobs.value(name), 0.0).startswith(f"{name.replace('_', ' ')} {given:g}")
 
 
 # sharpness

@@ -87,6 +87,18 @@ def test_a_slider_moves_the_compensated_cloud(window: Window, name: str, value: 
     assert window.knob == name
 
 
+def test_the_slider_of_the_size_is_that_of_a_vibrating_camera(recording: Recording) -> None:
+    inspector = Inspector(replace(recording, encoder=None, prism=None))
+    inspector.use_model("vibration")
+    made = Window(inspector, size=SIZE, off_screen=True)
+    assert list(made.sliders) == ["amplitude", "phase", "rpm", "start_ms", "length_ms"]
+    drag(made, "amplitude", 0.35)
+    title = made.sliders["amplitude"].GetRepresentation().GetTitleText()
+    assert title == "amplitude 0.35° (set by hand)"
+    assert made.inspector.knobs.value("amplitude") == pytest.approx(math.radians(0.35), abs=1e-6)
+    made.scene.close()
+
+
 def test_sliders_set_the_time_window(window: Window, recording: Recording) -> None:
     drag(window, "length_ms", 20.0)
     drag(window, "start_ms", 50.0)

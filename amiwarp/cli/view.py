@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -233,7 +233,7 @@ class StartOptions:
         if self.model is not None:
             if self.model not in MODELS:
                 raise AmiwarpError(f"--model {self.model!r} is unknown; choose among {', '.join(MODELS)}")
-            inspector.set(replace(inspector.knobs, model=self.model))
+            inspector.use_model(self.model)
         if self.window is not None:
             events = inspector.recording.events
             low, high = span(self.window, events.t_first, events.t_last)

@@ -17,16 +17,8 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.mirror import MirrorParams
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, PHASE, Model, Parameter, RisleyModel, both_angles, struct_of
-from amiwarp.optics.prism import (
-    NominalPrism,
-    Plate,
-    Prism,
-    apex_from_deflection,
-    as_wedge,
-    check_phase,
-    deflection_from_apex,
-)
+from amiwarp.optics.models import AMPLITUDE, MODELS, PHASE, Model, Parameter, RisleyModel, both_angles, struct_of
+from amiwarp.optics.prism import Plate, Prism, check_phase
 from amiwarp.validation import array, guarded, instance, one_of, real
 
 LARGEST_TILT = 0.2
@@ -71,7 +63,7 @@ class MirrorModel(Model):
 
     NAME, TEXT, NUMBERS, STRUCT, ANGLES = "mirror", "mirror with two tilts", "8", MirrorParams, 2
     PARAMETERS = (
-        Parameter("amplitude", "rad"),
+        AMPLITUDE,
         PHASE,
         Parameter("second_amplitude", "rad"),
         next(parameter for parameter in RisleyModel.PARAMETERS if parameter.name == "second_phase"),
@@ -134,16 +126,6 @@ class MirrorModel(Model):
         if one_of(name, cls.FREE, "name") in dict(cls.ORBITS):
             return 0.0, min(0.5 * LARGEST_PX / camera.fx, LARGEST_TILT)
         return super().default_bounds(name, value, camera, prism)
-
-    @classmethod
-    def size_from_apex(cls, apex: float, prism: NominalPrism) -> float:
-        wedge = as_wedge(prism)
-        return 0.5 * deflection_from_apex(apex, wedge.index, wedge.flat_side)
-
-    @classmethod
-    def apex_from_size(cls, size: float, prism: NominalPrism) -> float:
-        wedge = as_wedge(prism)
-        return apex_from_deflection(2.0 * size, wedge.index, wedge.flat_side)
 
     @classmethod
     def freed(cls, ratio: float | None) -> tuple[str, ...]:

@@ -67,13 +67,18 @@ class Parameter:
     label: str = ""
     """Text of its slider in ``amiwarp view``; empty without a slider."""
     slider: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Minimum, maximum and step of its slider, angles in degrees; the slider starts at 0."""
+    """Minimum, maximum and step of its slider, angles in degrees. The slider starts at 0, that of a size at a typical
+    value."""
     fine: bool = False
     """Whether its effect is so small that the global search keeps its start value."""
 
 
 PHASE = Parameter("phase", "rad")
 """Phase θ_b, which is added to the encoder's angle."""
+AMPLITUDE = Parameter(
+    "amplitude", "rad", math.radians(0.4), limits=(0.0, 11.4), label="amplitude", slider=(0.0, 3.0, 0.005)
+)
+"""Size of a motion that no glass makes."""
 
 
 class Model:
@@ -1154,7 +1159,11 @@ class PlateModel(Model):
 
     NAME, TEXT, NUMBERS, STRUCT = "plate", "tilted plate", "2, plate given", plate_kernels.PlateParams
     GLASS = Plate
-    PARAMETERS = (Parameter("inverse_depth", "1/m", 5.0, limits=(0.0, LARGEST_INVERSE_DEPTH)), PHASE)
+    PARAMETERS = (
+        Parameter("inverse_depth", "1/m", 1.0, limits=(0.0, LARGEST_INVERSE_DEPTH), label="inverse depth",
+                  slider=(0.0, 5.0, 0.01)),
+        PHASE,
+    )  # fmt: skip
 
     camera: Camera
     """Camera intrinsics."""

@@ -18,16 +18,8 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.vibration import VibrationParams
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, PHASE, Model, Parameter, check_given, phase_values, struct_of
-from amiwarp.optics.prism import (
-    NominalPrism,
-    Plate,
-    Prism,
-    apex_from_deflection,
-    as_wedge,
-    check_phase,
-    deflection_from_apex,
-)
+from amiwarp.optics.models import AMPLITUDE, MODELS, PHASE, Model, Parameter, check_given, phase_values, struct_of
+from amiwarp.optics.prism import Plate, Prism, check_phase
 from amiwarp.validation import array, guarded, instance, one_of, real, vector
 
 LARGEST_AMPLITUDE = 0.2
@@ -74,7 +66,7 @@ class VibrationModel(Model):
 
     NAME, TEXT, NUMBERS, STRUCT = "vibration", "vibrating camera", "10", VibrationParams
     PARAMETERS = (
-        Parameter("amplitude", "rad"),
+        AMPLITUDE,
         PHASE,
         *_parameters("backward circle", "backward", fine=False),
         *_parameters("roll", "roll", fine=True),
@@ -123,16 +115,6 @@ class VibrationModel(Model):
             return super().default_bounds(name, value, camera, prism)
         largest = min(LARGEST_PX / camera.fx, LARGEST_AMPLITUDE)
         return (0.0 if name == cls.SIZE else -largest), largest
-
-    @classmethod
-    def size_from_apex(cls, apex: float, prism: NominalPrism) -> float:
-        wedge = as_wedge(prism)
-        return deflection_from_apex(apex, wedge.index, wedge.flat_side)
-
-    @classmethod
-    def apex_from_size(cls, size: float, prism: NominalPrism) -> float:
-        wedge = as_wedge(prism)
-        return apex_from_deflection(size, wedge.index, wedge.flat_side)
 
     @classmethod
     def still_values(cls, values: Mapping[str, float]) -> dict[str, float]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from amiwarp.calib.bad_pixels import strange_pixels, stretch
 from amiwarp.calib.parameters import nominal, optical_parameters
+from amiwarp.calib.plate import LARGEST_INVERSE
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.choices import Colour, Sharpness, Vote
 from amiwarp.compensation.recordings import compensate_events
@@ -31,8 +32,8 @@ from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, upload_event
 from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_variance
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, PHASE, ExactModel, Model, RisleyModel, alternatives, build_model, size_names
-from amiwarp.optics.prism import NominalPrism, as_wedge
+from amiwarp.optics.models import MODELS, PHASE, ExactModel, Model, PlateModel, RisleyModel, alternatives, build_model
+from amiwarp.optics.prism import NominalPrism, Plate, Prism, as_wedge
 from amiwarp.reconstruction.picture import Picture, border_displacements
 
 # Rates of ON and OFF events over a recording at any zoom, counted once in bounded memory.
@@ -352,7 +353,7 @@ class Knobs:
     model: str = "exact"
     """Name of the optical model."""
     apex: float = 0.0
-    """Apex angle of the prism [rad]."""
+    """Apex angle of the prism [rad]. Other optics have their size among :attr:`others`."""
     phase: float = 0.0
     """Phase θ_b of the prism [rad]."""
     clock_offset: float = 0.0
@@ -389,8 +390,16 @@ class Knobs:
         return {name: value for name, value in found.items() if value is not None}
 
 
-OTHERS = {name: p for name, p in optical_parameters().items() if name not in (*size_names(), PHASE.name)}
-"""Parameters of the optical models but for sizes and phase, by name."""
+def size_name(model: str) -> str:
+    """Return the name of the parameter that the slider of a model's size sets: for all models of wedges the apex."""
+    kind = MODELS[model]
+    return "apex" if kind.PRISM and kind.GLASS is Prism else kind.SIZE
+
+
+WEDGE_SIZES = {kind.SIZE for name, kind in MODELS.items() if size_name(name) == "apex"}
+"""Names of the sizes of models that the slider of the apex sets."""
+OTHERS = {name: p for name, p in optical_parameters().items() if name not in (*WEDGE_SIZES, PHASE.name)}
+"""Parameters of the optical models but for phase and sizes of wedges, by name."""
 SLIDING = {name: p for name, p in OTHERS.items() if p.label}
 """Those among :data:`OTHERS` that have a slider."""
 
@@ -753,13 +762,15 @@ class Inspector:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
         self.recording, self.device, self.latest = recording, device, latest
         self._most_events = most_events
-        self.prism = as_wedge(nominal(recording.prism))
-        """Nominal prism of the recording, with an assumed apex if it is unknown."""
+        self.prism = nominal(recording.prism)
+        """Nominal glass of the recording; a prism with an assumed apex if it is unknown."""
         self.zero_us = (source.t_first + source.t_last) // 2
         """Time at which the prism angle is 0 if there is no encoder [us]."""
+        best = self._best_model
         self.knobs = Knobs.given(
-            self._second_prism, model=self._best_model, apex=self.prism.apex, clock_offset=self._recorded_offset_us
-        )
+            self._second_prism | self._typical_size(best), model=best, apex=self.nominal_apex,
+            clock_offset=self._recorded_offset_us,
+        )  # fmt: skip
         self.window: tuple[int, int] | None = None
         """Start and length of the time window [us]; None: that of :meth:`first_window`."""
         self.selection = Selection()
@@ -822,8 +833,13 @@ class Inspector:
         """Prism of the recording, or the one that was set by hand; None if neither is known."""
         given = self.recording.prism
         if Source.HAND in (self.sources["prism"], None if given is not None else self.sources["apex"]):
-            return replace(self.prism, apex=self.knobs.apex)
+            return replace(as_wedge(self.prism), apex=self.knobs.apex)
         return given
+
+    @property
+    def nominal_apex(self) -> float:
+        """Apex angle of the nominal prism [rad]; 0 for a plate."""
+        return self.prism.apex if isinstance(self.prism, Prism) else 0.0
 
     @property
     def has_encoder(self) -> bool:
@@ -859,15 +875,35 @@ class Inspector:
 
     @property
     def _best_model(self) -> str:
-        """Name of the best model of the recording's optic: one prism, or a pair."""
+        """Name of the best model of the recording's optic: one prism, a pair, or a plate."""
         encoder = self.recording.encoder
+        if isinstance(self.prism, Plate):
+            return PlateModel.NAME
         return ExactModel.NAME if encoder is None or encoder.second is None else RisleyModel.NAME
 
     @property
     def _second_prism(self) -> dict[str, float]:
         """Values of the second prism of a pair as the recording gives them; none for one prism."""
         ratio = None if self.recording.encoder is None else self.recording.encoder.ratio
-        return {} if ratio is None else {"second_apex": (self.prism.second or self.prism).apex, "ratio": ratio}
+        return {} if ratio is None else {"second_apex": self._second_apex, "ratio": ratio}
+
+    @property
+    def _second_apex(self) -> float:
+        """Apex angle of the second prism of a pair [rad], by default that of the first."""
+        wedge = as_wedge(self.prism)
+        return (wedge.second or wedge).apex
+
+    def _typical_size(self, model: str) -> dict[str, float]:
+        """Return the size with which a model of another optic than a wedge starts; none for a wedge."""
+        size = size_name(model)
+        return {} if size == "apex" else {size: MODELS[model].typical_size(self.camera, self.prism)}
+
+    def use_model(self, model: str) -> None:
+        """Set the optical model. A size of which nothing is known starts at a typical value."""
+        size = self._typical_size(model)
+        self.set(replace(self.knobs, model=model))
+        if not all(map(self.knobs.value, size)):
+            self.knobs = self.knobs.with_values(size)
 
     @property
     def adjusted_encoder(self) -> Encoder:
@@ -876,9 +912,13 @@ class Inspector:
 
     @property
     def margin_px(self) -> int:
-        """How far outside a region the events of its images may be: how far the prism may move them [px]."""
-        largest = replace(self.prism, apex=max(LARGEST_APEX, 2.0 * abs(self.prism.apex)))
-        return math.ceil(1.2 * math.tan(abs(largest.deflection)) * max(self.camera.fx, self.camera.fy))
+        """How far outside a region the events of its images may be: how far the optic may move them [px]."""
+        if isinstance(self.prism, Plate):
+            reach = self.prism.shift * LARGEST_INVERSE
+        else:
+            largest = replace(self.prism, apex=max(LARGEST_APEX, 2.0 * self.prism.apex))
+            reach = math.tan(abs(largest.deflection))
+        return math.ceil(1.2 * reach * max(self.camera.fx, self.camera.fy))
 
     @property
     def model(self) -> Model:
@@ -930,12 +970,12 @@ class Inspector:
                 f"the calibration is of {given[0]}x{given[1]} pixels, the events are of {size[0]}x{size[1]}; "
                 "calibrate this recording"
             )
-        self.prism, self.recording = as_wedge(calibration.prism), replace(self.recording, camera=calibration.camera)
+        self.prism, self.recording = calibration.prism, replace(self.recording, camera=calibration.camera)
         self._harmonics = calibration.harmonics
         self._forget_angles()
         self.set(self.knobs_of(calibration))
         found, free = (
-            {"apex" if name in size_names() else name for name in names} & set(self.sources)
+            {"apex" if name in WEDGE_SIZES else name for name in names} & set(self.sources)
             for names in (calibration.parameters, calibration.free)
         )
         self.sources |= dict.fromkeys(found, Source.FILE) | dict.fromkeys(("model", *free), Source.CALIBRATED)
@@ -948,9 +988,10 @@ class Inspector:
         if calibration.zero_us is not None:
             p = kind.turned_values(p, rpm * math.tau / 60e6 * (self.zero_us - calibration.zero_us))
         offset = p.get("clock_offset", self._recorded_offset_us)
+        apex = kind.apex_from_size(p[kind.SIZE], as_wedge(prism)) if kind.SIZE in WEDGE_SIZES else self.knobs.apex
         return Knobs.given(
-            p, model=kind.NAME, apex=kind.apex_from_size(p[kind.SIZE], prism), phase=p["phase"], clock_offset=offset,
-            rpm=rpm, focal_length=p.get("focal_length"),
+            p, model=kind.NAME, apex=apex, phase=p["phase"], clock_offset=offset, rpm=rpm,
+            focal_length=p.get("focal_length"),
         )  # fmt: skip
 
     @property
@@ -987,8 +1028,8 @@ class Inspector:
         with self.lock:
             before, after = (self._imager.measure(*self.warped(w, each), w.region)[0] for each in (None, k))
         return Calibration(
-            model_name=k.model, camera=self.camera, prism=self.prism, parameters=kept, uncertainty={}, free=(),
-            sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before, sharpness_after=after,
+            model_name=k.model, camera=self.camera, prism=nominal(self.prism, kind), parameters=kept, uncertainty={},
+            free=(), sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before, sharpness_after=after,
             stages=(), events=len(w.events), seconds=0.0, warnings=("set by hand in the inspector",),
             zero_us=None if self.has_encoder else self.zero_us, harmonics=self._harmonics,
         )  # fmt: skip
@@ -1085,7 +1126,7 @@ class Inspector:
         """Yield the points of :meth:`curve` one after the other."""
         knobs, half, sharpness = self.knobs, CURVE_HALF_WIDTH[name], self.sharpness_meter(self._curve_imager)
         values = (knobs.value(name) or 0.0) + np.linspace(-half, half, CURVE_POINTS)
-        for value in values[values >= 0.0].tolist() if name == "apex" else values.tolist():
+        for value in values[values >= 0.0].tolist() if name == size_name(knobs.model) else values.tolist():
             yield value, sharpness(knobs.with_values({name: value}))
 
     def sharpness_meter(self, imager: WindowImager | None = None) -> Callable[[Knobs | None], float]:
@@ -1155,11 +1196,12 @@ class Inspector:
         A prism that does not rotate gets apex 0 and no cylinder power, so that nothing is compensated.
         """
         turns, more = bool(self.has_encoder or knobs.rpm), knobs.calibrated_only
-        apex = knobs.apex if turns else 0.0
-        prism = replace(self.prism, apex=apex, index=more.get("index", self.prism.index))
-        kind = MODELS[knobs.model]
         others = {name: (knobs.value(name) if turns else None) or 0.0 for name in SLIDING}
-        return {**more, **others, kind.SIZE: kind.size_from_apex(apex, prism), "phase": knobs.phase}
+        kind, values = MODELS[knobs.model], {**more, **others, "phase": knobs.phase}
+        if kind.SIZE in WEDGE_SIZES:
+            wedge = replace(as_wedge(self.prism), index=more.get("index", self.prism.index))
+            values[kind.SIZE] = kind.size_from_apex(knobs.apex if turns else 0.0, wedge)
+        return values
 
     def model_of(self, knobs: Knobs, camera: Camera | None = None) -> Model:
         """Return the optical model with given parameters, of the recording's camera or another one."""

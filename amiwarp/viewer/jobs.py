@@ -31,7 +31,7 @@ from amiwarp.live.stream.session import RecentEvents
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.tasks import Progress, silent
 from amiwarp.viewer.drawing import Look, Scene, ShownImages, caption, select_part, shown_lines
-from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, MOST_SEARCHED, Inspector, Knobs, Source, busiest
+from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, MOST_SEARCHED, Inspector, Knobs, Source, busiest, size_name
 
 # Work of one page: its threads, jobs and updates, and the messages about their errors.
 
@@ -333,24 +333,25 @@ def cost_surface(
 ) -> CostSurface:
     """Return the sharpness over the two parameters that matter most.
 
-    These are apex, from 0 to twice its value, and phase, over one turn about its value. Without an encoder, they are
-    speed and apex. ``points``: numbers of their values. The call may run in a thread; ``progress`` may raise an error
-    to stop it.
+    These are the size, from 0 to twice its value, and phase, over one turn about its value. Without an encoder, they
+    are speed and size. ``points``: numbers of their values. The call may run in a thread; ``progress`` may raise an
+    error to stop it.
     """
     progress, current = progress or silent, inspector.knobs
     sharpness = inspector.sharpness_meter()
-    apex = np.linspace(0.0, 2.0 * (current.apex or inspector.prism.apex), points[0])
+    size = size_name(current.model)
+    sizes = np.linspace(0.0, 2.0 * (current.value(size) or inspector.nominal_apex or CURVE_HALF_WIDTH[size]), points[0])
     if inspector.has_encoder:
-        names, values = ("apex", "phase"), (apex, current.phase + np.linspace(-math.pi, math.pi, points[1]))
+        names, values = (size, "phase"), (sizes, current.phase + np.linspace(-math.pi, math.pi, points[1]))
     else:
         width = CURVE_HALF_WIDTH["rpm"]
-        names, values = ("apex", "rpm"), (apex, current.rpm + np.linspace(-width, width, points[1]))
+        names, values = (size, "rpm"), (sizes, current.rpm + np.linspace(-width, width, points[1]))
     out = np.empty((len(values[1]), len(values[0])))
     for row, second in enumerate(values[1]):
         progress(f"sharpness over {names[0]} and {names[1]}", row / len(out))
         for column, first in enumerate(values[0]):
             changes: dict[str, Any] = {names[0]: float(first), names[1]: float(second)}
-            out[row, column] = sharpness(replace(current, **changes))
+            out[row, column] = sharpness(current.with_values(changes))
     return CostSurface(names, values, out)
 
 

@@ -10,17 +10,19 @@ from urllib.parse import parse_qsl, urlencode
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
-from amiwarp.optics.models import MODELS, alternatives
+from amiwarp.optics.models import MODELS, alternatives, size_names
 from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look, Scale, picture_state
 from amiwarp.viewer.inspector import (
     OTHERS,
     SLIDING,
+    WEDGE_SIZES,
     Inspector,
     Knobs,
     Selection,
     Source,
     colours_on_offer,
     foreign_names,
+    size_name,
     truth_text,
 )
 from amiwarp.viewer.jobs import EXPORTS, FILMS, CostSurface, FoundCalibration, LiveFigures
@@ -300,17 +302,25 @@ GIVEN = {"fov_deg": ("field of view", "°", "gives_camera"), "index": ("refracti
 FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, "fov_deg": HAND_LIMITS["fov_deg"],
                 "index": HAND_LIMITS["prism_index"]}  # fmt: skip
 """Smallest and largest value of the fields of the prism and the camera, in the page's units."""
+
+
+def _if_free(*names: str) -> str:
+    """Return the condition for showing a slider: that the model has one of the parameters."""
+    return " || ".join(f"model === '{kind.NAME}'" for kind in MODELS.values() if {*names} & {*kind.FREE})
+
+
+_OF_MODELS = {
+    name: (p.label, {"rad": "°", "1": ""}.get(p.unit, p.unit), tuple(f"{x:g}" for x in p.slider), _if_free(name))
+    for name, p in SLIDING.items()
+}
 SLIDERS = {
-    "apex": ("apex angle", "°", ("0", "apex_most", "0.005"), "true"),
+    "apex": ("apex angle", "°", ("0", "apex_most", "0.005"), _if_free(*WEDGE_SIZES)),
+    **{name: slider for name, slider in _OF_MODELS.items() if name in size_names()},
     "phase": ("phase", "°", ("-180", "180", "0.25"), "true"),
     "clock_offset": ("clock offset", "µs", ("-20000", "20000", "10"), "has_encoder"),
     "rpm": ("speed of the prism", "rpm", ("-3000", "3000", "0.5"), "!has_encoder"),
-    **{
-        name: (p.label, "°" if p.unit == "rad" else "", tuple(f"{x:g}" for x in p.slider),
-               " || ".join(f"model === '{each.NAME}'" for each in MODELS.values() if name in each.FREE))
-        for name, p in SLIDING.items()
-    },
-}  # fmt: skip
+    **{name: slider for name, slider in _OF_MODELS.items() if name not in size_names()},
+}
 """Sliders of the page by parameter: label, unit, (minimum, maximum, step), and the condition for showing the slider."""
 SCOPES = ("selection", "whole recording")
 """Choices of the events that a calibration uses."""
@@ -582,7 +592,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "exports": [[name, text, name in FILMS] for name, (text, _) in EXPORTS.items()],
         "help_shown": False, "open_shown": False, "playing": False, "speed": 0.1, "loop": False, "polarity": "both",
         "hide_hot": False, "noise_filter": False, "noise_ms": 2.0, "region_kind": "whole",
-        "region_wanted": [0, 0, *size], "region": [0, 0, *size], "knob": "apex",
+        "region_wanted": [0, 0, *size], "region": [0, 0, *size], "knob": size_name(inspector.knobs.model),
         "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
         "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
@@ -606,7 +616,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
 
 def apex_most(inspector: Inspector) -> float:
     """Return the end of the slider of the apex angle [deg]."""
-    return max(3.0, round(2.0 * math.degrees(inspector.prism.apex), 1))
+    return max(3.0, round(2.0 * math.degrees(inspector.nominal_apex), 1))
 
 
 def source_state(inspector: Inspector) -> dict[str, Any]:
@@ -640,7 +650,9 @@ def given_state(inspector: Inspector) -> dict[str, Any]:
     return {
         "fov_deg": inspector.fov_deg, "index": round(inspector.prism.index, 4),
         "gives_camera": inspector.sources["camera"] in (Source.ASSUMED, Source.HAND),
-        "gives_prism": inspector.sources["prism"] in (Source.ASSUMED, Source.HAND),
+        "gives_prism": (
+            inspector.sources["prism"] in (Source.ASSUMED, Source.HAND) and MODELS[inspector.knobs.model].PRISM
+        ),
     }  # fmt: skip
 
 
@@ -687,16 +699,26 @@ def live_state(f: LiveFigures) -> dict[str, Any]:
     return {"live_rows": [[name, text, "bad" if bad else ""] for name, text, bad in rows], "stream_note": note}
 
 
+def with_unit(name: str, value: float, digits: int = 4) -> str:
+    """Return a value of a slider, in its unit, as text."""
+    unit = SLIDERS[name][1]
+    return f"{value:.{digits}g}{unit if unit in ('°', '') else f' {unit}'}"
+
+
+def orbit_text(model: str, size: float | None, phase: float) -> str:
+    """Return the size of a model, as its slider sets it, and its phase [rad], with their units."""
+    name = size_name(model)
+    return f"{name.replace('_', ' ')} {with_unit(name, (size or 0.0) / UNITS[name])}, phase {math.degrees(phase):.4g}°"
+
+
 def found_text(found: FoundCalibration) -> str:
     """Return a description of the result of a calibration."""
-    c = found.calibration
-    p, exact = c.parameters, c.exact.parameters
+    c, exact = found.calibration, found.calibration.exact
     warnings = "".join(f"; {text}" for text in c.warnings)
-    apex, phase = (math.degrees(x) for x in (exact.get("apex", 0.0), p["phase"]))
+    orbit = orbit_text(exact.model_name, exact.parameters.get(size_name(exact.model_name)), c.parameters["phase"])
     return (
-        f"found on {found.scope}: {c.model_name} model, apex {apex:.4g}°, phase {phase:.4g}°; sharpness of the region "
-        f"{found.before:.3g} as recorded, {found.current:.3g} now, {found.after:.3g} with the result; "
-        f"{c.seconds:.1f} s{warnings}"
+        f"found on {found.scope}: {c.model_name} model, {orbit}; sharpness of the region {found.before:.3g} as "
+        f"recorded, {found.current:.3g} now, {found.after:.3g} with the result; {c.seconds:.1f} s{warnings}"
     )
 
 
@@ -711,7 +733,7 @@ def surface_state(surface: CostSurface, inspector: Inspector, found: Calibration
     marks = []
     for title, (sign, knobs) in known.items():
         if knobs is not None:
-            place = [getattr(knobs, name) / scale for name, scale in zip(names, scales, strict=True)]
+            place = [(knobs.value(name) or 0.0) / scale for name, scale in zip(names, scales, strict=True)]
             if names[1] == "phase":
                 place[1] += 360.0 * round((inspector.knobs.phase / scales[1] - place[1]) / 360.0)
             marks.append({"x": place[0], "y": place[1], "sign": sign, "title": title})

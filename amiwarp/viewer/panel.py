@@ -25,7 +25,7 @@ from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
-from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection
+from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection, size_name
 from amiwarp.viewer.jobs import SLOW, JobCancelled, JobProgress, PageWork
 from amiwarp.viewer.serve import finite, serve, use_page
 
@@ -368,9 +368,9 @@ class Panel(PageWork, layout.Actions):
     def show_b(self, knobs: Knobs | None) -> None:
         """Show parameters on the left as B; None for the recorded events."""
         self.b = knobs
-        text = "" if knobs is None else (
-            f"{knobs.model}, apex {math.degrees(knobs.apex):.4g}°, phase {math.degrees(knobs.phase):.4g}°"
-        )  # fmt: skip
+        text = ""
+        if knobs is not None:
+            text = f"{knobs.model}, {layout.orbit_text(knobs.model, knobs.value(size_name(knobs.model)), knobs.phase)}"
         against = "recorded" if knobs is None else "B"
         self.state.update({"has_b": knobs is not None, "b_text": text, "against": against})
         self.request("knobs")

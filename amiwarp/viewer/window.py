@@ -23,7 +23,7 @@ from amiwarp.optics.models import MODELS, alternatives
 from amiwarp.tasks import no_garbage_collection
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import Look, Scene
-from amiwarp.viewer.inspector import SLIDING, DisplayedWindow, Inspector, colours_on_offer
+from amiwarp.viewer.inspector import SLIDING, DisplayedWindow, Inspector, colours_on_offer, size_name
 
 SIZE = (1500, 950)
 """Width and height of the window at the start [px]."""
@@ -109,7 +109,7 @@ class Window(layout.Actions):
         self.shown: DisplayedWindow
         """What the window shows."""
         self.help_shown = self.statistics_shown = self.plays = self.loop = self.closed = False
-        self.knob, self.message = "apex", ""
+        self.knob, self.message = size_name(inspector.knobs.model), ""
         self.sliders: dict[str, Any] = {}
         """Slider widgets by the name of their value."""
         self.plotter = self.scene.plotter
@@ -459,7 +459,7 @@ class Window(layout.Actions):
 
         inspector, dark = self.inspector, self.look.dark
         names = tuple(self._names())
-        self.knob = self.knob if self.knob in names else "apex"
+        self.knob = self.knob if self.knob in names else names[0]
         built, self._built = self._built, (names, dark, self.compensates, self.knob)
         if built[:1] != self._built[:1]:
             self._make_sliders(names)
@@ -485,15 +485,16 @@ class Window(layout.Actions):
         """Return the names of the sliders: of the parameters that matter, and of the time window."""
         knobs, model = self.inspector.knobs, MODELS[self.inspector.knobs.model]
         time_name = "clock_offset" if self.inspector.has_encoder else "rpm"
+        names = [size_name(knobs.model), "phase", time_name]
         others = [n for n in SLIDING if n in model.FREE and (n.startswith("tilt") or knobs.value(n))]
-        return ["apex", "phase", time_name, *others, *FINE]
+        return [*dict.fromkeys([*names, *others]), *FINE]
 
     def _slider_title(self, name: str, value: float) -> str:
         """Return name, value and unit of a slider, and where the value comes from."""
         if name in FINE:
             return f"{'window from' if name == 'start_ms' else 'length'} {value:.3f} ms"
-        label, unit, *_ = layout.SLIDERS[name]
-        return f"{label} {value:.6g}{unit if unit in ('°', '') else f' {unit}'} ({self.inspector.sources[name].value})"
+        text = f"{layout.SLIDERS[name][0]} {layout.with_unit(name, value, 6)}"
+        return f"{text} ({self.inspector.sources[name].value})"
 
     def _range(self, name: str) -> tuple[float, float]:
         whole_ms = self.whole_us * 1e-3
@@ -563,8 +564,8 @@ class Window(layout.Actions):
         return chart, lines
 
     def _curve_names(self) -> tuple[str, str]:
-        """Return the parameters of the two sharpness curves: the chosen one, and phase or apex."""
-        return self.knob, "apex" if self.knob == "phase" else "phase"
+        """Return the parameters of the two sharpness curves: the chosen one, and phase or size."""
+        return self.knob, size_name(self.inspector.knobs.model) if self.knob == "phase" else "phase"
 
     def _curve_steps(self) -> Iterator[None]:
         """Compute statistics and sharpness curves, one value at a time, so that the window follows its user."""
