@@ -185,6 +185,7 @@ OVER_INPUTS = (
     ("view a.h5 --calibration cal.json --screenshot {}", "cal.json"),
     ("view a.h5 --camera cam.json --screenshot {}", "cam.json"),
     ("view a.h5 --beside b.h5 --screenshot {}", "b.h5"),
+    ("view a.h5 --thickness-mm 10 --plate-tilt-deg 45 --depth depth.npz --screenshot {}", "depth.npz"),
 )
 
 
@@ -583,6 +584,7 @@ ENDLESS = (
     "truth {} out --flow dsec",
     "view a.h5 --camera {}.json --screenshot out.png",
     "view a.h5 --beside {} --screenshot out.png",
+    "view a.h5 --thickness-mm 10 --plate-tilt-deg 45 --depth {} --screenshot out.png",
 )
 
 

@@ -23,9 +23,11 @@ from amiwarp import (
     AmiwarpError,
     Calibration,
     Camera,
+    DepthMap,
     Encoder,
     Events,
     MemoryEvents,
+    Plate,
     Prism,
     PrismMotion,
     Recording,
@@ -140,9 +142,16 @@ def opened(context: Any, tabs: Tabs, recording: Recording, nothing_fails: None) 
     pages: list[Any] = []
 
     def open_page(
-        of: Recording | None = None, calibration: Calibration | None = None, address: str = "", **more: Any
-    ) -> Any:
-        pages.append(tabs.open(context, lambda: Inspector(of or recording, calibration, **more), address))
+        of: Recording | None = None, calibration: Calibration | None = None, address: str = "",
+        depth: DepthMap | None = None, **more: Any,
+    ) -> Any:  # fmt: skip
+        def make() -> Inspector:
+            made = Inspector(of or recording, calibration, **more)
+            if depth is not None:
+                made.use_depths(depth)
+            return made
+
+        pages.append(tabs.open(context, make, address))
         return pages[-1]
 
     yield open_page
@@ -840,6 +849,42 @@ def test_counts_and_polarities_are_exact_in_image_colour_pointer_and_file(
     np.testing.assert_array_equal(found, np.rint(found))
     page.mouse.move(*pixel(page, "#image-after", x, y))
     hover.filter(has_text=f"x {x}, y {y} px: {found[y - top, x - left]:.0f} events").wait_for()
+
+
+def test_a_depth_map_is_an_image_in_metres_with_unknown_pixels_marked(opened: Open, tmp_path: Path) -> None:
+    rng, n = np.random.default_rng(0), 20_000
+    x, y = (rng.integers(0, size, n).astype(np.uint16) for size in (64, 48))
+    events = Events(x, y, np.sort(rng.integers(0, 100_000, n)), rng.integers(0, 2, n).astype(np.uint8))
+    behind = Recording(
+        MemoryEvents(events, 64, 48), Camera.from_fov(64, 48, 1.0), Encoder.constant_speed(720.0, 0, 100_000),
+        Plate(0.01, 0.8),
+    )  # fmt: skip
+    inverse = np.full((48, 64), np.nan, np.float32)
+    inverse[:24, :32], inverse[24:, :32] = 2.0, 1.25
+    depth = DepthMap(inverse, 0.05 * inverse, np.zeros((48, 64, 3), np.float32))
+    page = opened(behind)
+    assert page.locator(".knob label").first.inner_text() == "inverse depth (1/m)"
+    assert "depth" not in page.locator("#kind option").all_inner_texts()
+    page = opened(behind, depth=depth)
+    assert page.locator(".knob label").first.inner_text() == "phase (°)"  # the map gives the depths
+    page.locator("#do-whole").click()
+    page.wait_for_function("document.querySelector('#region-right').value === '64'")
+    page.locator("#kind").select_option("depth")
+    page.locator("#after-title").filter(has_text="depth map").wait_for()
+    ready(page)
+    assert page.locator(".colour-bar .title").last.inner_text() == "depth [m]; blue: unknown"
+    hover = page.locator(".tile small").first
+    for (column, row), text in {(10, 10): "0.5 m", (10, 40): "0.8 m", (50, 10): "unknown"}.items():
+        page.mouse.move(*pixel(page, "#image-after", column, row))
+        hover.filter(has_text=f"x {column}, y {row} px: {text}").wait_for()
+    page.mouse.move(2, 2)
+    picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), np.int16)
+    seen = [picture[int(y), int(x)] for x, y in (pixel(page, "#image-after", *at) for at in ((10, 10), (50, 10)))]
+    _, scale = drawing.depth_image(depth)
+    for colour, metres in zip(seen, (0.5, math.nan), strict=True):
+        assert np.abs(colour - scale.rgb(np.array([metres]))[0].astype(int)).max() <= 1
+    with Image.open(download(page, "values", tmp_path)) as values:
+        np.testing.assert_allclose(np.asarray(values), 1.0 / inverse, rtol=1e-6)
 
 
 def test_a_click_on_an_event_tells_all_about_it(page: Any, kept: Any, recording: Recording) -> None:

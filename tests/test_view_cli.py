@@ -129,6 +129,25 @@ def test_bad_input_is_reported_in_one_line(files: Path, args: list[str], says: s
     assert list(tmp_path.iterdir()) == []
 
 
+def test_events_behind_a_plate_are_shown_at_the_depths_of_a_map(files: Path, tmp_path: Path) -> None:
+    recording = replace(open_recording(files / "recording.h5"), prism=amiwarp.Plate(0.03, 0.8), truth=None)
+    save_recording(tmp_path / "plate.h5", recording)
+    inverse = np.full((90, 120), 0.5, np.float32)
+    inverse[:, 60:] = 3.0
+    amiwarp.DepthMap(inverse, 0.05 * inverse, np.zeros((90, 120, 3), np.float32)).save(tmp_path / "d.npz")
+    found = []
+    for k, options in enumerate(([], ["--depth", tmp_path / "d.npz"])):
+        code, said, _ = view(tmp_path / "plate.h5", "--screenshot", tmp_path / f"{k}.png", "--json", *options)
+        assert code == 0
+        found.append(json.loads(said)["sharpness_after"])
+    assert found[0] != found[1]
+    assert (tmp_path / "0.png").read_bytes() != (tmp_path / "1.png").read_bytes()
+    code, _, error = view(files / "recording.h5", "--screenshot", tmp_path / "x.png", "--depth", tmp_path / "d.npz")
+    assert code == 1
+    assert "a depth map is for a rotating tilted plate" in error
+    assert not (tmp_path / "x.png").exists()
+
+
 def test_an_unreadable_and_an_empty_file(tmp_path: Path) -> None:
     (tmp_path / "noise.h5").write_bytes(b"not at all")
     assert view(tmp_path / "noise.h5")[0] == 1

@@ -17,10 +17,12 @@ from PIL import Image
 from amiwarp import (
     AmiwarpError,
     Camera,
+    DepthMap,
     Encoder,
     Events,
     MemoryEvents,
     Plate,
+    PlateModel,
     Prism,
     Recording,
     Settings,
@@ -68,6 +70,7 @@ from amiwarp.viewer.layout import (
     current_state,
     decode_state,
     encode_state,
+    initial_state,
     knob_values,
     orbit_text,
 )
@@ -145,6 +148,87 @@ def test_the_slider_of_the_size_has_name_and_unit_of_the_optic_s_own(
     again = Inspector(recording, inspector.as_calibration())
     assert knob_values(again)[name] == pytest.approx(given, abs=1e-4)
     assert orbit_text(model, again.knobs.value(name), 0.0).startswith(f"{name.replace('_', ' ')} {given:g}")
+
+
+# depth maps of recordings behind a plate
+
+
+def behind_a_plate() -> tuple[Inspector, np.ndarray]:
+    """Return an inspector with a depth map, and the inverse depths: known in the left half, of two values."""
+    camera, plate = Camera.from_fov(40, 30, 1.0), Plate(0.01, 0.8)
+    source = MemoryEvents(random_events(4000, 40, 30), 40, 30)
+    recording = Recording(source, camera, Encoder.constant_speed(720.0, 0, 100_000), plate)
+    inverse = np.full((30, 40), np.nan, np.float32)
+    inverse[:15, :20], inverse[15:, :20] = 2.0, 1.25
+    y, x = np.mgrid[:30, :40]
+    points = camera.pixels_to_rays(np.stack([x.ravel(), y.ravel()], axis=1)).reshape(30, 40, 3) / inverse[..., None]
+    inspector = Inspector(recording)
+    inspector.use_depths(DepthMap(inverse, 0.05 * inverse, points.astype(np.float32)))
+    inspector.set(replace(inspector.knobs, phase=0.4))
+    return inspector, inverse
+
+
+def test_events_behind_a_plate_are_compensated_at_the_depths_of_the_map() -> None:
+    inspector, inverse = behind_a_plate()
+    shown = inspector.show()
+    assert inspector.depth is not None
+    xy, filled = shown.before, inspector.depth.filled()
+    plane = PlateModel(inspector.camera, Plate(0.01, 0.8), 0.4)
+    theta = inspector.encoder.angle_at(shown.events.t)
+    expected = plane.compensate_at(xy, theta, filled[shown.events.y, shown.events.x])
+    np.testing.assert_allclose(shown.after, expected, rtol=0, atol=2e-3)  # px
+    assert np.abs(shown.after - xy).max() > 0.2
+    unmoved = inspector.show(replace(inspector.knobs, others=())).after  # without the plate
+    np.testing.assert_allclose(unmoved, xy, rtol=0, atol=1e-5)
+    # of a part of the image, every second column and row
+    part = replace(inspector.camera, width=10, height=8, fx=inspector.camera.fx / 2, fy=inspector.camera.fy / 2,
+                   cx=(inspector.camera.cx - 6) / 2, cy=(inspector.camera.cy - 10) / 2)  # fmt: skip
+    small = inspector.model_of(inspector.knobs, part, np.s_[10:26:2, 6:26:2])
+    at = np.array([[0.0, 0.0], [9.0, 7.0], [3.0, 2.0]])
+    angles = np.array([0.0, 1.0, 2.0])
+    moved = small.compensate_points(at, angles)
+    np.testing.assert_allclose(
+        2.0 * moved + [6.0, 10.0], inspector.model.compensate_points(2.0 * at + [6.0, 10.0], angles), rtol=0, atol=2e-3
+    )
+    # the drawn orbit is that of a point at the depth of its pixel
+    for x, y in ((5.0, 20.0), (5.0, 4.0)):
+        theta, orbit = inspector.orbit(x, y)
+        own = replace(plane, inverse_depth=float(inverse[int(y), int(x)]))
+        np.testing.assert_allclose(own.compensate_points(orbit, theta.astype(np.float32)), [[x, y]] * 181, atol=2e-3)
+
+
+def test_a_depth_map_is_shown_in_metres_with_unknown_pixels_in_a_colour_of_their_own() -> None:
+    inspector, inverse = behind_a_plate()
+    inspector.open(*inspector.first_window(), Selection(region=(4, 3, 36, 28)))
+    images, counts = (make_images(inspector, kind) for kind in (ImageKind.DEPTH, ImageKind.COUNT))
+    assert images.before is not None
+    np.testing.assert_array_equal(images.before, counts.before)
+    np.testing.assert_allclose(images.after, 1.0 / inverse[3:28, 4:36], rtol=1e-6)
+    scale = images.after_scale
+    assert scale is not None
+    assert (scale.low, scale.high, scale.label) == (pytest.approx(0.5), pytest.approx(0.8), "depth [m]; blue: unknown")
+    rgb, table = scale.rgb(images.after), drawing.table_of(scale.colours).astype(int)
+    missing = rgb[np.isnan(images.after)].astype(int)
+    assert len(np.unique(missing, axis=0)) == 1
+    assert np.abs(table - missing[0]).max(axis=1).min() > 60  # no colour of the scale is near
+    state = drawing.picture_state(images.after, scale)
+    assert state["missing"] == [*missing[0].tolist(), "unknown"]
+    assert (np.frombuffer(state["values"], np.float32) == images.after.ravel())[~np.isnan(images.after.ravel())].all()
+    assert initial_state(inspector)["kinds"] == [kind.value for kind in ImageKind]
+    assert "depth" not in initial_state(Inspector(inspector.recording))["kinds"]
+    with pytest.raises(AmiwarpError, match="there is no depth map"):
+        make_images(Inspector(inspector.recording), ImageKind.DEPTH)
+
+
+def test_a_depth_map_of_another_optic_or_size_is_refused(inspector: Inspector) -> None:
+    behind, inverse = behind_a_plate()
+    depth = behind.depth
+    assert depth is not None
+    with pytest.raises(AmiwarpError, match="a depth map is for a rotating tilted plate, but a prism moves"):
+        inspector.use_depths(depth)
+    with pytest.raises(AmiwarpError, match="the camera's rows and columns"):
+        behind.use_depths(DepthMap(inverse[1:], inverse[1:], depth.points[1:]))
+    assert behind.depth is depth
 
 
 # sharpness

@@ -11,11 +11,11 @@ import av
 import numpy as np
 import pytest
 
-from amiwarp import AmiwarpError, Camera, Events, MemoryEvents, Prism, Recording, simulate
+from amiwarp import AmiwarpError, Camera, DepthMap, Encoder, Events, MemoryEvents, Plate, Prism, Recording, simulate
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
 from amiwarp.viewer import jobs, layout
-from amiwarp.viewer.drawing import RECORDED, Look, orbit_lines
+from amiwarp.viewer.drawing import RECORDED, Look, depth_image, orbit_lines
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector
 from amiwarp.viewer.window import HELP_PAPER, MORE_KEYS, Window
 
@@ -96,6 +96,46 @@ def test_the_slider_of_the_size_is_that_of_a_vibrating_camera(recording: Recordi
     title = made.sliders["amplitude"].GetRepresentation().GetTitleText()
     assert title == "amplitude 0.35° (set by hand)"
     assert made.inspector.knobs.value("amplitude") == pytest.approx(math.radians(0.35), abs=1e-6)
+    made.scene.close()
+
+
+def test_a_depth_map_is_shown_as_an_image_and_as_points(window: Window) -> None:
+    window.key("5")
+    assert window.turn()
+    assert "there is no depth map" in window._texts[0].input
+    camera = Camera.from_fov(40, 30, 1.0)
+    rng = np.random.default_rng(0)
+    x, y = (rng.integers(0, size, 4000).astype(np.uint16) for size in (40, 30))
+    events = Events(x, y, np.sort(rng.integers(0, 100_000, 4000)), rng.integers(0, 2, 4000).astype(np.uint8))
+    inverse = np.full((30, 40), np.nan, np.float32)
+    inverse[:15, :20], inverse[15:, :20] = 2.0, 1.25
+    points = np.dstack([*np.mgrid[:30, :40][::-1], np.zeros((30, 40))]).astype(np.float32)
+    points[..., 2] = 1.0 / inverse
+    encoder = Encoder.constant_speed(720.0, 0, 100_000)
+    inspector = Inspector(Recording(MemoryEvents(events, 40, 30), camera, encoder, Plate(0.01, 0.8)))
+    inspector.use_depths(DepthMap(inverse, 0.05 * inverse, points))
+    made = Window(inspector, size=SIZE, off_screen=True)
+    assert list(made.sliders) == ["phase", "clock_offset", "start_ms", "length_ms"]  # the map gives the depths
+    bar, image, cloud = made._depth
+    place = (500, 400)  # on the left cloud
+    assert made.plotter.iren.interactor.FindPokedRenderer(*place) is made.scene._views[0]
+    made.key("5")
+    assert made.turn()
+    assert [bool(each.GetDraw()) for each in (bar, image, cloud)] == [True] * 3
+    assert made.plotter.iren.interactor.FindPokedRenderer(*place) is image
+    shown = [next(actor.mapper.dataset for actor in each.actors.values() if hasattr(actor, "mapper"))
+             for each in (image, cloud)]  # fmt: skip
+    metres, scale = depth_image(inspector.depth)
+    np.testing.assert_array_equal(np.asarray(shown[0]["colour"]).reshape(30, 40, 3)[::-1], scale.rgb(metres))
+    assert shown[0].bounds[:4] == (-0.5, 39.5, -29.5, 0.5)  # as the pixels of the clouds
+    known = np.isfinite(inverse)
+    found, (px, py, pz) = np.asarray(shown[1].points), points[known].T
+    np.testing.assert_array_equal(found, np.column_stack([px, pz, -py]))
+    np.testing.assert_array_equal(shown[1]["colour"], scale.rgb(metres[known]))
+    made.key("1")
+    assert made.turn()
+    assert not any(each.GetDraw() for each in made._depth)
+    assert made.plotter.iren.interactor.FindPokedRenderer(*place) is made.scene._views[0]
     made.scene.close()
 
 

@@ -215,6 +215,13 @@ class StartOptions:
             "its first event. Default: none."
         ),
     ] = None
+    depth: Annotated[
+        Path | None,
+        typer.Option(
+            help="Depth map from 'amiwarp depth' (.npz), for a recording behind a rotating tilted plate: it is shown, "
+            "and events are compensated at its depths. Default: none."
+        ),
+    ] = None
 
     def build(
         self, recording: Recording, device: str, latest: Callable[[], Recording] | None, most_points: int | None
@@ -225,6 +232,7 @@ class StartOptions:
         of points in each cloud, or None.
         """
         from amiwarp.calib import Calibration
+        from amiwarp.io.depth_map import DepthMap
         from amiwarp.optics.models import MODELS
         from amiwarp.viewer.inspector import Inspector
 
@@ -240,6 +248,8 @@ class StartOptions:
             inspector.window = low, high - low
         if self.beside is not None:
             inspector.put_beside(open_recording(self.beside))
+        if self.depth is not None:
+            inspector.use_depths(DepthMap.load(self.depth))
         return inspector
 
 

@@ -349,7 +349,7 @@ def compensate(
     rounding = check_rounding(out_path, rounding, chosen)
     width, height = recording.events.size
     check_size(calibration, recording.events.size, recording.name)
-    model = calibration.model if depth is None else _at_depths(calibration.model, depth)
+    model = calibration.model if depth is None else at_depths(calibration.model, depth)
     n = len(recording.events)
     encoder = recording.encoder
     if n:
@@ -390,12 +390,15 @@ def compensate(
     return CompensationSummary(done, outside, time.perf_counter() - began)
 
 
-def _at_depths(model: Model, depth: DepthMap) -> PlateModel:
-    """Return the model of a plate with the depth of what each pixel sees."""
+def at_depths(model: Model, depth: DepthMap) -> PlateModel:
+    """Return the model of a plate with the depth of what each pixel sees.
+
+    Raises :class:`AmiwarpError` for another optic, or if the map does not have the camera's size.
+    """
     if not isinstance(model, PlateModel):
         raise AmiwarpError(
-            f"a depth map is for a rotating tilted plate, but the calibration is that of a {model.TEXT}, which moves "
-            "near and far points alike; leave the depth map out"
+            f"a depth map is for a rotating tilted plate, but a {model.MOVER} moves this image, and near and far "
+            "points alike; leave the depth map out"
         )
     return model.with_depths(depth.filled())
 

@@ -25,8 +25,9 @@ from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.export import GAMMA, PERCENTILE, save_png
 from amiwarp.imaging.metrics import random_variance
 from amiwarp.imaging.palette import BLUE, OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK, ORANGE, PINK, VERMILION
+from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import check_output, interrupts_later
-from amiwarp.plotting.figures import instance_colours
+from amiwarp.plotting.figures import SKY, instance_colours
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.validation import choice, guarded, vector, whole
 from amiwarp.viewer.inspector import (
@@ -149,7 +150,8 @@ def log_intensity(
     step = part.step
     if knobs.focal_length is not None:
         knobs = replace(knobs, focal_length=knobs.focal_length / step)
-    model, encoder = inspector.model_of(knobs, part.recording.camera), inspector.encoder_of(knobs)
+    model = inspector.model_of(knobs, part.recording.camera, np.s_[top:bottom:step, left:right:step])
+    encoder = inspector.encoder_of(knobs)
     work = Reconstruction(part.recording, model=model, encoder=encoder, device=inspector.device)
     picture = _picture(work, part, window.chosen)
     rows, columns = (np.arange(window.region[k], window.region[k + 2]) for k in (1, 0))
@@ -188,6 +190,8 @@ class ImageKind(enum.StrEnum):
     """Time of the latest event of each pixel."""
     LOG_INTENSITY = "log intensity"
     """Log intensity of the scene, reconstructed from the compensated events."""
+    DEPTH = "depth"
+    """Depth of what each pixel sees, of a depth map."""
 
 
 @dataclass(frozen=True)
@@ -206,6 +210,10 @@ class Scale:
     """Colours, as :func:`table_of` knows them, or "polarity" for OFF and ON in two colours on black."""
     gamma: float = 1.0
     """Exponent of the tone curve: a colour's place on the bar is the share of the range to this power."""
+    missing: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Red, green and blue of pixels without a value, 0 to 1."""
+    missing_text: str = "no event"
+    """What a pixel without a value means."""
 
     def __post_init__(self) -> None:
         assert self.low < self.high
@@ -216,7 +224,7 @@ class Scale:
         return np.asarray(np.clip(share, 0.0, 1.0) ** self.gamma, np.float64)
 
     def rgb(self, values: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """Return the colours of an image, shape ``(height, width, 3)``; pixels without a value are black.
+        """Return the colours of an image, shape ``(height, width, 3)``.
 
         ``values``: shape ``(height, width)`` or ``(n,)``, or ``(2, height, width)`` for OFF and ON.
         """
@@ -225,7 +233,8 @@ class Scale:
             both = places[0][..., None] * np.array(OFF_ON_BLACK) + places[1][..., None] * np.array(ON_ON_BLACK)
             return np.asarray(np.rint(255.0 * np.clip(both, 0.0, 1.0)), np.uint8)
         known = ~np.isnan(places)
-        return table_of(self.colours)[(255.0 * np.where(known, places, 0.0)).astype(np.uint8)] * known[..., None]
+        rgb = table_of(self.colours)[(255.0 * np.where(known, places, 0.0)).astype(np.uint8)]
+        return np.where(known[..., None], rgb, _bytes(self.missing))
 
     @property
     def counts(self) -> bool:
@@ -234,13 +243,19 @@ class Scale:
 
     @property
     def label(self) -> str:
-        """Name and unit of the quantity."""
-        return f"{self.title} {self.unit}" if self.counts else f"{self.title} [{self.unit}]"
+        """Name and unit of the quantity, and what a colour means that is not on the bar."""
+        label = f"{self.title} {self.unit}" if self.counts else f"{self.title} [{self.unit}]"
+        return f"{label}; blue: {self.missing_text}" if self.missing == SKY else label
 
     def ticks(self) -> tuple[tuple[float, str], ...]:
         """Return the marks of the colour bar: their places, 0 to 1, and their texts."""
         values = ticks(self.low, self.high, 4, whole=self.counts)
         return tuple((float(place), f"{v:g}") for place, v in zip(self.places(values), values, strict=True))
+
+
+def _bytes(rgb: Sequence[float]) -> NDArray[np.uint8]:
+    """Return red, green and blue as 0 to 255, shape ``(3,)``."""
+    return np.rint(255.0 * np.asarray(rgb)).astype(np.uint8)
 
 
 @cache
@@ -286,12 +301,19 @@ def make_images(
     """Return the images of the inspector's window.
 
     ``against``: parameters of the first image instead of none. ``shown``: the window with these parameters, if it is
-    known: its counts are not made again. Raises :class:`AmiwarpError` if a log intensity cannot be reconstructed.
+    known: its counts are not made again. Raises :class:`AmiwarpError` if a log intensity cannot be reconstructed, or
+    there is no depth map.
     """
     window, knobs = inspector.loaded, inspector.knobs
     left, top, right, bottom = window.region
     if kind is ImageKind.LOG_INTENSITY:
         return _log_images(inspector, window, knobs, against)
+    if kind is ImageKind.DEPTH:
+        if inspector.depth is None:
+            raise AmiwarpError("there is no depth map; start 'amiwarp view' with --depth")
+        counts = make_images(inspector, ImageKind.COUNT, against=against, shown=shown)
+        metres, scale = depth_image(inspector.depth)
+        return replace(counts, kind=kind, after=metres[top:bottom, left:right], after_scale=scale)
     first = inspector.beside if against is None and inspector.beside is not None else inspector
     pair = (first, first.loaded, against), (inspector, window, knobs)
     if kind is ImageKind.TIME_SURFACE:
@@ -346,6 +368,13 @@ def _log_images(inspector: Inspector, window: LoadedWindow, knobs: Knobs, agains
     scale = Scale("log intensity", "ON thresholds", low, max(high, low + 1e-3), "gray")
     before = None if against is None else found[0][0]
     return ShownImages(ImageKind.LOG_INTENSITY, before, found[-1][0], scale, found[-1][2])
+
+
+def depth_image(depth: DepthMap) -> tuple[NDArray[np.float32], Scale]:
+    """Return the depths of a map [m], shape ``(height, width)``, NaN where they are unknown, and their scale."""
+    with np.errstate(divide="ignore"):
+        metres = 1.0 / depth.inverse_depth
+    return metres, Scale("depth", "m", *_scale(metres), DEPTH_MAP, missing=SKY, missing_text="unknown")
 
 
 # Colours for events by cause, instance and depth, and the legend of these colours.
@@ -1115,6 +1144,42 @@ class Scene:
         return actors
 
 
+def draw_depth(plotter: pyvista.Plotter, first: int, depth: DepthMap) -> None:
+    """Draw a depth map in three renderers, from number ``first`` on: colour bar, image, and its points in space.
+
+    The background is light, as the dark colours of far points need it.
+    """
+    import pyvista
+
+    (background, ink), (metres, scale) = BACKGROUND_AND_INK[False], depth_image(depth)
+    height, width = metres.shape
+    image = pyvista.ImageData(dimensions=(width + 1, height + 1, 1), origin=(-0.5, 0.5 - height, 0.0))
+    image["colour"] = scale.rgb(metres[::-1]).reshape(-1, 3)
+    known = depth.known & np.isfinite(depth.points).all(axis=2)
+    x, y, z = depth.points[known].T
+    cloud = pyvista.PolyData(np.column_stack([x, z, -y]))  # VTK's third axis points up
+    cloud["colour"] = scale.rgb(metres[known])
+    for k, mesh in enumerate((None, image, cloud)):
+        plotter.subplot(0, first + k)
+        plotter.set_background(background, all_renderers=False)
+        if mesh is None:
+            for actor in bar_actors(scale, ink, plotter.window_size[1]):
+                plotter.add_actor(actor, render=False, pickable=False, reset_camera=False)
+            continue
+        plotter.add_mesh(mesh, scalars="colour", rgb=True, lighting=False, render=False, pickable=False, point_size=3.0)
+        title = "depth map" if k == 1 else "its points"
+        plotter.add_text(title, position="upper_edge", font_size=9, color=ink, render=False, font_file=str(font()))
+    plotter.show_bounds(
+        mesh=cloud, xtitle="x [m]", ytitle="depth [m]", ztitle="-y [m]", color=ink, location="outer", fmt="%.1f",
+        n_xlabels=3, n_ylabels=3, n_zlabels=3, bold=False, font_size=10, use_3d_text=False, render=False,
+    )  # fmt: skip
+    plotter.view_vector((0.6, -1.0, 0.5), (0.0, 0.0, 1.0), render=False)
+    plotter.camera.zoom(0.8)
+    plotter.subplot(0, first + 1)
+    plotter.view_xy(render=False)
+    plotter.enable_parallel_projection()
+
+
 def save_screenshot(
     inspector: Inspector, path: Path, *, view: View = View.FREE, look: Look | None = None, size: tuple[int, int]
 ) -> None:
@@ -1220,6 +1285,7 @@ def picture_state(values: NDArray[Any], scale: Scale) -> dict[str, Any]:
         "low": scale.low, "high": scale.high, "gamma": scale.gamma, "step": step,
         "unit": unit if step == 1 else f"{unit} at most in {step}×{step} px",
         "pair": [list(OFF_ON_BLACK), list(ON_ON_BLACK)] if two else None,
+        "missing": [*_bytes(scale.missing).tolist(), scale.missing_text],
         "table": b"" if two else _pixels(table_of(scale.colours)),
     }  # fmt: skip
 

@@ -21,7 +21,7 @@ from amiwarp.calib.parameters import nominal, optical_parameters
 from amiwarp.calib.plate import LARGEST_INVERSE
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.choices import Colour, Sharpness, Vote
-from amiwarp.compensation.recordings import compensate_events
+from amiwarp.compensation.recordings import at_depths, compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, check_prisms, turn_between
 from amiwarp.events.recording import Events, EventSource, Recording
@@ -30,6 +30,7 @@ from amiwarp.imaging.corners import find_background_activity
 from amiwarp.imaging.export import PERCENTILE
 from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, upload_events
 from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_variance
+from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, PHASE, ExactModel, Model, PlateModel, RisleyModel, alternatives, build_model
@@ -778,6 +779,8 @@ class Inspector:
         """Largest number of points in each event cloud."""
         self.beside: Inspector | None = None
         """Another recording that is shown beside this one, see :meth:`put_beside`."""
+        self.depth: DepthMap | None = None
+        """Depths of what the pixels see through a plate, see :meth:`use_depths`."""
         self._is_beside = False
         self._found: tuple[Knobs, Calibration] | None = None
         self._harmonics: tuple[float, ...] | None = None
@@ -885,13 +888,10 @@ class Inspector:
     def _second_prism(self) -> dict[str, float]:
         """Values of the second prism of a pair as the recording gives them; none for one prism."""
         ratio = None if self.recording.encoder is None else self.recording.encoder.ratio
-        return {} if ratio is None else {"second_apex": self._second_apex, "ratio": ratio}
-
-    @property
-    def _second_apex(self) -> float:
-        """Apex angle of the second prism of a pair [rad], by default that of the first."""
+        if ratio is None:
+            return {}
         wedge = as_wedge(self.prism)
-        return (wedge.second or wedge).apex
+        return {"second_apex": (wedge.second or wedge).apex, "ratio": ratio}
 
     def _typical_size(self, model: str) -> dict[str, float]:
         """Return the size with which a model of another optic than a wedge starts; none for a wedge."""
@@ -910,11 +910,25 @@ class Inspector:
         """Encoder with the clock offset set on the page."""
         return self.encoder_of(self.knobs)
 
+    def use_depths(self, depth: DepthMap) -> None:
+        """Compensate each event at the depth of what its pixel sees, as :func:`amiwarp.compensate` does.
+
+        Raises :class:`AmiwarpError` for another optic than a plate, or a map of another size.
+        """
+        table = at_depths(self.model, depth).depths
+        assert table is not None
+        self.depth, self._depths, self._window = depth, table, None
+
+    @property
+    def orbit_names(self) -> tuple[str, ...]:
+        """Names of size and phase, as far as they have a slider: with a depth map, there is no size to set."""
+        return (*((size_name(self.knobs.model),) if self.depth is None else ()), PHASE.name)
+
     @property
     def margin_px(self) -> int:
         """How far outside a region the events of its images may be: how far the optic may move them [px]."""
         if isinstance(self.prism, Plate):
-            reach = self.prism.shift * LARGEST_INVERSE
+            reach = self.prism.shift * (LARGEST_INVERSE if self.depth is None else float(self._depths.max()))
         else:
             largest = replace(self.prism, apex=max(LARGEST_APEX, 2.0 * self.prism.apex))
             reach = math.tan(abs(largest.deflection))
@@ -1173,9 +1187,12 @@ class Inspector:
 
         Returns prism angles over one turn [rad], shape ``(n,)``, and pixels, shape ``(n, 2)``.
         """
-        theta = np.linspace(0.0, math.tau, ORBIT_POINTS)
+        theta, model = np.linspace(0.0, math.tau, ORBIT_POINTS), self.model
         point = np.broadcast_to(np.array([[x, y]], np.float32), (len(theta), 2))
-        return theta, self.model.deflect_points(point, theta.astype(np.float32))
+        if isinstance(model, PlateModel) and model.depths is not None:  # the point has one depth
+            at = np.clip(np.rint(np.nan_to_num([y, x])).astype(int), 0, np.array(model.depths.shape) - 1)
+            model = replace(model, depths=None, inverse_depth=float(model.depths[*at]))
+        return theta, model.deflect_points(point, theta.astype(np.float32))
 
     @property
     def _recorded_offset_us(self) -> float:
@@ -1203,9 +1220,17 @@ class Inspector:
             values[kind.SIZE] = kind.size_from_apex(knobs.apex if turns else 0.0, wedge)
         return values
 
-    def model_of(self, knobs: Knobs, camera: Camera | None = None) -> Model:
-        """Return the optical model with given parameters, of the recording's camera or another one."""
-        return build_model(knobs.model, camera or self.camera, self.prism, self._values(knobs))
+    def model_of(
+        self, knobs: Knobs, camera: Camera | None = None, part: tuple[slice, slice] = (slice(None), slice(None))
+    ) -> Model:
+        """Return the optical model with given parameters.
+
+        ``camera``: another camera than the recording's, which sees these rows and columns of its pixels.
+        """
+        model = build_model(knobs.model, camera or self.camera, self.prism, self._values(knobs))
+        if self.depth is None or not isinstance(model, PlateModel) or not model.inverse_depth:  # of 0, nothing moves
+            return model
+        return model.with_depths(self._depths[part])
 
     def encoder_of(self, knobs: Knobs) -> Encoder:
         """Return the encoder with the clock offset or the speed of given parameters."""

@@ -334,13 +334,16 @@ def cost_surface(
     """Return the sharpness over the two parameters that matter most.
 
     These are the size, from 0 to twice its value, and phase, over one turn about its value. Without an encoder, they
-    are speed and size. ``points``: numbers of their values. The call may run in a thread; ``progress`` may raise an
-    error to stop it.
+    are speed and size; with a depth map, clock offset and phase. ``points``: numbers of their values. The call may run
+    in a thread; ``progress`` may raise an error to stop it.
     """
     progress, current = progress or silent, inspector.knobs
     sharpness = inspector.sharpness_meter()
     size = size_name(current.model)
     sizes = np.linspace(0.0, 2.0 * (current.value(size) or inspector.nominal_apex or CURVE_HALF_WIDTH[size]), points[0])
+    if inspector.depth is not None:  # there is no one size
+        width, size = CURVE_HALF_WIDTH["clock_offset"], "clock_offset"
+        sizes = current.clock_offset + np.linspace(-width, width, points[0])
     if inspector.has_encoder:
         names, values = (size, "phase"), (sizes, current.phase + np.linspace(-math.pi, math.pi, points[1]))
     else:

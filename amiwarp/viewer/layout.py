@@ -310,7 +310,12 @@ def _if_free(*names: str) -> str:
 
 
 _OF_MODELS = {
-    name: (p.label, {"rad": "°", "1": ""}.get(p.unit, p.unit), tuple(f"{x:g}" for x in p.slider), _if_free(name))
+    name: (
+        p.label,
+        {"rad": "°", "1": ""}.get(p.unit, p.unit),
+        tuple(f"{x:g}" for x in p.slider),
+        f"({_if_free(name)}) && !has_depth" if name in size_names() else _if_free(name),
+    )
     for name, p in SLIDING.items()
 }
 SLIDERS = {
@@ -592,7 +597,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "exports": [[name, text, name in FILMS] for name, (text, _) in EXPORTS.items()],
         "help_shown": False, "open_shown": False, "playing": False, "speed": 0.1, "loop": False, "polarity": "both",
         "hide_hot": False, "noise_filter": False, "noise_ms": 2.0, "region_kind": "whole",
-        "region_wanted": [0, 0, *size], "region": [0, 0, *size], "knob": size_name(inspector.knobs.model),
+        "region_wanted": [0, 0, *size], "region": [0, 0, *size], "knob": inspector.orbit_names[0],
         "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
         "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
@@ -605,7 +610,8 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "titles": [], "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
         "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
         "overview": None, "before": None, "after": None, "kind": ImageKind.COUNT.value,
-        "kinds": [each.value for each in ImageKind], "image_note": "", "image_slow": False, "image_scale": NO_SCALE,
+        "kinds": [each.value for each in ImageKind if each is not ImageKind.DEPTH or inspector.depth is not None],
+        "has_depth": inspector.depth is not None, "image_note": "", "image_slow": False, "image_scale": NO_SCALE,
         "after_scale": NO_SCALE, "difference": False, "against_title": "",
         "against_choices": [], "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
         "curve_mark": 0.0, "against": "recorded", "has_b": False, "b_text": "", "busy": "", "calibrating": False,

@@ -21,6 +21,7 @@ from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
+from amiwarp.io.depth_map import DepthMap
 from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
@@ -611,10 +612,7 @@ class Panel(PageWork, layout.Actions):
         elif name == "curve":
             await self._curve()
         elif self.image is ImageKind.LOG_INTENSITY and self.shown is not None:
-            try:
-                self.state.update(await self.in_thread(self._images, self.shown))
-            except AmiwarpError as error:
-                self.state.update({"before": None, "after": None, "image_note": str(error)})
+            self.state.update(await self.in_thread(self._images, self.shown))
 
     async def _open(self, *, suggest: bool) -> None:
         """Read the window and the selection that the page shows."""
@@ -663,8 +661,11 @@ class Panel(PageWork, layout.Actions):
         }  # fmt: skip
 
     def _images(self, shown: DisplayedWindow) -> dict[str, Any]:
-        """Return the state variables of the images of the region."""
-        pair = self._pair(shown)
+        """Return the state variables of the images of the region, or why there are none."""
+        try:
+            pair = self._pair(shown)
+        except AmiwarpError as error:
+            return {"before": None, "after": None, "image_note": str(error)}
         scales = pair.scale, pair.after_scale or pair.scale
         before, after = (
             None if image is None else drawing.picture_state(image, scale)
@@ -779,6 +780,7 @@ def view(
     calibration: Calibration | None = None,
     *,
     beside: Recording | None = None,
+    depth: DepthMap | None = None,
     device: Any = "cpu",
     height: int = 700,
 ) -> NotebookPage:
@@ -793,6 +795,8 @@ def view(
     beside : Recording or None
         Another recording with as many pixels, which the left cloud shows as recorded, at the same time after its first
         event.
+    depth : DepthMap or None
+        Depth map of a recording behind a plate. It is shown, and the events are compensated at its depths.
     device : str or warp.Device
         Device that compensates the events.
     height : int
@@ -806,7 +810,8 @@ def view(
     Raises
     ------
     AmiwarpError
-        If a recording holds no events, or the calibration or the recording beside belongs to a camera of another size.
+        If a recording holds no events, the calibration, the recording beside or the depth map belongs to a camera of
+        another size, or the depth map is given for another optic than a plate.
 
     Examples
     --------
@@ -827,6 +832,8 @@ def view(
         made = Inspector(recording, calibration, device=device)
         if beside is not None:
             made.put_beside(beside)
+        if depth is not None:
+            made.use_depths(depth)
         return made
 
     make_inspector()  # raises errors in the cell, before the page is served

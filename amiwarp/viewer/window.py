@@ -23,7 +23,7 @@ from amiwarp.optics.models import MODELS, alternatives
 from amiwarp.tasks import no_garbage_collection
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import Look, Scene
-from amiwarp.viewer.inspector import SLIDING, DisplayedWindow, Inspector, colours_on_offer, size_name
+from amiwarp.viewer.inspector import SLIDING, DisplayedWindow, Inspector, colours_on_offer
 
 SIZE = (1500, 950)
 """Width and height of the window at the start [px]."""
@@ -43,8 +43,10 @@ IDLE_S, FOLLOW_S = 0.005, 0.25
 """Interval between two looks for input, and between two pictures of a live stream [s]."""
 COLUMN_LETTERS = 34
 """Length of the lines of text above the sliders [characters]."""
-HELP_PLACE, STATISTICS_PLACE = (0.35, 0.48, 0.72, 0.97), (0.735, 0.0, 1.0, 0.25)
+HELP_PLACE, STATISTICS_PLACE = (0.35, 0.46, 0.72, 0.97), (0.735, 0.0, 1.0, 0.25)
 """Left, bottom, right and top of help and statistics, in shares of the window's size."""
+DEPTH_SHARES = (CORNER[0], 0.34, 0.67, 1.0)
+"""Edges between colour bar, image and points of a depth map, in shares of the window's width."""
 VTK_FONT_FILE = 4
 """Number by which VTK knows that a text has a font of a file."""
 HELP_PAPER = {False: "#f0f0ea", True: "#24282e"}
@@ -73,6 +75,7 @@ MORE_KEYS = (
     ("Down", ("nudge", -1), "the parameter moved last: down by a step"),
     ("Tab", ("choose_next", "knob"), "choose the next parameter for these keys and the curve"),
     ("m", ("choose_next", "model"), "next optical model"),
+    ("5", ("toggle", "depth_shown"), "the depth map (--depth) as an image and as points, or the clouds"),
     ("k", ("choose_next", "colour"), "next quantity shown by colour"),
     ("n", ("choose_next", "polarity"), "ON, OFF or both"),
     ("i", ("toggle", "statistics_shown"), "statistics of the selected events of the region: show or hide"),
@@ -102,18 +105,19 @@ class Window(layout.Actions):
 
         Raises :class:`AmiwarpError` if there is no display, or no events in the inspector's window.
         """
-        self.scene = Scene(size, corner=CORNER, more=4, off_screen=off_screen)
+        self.scene = Scene(size, corner=CORNER, more=7, off_screen=off_screen)
         self.inspector, self.view = inspector, view
         compensates = math.isfinite(inspector.turn_us)
         self.look = look or Look(axis=Axis.ANGLE if compensates else Axis.TIME)
         self.shown: DisplayedWindow
         """What the window shows."""
-        self.help_shown = self.statistics_shown = self.plays = self.loop = self.closed = False
-        self.knob, self.message = size_name(inspector.knobs.model), ""
+        self.help_shown = self.statistics_shown = self.depth_shown = self.plays = self.loop = self.closed = False
+        self.knob, self.message = inspector.orbit_names[0], ""
         self.sliders: dict[str, Any] = {}
         """Slider widgets by the name of their value."""
         self.plotter = self.scene.plotter
-        self._controls, self._charts, self._help, self._statistics = list(self.plotter.renderers)[-4:]
+        self._controls, self._charts, *self._depth, self._help, self._statistics = list(self.plotter.renderers)[-7:]
+        self._depth_drawn = False
         self._wanted: set[str] = set()
         self.time_window = inspector.window or inspector.first_window()
         self._change, self._progress, self._film_ends = "", False, False
@@ -258,13 +262,16 @@ class Window(layout.Actions):
         if name in ("overlaid", "dark"):
             self.restyle(**{name: not getattr(self.look, name)})
             return
+        if name == "depth_shown" and self.inspector.depth is None:
+            self.say("there is no depth map; start with --depth FILE")
+            return
         setattr(self, name, not getattr(self, name))
         self._curves = self._curve_steps()
         self.request("look")
 
     def look_from(self, view: str) -> None:
         """Set the direction from which the clouds are seen, and fit them into the window."""
-        self.view = View(view)
+        self.view, self.depth_shown = View(view), False
         self.scene.look_from(self.view, self._look)
         self.request("look")
 
@@ -272,7 +279,7 @@ class Window(layout.Actions):
         place = self.plotter.iren.interactor.GetEventPosition()
         if event.startswith("LeftButtonPress"):
             self._pressed = place
-        elif math.dist(place, self._pressed) <= CLICK_PX:
+        elif math.dist(place, self._pressed) <= CLICK_PX and not self.depth_shown:
             self.pick(place)
 
     def pick(self, place: tuple[int, int]) -> None:
@@ -412,6 +419,8 @@ class Window(layout.Actions):
         self._charts.SetViewport(CORNER[0], 0.0, 1.0, CORNER[1])
         self._help.SetViewport(*HELP_PLACE)
         self._statistics.SetViewport(*STATISTICS_PLACE)
+        for renderer, place in zip(self._depth, itertools.pairwise(DEPTH_SHARES), strict=True):
+            renderer.SetViewport(place[0], CORNER[1], place[1], 1.0)
         homes = self._controls, self._help, self._controls, self._statistics
         for renderer, actor in zip(homes, self._texts, strict=True):
             renderer.add_actor(actor, render=False, pickable=False, reset_camera=False)
@@ -485,9 +494,9 @@ class Window(layout.Actions):
         """Return the names of the sliders: of the parameters that matter, and of the time window."""
         knobs, model = self.inspector.knobs, MODELS[self.inspector.knobs.model]
         time_name = "clock_offset" if self.inspector.has_encoder else "rpm"
-        names = [size_name(knobs.model), "phase", time_name]
-        others = [n for n in SLIDING if n in model.FREE and (n.startswith("tilt") or knobs.value(n))]
-        return [*dict.fromkeys([*names, *others]), *FINE]
+        names = [*self.inspector.orbit_names, time_name]
+        others = [n for n in SLIDING if n in model.FREE[2:] and (n.startswith("tilt") or knobs.value(n))]
+        return [*names, *others, *FINE]
 
     def _slider_title(self, name: str, value: float) -> str:
         """Return name, value and unit of a slider, and where the value comes from."""
@@ -564,8 +573,8 @@ class Window(layout.Actions):
         return chart, lines
 
     def _curve_names(self) -> tuple[str, str]:
-        """Return the parameters of the two sharpness curves: the chosen one, and phase or size."""
-        return self.knob, size_name(self.inspector.knobs.model) if self.knob == "phase" else "phase"
+        """Return the parameters of the two sharpness curves: the chosen one, and phase or the first one."""
+        return self.knob, next(name for name in ("phase", *self.sliders) if name != self.knob)
 
     def _curve_steps(self) -> Iterator[None]:
         """Compute statistics and sharpness curves, one value at a time, so that the window follows its user."""
@@ -627,11 +636,17 @@ class Window(layout.Actions):
             actor.input = "\n".join(lines)
         for actor in self._texts:
             actor.prop.color = ink
-        for renderer, drawn in ((self._help, self.help_shown), (self._statistics, self.statistics_shown)):
+        shown = (self._help, self.help_shown), (self._statistics, self.statistics_shown)
+        for renderer, drawn in (*shown, *((each, self.depth_shown) for each in self._depth)):
             renderer.SetDraw(drawn)
+            renderer.SetInteractive(drawn)  # or it would take the mouse from the clouds while it is hidden
+        for renderer in (self._help, self._statistics):
             renderer.set_background(HELP_PAPER[self.look.dark])
         for renderer in (self._controls, self._charts):
             renderer.set_background(paper)
+        if self.depth_shown and self.inspector.depth is not None and not self._depth_drawn:
+            drawing.draw_depth(self.plotter, drawing.OWN_RENDERERS + 2, self.inspector.depth)
+            self._depth_drawn = True
 
 
 def _following(choices: list[Any], now: Any) -> Any:

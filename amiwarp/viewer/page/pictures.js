@@ -12,7 +12,7 @@ const clamp = (value, low, high) => Math.max(low, Math.min(high, value));
 
 // Return a canvas with a picture of the server: each value's place on its scale gives its colour.
 export function painted(picture) {
-  const { width, height, low, high, gamma, pair } = picture;
+  const { width, height, low, high, gamma, pair, missing } = picture;
   const values = numbers(picture.values, ARRAYS[picture.kind]);
   const canvas = Object.assign(document.createElement('canvas'), { width, height });
   const image = new ImageData(width, height);
@@ -24,12 +24,13 @@ export function painted(picture) {
     return known.get(value);
   };
   const table = numbers(picture.table, Uint32Array);
+  const unknown = (0xff000000 | (missing[2] << 16) | (missing[1] << 8) | missing[0]) >>> 0;
   for (let i = 0; i < pixels.length; i++) {
     if (pair) {
       const [off, on] = [at(values[i]), at(values[pixels.length + i])];
       const [r, g, b] = [0, 1, 2].map((k) => Math.round(255 * Math.min(1, off * pair[0][k] + on * pair[1][k])));
       pixels[i] = (0xff000000 | (b << 16) | (g << 8) | r) >>> 0;
-    } else pixels[i] = Number.isNaN(values[i]) ? 0xff000000 : table[Math.floor(255 * at(values[i]))];
+    } else pixels[i] = Number.isNaN(values[i]) ? unknown : table[Math.floor(255 * at(values[i]))];
   }
   canvas.getContext('2d').putImageData(image, 0, 0);
   return canvas;
@@ -43,7 +44,7 @@ function valueAt(picture, x, y) {
   if (column < 0 || row < 0 || column >= width || row >= height) return '';
   const k = row * width + column;
   if (pair) return `${values[k]} OFF, ${values[width * height + k]} ON`;
-  return Number.isNaN(values[k]) ? 'no event' : `${round(values[k])} ${unit}`;
+  return Number.isNaN(values[k]) ? picture.missing[3] : `${round(values[k])} ${unit}`;
 }
 
 export const EventPicture = {
