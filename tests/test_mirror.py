@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 import amiwarp
+from amiwarp.calib.parameters import best_model
 from amiwarp.cli.app import app
 from reference import optics as reference
 
@@ -219,6 +220,44 @@ def test_a_file_keeps_it(calibrated: amiwarp.Calibration, recording: amiwarp.Rec
     assert np.std(away) < 0.03  # px
 
 
+ONE = amiwarp.Encoder.constant_speed(720.0, 0, 100_000)
+TWO = ONE.with_second(0.7)
+
+
+@pytest.mark.parametrize(
+    ("glass", "encoder", "optic", "best"),
+    [
+        (None, TWO, "mirror", "mirror"),
+        (None, None, "vibration", "vibration"),
+        (None, TWO, None, None),  # two prisms or a mirror
+        (None, TWO, "vibration", None),  # which has no angles
+        (None, ONE, "mirror", "exact"),  # which has two
+        (None, TWO, "kaleidoscope", None),
+        (None, TWO, 7, None),
+        (None, ONE, None, "exact"),
+        (amiwarp.Prism(0.02), TWO, None, "risley"),
+        (amiwarp.UnsizedPrism(), TWO, None, "risley"),
+        (amiwarp.Prism(0.02), TWO, "mirror", "risley"),  # known glass tells more
+        (amiwarp.Plate(0.01, 0.7), ONE, None, "plate"),
+    ],
+)
+def test_a_recording_tells_its_optic(
+    glass: amiwarp.Prism | amiwarp.UnsizedPrism | amiwarp.Plate | None, encoder: amiwarp.Encoder | None,
+    optic: str | int | None, best: str | None,
+) -> None:  # fmt: skip
+    events = amiwarp.MemoryEvents(amiwarp.Events.from_arrays([1], [1], [10], [1]), 4, 3)
+    metadata = {} if optic is None else {"optic": optic}
+    assert best_model(amiwarp.Recording(events, None, encoder, glass, metadata=metadata)) == best
+
+
+def test_two_angles_without_a_named_optic_are_refused_with_the_choices(recording: amiwarp.Recording) -> None:
+    assert recording.metadata["optic"] == "mirror"
+    camera, scene = amiwarp.Camera.from_fov(8, 6, 1.0), amiwarp.Scene.from_picture(np.zeros((8, 8), np.float32))
+    assert "optic" not in amiwarp.Simulation(scene, camera, MIRROR, 0.1).without_prism().metadata()
+    with pytest.raises(amiwarp.AmiwarpError, match=r"names no optic; give .*--model risley.*--model mirror"):
+        amiwarp.calibrate(replace(recording, metadata={}))
+
+
 def test_commands_that_nothing_follows_are_refused(recording: amiwarp.Recording) -> None:
     encoder = recording.encoder
     assert encoder is not None
@@ -318,10 +357,12 @@ def test_programs(tmp_path: Path, texture: np.ndarray) -> None:
     truth = json.loads(runner.invoke(app, ["info", str(out), "--json"]).stdout)["truth"]
     assert (truth["second_amplitude_deg"], truth["fold_deg"]) == (pytest.approx(0.7), pytest.approx(90.0))
     file = tmp_path / "c.json"
-    given = ["calibrate", str(out), str(file), "--model", "mirror", "--start", "fold=90deg", "--stages", "sharpness"]
-    found = runner.invoke(app, given)
+    given = ["calibrate", str(out), str(file), "--start", "fold=90deg", "--stages", "sharpness"]
+    found = runner.invoke(app, given)  # the file names its optic
     assert found.exit_code == 0, found.output
-    assert json.loads(file.read_text())["parameters"]["amplitude"]["degrees"] == pytest.approx(0.9, rel=0.05)
+    saved = json.loads(file.read_text())
+    assert saved["model"] == "mirror"
+    assert saved["parameters"]["amplitude"]["degrees"] == pytest.approx(0.9, rel=0.05)
     for command in (
         ["compensate", str(out), str(tmp_path / "o.h5")],
         ["reconstruct", str(out), str(tmp_path / "o.png")],

@@ -233,7 +233,7 @@ def test_programs(tmp_path: Path, texture: np.ndarray) -> None:
     assert (truth["rpm"], truth["backward_y_deg"]) == (4800.0, pytest.approx(0.1))
     assert "amplitude_deg 0.8" in runner.invoke(app, ["info", str(out)]).stdout
     file = tmp_path / "c.json"
-    found = runner.invoke(app, ["calibrate", str(out), str(file), "--model", "vibration", "--stages", "sharpness"])
+    found = runner.invoke(app, ["calibrate", str(out), str(file), "--stages", "sharpness"])  # of the file's optic
     assert found.exit_code == 0, found.output
     assert "\nfrequency: " in found.stdout
     assert json.loads(file.read_text())["parameters"]["rpm"]["hz"] == pytest.approx(80.0, rel=1e-3)

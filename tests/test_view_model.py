@@ -150,6 +150,36 @@ def test_the_slider_of_the_size_has_name_and_unit_of_the_optic_s_own(
     assert orbit_text(model, again.knobs.value(name), 0.0).startswith(f"{name.replace('_', ' ')} {given:g}")
 
 
+@pytest.mark.parametrize(
+    ("shown", "calibrated"),
+    [("exact", "auto"), ("circle", "auto"), ("mirror", "mirror"), ("risley", "risley"), ("vibration", "vibration")],
+)
+def test_calibration_is_that_of_the_shown_optic(shown: str, calibrated: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    encoder, given = Encoder.constant_speed(720.0, 0, 100_000), []
+    events = MemoryEvents(random_events(2000, 40, 30), 40, 30)
+    encoder = encoder.with_second(-0.5) if MODELS[shown].ANGLES == 2 else encoder
+    inspector = Inspector(Recording(events, Camera.from_fov(40, 30, 1.0), encoder))
+    inspector.use_model(shown)
+
+    def refusing(recording: Recording, settings: Settings, **_: Any) -> None:
+        given.append(settings.model)
+        raise AmiwarpError("enough")
+
+    monkeypatch.setattr(jobs, "calibrate", refusing)
+    with pytest.raises(AmiwarpError, match="enough"):
+        find_calibration(inspector)
+    assert given == [calibrated]
+
+
+def test_a_recording_that_names_its_optic_is_shown_with_its_model() -> None:
+    events, encoder = MemoryEvents(random_events(2000, 40, 30), 40, 30), Encoder.constant_speed(720.0, 0, 100_000)
+    recording = Recording(events, Camera.from_fov(40, 30, 1.0), encoder.with_second(-0.5))
+    assert Inspector(recording).knobs.model == "risley"  # two angles may be those of two prisms
+    inspector = Inspector(replace(recording, metadata={"optic": "mirror"}))
+    assert inspector.knobs.model == "mirror"
+    assert inspector.show().sharpness_after != inspector.show().sharpness_before
+
+
 # depth maps of recordings behind a plate
 
 

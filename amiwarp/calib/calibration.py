@@ -24,7 +24,7 @@ from amiwarp.calib import checks, first_guess, plate
 from amiwarp.calib.bad_pixels import MaskedEventSource, strange_pixels, stretch
 from amiwarp.calib.calibration_events import CalibrationEvents, middle_time, rotation_window, thin
 from amiwarp.calib.model_choice import ModelChooser
-from amiwarp.calib.parameters import MOTION, RATES, ParameterSpace, make_space, nominal
+from amiwarp.calib.parameters import MOTION, RATES, ParameterSpace, best_model, make_space, nominal
 from amiwarp.calib.photometric import stage
 from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
@@ -35,7 +35,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.optics.camera import LENS, Camera, with_lens
-from amiwarp.optics.models import MODELS, PlateModel, RisleyModel, predicted_error, size_names
+from amiwarp.optics.models import MODELS, ExactModel, PlateModel, predicted_error, size_names
 from amiwarp.optics.prism import Plate, Prism
 from amiwarp.tasks import Progress
 from amiwarp.validation import check_names, guarded
@@ -97,10 +97,16 @@ def calibrate(
     check_names(changes, [entry.name for entry in fields(Settings)], "calibrate: setting ")
     settings = replace(settings or Settings(), **changes)
     settings.check()
+    best = best_model(recording) if settings.model == AUTO else settings.model
+    if best is None:
+        raise AmiwarpError(
+            f"{recording.name}: has the angles of two motors, and names no optic; give model 'risley' (--model risley) "
+            "for a pair of prisms, or model 'mirror' (--model mirror) for a mirror with two tilts"
+        )
+    if best != ExactModel.NAME:
+        settings = replace(settings, model=best)
     if isinstance(recording.prism, Plate) or settings.model == PlateModel.NAME:
         return _plate(recording, settings, device, progress)
-    if settings.model == AUTO and recording.encoder is not None and recording.encoder.second is not None:
-        settings = replace(settings, model=RisleyModel.NAME)
     if settings.model != AUTO:
         return Calibrator(recording, settings, device, progress).run()
     chooser = ModelChooser(recording, settings, device)
@@ -113,13 +119,12 @@ def _plate(recording: Recording, settings: Settings, device: Any, progress: Prog
     began, name = time.perf_counter(), recording.name
     if not isinstance(recording.prism, Plate):
         raise AmiwarpError(f"{name}: the plate is unknown; give its --thickness-mm and --plate-tilt-deg")
-    if settings.model not in (AUTO, PlateModel.NAME):
+    if settings.model != PlateModel.NAME:
         raise AmiwarpError(
             f"{name}: the glass is a plate, the model {settings.model!r}; give model 'plate', or a prism"
         )
     if recording.encoder is None:
         raise AmiwarpError(f"{name}: a plate's phase needs the encoder, which the recording lacks; add its log")
-    settings = replace(settings, model=PlateModel.NAME)
     found = Calibrator(recording, replace(settings, stages=("sharpness",)), device, progress).run()
     if "photometric" in settings.stages:
 

@@ -16,13 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.recording import Recording
 from amiwarp.optics import mirror, vibration  # noqa: F401  # models in files of their own, which enter themselves in MODELS
 from amiwarp.optics.camera import LENS, Camera, CameraRotation, given_lens
 from amiwarp.optics.models import (
     MODELS,
     PHASE,
+    ExactModel,
     Model,
     Parameter,
+    PlateModel,
+    RisleyModel,
     build_model,
     check_given,
     compensate_by_each,
@@ -354,6 +358,20 @@ def nominal(prism: NominalPrism | None, kind: type[Model] | None = None) -> Pris
     if kind is not None and not kind.PRISM:
         return Prism(0.0)
     return prism if isinstance(prism, Prism | Plate) else (prism or UnsizedPrism()).with_apex(NOMINAL_APEX)
+
+
+def best_model(recording: Recording) -> str | None:
+    """Return the name of the best model of a recording's optic: that of its glass, or that which its metadata names.
+
+    A recording with two angles without either may be of two prisms or of a mirror; None then.
+    """
+    glass, two = recording.prism, recording.encoder is not None and recording.encoder.second is not None
+    if isinstance(glass, Plate):
+        return PlateModel.NAME
+    named = MODELS.get(str(recording.metadata.get("optic")))
+    if glass is None and named is not None and not named.PRISM and (named.ANGLES == 2) == two:
+        return named.NAME
+    return ExactModel.NAME if not two else None if glass is None else RisleyModel.NAME
 
 
 def _difference(name: str, a: float, b: float) -> float:

@@ -88,7 +88,8 @@ class Settings:
     """
 
     model: str = AUTO
-    """Name of the model, such as ``exact``, or ``auto`` for the smallest with a tolerable error."""
+    """Name of the model, such as ``exact``, or ``auto`` for that of the recording's optic; of the models of a wedge,
+    for the smallest with a tolerable error."""
     budget_px: float | None = None
     """Largest tolerated error of a smaller model for ``auto``, relative to the exact model [px rms]; None: a tenth of
     the blur by quantisation and timing."""

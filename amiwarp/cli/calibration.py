@@ -71,8 +71,8 @@ class SearchOptions:
     model: Annotated[
         str | None,
         typer.Option(
-            help=f"Optical model: {', '.join(OPTICAL_MODELS)}, or auto: the smallest prism model within --budget-px. "
-            "Default: auto.",
+            help=f"Optical model: {', '.join(OPTICAL_MODELS)}, or auto: that of the recording's optic, for one prism "
+            "the smallest within --budget-px. Default: auto.",
             rich_help_panel=_SEARCH,
         ),
     ] = None

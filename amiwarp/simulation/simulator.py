@@ -1004,9 +1004,12 @@ class Simulation(SimulationValues):
         Returns
         -------
         dict
-            Seed and duration, and :attr:`source`.
+            Seed and duration, the optic if no glass tells it, and :attr:`source`.
         """
-        return {"simulated": True, "seed": self.seed, "duration_us": self.duration_us, **self.source}
+        known: dict[str, MetadataValue] = {"simulated": True, "seed": self.seed, "duration_us": self.duration_us}
+        if isinstance(self.prism, Vibration) or (isinstance(self.prism, Mirror) and self.encoder_model is not None):
+            known["optic"] = self.moving_model.NAME
+        return {**known, **self.source}
 
     def blocks(
         self, *, chunk_us: int | None = None, progress: Progress | None = None

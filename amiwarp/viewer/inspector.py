@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.calib.bad_pixels import strange_pixels, stretch
-from amiwarp.calib.parameters import nominal, optical_parameters
+from amiwarp.calib.parameters import best_model, nominal, optical_parameters
 from amiwarp.calib.plate import LARGEST_INVERSE
 from amiwarp.calib.result import Calibration, constant_speed
 from amiwarp.choices import Colour, Sharpness, Vote
@@ -33,7 +33,7 @@ from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_va
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import MODELS, PHASE, ExactModel, Model, PlateModel, RisleyModel, alternatives, build_model
+from amiwarp.optics.models import MODELS, PHASE, Model, PlateModel, RisleyModel, alternatives, build_model
 from amiwarp.optics.prism import NominalPrism, Plate, Prism, as_wedge
 from amiwarp.reconstruction.picture import Picture, border_displacements
 
@@ -878,11 +878,8 @@ class Inspector:
 
     @property
     def _best_model(self) -> str:
-        """Name of the best model of the recording's optic: one prism, a pair, or a plate."""
-        encoder = self.recording.encoder
-        if isinstance(self.prism, Plate):
-            return PlateModel.NAME
-        return ExactModel.NAME if encoder is None or encoder.second is None else RisleyModel.NAME
+        """Name of the best model of the recording's optic; a pair of prisms if two angles may be theirs."""
+        return best_model(self.recording) or RisleyModel.NAME
 
     @property
     def _second_prism(self) -> dict[str, float]:

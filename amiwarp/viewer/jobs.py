@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.calib import Calibration, Settings, calibrate
+from amiwarp.calib.settings import AUTO
 from amiwarp.choices import View
 from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
@@ -28,6 +29,7 @@ from amiwarp.io.file_scan import FileEvents
 from amiwarp.io.files import NewFile
 from amiwarp.io.formats import check_ending
 from amiwarp.live.stream.session import RecentEvents
+from amiwarp.optics.models import ExactModel, alternatives
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.tasks import Progress, silent
 from amiwarp.viewer.drawing import Look, Scene, ShownImages, caption, select_part, shown_lines
@@ -305,7 +307,8 @@ def find_calibration(
     cannot determine the parameters.
     """
     (recording, scope), rpm = calibrated_events(inspector, whole=whole), inspector.knobs.rpm
-    settings = settings or Settings()
+    wedge = ExactModel.NAME in alternatives(inspector.knobs.model)
+    settings = settings or Settings(model=AUTO if wedge else inspector.knobs.model)
     if rpm and not inspector.has_encoder:
         settings = replace(settings, start={"rpm": rpm, **settings.start})
     found = calibrate(recording, settings, device=inspector.device, progress=progress)
