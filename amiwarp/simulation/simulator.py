@@ -1032,26 +1032,6 @@ class Simulation(SimulationValues):
         for block, _ in self._run_engine(chunk_us, progress):
             yield block.events(), block.points()
 
-    def blocks_with_truth(
-        self, *, chunk_us: int | None = None, progress: Progress | None = None
-    ) -> Iterator[tuple[Events, EventTruth]]:
-        """Yield the events of successive time spans with all their ground truth. Memory use is constant.
-
-        Parameters
-        ----------
-        chunk_us : int, optional
-            Length of a span [us]. The default depends on the device. The events do not depend on it.
-        progress : Progress, optional
-            Called with the finished share.
-
-        Yields
-        ------
-        tuple
-            Events, and their ground truth: points and causes; in a world also instances, depths and places.
-        """
-        for block, _ in self._run_engine(chunk_us, progress):
-            yield block.events(), block.truth()
-
     def device_blocks(
         self, *, chunk_us: int | None = None, progress: Progress | None = None
     ) -> Iterator[tuple[DeviceEvents, wp.array]]:
