@@ -313,6 +313,88 @@ def test_few_jobs_wait_and_the_rest_is_not_read() -> None:
         assert sorted(f.result() for _, f in run_jobs(alone, str, range(5))) == list("01234")
 
 
+PLAIN = """
+duration_s = 0.05
+no_prism = true
+sensors = ["ideal"]
+camera = {size = [24, 18], fov_deg = 40.0}
+[[sources]]
+pictures = "pictures/*/*.png"
+rotate_deg_s = [0.0, 200.0, 0.0]
+label_from_folder = "class"
+"""
+
+
+def test_plain_cameras_have_neither_prism_nor_encoder(place: Path) -> None:
+    (place / "spec.toml").write_text(HEAD + PLAIN)
+    assert make(place).failed == {}
+    items = manifest(place)["items"]
+    assert len(items) == 6
+    for item in items:
+        assert [item[name] for name in ("apex_deg", "index", "flat_side", "rpm")] == [None] * 4
+        assert item["labels"] == {"class": Path(item["source"]).parent.name}
+        recording = amiwarp.open_recording(place / "out" / item["file"])
+        assert (recording.prism, recording.encoder) == (None, None)
+        assert recording.truth is not None
+        assert len(recording.events) == item["events"] > 100
+    (item, *_) = list_items(load_specification(place / "spec.toml"))
+    expected = amiwarp.Simulation(
+        amiwarp.Scene.from_picture(place / item.source), amiwarp.Camera.from_fov(24, 18, math.radians(40.0)),
+        amiwarp.Prism(0.0), 0.05, camera_motion=amiwarp.CameraMotion((0.0, math.radians(200.0), 0.0)),
+        sensor=amiwarp.SensorModel.ideal(), encoder_model=None, seed=item.seed,
+    ).run()  # fmt: skip
+    made = amiwarp.open_recording(place / "out" / item.file)
+    for name in ("x", "y", "t", "p"):
+        np.testing.assert_array_equal(
+            getattr(made.events.slice(0, 10**9), name), getattr(expected.events.slice(0, 10**9), name)
+        )
+
+
+def test_plain_cameras_and_prisms_see_the_same_world(place: Path) -> None:
+    worlds = '[[sources]]\nworlds = ["room"]\ntrajectories = ["handheld"]\nlabels = {class = "room"}\n'
+    (place / "spec.toml").write_text(BASE + "seeds = 2\ntruth_hz = 100.0\n" + worlds)
+    alone = {item.key for item in list_items(load_specification(place / "spec.toml"))}
+    (place / "spec.toml").write_text(BASE + "no_prism = true\nseeds = 2\ntruth_hz = 100.0\n" + worlds)
+    items = list_items(load_specification(place / "spec.toml"))
+    assert alone < {item.key for item in items}
+    assert len(items) == 6  # two prisms and a plain camera, two seeds
+    pairs = [[i for i in items if i.recipe["seed"] == seed] for seed in (0, 1)]
+    assert all(len({i.split for i in pair}) == 1 for pair in pairs)
+    plain, ami = (next(i for i in pairs[1] if (i.recipe["prism"] is None) == kind) for kind in (True, False))
+    frames = []
+    for item in (plain, ami):
+        recordings.write_recording(item, place / f"{item.key}.h5", "cpu")
+        recording = amiwarp.open_recording(place / f"{item.key}.h5")
+        assert (recording.encoder is None) == (item is plain)
+        assert recording.truth is not None
+        assert recording.truth.frames is not None
+        frames.append(recording.truth.frames[1])
+    for name in ("depth", "instance", "flow", "rotation", "position"):
+        np.testing.assert_array_equal(getattr(frames[0], name), getattr(frames[1], name))
+    np.testing.assert_allclose(frames[0].flow_with_prism, frames[0].flow, rtol=0, atol=1e-3)  # px/s
+    assert np.nanmax(np.abs(frames[1].flow_with_prism - frames[1].flow)) > 1.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("no_prism = true", "no_prism = 1", "field no_prism is 1; expected true or false"),
+        ("no_prism = true", "no_prism = false", "field prisms is missing; add"),
+        ("no_prism = true", "no_prism = true\nspeeds_rpm = [90.0]", "prisms is empty; .* remove both prisms and"),
+        ("no_prism", "prisms = [{apex_deg = 1.0}]\nno_prism", "speeds_rpm is empty; give at least one entry or, for"),
+        ("rotate_deg_s = [0.0, 200.0, 0.0]", "", r"sources\[0\]\.pictures stand still, .* with rotate_deg_s"),
+        ("[0.0, 200.0, 0.0]", "[0.0, 200.0]", r"field sources\[0\]\.rotate_deg_s has 2 entries; expected 3"),
+        ("pictures =", "videos =", r"field sources\[0\]\.rotate_deg_s does not apply to videos; remove it"),
+        ("[[sources]]", '[[sources]]\ntranslated = "a.h5"\n[[sources]]', "is of a plain camera already, but no_"),
+    ],
+)  # fmt: skip
+def test_what_contradicts_a_plain_camera_is_named(place: Path, old: str, new: str, message: str) -> None:
+    assert old in PLAIN
+    (place / "spec.toml").write_text(HEAD + PLAIN.replace(old, new, 1))
+    with pytest.raises(AmiwarpError, match=message):
+        load_specification(place / "spec.toml")
+
+
 def test_other_sources(place: Path, recording: amiwarp.Recording) -> None:
     video = place / "films" / "one"
     video.mkdir(parents=True)

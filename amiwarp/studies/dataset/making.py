@@ -32,7 +32,8 @@ from amiwarp.io.formats import FORMAT, MANIFEST, VERSION, make_folder
 from amiwarp.io.json_files import LARGEST_INTEGER, append_line, build, create_journal, read_journal
 from amiwarp.kernels import launch
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
-from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
+from amiwarp.optics.prism import Prism
+from amiwarp.simulation.description import CameraMotion, PrismMotion, Scene, SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.simulation.worlds.world_files import POSE_FILES, open_world
@@ -119,14 +120,15 @@ def _of_source(specification: spec.Specification, source: spec.Source, axes: Seq
 
 
 def _axes(specification: spec.Specification, source: spec.Source) -> tuple[Sequence[Any], ...]:
-    """Return what one source is combined with: trajectories, prisms, speeds, sensors and seeds."""
+    """Return what one source is combined with: trajectories, optics, sensors and seeds."""
     if source.entry.kind == "recordings":
         return ()
-    return (
-        _trajectories(specification, source), [asdict(prism) for prism in specification.prisms],
-        specification.speeds_rpm, [{"name": name, **asdict(sensor)} for name, sensor in specification.sensors.items()],
-        specification.seeds,
-    )  # fmt: skip
+    prisms = [asdict(prism) for prism in specification.prisms]
+    optics = [{"prism": prism, "rpm": rpm} for prism, rpm in itertools.product(prisms, specification.speeds_rpm)]
+    if specification.no_prism:
+        optics.append({"prism": None, "rpm": None})
+    sensors = [{"name": name, **asdict(sensor)} for name, sensor in specification.sensors.items()]
+    return _trajectories(specification, source), optics, sensors, specification.seeds
 
 
 def _recipes(
@@ -145,8 +147,10 @@ def _recipes(
         base |= {"duration_s": entry.duration_s or specification.duration_s}
     if entry.kind in ("worlds", "world_files"):
         base |= {"truth_hz": specification.truth_hz}
-    for trajectory, prism, rpm, sensor, seed in itertools.product(*axes):
-        yield base | trajectory | {"prism": prism, "rpm": rpm, "sensor": sensor, "seed": seed}
+    if entry.rotate_deg_s is not None:
+        base |= {"rotate_deg_s": entry.rotate_deg_s}
+    for trajectory, optic, sensor, seed in itertools.product(*axes):
+        yield base | trajectory | optic | {"sensor": sensor, "seed": seed}
 
 
 def _trajectories(specification: spec.Specification, source: spec.Source) -> list[dict[str, Any]]:
@@ -288,10 +292,17 @@ def write_recording(
 
 def simulation_of(item: Item, device: str, duration_s: float | None = None) -> Simulation:
     """Return the simulation of a recording. ``duration_s`` shortens it."""
+    if item.recipe["prism"] is None:
+        return _seen_through(item, Prism(0.0), PrismMotion(), device, duration_s).without_prism()
+    prism, motion = spec.PrismEntry(**item.recipe["prism"]).build(), PrismMotion(item.recipe["rpm"])
+    return _seen_through(item, prism, motion, device, duration_s)
+
+
+def _seen_through(item: Item, prism: Prism, motion: PrismMotion, device: str, duration_s: float | None) -> Simulation:
+    """Return the simulation of a recording through a prism."""
     recipe = item.recipe
     camera, source = spec.CameraEntry(**recipe["camera"]), os.fspath(item.folder / item.source)
     length = recipe["duration_s"] if duration_s is None else duration_s
-    prism, motion = spec.PrismEntry(**recipe["prism"]).build(), PrismMotion(recipe["rpm"])
     sensor = SensorModel(**{name: value for name, value in recipe["sensor"].items() if name != "name"})
     if item.kind == "translated":
         return translation(open_recording(source), prism, duration_s=length, motion=motion, sensor=sensor,
@@ -300,7 +311,9 @@ def simulation_of(item: Item, device: str, duration_s: float | None = None) -> S
         return _of_video(item, source, camera, duration_s=length, prism=prism, motion=motion, sensor=sensor,
                          seed=item.seed, device=device)  # fmt: skip
     scene = Scene.from_picture(source) if item.kind == "pictures" else _world(item, source)
-    return Simulation(scene, camera.build(), prism, length, motion, sensor=sensor, seed=item.seed, device=device)
+    turning = CameraMotion([math.radians(rate) for rate in recipe.get("rotate_deg_s", (0.0, 0.0, 0.0))])
+    return Simulation(scene, camera.build(), prism, length, motion, turning, sensor=sensor, seed=item.seed,
+                      device=device)  # fmt: skip
 
 
 def _of_video(item: Item, source: str, entry: spec.CameraEntry, **settings: Any) -> Simulation:

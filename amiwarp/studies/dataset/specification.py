@@ -81,6 +81,8 @@ class SourceEntry:
     """Pictures per second of a video."""
     duration_s: float | None = None
     """Duration, instead of that of the specification."""
+    rotate_deg_s: tuple[float, float, float] | None = None
+    """Angular velocity of the camera in front of a picture about its x, y and z axes [deg/s]."""
     trajectories: tuple[str, ...] | None = None
     """Camera motions in a world: still, handheld or fast, or files of poses."""
     label_from_folder: str | None = None
@@ -108,8 +110,10 @@ class _Plain:
     """Fields of the file that need no conversion."""
 
     duration_s: float
-    prisms: tuple[PrismEntry, ...]
-    speeds_rpm: tuple[float, ...]
+    prisms: tuple[PrismEntry, ...] = ()
+    speeds_rpm: tuple[float, ...] = ()
+    no_prism: bool = False
+    """Whether to make recordings of a plain event camera too; without ``prisms``, these only."""
     name: str = ""
     camera: CameraEntry = field(default_factory=CameraEntry)
     splits: Mapping[str, float] = field(default_factory=lambda: dict(SPLITS))
@@ -144,20 +148,24 @@ def load_specification(path: str | Path) -> Specification:
     data = read_toml(path, "a specification of a data set")
     with errors_name(path, lambda: "is no specification of a data set"):
         plain = [f.name for f in fields(_Plain)]
-        needed = ("format", "version", "duration_s", "prisms", "speeds_rpm", "sources")
+        optics = () if data.get("no_prism") else ("prisms", "speeds_rpm")
+        needed = ("format", "version", "duration_s", *optics, "sources")
         fields_of(data, "", *needed, optional=tuple(n for n in (*plain, *_OWN) if n not in needed))
         if data["format"] != FORMAT or data["version"] != VERSION:
             given = f"{shown(data['format'])} and {shown(data['version'])}"
             raise AmiwarpError(f"fields format and version are {given}; expected {FORMAT!r} and {VERSION}")
         values = build(_Plain, {name: data[name] for name in plain if name in data}, "")
         _check(values)
+        sources = tuple(_source(entry, f"sources[{k}]") for k, entry in enumerate(_entries(data, "sources")))
+        if values.no_prism:
+            _check_motion(sources)
         return Specification(
             **vars(values) | {"name": values.name or path.stem},
             path=path,
             data=data,
             sensors=_sensors(data.get("sensors", ["default"])),
             seeds=_seeds(data.get("seeds", 1)),
-            sources=tuple(_source(entry, f"sources[{k}]") for k, entry in enumerate(_entries(data, "sources"))),
+            sources=sources,
         )
 
 
@@ -173,8 +181,10 @@ def _check(values: _Plain) -> None:
     """Raise :class:`AmiwarpError` for values out of range and for repeated ones."""
     real(values.duration_s, "field duration_s", 1e-3, LONGEST_S, " s")
     at_field("camera", values.camera.build)
-    for name in ("prisms", "speeds_rpm"):
-        _check_distinct(getattr(values, name), name)
+    if not values.no_prism or values.prisms or values.speeds_rpm:
+        for name in ("prisms", "speeds_rpm"):
+            other = " or, for plain cameras only, remove both prisms and speeds_rpm" if values.no_prism else ""
+            _check_distinct(getattr(values, name), name, other)
     for k, prism in enumerate(values.prisms):
         at_field(f"prisms[{k}]", prism.build)
     for k, rpm in enumerate(values.speeds_rpm):
@@ -192,10 +202,28 @@ def _check(values: _Plain) -> None:
         raise AmiwarpError(f"field splits has shares that sum to {total:g}; change them so that they sum to 1")
 
 
-def _check_distinct(values: tuple[Any, ...], name: str) -> None:
-    """Raise :class:`AmiwarpError` for an empty list and for equal entries, whose recordings would be the same."""
+def _check_motion(sources: tuple[SourceGroup, ...]) -> None:
+    """Raise :class:`AmiwarpError` for a source that a camera without a prism cannot see, or that needs a prism."""
+    for k, entry in enumerate(group.entry for group in sources):
+        if entry.kind == "translated":
+            raise AmiwarpError(
+                f"field sources[{k}].translated is of a plain camera already, but no_prism is true; name it as "
+                "recordings in a specification without prisms, or remove no_prism"
+            )
+        if entry.kind == "pictures" and not any(entry.rotate_deg_s or ()):
+            raise AmiwarpError(
+                f"field sources[{k}].pictures stand still, so a camera without a prism (no_prism) sees only noise; "
+                "let the camera turn with rotate_deg_s = [x, y, z], or remove no_prism"
+            )
+
+
+def _check_distinct(values: tuple[Any, ...], name: str, other: str = "") -> None:
+    """Raise :class:`AmiwarpError` for an empty list and for equal entries, whose recordings would be the same.
+
+    ``other`` adds a remedy for an empty list.
+    """
     if not values:
-        raise AmiwarpError(f"field {name} is empty; give at least one entry")
+        raise AmiwarpError(f"field {name} is empty; give at least one entry{other}")
     first: dict[Any, int] = {}
     for k, value in enumerate(values):
         if first.setdefault(value, k) != k:
@@ -264,7 +292,7 @@ def _check_source(entry: SourceEntry, where: str) -> None:
     kinds = [kind for kind in KINDS if getattr(entry, kind) is not None]
     if len(kinds) != 1:
         raise AmiwarpError(f"field {where} has {' and '.join(kinds) or 'no source'}; give one of {', '.join(KINDS)}")
-    uses = {"fps": ("videos",), "trajectories": ("worlds", "world_files"),
+    uses = {"fps": ("videos",), "rotate_deg_s": ("pictures",), "trajectories": ("worlds", "world_files"),
             "duration_s": ("pictures", "videos", "translated", "worlds", "world_files")}  # fmt: skip
     for name, allowed in uses.items():
         if getattr(entry, name) is not None and kinds[0] not in allowed:
