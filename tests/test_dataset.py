@@ -313,6 +313,74 @@ def test_few_jobs_wait_and_the_rest_is_not_read() -> None:
         assert sorted(f.result() for _, f in run_jobs(alone, str, range(5))) == list("01234")
 
 
+def spread(items: list[recordings.Item]) -> dict[Any, dict[str, int]]:
+    """Return how many different sources of each class lie in each split."""
+    found: dict[Any, dict[str, set[str]]] = {}
+    for item in items:
+        of = f"{item.source} {item.recipe['seed']}" if item.kind == "worlds" else item.recipe["source"]["sha256"]
+        found.setdefault(item.labels["class"], {}).setdefault(item.split, set()).add(of)
+    for splits in found.values():
+        assert len(set().union(*splits.values())) == sum(map(len, splits.values()))  # none lies in two
+    return {value: {name: len(of) for name, of in splits.items()} for value, splits in found.items()}
+
+
+def test_splits_are_stratified_by_class(place: Path) -> None:
+    rng = np.random.default_rng(3)
+    for folder, count in (("disc", 40), ("square", 25)):
+        for k in range(3, count):
+            Image.fromarray(rng.integers(0, 256, (4, 4), np.uint8)).save(place / "pictures" / folder / f"new{k}.png")
+    copy = place / "pictures" / "disc" / "copy.png"
+    copy.write_bytes((place / "pictures" / "disc" / "0.png").read_bytes())
+    worlds = '[[sources]]\nworlds = ["room"]\nlabels = {class = "room"}\n'
+    text = 'stratify = "class"\nseeds = 10\n' + BASE + PICTURES + worlds
+    (place / "spec.toml").write_text(text)
+    items = list_items(load_specification(place / "spec.toml"))
+    # 25 * 0.1 = 2.5 is rounded to 3 and 2: the first of two equal remainders gets the source
+    expected = {"disc": (32, 4, 4), "square": (20, 3, 2), "room": (8, 1, 1)}
+    assert spread(items) == {
+        name: dict(zip(("train", "val", "test"), of, strict=True)) for name, of in expected.items()
+    }
+    assert [i.split for i in list_items(load_specification(place / "spec.toml"))] == [i.split for i in items]
+    (place / "spec.toml").write_text("split_seed = 1\n" + text)
+    other = list_items(load_specification(place / "spec.toml"))
+    assert spread(other) == spread(items)
+    assert [i.split for i in other] != [i.split for i in items]
+    (place / "pictures" / "disc" / "one_more.png").write_bytes(b"a")
+    (place / "spec.toml").write_text(text)
+    more = {item.key: item.split for item in list_items(load_specification(place / "spec.toml"))}
+    moved = {item.source for item in items if more[item.key] != item.split}
+    assert len(moved) <= 3
+
+
+@pytest.mark.parametrize("total", [3, 4, 7, 10, 101])
+@pytest.mark.parametrize("shares", [(0.8, 0.1, 0.1), (0.98, 0.01, 0.01), (0.5, 0.25, 0.25)])
+def test_each_split_gets_its_share_and_at_least_one(total: int, shares: tuple[float, ...]) -> None:
+    counts = list(recordings._counts(dict(zip("abc", shares, strict=True)), total).values())
+    assert sum(counts) == total
+    assert min(counts) >= 1
+    for count, share in zip(counts, shares, strict=True):
+        assert count == 1 or abs(count - share * total) < 1.0 + (counts.count(1) if total * min(shares) < 1.0 else 0)
+
+
+def test_what_cannot_be_stratified_is_named(place: Path) -> None:
+    def fails(message: str) -> None:
+        with pytest.raises(AmiwarpError, match=message):
+            list_items(load_specification(place / "spec.toml"))
+
+    text = 'stratify = "class"\n' + BASE + PICTURES
+    (place / "spec.toml").write_text(text.replace('"class"', '"colour"', 1))
+    fails(r"spec\.toml: field stratify is 'colour': pictures/disc/0\.png has no such label; add it, or remove")
+    (place / "spec.toml").write_text(text + '[[sources]]\nworlds = ["room"]\n')
+    fails("room has no such label")
+    (place / "spec.toml").write_text(text)
+    (place / "pictures" / "square" / "5.png").unlink()
+    fails(r"class 'square' has 2 different sources for the 3 splits train, val, test; add sources of it, or give fewer")
+    (place / "spec.toml").write_text("splits = {train = 0.5, test = 0.5, val = 0.0}\n" + text)
+    assert len(list_items(load_specification(place / "spec.toml"))) == 10
+    (place / "pictures" / "square" / "5.png").write_bytes((place / "pictures" / "disc" / "0.png").read_bytes())
+    fails(r"disc/0\.png and pictures/square/5\.png have the same content but the labels 'disc' and 'square'; remove")
+
+
 PLAIN = """
 duration_s = 0.05
 no_prism = true

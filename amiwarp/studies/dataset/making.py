@@ -27,7 +27,7 @@ from typing import Annotated, Any
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import convert, open_recording
-from amiwarp.io.files import NewFile, put_in_place, scratch_folder, write_text
+from amiwarp.io.files import NewFile, errors_name, put_in_place, scratch_folder, write_text
 from amiwarp.io.formats import FORMAT, MANIFEST, VERSION, make_folder
 from amiwarp.io.json_files import LARGEST_INTEGER, append_line, build, create_journal, read_journal
 from amiwarp.kernels import launch
@@ -105,18 +105,23 @@ def list_items(specification: spec.Specification) -> list[Item]:
             f"{specification.path}: describes {count:,} recordings; divide it among specifications of at most "
             f"{spec.MOST_RECORDINGS:,} recordings each"
         )
-    return [item for source, axes in found for item in _of_source(specification, source, axes)]
+    sources = [source for source, _ in found]
+    splits = _drawn(specification, sources) if specification.stratify is None else _stratified(specification, sources)
+    return [
+        Item(recipe, specification.folder, splits[_identity(source, recipe.get("seed"))], source.labels,
+             source.entry.licence)
+        for source, axes in found for recipe in _recipes(specification, source, axes)
+    ]  # fmt: skip
 
 
-def _of_source(specification: spec.Specification, source: spec.Source, axes: Sequence[Sequence[Any]]) -> Iterator[Item]:
-    """Yield the recordings of one source."""
-    split: dict[str, str] = {}
-    for recipe in _recipes(specification, source, axes):
-        # Equal files, and the worlds of one seed, are the same source and lie in the same split.
-        same = source.digest or f"{source.name} {recipe['seed']}"
-        if same not in split:
-            split[same] = _split(specification, same)
-        yield Item(recipe, specification.folder, split[same], source.labels, source.entry.licence)
+def _identity(source: spec.Source, seed: int | None) -> str:
+    """Return what identifies a source for its split. Equal files, and the worlds of one seed, are the same source."""
+    return source.digest or f"{source.name} {seed}"
+
+
+def _identities(specification: spec.Specification, source: spec.Source) -> list[str]:
+    """Return all identities of a source: one, or that of each seed for a named world."""
+    return [_identity(source, seed) for seed in (specification.seeds if source.path is None else (None,))]
 
 
 def _axes(specification: spec.Specification, source: spec.Source) -> tuple[Sequence[Any], ...]:
@@ -167,15 +172,74 @@ def _trajectories(specification: spec.Specification, source: spec.Source) -> lis
     ]
 
 
-def _split(specification: spec.Specification, source: str) -> str:
-    """Return the split of a source, drawn by a hash of it and of the split seed."""
-    drawn = int(_digest([specification.split_seed, source])[:13], 16) / 16**13
+def _drawn(specification: spec.Specification, sources: Sequence[spec.Source]) -> dict[str, str]:
+    """Return the split of each source by its identity, drawn by a hash of it and of the split seed."""
+    names = dict.fromkeys(same for source in sources for same in _identities(specification, source))
+    return {same: _split(specification, same) for same in names}
+
+
+def _split(specification: spec.Specification, same: str) -> str:
+    """Return the split of the source with an identity."""
+    drawn = int(_draw(specification, same)[:13], 16) / 16**13
     total = 0.0
     for name, share in specification.splits.items():
         total += share
         if drawn < total:
             return name
     return [name for name, share in specification.splits.items() if share > 0.0][-1]
+
+
+def _draw(specification: spec.Specification, same: str) -> str:
+    """Return the hash of a source's identity and of the split seed."""
+    return _digest([specification.split_seed, same])
+
+
+def _stratified(specification: spec.Specification, sources: Sequence[spec.Source]) -> dict[str, str]:
+    """Return the split of each source by its identity, so that the splits share the sources of every class.
+
+    The sources of a class are ordered by their hash, and this order is cut at the shares. Raises
+    :class:`AmiwarpError` for a source without class or with two of them, and for a class with fewer sources than
+    splits.
+    """
+    label = str(specification.stratify)
+    first: dict[str, spec.Source] = {}
+    classes: defaultdict[Any, list[str]] = defaultdict(list)
+    with errors_name(specification.path, lambda: f"field stratify is {shown(label)}"):
+        for source in sources:
+            if label not in source.labels:
+                raise AmiwarpError(f"{source.name} has no such label; add it, or remove stratify")
+            for same in _identities(specification, source):
+                known = first.setdefault(same, source)
+                if known is source:
+                    classes[source.labels[label]].append(same)
+                elif known.labels[label] != source.labels[label]:
+                    raise AmiwarpError(
+                        f"{known.name} and {source.name} have the same content but the labels "
+                        f"{shown(known.labels[label])} and {shown(source.labels[label])}; remove one of them"
+                    )
+        shares = {name: share for name, share in specification.splits.items() if share > 0.0}
+        splits: dict[str, str] = {}
+        for value, members in classes.items():
+            if len(members) < len(shares):
+                raise AmiwarpError(
+                    f"class {shown(value)} has {len(members)} different sources for the {len(shares)} splits "
+                    f"{', '.join(shares)}; add sources of it, or give fewer splits"
+                )
+            members.sort(key=partial(_draw, specification))
+            names = [name for name, count in _counts(shares, len(members)).items() for _ in range(count)]
+            splits.update(zip(members, names, strict=True))
+    return splits
+
+
+def _counts(shares: Mapping[str, float], total: int) -> dict[str, int]:
+    """Return how many of ``total`` sources each split gets: its share, rounded, but at least one."""
+    exact = {name: share * total for name, share in shares.items()}
+    counts = {name: max(1, math.floor(value)) for name, value in exact.items()}
+    while (spare := total - sum(counts.values())) != 0:
+        able = [name for name in counts if spare > 0 or counts[name] > 1]
+        name = max(able, key=lambda name: math.copysign(1.0, spare) * (exact[name] - counts[name]))
+        counts[name] += 1 if spare > 0 else -1
+    return counts
 
 
 # Making of one recording of a data set, by a worker.

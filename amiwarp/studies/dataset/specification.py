@@ -118,6 +118,8 @@ class _Plain:
     camera: CameraEntry = field(default_factory=CameraEntry)
     splits: Mapping[str, float] = field(default_factory=lambda: dict(SPLITS))
     split_seed: int = 0
+    stratify: str | None = None
+    """Label whose values, the classes, are each divided among the splits by their shares; None: a draw per source."""
     truth_hz: float | None = None
 
 
