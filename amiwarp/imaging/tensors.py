@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, TypeAlias
+from functools import lru_cache, partial
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -201,10 +203,34 @@ def _find(events: Events | DeviceEvents, times: NDArray[np.int64]) -> NDArray[np
 
 def _look_up(kernel: Any, t: wp.array, given: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return what a kernel finds in the times of events on a device for each given number."""
-    asked = wp.array(given, dtype=wp.int64, device=t.device)
-    found = wp.empty_like(asked)
-    launch(kernel, len(asked), [t, asked], [found], device=t.device)
-    return np.asarray(found.numpy())
+    if not len(given):
+        return given.copy()
+    shared = _shared(len(given), wp.int64, t.device)
+    shared.numpy()[: len(given)] = given
+    launch(kernel, len(given), [t, shared], [shared], device=t.device)
+    wait(t.device)
+    found = shared.numpy()[: len(given)].copy()
+    _idle[t.device.is_cpu, wp.int64].append(shared)
+    return found
+
+
+_idle: defaultdict[tuple[bool, Any], list[wp.array]] = defaultdict(list)
+"""Memory of the host that a later call uses again, by whether it is for a CPU, and type. GPUs read it and write to it,
+so it is page-locked for them. Locking takes longer than many calls. What is not used is 0 in arrays of int32."""
+
+
+def _shared(n: int, dtype: Any, device: Any) -> wp.array:
+    """Return at least ``n`` numbers in memory of the host that the device, too, reads and writes.
+
+    A caller that has waited for the device puts it back to ``_idle``.
+    """
+    idle = _idle[device.is_cpu, dtype]
+    while idle:
+        with contextlib.suppress(IndexError):  # another thread took it
+            found = idle.pop()
+            if len(found) >= n:
+                return found
+    return wp.zeros(max(n, 64), dtype=dtype, device="cpu", pinned=device.is_cuda)
 
 
 # Batches of recordings.
@@ -286,6 +312,8 @@ class _Batch:
     """Whether the result has no axis of windows."""
     on_host: bool
     """Whether the result is a NumPy array."""
+    unsorted: wp.array
+    """Its element becomes 1 if times decrease in a window. Memory of the host, which the device writes to."""
 
     @property
     def device(self) -> Any:
@@ -298,8 +326,13 @@ class _Batch:
         return wp.empty((len(self.windows), *shape), dtype=dtype, device=self.device)
 
     def finish(self, out: wp.array) -> Any:
-        """Return the result of a public function."""
+        """Return the result of a public function. Raises :class:`AmiwarpError` if times decrease in a window."""
         wait(self.device)
+        if self.unsorted.numpy()[0]:
+            host = self.events.to_host()
+            for start, stop in zip(self.windows.start.tolist(), self.windows.stop.tolist(), strict=True):
+                check_order(host[start:stop], where="events", first_index=start)
+        _idle[self.device.is_cpu, wp.int32].append(self.unsorted)
         found = out.numpy() if self.on_host else out
         return found[0] if self.single else found
 
@@ -328,12 +361,16 @@ def _batch(
     found = _on_device(events, there)
     if model is not None and encoder is not None:
         found = _compensated(found, model, encoder)
-    return _Batch(found, cut, single, on_host)
+    return _Batch(found, cut, single, on_host, _shared(1, wp.int32, there))
 
 
 def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | None) -> Windows:
     """Return one window, from ``t_start`` to ``t_end``, both included [us]; None for the first or the last event."""
-    first, last = _times_at(events, np.array([0, len(events) - 1])).tolist() if len(events) else (0, 0)
+    limits = events._limits if isinstance(events, DeviceEvents) else []
+    if limits and not limits[5]:  # known, and the times ascend
+        first, last = limits[:2]
+    else:
+        first, last = _times_at(events, np.array([0, len(events) - 1])).tolist() if len(events) else (0, 0)
     low, high = first if t_start is None else t_start, last if t_end is None else t_end
     if high < low:
         if t_start is not None and t_end is not None:
@@ -363,13 +400,32 @@ def _compensated(events: DeviceEvents, model: Model, encoder: Encoder) -> Device
     return DeviceEvents(columns.out_x[: len(events)], columns.out_y[: len(events)], events.t, events.p)
 
 
-def _grid(width: int, height: int, *, steps: int = 1, rate: int = 0, layers: int = 1, border: int = 0) -> Any:
-    """Return the struct of the images of each window. ``rate``: see :class:`amiwarp.kernels.tensors.Grid`."""
-    grid = kernels.Grid()
-    grid.width = whole(width, "width", 1, LARGEST_SIZE, " pixels")
-    grid.height = whole(height, "height", 1, LARGEST_SIZE, " pixels")
-    grid.steps, grid.rate, grid.layers, grid.border, grid.off = steps, rate, layers, border, 1
-    return grid
+class _Grid(NamedTuple):
+    """Values of :class:`amiwarp.kernels.tensors.Grid`."""
+
+    width: int
+    height: int
+    border: int = 0
+    steps: int = 1
+    rate: int = 0
+    layers: int = 1
+    low: int = 0
+    off: int = 1
+
+
+def _grid(width: int, height: int, **values: int) -> _Grid:
+    """Return the values of the images of each window."""
+    size = whole(width, "width", 1, LARGEST_SIZE, " pixels"), whole(height, "height", 1, LARGEST_SIZE, " pixels")
+    return _Grid(*size, **values)
+
+
+@lru_cache(maxsize=256)
+def _struct(kind: Any, *values: int) -> Any:
+    """Return a struct of numbers, which must not be changed. To make one takes as long as a launch."""
+    found = kind()
+    for name, value in zip(kind.vars, values, strict=False):
+        setattr(found, name, value)
+    return found
 
 
 _zeros: list[wp.array] = []
@@ -386,22 +442,18 @@ def _take_zeros(n: int) -> wp.array:
 
 
 def _images(
-    batch: _Batch, grid: Any, kernel: Any, on_cpu: Any, dtype: Any, *, sums: int = 1, empty: int = 0
+    batch: _Batch, grid: _Grid, kernel: Any, on_cpu: Any, dtype: Any, *, sums: int = 1, empty: int = 0
 ) -> Iterator[tuple[int, int, wp.array]]:
     """Compute the images of all windows by a kernel. Yield the first window, the number of windows, and their images.
 
     ``on_cpu``: kernel for blocks of events. ``sums``: numbers of type ``dtype`` in each pixel, ``empty`` at first. The
-    images are overwritten by the next ones; on a CPU, the caller clears images of words. Raises :class:`AmiwarpError`
-    if times decrease in a window.
+    images are overwritten by the next ones; on a CPU, the caller clears images of words.
     """
-    cut, device = batch.windows, batch.device
+    cut, events, device = batch.windows, batch.events, batch.device
     group = grid.layers * (grid.height + 2 * grid.border) * (grid.width + 2 * grid.border)
     span = cut.t_end - cut.t_start
     if grid.rate and len(cut) and int(span.max()) >= (1 << 53) // grid.rate:
         raise AmiwarpError(f"a window lasts {int(span.max())} us; give one below {(1 << 53) // grid.rate} us")
-    columns = kernels.Columns()
-    columns.t, columns.p = batch.events.t, batch.events.p
-    columns.unsorted = wp.zeros(1, dtype=int, device=device)
     bytes_each = grid.steps * group * sums * wp.types.type_size_in_bytes(dtype)
     most = min(max(MOST_BYTES["cpu" if device.is_cpu else "cuda"] // bytes_each, 1), len(cut))
     # behind the images there are the spare groups of the slices, and places for the events outside the image
@@ -417,71 +469,70 @@ def _images(
         number = min(most, len(cut) - first)
         if not in_words:
             images.fill_(empty)
-        arrays, blocks = _window_arrays(cut[first : first + number], device)
-        inputs = [batch.events.x, batch.events.y, columns, arrays, grid]
+        rows, blocks = _rows(cut if number == len(cut) else cut[first : first + number], device)
+        inputs = [events.x, events.y, events.t, events.p, rows, _struct(kernels.Grid, *grid)]
+        outputs = [batch.unsorted, images]
         if device.is_cpu:
-            _add_on_cpu(on_cpu, inputs, blocks, images, spare, group * sums, trash)
+            _add_on_cpu(on_cpu, inputs, outputs, blocks, spare, group * sums, trash)
         elif blocks:
-            wp.launch(kernel, blocks * int(BLOCK), [*inputs, kernels.Part()], [images], device=device)
+            wp.launch(kernel, blocks * int(BLOCK), [*inputs, _struct(kernels.Part)], outputs, device=device)
         yield first, number, images
     if in_words:
         images.numpy()[trash:size] = 0
         if images.size * 8 <= 2 * MOST_BYTES["cpu"]:
             _zeros[:] = [images]
-    if columns.unsorted.numpy()[0]:
-        host = batch.events.to_host()
-        for start, stop in zip(cut.start.tolist(), cut.stop.tolist(), strict=True):
-            check_order(host[start:stop], where="events", first_index=start)
 
 
-def _window_arrays(cut: Windows, device: Any) -> tuple[Any, int]:
-    """Return windows as the struct that kernels take, and the number of their blocks."""
-    blocks = np.cumsum(-(-(cut.stop - cut.start) // int(BLOCK)))
-    first = np.concatenate([[0], blocks[:-1]])
-    span = np.maximum(cut.t_end - cut.t_start, 1).astype(np.float64)
-    columns = np.stack([cut.start, cut.stop, first, cut.t_start, span.view(np.int64)])
-    rows = wp.array(columns, dtype=wp.int64, device=device)  # one copy to the device instead of five
-    arrays = kernels.WindowArrays()
-    arrays.start, arrays.stop, arrays.block, arrays.t_start = rows[0], rows[1], rows[2], rows[3]
-    arrays.span = rows[4].view(wp.float64)
-    return arrays, int(blocks[-1])
+def _rows(cut: Windows, device: Any) -> tuple[wp.array, int]:
+    """Return windows as the array that kernels take, and the number of their blocks."""
+    ends = np.cumsum(-(-(cut.stop - cut.start) // int(BLOCK)))
+    rows = np.empty((len(cut), 5), np.int64)
+    rows[:, 0], rows[:, 1], rows[0, 2], rows[1:, 2] = cut.start, cut.stop, 0, ends[:-1]
+    rows[:, 3], rows[:, 4] = cut.t_start, np.maximum(cut.t_end - cut.t_start, 1)
+    return wp.array(rows, dtype=wp.int64, device=device, copy=not device.is_cpu), int(ends[-1])
 
 
 def _add_on_cpu(
-    kernel: Any, inputs: list[Any], blocks: int, images: wp.array, spare: int, group: int, trash: int
+    kernel: Any, inputs: list[Any], outputs: list[wp.array], blocks: int, spare: int, group: int, trash: int
 ) -> None:
     """Run a kernel on slices of the blocks. Add the spare groups of all slices but the first, and clear them.
 
     ``spare``: number of the first spare group. ``group``: numbers in a group. ``trash``: first pixel after all groups.
     """
+    images, grid = outputs[-1], inputs[-1]
     load(kernel, images.device)
     if not blocks:
         return
     parts = []
     for k, (first, stop) in enumerate(slices(blocks, cpu_threads(), SMALLEST)):
-        part = kernels.Part()
-        part.block, part.spare = first, spare + k - 1 if k else -1
-        part.trash = trash + k * 2 * (inputs[4].width + 16)
-        parts.append((part, stop - first))
+        part = first, spare + k - 1 if k else -1, trash + k * 2 * (grid.width + 16)
+        parts.append((_struct(kernels.Part, *part), stop - first))
 
     def run(part: Any, n: int) -> None:
-        wp.launch(kernel, n, [*inputs, part], [images], device=images.device)
+        wp.launch(kernel, n, [*inputs, part], outputs, device=images.device)
 
     run_together([partial(run, *part) for part in parts])
+    if len(parts) == 1:
+        return
     own, values = wp.zeros(1, dtype=int, device=images.device), images.numpy()
     for part, _ in parts[1:]:
-        wp.launch(kernels.find_own, 1, [*inputs[2:], part], [own], device=images.device)
+        wp.launch(kernels.find_own, 1, [inputs[2], *inputs[4:], part], [own], device=images.device)
         to, added = (values[k * group : (k + 1) * group] for k in (int(own.numpy()[0]), part.spare))
         (np.maximum if kernel is kernels.keep_latest_blocks else np.add)(to, added, out=to)
         added[:] = 0
 
 
-def _counts(batch: _Batch, grid: Any) -> Iterator[tuple[int, int, wp.array]]:
+def _part(out: wp.array, first: int, number: int) -> wp.array:
+    """Return the results of some windows as one row."""
+    return (out if number == len(out) else out[first : first + number]).flatten()
+
+
+def _counts(batch: _Batch, grid: _Grid) -> Iterator[tuple[int, int, wp.array]]:
     """Count the events at the nearest pixels, see :func:`_images`."""
     return _images(batch, grid, kernels.count_events, kernels.count_event_blocks, wp.int32)
 
 
-def _latest(batch: _Batch, grid: Any, *, carry: bool) -> Iterator[tuple[int, int, wp.array]]:
+def _latest(batch: _Batch, grid: _Grid, *, carry: bool) -> Iterator[tuple[int, int, wp.array]]:
     """Find the latest times at the nearest pixels, see :func:`_images`. With ``carry``, also of earlier windows."""
     size = grid.layers * grid.height * grid.width
     before = None
@@ -494,20 +545,21 @@ def _latest(batch: _Batch, grid: Any, *, carry: bool) -> Iterator[tuple[int, int
         yield first, number, images
 
 
-def _shares(batch: _Batch, grid: Any, bins: int) -> wp.array:
+def _shares(batch: _Batch, grid: _Grid, bins: int) -> wp.array:
     """Return the bins of all windows, shape (windows, layers * bins, height, width)."""
     out = batch.empty((grid.layers * bins, grid.height, grid.width), wp.float32)
     fullest = _fullest(batch, grid)
     in_words = batch.events.whole_pixels and fullest < CAPACITY
-    grid.border, grid.low = int(not in_words), 63 - max(fullest.bit_length(), LEAST_BITS)
+    grid = grid._replace(border=int(not in_words), low=63 - max(fullest.bit_length(), LEAST_BITS))
     kernel, on_cpu, read, sums = kernels.share_events, kernels.share_event_blocks, kernels.read_shares, 2
     if in_words:
         kernel, on_cpu, read, sums = kernels.add_event_words, kernels.add_event_word_blocks, kernels.read_bins, 1
     length = grid.width if batch.device.is_cpu else 1
     for first, number, images in _images(batch, grid, kernel, on_cpu, wp.int64, sums=sums):
-        part = out[first : first + number].flatten()
+        part = _part(out, first, number)
         threads = part.size // (length * (bins if in_words else 1))
-        launch(read, threads, [images, grid, bins, length], [part], device=batch.device, smallest=SMALLEST // 4)
+        inputs = [images, _struct(kernels.Grid, *grid), bins, length]
+        launch(read, threads, inputs, [part], device=batch.device, smallest=SMALLEST // 4)
     return out
 
 
@@ -517,7 +569,7 @@ bits just below the capacity, and 30 bits below ``2**LEAST_BITS`` events. With 2
 exact to 1e-5."""
 
 
-def _fullest(batch: _Batch, grid: Any) -> int:
+def _fullest(batch: _Batch, grid: _Grid) -> int:
     """Return an upper bound for the number of events in a time interval of a window; exact if there are many."""
     cut = batch.windows
     most = int((cut.stop - cut.start).max(initial=0))
@@ -666,14 +718,14 @@ def polarity_histogram(
     return batch.finish(_counted(batch, _grid(width, height, layers=2)))
 
 
-def _counted(batch: _Batch, grid: Any) -> wp.array:
+def _counted(batch: _Batch, grid: _Grid) -> wp.array:
     """Return the counts of all windows, shape (windows, layers, height, width)."""
     if not batch.events.whole_pixels:
         return _shares(batch, grid, 1)
     shape = grid.layers, grid.height, grid.width
     out = batch.empty(shape, wp.int32)
     for first, number, images in _counts(batch, grid):
-        wp.copy(out[first : first + number].flatten(), images, count=number * math.prod(shape))
+        wp.copy(_part(out, first, number), images, count=number * math.prod(shape))
     return out
 
 
@@ -751,8 +803,7 @@ def voxel_grid(
     bins = whole(bins, "bins", 1, MOST_BINS)
     batch = _batch(events, windows, t_start, t_end, model, encoder, device)
     intervals = bins - 1 if end_bin else bins
-    grid = _grid(width, height, steps=max(intervals, 1), rate=intervals)
-    grid.off = -1
+    grid = _grid(width, height, steps=max(intervals, 1), rate=intervals, off=-1)
     out = _shares(batch, grid, bins)
     if normalize:
         _normalise(out.reshape((len(batch.windows), -1)))
@@ -832,8 +883,8 @@ def stacked_histogram(
     out = batch.empty((2 * bins, height, width), wp.uint8)
     length = width if batch.device.is_cpu else 1
     for first, number, images in _counts(batch, grid):
-        part = out[first : first + number].flatten()
-        inputs = [images, grid, limit, length]
+        part = _part(out, first, number)
+        inputs = [images, _struct(kernels.Grid, *grid), limit, length]
         launch(kernels.clip_counts, part.size // length, inputs, [part], device=batch.device, smallest=SMALLEST)
     return batch.finish(out)
 
@@ -918,7 +969,7 @@ def time_surface(
     size = grid.layers * height * width
     out = batch.empty((grid.layers, height, width), wp.float32)
     for first, number, images in _latest(batch, grid, carry=carry):
-        part = out[first : first + number].flatten()
+        part = _part(out, first, number)
         ends = wp.array(batch.windows.t_end[first : first + number], dtype=wp.int64, device=batch.device)
         launch(kernels.decay_times, part.size, [images, ends, size, tau, int(linear)], [part], device=batch.device)
     return batch.finish(out if per_polarity else out.reshape((-1, height, width)))
@@ -987,7 +1038,7 @@ def latest_times(
     out = batch.empty((grid.layers, height, width), wp.int64)
     for first, number, images in _latest(batch, grid, carry=carry):
         size = number * grid.layers * height * width
-        wp.copy(out[first : first + number].flatten(), images, count=size)
+        wp.copy(_part(out, first, number), images, count=size)
     return batch.finish(out if per_polarity else out.reshape((-1, height, width)))
 
 

@@ -45,25 +45,12 @@ BLOCK = wp.constant(64)  # number of events of a block
 WHOLE = wp.constant(1 << 30)  # share of a whole event
 EARLIEST = wp.constant(wp.int64(-(2**62)))  # limit of the times of events [us]; without events, a pixel holds less
 
-
-@wp.struct
-class Columns:
-    """Times and polarities of events."""
-
-    t: wp.array(dtype=wp.int64)
-    p: wp.array(dtype=wp.uint8)
-    unsorted: wp.array(dtype=int)  # its element becomes 1 if times decrease in a window
-
-
-@wp.struct
-class WindowArrays:
-    """Windows of events: ranges of indices, and time spans."""
-
-    start: wp.array(dtype=wp.int64)  # index of the first event
-    stop: wp.array(dtype=wp.int64)  # index after the last event
-    block: wp.array(dtype=wp.int64)  # number of the first block
-    t_start: wp.array(dtype=wp.int64)  # start of the time span [us]
-    span: wp.array(dtype=wp.float64)  # length of the time span [us], at least 1
+# Columns of the array of windows, which has a row for each window.
+START = wp.constant(0)  # index of the first event
+STOP = wp.constant(1)  # index after the last event
+FIRST_BLOCK = wp.constant(2)  # number of the first block
+T_START = wp.constant(3)  # start of the time span [us]
+SPAN = wp.constant(4)  # length of the time span [us], at least 1
 
 
 @wp.struct
@@ -93,13 +80,13 @@ class Part:
 
 
 @wp.func
-def window_of(windows: WindowArrays, block: int) -> int:
+def window_of(windows: wp.array2d(dtype=wp.int64), block: int) -> int:
     """Return the window of a block."""
     low = int(0)
-    high = windows.block.shape[0] - 1
+    high = windows.shape[0] - 1
     while low < high:
         middle = (low + high + 1) / 2
-        if windows.block[middle] <= wp.int64(block):
+        if windows[middle, FIRST_BLOCK] <= wp.int64(block):
             low = middle
         else:
             high = middle - 1
@@ -107,18 +94,19 @@ def window_of(windows: WindowArrays, block: int) -> int:
 
 
 @wp.func
-def first_event(windows: WindowArrays, window: int, block: int) -> int:
+def first_event(windows: wp.array2d(dtype=wp.int64), window: int, block: int) -> int:
     """Return the index of the first event of a block."""
-    return int(windows.start[window]) + (block - int(windows.block[window])) * BLOCK
+    return int(windows[window, START]) + (block - int(windows[window, FIRST_BLOCK])) * BLOCK
 
 
 @wp.func
-def time_at(grid: Grid, t_start: wp.int64, span: wp.float64, t: wp.int64) -> wp.float64:
+def time_at(grid: Grid, t_start: wp.int64, span: wp.int64, t: wp.int64) -> wp.float64:
     """Return a time in units of a window's intervals. Times outside the window move to its ends.
 
     The division is rounded once, so that the whole part is exact if the product is below 2**53.
     """
-    return wp.clamp(wp.float64((t - t_start) * wp.int64(grid.rate)) / span, wp.float64(0.0), wp.float64(grid.rate))
+    time = wp.float64((t - t_start) * wp.int64(grid.rate)) / wp.float64(span)
+    return wp.clamp(time, wp.float64(0.0), wp.float64(grid.rate))
 
 
 @wp.func
@@ -184,50 +172,55 @@ def part_of(share: int, part: wp.float64) -> int:
 
 
 @wp.func
-def event_of(windows: WindowArrays, columns: Columns, window: int, thread: int) -> int:
+def event_of(
+    windows: wp.array2d(dtype=wp.int64), t: wp.array(dtype=wp.int64), unsorted: wp.array(dtype=int), window: int,
+    thread: int,
+) -> int:  # fmt: skip
     """Return the event of a thread, or -1 if there is none. Check that it is not earlier than the one before."""
     i = first_event(windows, window, thread / BLOCK) + thread % BLOCK
-    if wp.int64(i) >= windows.stop[window]:
+    if wp.int64(i) >= windows[window, STOP]:
         return -1
-    if wp.int64(i) > windows.start[window]:
-        if columns.t[i] < columns.t[i - 1]:
-            columns.unsorted[0] = 1
+    if wp.int64(i) > windows[window, START]:
+        if t[i] < t[i - 1]:
+            unsorted[0] = 1
     return i
 
 
 @wp.func
-def group_of(grid: Grid, windows: WindowArrays, window: int, t: wp.int64) -> int:
+def group_of(grid: Grid, windows: wp.array2d(dtype=wp.int64), window: int, t: wp.int64) -> int:
     """Return the number of the group of images for a time."""
-    return window * grid.steps + interval_of(grid, time_at(grid, windows.t_start[window], windows.span[window], t))
+    return window * grid.steps + interval_of(grid, time_at(grid, windows[window, T_START], windows[window, SPAN], t))
 
 
 @wp.kernel
 def count_events(
-    x: wp.array(dtype=Any), y: wp.array(dtype=Any), columns: Columns, windows: WindowArrays, grid: Grid, part: Part,
+    x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
     counts: wp.array(dtype=int),
 ):  # fmt: skip
     """Count the event of each thread at its nearest pixel."""
     window = window_of(windows, wp.tid() / BLOCK)
-    i = event_of(windows, columns, window, wp.tid())
+    i = event_of(windows, t, unsorted, window, wp.tid())
     if i >= 0:
         col, row = nearest(x[i]), nearest(y[i])
         if is_pixel(grid, col, row) == 1:
-            group = group_of(grid, windows, window, columns.t[i])
-            wp.atomic_add(counts, place_of(grid, group, columns.p[i], col, row), 1)
+            group = group_of(grid, windows, window, t[i])
+            wp.atomic_add(counts, place_of(grid, group, p[i], col, row), 1)
 
 
 @wp.kernel
 def keep_latest(
-    x: wp.array(dtype=Any), y: wp.array(dtype=Any), columns: Columns, windows: WindowArrays, grid: Grid, part: Part,
+    x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
     latest: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Keep the time of each thread's event at its nearest pixel, if it is the latest."""
     window = window_of(windows, wp.tid() / BLOCK)
-    i = event_of(windows, columns, window, wp.tid())
+    i = event_of(windows, t, unsorted, window, wp.tid())
     if i >= 0:
         col, row = nearest(x[i]), nearest(y[i])
         if is_pixel(grid, col, row) == 1:
-            wp.atomic_max(latest, place_of(grid, window * grid.steps, columns.p[i], col, row), columns.t[i])
+            wp.atomic_max(latest, place_of(grid, window * grid.steps, p[i], col, row), t[i])
 
 
 @wp.func
@@ -240,19 +233,20 @@ def word_of(grid: Grid, weight: int, end: int) -> wp.int64:
 
 @wp.kernel
 def add_event_words(
-    x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), columns: Columns, windows: WindowArrays, grid: Grid,
-    part: Part, words: wp.array(dtype=wp.int64),
+    x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8), windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part,
+    unsorted: wp.array(dtype=int), words: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Add the word of each thread's event."""
     window = window_of(windows, wp.tid() / BLOCK)
-    i = event_of(windows, columns, window, wp.tid())
+    i = event_of(windows, t, unsorted, window, wp.tid())
     if i >= 0:
         col, row = int(x[i]), int(y[i])
         if is_pixel(grid, col, row) == 1:
-            time = time_at(grid, windows.t_start[window], windows.span[window], columns.t[i])
+            time = time_at(grid, windows[window, T_START], windows[window, SPAN], t[i])
             interval = interval_of(grid, time)
-            place = place_of(grid, window * grid.steps + interval, columns.p[i], col, row)
-            wp.atomic_add(words, place, word_of(grid, weight_of(grid, columns.p[i]), end_share(time, interval)))
+            place = place_of(grid, window * grid.steps + interval, p[i], col, row)
+            wp.atomic_add(words, place, word_of(grid, weight_of(grid, p[i]), end_share(time, interval)))
 
 
 @wp.func
@@ -267,22 +261,23 @@ def add_parts(sums: wp.array(dtype=wp.int64), place: int, weight: int, part: wp.
 
 @wp.kernel
 def share_events(
-    x: wp.array(dtype=Any), y: wp.array(dtype=Any), columns: Columns, windows: WindowArrays, grid: Grid, part: Part,
+    x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
     sums: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Share the event of each thread among the four nearest pixels and the two ends of its time interval."""
     window = window_of(windows, wp.tid() / BLOCK)
-    i = event_of(windows, columns, window, wp.tid())
+    i = event_of(windows, t, unsorted, window, wp.tid())
     if i >= 0:
         u, v = float(x[i]), float(y[i])
         if is_near(grid, u, v) == 1:
-            time = time_at(grid, windows.t_start[window], windows.span[window], columns.t[i])
+            time = time_at(grid, windows[window, T_START], windows[window, SPAN], t[i])
             interval = interval_of(grid, time)
-            end, weight = end_share(time, interval), weight_of(grid, columns.p[i])
+            end, weight = end_share(time, interval), weight_of(grid, p[i])
             col, row = wp.floor(u), wp.floor(v)
             right, below = wp.float64(u - col), wp.float64(v - row)
             left, above = wp.float64(1.0) - right, wp.float64(1.0) - below
-            place = 2 * place_of(grid, window * grid.steps + interval, columns.p[i], int(col), int(row))
+            place = 2 * place_of(grid, window * grid.steps + interval, p[i], int(col), int(row))
             under = place + 2 * (grid.width + 2 * grid.border)
             add_parts(sums, place, weight, left * above, end)
             add_parts(sums, place + 2, weight, right * above, end)
@@ -295,18 +290,20 @@ def share_events(
 
 
 @wp.func
-def own_group(grid: Grid, windows: WindowArrays, columns: Columns, part: Part) -> int:
+def own_group(grid: Grid, windows: wp.array2d(dtype=wp.int64), t: wp.array(dtype=wp.int64), part: Part) -> int:
     """Return the group that a part's spare group replaces, or -1."""
     if part.spare < 0:
         return -1
     window = window_of(windows, part.block)
-    return group_of(grid, windows, window, columns.t[first_event(windows, window, part.block)])
+    return group_of(grid, windows, window, t[first_event(windows, window, part.block)])
 
 
 @wp.kernel
-def find_own(columns: Columns, windows: WindowArrays, grid: Grid, part: Part, own: wp.array(dtype=int)):
+def find_own(
+    t: wp.array(dtype=wp.int64), windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, own: wp.array(dtype=int)
+):
     """Find the group that a part's spare group replaces."""
-    own[0] = own_group(grid, windows, columns, part)
+    own[0] = own_group(grid, windows, t, part)
 
 
 @wp.func
@@ -337,28 +334,30 @@ def copy_positions(out: wp.array(dtype=float), values: wp.array(dtype=wp.uint16)
 
 @wp.func
 def start_block(
-    columns: Columns, windows: WindowArrays, block: int, t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8)
-):
+    t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8), windows: wp.array2d(dtype=wp.int64), block: int,
+    unsorted: wp.array(dtype=int), times: wp.array(dtype=wp.int64), signs: wp.array(dtype=wp.uint8),
+):  # fmt: skip
     """Copy times and polarities of a block. Return its window, its first event and the number of its events.
 
     Check that no event is earlier than the one before in the window.
     """
     window = window_of(windows, block)
     first = first_event(windows, window, block)
-    n = wp.min(BLOCK, int(windows.stop[window]) - first)
-    copy_int64s(t, columns.t, first, n)
-    copy_bytes(p, columns.p, first, n)
-    if descends(columns.t, wp.max(first, int(windows.start[window]) + 1), first + n):
-        columns.unsorted[0] = 1
+    n = wp.min(BLOCK, int(windows[window, STOP]) - first)
+    copy_int64s(times, t, first, n)
+    copy_bytes(signs, p, first, n)
+    if descends(t, wp.max(first, int(windows[window, START]) + 1), first + n):
+        unsorted[0] = 1
     return window, first, n
 
 
 @wp.func
 def time_block(
-    grid: Grid, part: Part, own: int, first_group: int, t_start: wp.int64, span: wp.float64,
-    t: wp.array(dtype=wp.int64), groups: wp.array(dtype=int), ends: wp.array(dtype=int),
+    grid: Grid, part: Part, own: int, windows: wp.array2d(dtype=wp.int64), window: int, t: wp.array(dtype=wp.int64),
+    groups: wp.array(dtype=int), ends: wp.array(dtype=int),
 ):  # fmt: skip
     """Compute the group of images of each event of a block, and its share of the end of its interval."""
+    t_start, span, first_group = windows[window, T_START], windows[window, SPAN], window * grid.steps
     for k in range(BLOCK):
         time = time_at(grid, t_start, span, load_int64(t, k))
         interval = interval_of(grid, time)
@@ -416,91 +415,95 @@ def position_block(
 
 @wp.kernel
 def count_event_blocks(
-    x: wp.array(dtype=Any), y: wp.array(dtype=Any), columns: Columns, windows: WindowArrays, grid: Grid, part: Part,
+    x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
     counts: wp.array(dtype=int),
 ):  # fmt: skip
     """Count the events of each thread's block at their nearest pixels."""
-    t = wp.zeros(shape=(64,), dtype=wp.int64)
-    p = wp.zeros(shape=(64,), dtype=wp.uint8)
+    times = wp.zeros(shape=(64,), dtype=wp.int64)
+    signs = wp.zeros(shape=(64,), dtype=wp.uint8)
     cols = wp.zeros(shape=(64,), dtype=int)
     rows = wp.zeros(shape=(64,), dtype=int)
     groups = wp.zeros(shape=(64,), dtype=int)
     places = wp.zeros(shape=(64,), dtype=int)
-    window, first, n = start_block(columns, windows, part.block + wp.tid(), t, p)
-    own = own_group(grid, windows, columns, part)
+    window, first, n = start_block(t, p, windows, part.block + wp.tid(), unsorted, times, signs)
+    own = own_group(grid, windows, t, part)
     copy_nearest(cols, x, first, n)
     copy_nearest(rows, y, first, n)
-    time_block(grid, part, own, window * grid.steps, windows.t_start[window], windows.span[window], t, groups, places)
-    place_block(grid, part, cols, rows, p, groups, places)
+    time_block(grid, part, own, windows, window, times, groups, places)
+    place_block(grid, part, cols, rows, signs, groups, places)
     count_places(counts, places, n)
 
 
 @wp.kernel
 def keep_latest_blocks(
-    x: wp.array(dtype=Any), y: wp.array(dtype=Any), columns: Columns, windows: WindowArrays, grid: Grid, part: Part,
+    x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
     latest: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Keep the latest times of the events of each thread's block at their nearest pixels."""
-    t = wp.zeros(shape=(64,), dtype=wp.int64)
-    p = wp.zeros(shape=(64,), dtype=wp.uint8)
+    times = wp.zeros(shape=(64,), dtype=wp.int64)
+    signs = wp.zeros(shape=(64,), dtype=wp.uint8)
     cols = wp.zeros(shape=(64,), dtype=int)
     rows = wp.zeros(shape=(64,), dtype=int)
     groups = wp.zeros(shape=(64,), dtype=int)
     places = wp.zeros(shape=(64,), dtype=int)
-    window, first, n = start_block(columns, windows, part.block + wp.tid(), t, p)
-    own = own_group(grid, windows, columns, part)
+    window, first, n = start_block(t, p, windows, part.block + wp.tid(), unsorted, times, signs)
+    own = own_group(grid, windows, t, part)
     copy_nearest(cols, x, first, n)
     copy_nearest(rows, y, first, n)
-    time_block(grid, part, own, window * grid.steps, windows.t_start[window], windows.span[window], t, groups, places)
-    place_block(grid, part, cols, rows, p, groups, places)
+    time_block(grid, part, own, windows, window, times, groups, places)
+    place_block(grid, part, cols, rows, signs, groups, places)
     for k in range(n):
-        latest[places[k]] = wp.max(latest[places[k]], t[k])
+        latest[places[k]] = wp.max(latest[places[k]], times[k])
 
 
 @wp.kernel
 def add_event_word_blocks(
-    x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), columns: Columns, windows: WindowArrays, grid: Grid,
-    part: Part, words: wp.array(dtype=wp.int64),
+    x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8), windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part,
+    unsorted: wp.array(dtype=int), words: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Add the words of the events of each thread's block."""
-    t = wp.zeros(shape=(64,), dtype=wp.int64)
-    p = wp.zeros(shape=(64,), dtype=wp.uint8)
+    times = wp.zeros(shape=(64,), dtype=wp.int64)
+    signs = wp.zeros(shape=(64,), dtype=wp.uint8)
     cols = wp.zeros(shape=(64,), dtype=int)
     rows = wp.zeros(shape=(64,), dtype=int)
     groups = wp.zeros(shape=(64,), dtype=int)
     ends = wp.zeros(shape=(64,), dtype=int)
     places = wp.zeros(shape=(64,), dtype=int)
     own_words = wp.zeros(shape=(64,), dtype=wp.int64)
-    window, first, n = start_block(columns, windows, part.block + wp.tid(), t, p)
-    own = own_group(grid, windows, columns, part)
+    window, first, n = start_block(t, p, windows, part.block + wp.tid(), unsorted, times, signs)
+    own = own_group(grid, windows, t, part)
     copy_nearest(cols, x, first, n)
     copy_nearest(rows, y, first, n)
-    time_block(grid, part, own, window * grid.steps, windows.t_start[window], windows.span[window], t, groups, ends)
-    place_block(grid, part, cols, rows, p, groups, places)
-    word_block(grid, p, ends, own_words)
+    time_block(grid, part, own, windows, window, times, groups, ends)
+    place_block(grid, part, cols, rows, signs, groups, places)
+    word_block(grid, signs, ends, own_words)
     add_words(words, places, own_words, n)
 
 
 @wp.kernel
 def share_event_blocks(
-    x: wp.array(dtype=Any), y: wp.array(dtype=Any), columns: Columns, windows: WindowArrays, grid: Grid, part: Part,
+    x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
+    windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part, unsorted: wp.array(dtype=int),
     sums: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Share the events of each thread's block among the four nearest pixels and the ends of their time intervals."""
-    t = wp.zeros(shape=(64,), dtype=wp.int64)
-    p = wp.zeros(shape=(64,), dtype=wp.uint8)
+    times = wp.zeros(shape=(64,), dtype=wp.int64)
+    signs = wp.zeros(shape=(64,), dtype=wp.uint8)
     us = wp.zeros(shape=(64,), dtype=float)
     vs = wp.zeros(shape=(64,), dtype=float)
     groups = wp.zeros(shape=(64,), dtype=int)
     ends = wp.zeros(shape=(64,), dtype=int)
     places = wp.zeros(shape=(64,), dtype=int)
     shares = wp.zeros(shape=(512,), dtype=wp.int64)
-    window, first, n = start_block(columns, windows, part.block + wp.tid(), t, p)
-    own = own_group(grid, windows, columns, part)
+    window, first, n = start_block(t, p, windows, part.block + wp.tid(), unsorted, times, signs)
+    own = own_group(grid, windows, t, part)
     copy_positions(us, x, first, n)
     copy_positions(vs, y, first, n)
-    time_block(grid, part, own, window * grid.steps, windows.t_start[window], windows.span[window], t, groups, ends)
-    position_block(grid, part, us, vs, p, groups, ends, places, shares)
+    time_block(grid, part, own, windows, window, times, groups, ends)
+    position_block(grid, part, us, vs, signs, groups, ends, places, shares)
     add_squares(sums, places, shares, 2 * (grid.width + 2 * grid.border), n)
 
 
