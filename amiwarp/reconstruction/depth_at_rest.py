@@ -19,6 +19,8 @@ from amiwarp.optics.models import LARGEST_INVERSE_DEPTH, PlateModel
 from amiwarp.tasks import Progress
 from amiwarp.validation import guarded, real
 
+LEAST_KNOWN = 1e-3
+"""Smallest share of the pixels with events whose depth must be known. Single pixels are known by chance."""
 LEAST_PAIRS = 3
 """Smallest number of pairs of events of a pixel whose depth is known."""
 KNOWN_SHARE = 0.1
@@ -94,7 +96,7 @@ def depth(
     found = find_depths(costs, model, 1.0 / nearest, report)
     check_still(found, name)
     known = (found.count >= LEAST_PAIRS) & (found.std < KNOWN_SHARE * found.inverse_depth)
-    if not known.any():
+    if known.sum() < LEAST_KNOWN * (found.count >= LEAST_PAIRS).sum() or not known.any():
         raise AmiwarpError(
             f"{name}: the events determine no depth: too little texture, or everything is beyond "
             f"{orbit_limit_m(model):.2g} m; record a nearer scene with more texture, or a longer time"
