@@ -366,7 +366,7 @@ def _batch(
 
 def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | None) -> Windows:
     """Return one window, from ``t_start`` to ``t_end``, both included [us]; None for the first or the last event."""
-    limits = events._limits if isinstance(events, DeviceEvents) else []
+    limits: list[Any] = events._limits if isinstance(events, DeviceEvents) else []
     if limits and not limits[5]:  # known, and the times ascend
         first, last = limits[:2]
     else:

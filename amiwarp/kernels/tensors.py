@@ -32,6 +32,7 @@ from amiwarp.kernels.native_code import (
     load_int,
     load_int64,
     load_uint8,
+    load_uint16,
     read_words,
     store_float,
     store_int,
@@ -44,6 +45,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 BLOCK = wp.constant(64)  # number of events of a block
 WHOLE = wp.constant(1 << 30)  # share of a whole event
 EARLIEST = wp.constant(wp.int64(-(2**62)))  # limit of the times of events [us]; without events, a pixel holds less
+LONGEST = wp.constant(wp.int64(1 << 31))  # time of a block from which it is not processed at once [us]
 
 # Columns of the array of windows, which has a row for each window.
 START = wp.constant(0)  # index of the first event
@@ -101,12 +103,17 @@ def first_event(windows: wp.array2d(dtype=wp.int64), window: int, block: int) ->
 
 @wp.func
 def time_at(grid: Grid, t_start: wp.int64, span: wp.int64, t: wp.int64) -> wp.float64:
-    """Return a time in units of a window's intervals. Times outside the window move to its ends.
+    """Return a time in units of a window's intervals. Times outside the window move to its ends."""
+    return in_intervals(grid, wp.float64((t - t_start) * wp.int64(grid.rate)), wp.float64(span))
+
+
+@wp.func
+def in_intervals(grid: Grid, elapsed: wp.float64, span: wp.float64) -> wp.float64:
+    """Return a time in units of a window's intervals from the time since the window's start, multiplied by the rate.
 
     The division is rounded once, so that the whole part is exact if the product is below 2**53.
     """
-    time = wp.float64((t - t_start) * wp.int64(grid.rate)) / wp.float64(span)
-    return wp.clamp(time, wp.float64(0.0), wp.float64(grid.rate))
+    return wp.clamp(elapsed / span, wp.float64(0.0), wp.float64(grid.rate))
 
 
 @wp.func
@@ -228,7 +235,8 @@ def word_of(grid: Grid, weight: int, end: int) -> wp.int64:
     """Return the word of an event, by its sign and its share of the interval's end in units of 2**-30."""
     drop = 94 - 2 * grid.low
     share = (end + ((1 << drop) >> 1)) >> drop
-    return wp.int64(weight) * ((wp.int64(1) << wp.int64(grid.low)) + wp.int64(share))
+    word = (wp.int64(1) << wp.int64(grid.low)) + wp.int64(share)
+    return wp.where(weight < 0, -word, word)
 
 
 @wp.kernel
@@ -334,18 +342,15 @@ def copy_positions(out: wp.array(dtype=float), values: wp.array(dtype=wp.uint16)
 
 @wp.func
 def start_block(
-    t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8), windows: wp.array2d(dtype=wp.int64), block: int,
-    unsorted: wp.array(dtype=int), times: wp.array(dtype=wp.int64), signs: wp.array(dtype=wp.uint8),
-):  # fmt: skip
-    """Copy times and polarities of a block. Return its window, its first event and the number of its events.
+    t: wp.array(dtype=wp.int64), windows: wp.array2d(dtype=wp.int64), block: int, unsorted: wp.array(dtype=int)
+):
+    """Return the window of a block, its first event and the number of its events.
 
     Check that no event is earlier than the one before in the window.
     """
     window = window_of(windows, block)
     first = first_event(windows, window, block)
     n = wp.min(BLOCK, int(windows[window, STOP]) - first)
-    copy_int64s(times, t, first, n)
-    copy_bytes(signs, p, first, n)
     if descends(t, wp.max(first, int(windows[window, START]) + 1), first + n):
         unsorted[0] = 1
     return window, first, n
@@ -426,7 +431,9 @@ def count_event_blocks(
     rows = wp.zeros(shape=(64,), dtype=int)
     groups = wp.zeros(shape=(64,), dtype=int)
     places = wp.zeros(shape=(64,), dtype=int)
-    window, first, n = start_block(t, p, windows, part.block + wp.tid(), unsorted, times, signs)
+    window, first, n = start_block(t, windows, part.block + wp.tid(), unsorted)
+    copy_int64s(times, t, first, n)
+    copy_bytes(signs, p, first, n)
     own = own_group(grid, windows, t, part)
     copy_nearest(cols, x, first, n)
     copy_nearest(rows, y, first, n)
@@ -448,7 +455,9 @@ def keep_latest_blocks(
     rows = wp.zeros(shape=(64,), dtype=int)
     groups = wp.zeros(shape=(64,), dtype=int)
     places = wp.zeros(shape=(64,), dtype=int)
-    window, first, n = start_block(t, p, windows, part.block + wp.tid(), unsorted, times, signs)
+    window, first, n = start_block(t, windows, part.block + wp.tid(), unsorted)
+    copy_int64s(times, t, first, n)
+    copy_bytes(signs, p, first, n)
     own = own_group(grid, windows, t, part)
     copy_nearest(cols, x, first, n)
     copy_nearest(rows, y, first, n)
@@ -458,13 +467,13 @@ def keep_latest_blocks(
         latest[places[k]] = wp.max(latest[places[k]], times[k])
 
 
-@wp.kernel
-def add_event_word_blocks(
+@wp.func
+def add_block_words(
+    grid: Grid, part: Part, own: int, windows: wp.array2d(dtype=wp.int64), window: int, first: int, n: int,
     x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
-    p: wp.array(dtype=wp.uint8), windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part,
-    unsorted: wp.array(dtype=int), words: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8), words: wp.array(dtype=wp.int64),
 ):  # fmt: skip
-    """Add the words of the events of each thread's block."""
+    """Add the words of a block's events."""
     times = wp.zeros(shape=(64,), dtype=wp.int64)
     signs = wp.zeros(shape=(64,), dtype=wp.uint8)
     cols = wp.zeros(shape=(64,), dtype=int)
@@ -473,14 +482,56 @@ def add_event_word_blocks(
     ends = wp.zeros(shape=(64,), dtype=int)
     places = wp.zeros(shape=(64,), dtype=int)
     own_words = wp.zeros(shape=(64,), dtype=wp.int64)
-    window, first, n = start_block(t, p, windows, part.block + wp.tid(), unsorted, times, signs)
-    own = own_group(grid, windows, t, part)
-    copy_nearest(cols, x, first, n)
-    copy_nearest(rows, y, first, n)
+    copy_int64s(times, t, first, n)
+    copy_bytes(signs, p, first, n)
+    copy_uint16s(cols, x, first, n)
+    copy_uint16s(rows, y, first, n)
     time_block(grid, part, own, windows, window, times, groups, ends)
     place_block(grid, part, cols, rows, signs, groups, places)
     word_block(grid, signs, ends, own_words)
     add_words(words, places, own_words, n)
+
+
+@wp.func
+def add_interval_words(
+    grid: Grid, part: Part, own: int, windows: wp.array2d(dtype=wp.int64), window: int, group: int, first: int,
+    x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8), words: wp.array(dtype=wp.int64),
+):  # fmt: skip
+    """Add the words of a whole block's events in one time interval, as most are. Times are from the first event on.
+
+    The sums and products are whole numbers below 2**53, so that a share is the same as from :func:`time_at`.
+    """
+    places = wp.zeros(shape=(64,), dtype=int)
+    own_words = wp.zeros(shape=(64,), dtype=wp.int64)
+    used = wp.where(group == own, part.spare, group)
+    interval, t_first = group - window * grid.steps, t[first]
+    start, span = wp.float64((t_first - windows[window, T_START]) * wp.int64(grid.rate)), windows[window, SPAN]
+    for k in range(BLOCK):
+        col, row, sign = int(load_uint16(x, first + k)), int(load_uint16(y, first + k)), load_uint8(p, first + k)
+        store_int(places, k, wp.where(is_pixel(grid, col, row) == 1, place_of(grid, used, sign, col, row), part.trash))
+    for k in range(BLOCK):
+        elapsed = wp.float64(int(load_int64(t, first + k) - t_first)) * wp.float64(grid.rate)
+        end = end_share(in_intervals(grid, start + elapsed, wp.float64(span)), interval)
+        store_int64(own_words, k, word_of(grid, weight_of(grid, load_uint8(p, first + k)), end))
+    add_words(words, places, own_words, BLOCK)
+
+
+@wp.kernel
+def add_event_word_blocks(
+    x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8), windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part,
+    unsorted: wp.array(dtype=int), words: wp.array(dtype=wp.int64),
+):  # fmt: skip
+    """Add the words of the events of each thread's block."""
+    window, first, n = start_block(t, windows, part.block + wp.tid(), unsorted)
+    own = own_group(grid, windows, t, part)
+    group = group_of(grid, windows, window, t[first])
+    t_last = t[first + n - 1]
+    if n == BLOCK and group == group_of(grid, windows, window, t_last) and t_last - t[first] < LONGEST:
+        add_interval_words(grid, part, own, windows, window, group, first, x, y, t, p, words)
+    else:
+        add_block_words(grid, part, own, windows, window, first, n, x, y, t, p, words)
 
 
 @wp.kernel
@@ -498,7 +549,9 @@ def share_event_blocks(
     ends = wp.zeros(shape=(64,), dtype=int)
     places = wp.zeros(shape=(64,), dtype=int)
     shares = wp.zeros(shape=(512,), dtype=wp.int64)
-    window, first, n = start_block(t, p, windows, part.block + wp.tid(), unsorted, times, signs)
+    window, first, n = start_block(t, windows, part.block + wp.tid(), unsorted)
+    copy_int64s(times, t, first, n)
+    copy_bytes(signs, p, first, n)
     own = own_group(grid, windows, t, part)
     copy_positions(us, x, first, n)
     copy_positions(vs, y, first, n)
