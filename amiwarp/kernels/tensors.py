@@ -239,6 +239,22 @@ def word_of(grid: Grid, weight: int, end: int) -> wp.int64:
     return wp.where(weight < 0, -word, word)
 
 
+@wp.func
+def add_event_word(
+    grid: Grid, part: Part, own: int, windows: wp.array2d(dtype=wp.int64), window: int, i: int,
+    x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8), words: wp.array(dtype=wp.int64),
+):  # fmt: skip
+    """Add the word of an event. ``own``: group that the part's spare group replaces, or -1."""
+    col, row = int(x[i]), int(y[i])
+    if is_pixel(grid, col, row) == 1:
+        time = time_at(grid, windows[window, T_START], windows[window, SPAN], t[i])
+        interval = interval_of(grid, time)
+        group = window * grid.steps + interval
+        place = place_of(grid, wp.where(group == own, part.spare, group), p[i], col, row)
+        wp.atomic_add(words, place, word_of(grid, weight_of(grid, p[i]), end_share(time, interval)))
+
+
 @wp.kernel
 def add_event_words(
     x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
@@ -249,12 +265,7 @@ def add_event_words(
     window = window_of(windows, wp.tid() / BLOCK)
     i = event_of(windows, t, unsorted, window, wp.tid())
     if i >= 0:
-        col, row = int(x[i]), int(y[i])
-        if is_pixel(grid, col, row) == 1:
-            time = time_at(grid, windows[window, T_START], windows[window, SPAN], t[i])
-            interval = interval_of(grid, time)
-            place = place_of(grid, window * grid.steps + interval, p[i], col, row)
-            wp.atomic_add(words, place, word_of(grid, weight_of(grid, p[i]), end_share(time, interval)))
+        add_event_word(grid, part, -1, windows, window, i, x, y, t, p, words)
 
 
 @wp.func
@@ -383,13 +394,6 @@ def place_block(
 
 
 @wp.func
-def word_block(grid: Grid, p: wp.array(dtype=wp.uint8), ends: wp.array(dtype=int), words: wp.array(dtype=wp.int64)):
-    """Compute the word of each event of a block."""
-    for k in range(BLOCK):
-        store_int64(words, k, word_of(grid, weight_of(grid, load_uint8(p, k)), load_int(ends, k)))
-
-
-@wp.func
 def store_parts(shares: wp.array(dtype=wp.int64), k: int, weight: int, part: wp.float64, end: int):
     """Store the parts of an event's two shares that belong to a pixel."""
     store_int64(shares, k, wp.int64(weight * part_of(WHOLE - end, part)))
@@ -468,31 +472,6 @@ def keep_latest_blocks(
 
 
 @wp.func
-def add_block_words(
-    grid: Grid, part: Part, own: int, windows: wp.array2d(dtype=wp.int64), window: int, first: int, n: int,
-    x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
-    p: wp.array(dtype=wp.uint8), words: wp.array(dtype=wp.int64),
-):  # fmt: skip
-    """Add the words of a block's events."""
-    times = wp.zeros(shape=(64,), dtype=wp.int64)
-    signs = wp.zeros(shape=(64,), dtype=wp.uint8)
-    cols = wp.zeros(shape=(64,), dtype=int)
-    rows = wp.zeros(shape=(64,), dtype=int)
-    groups = wp.zeros(shape=(64,), dtype=int)
-    ends = wp.zeros(shape=(64,), dtype=int)
-    places = wp.zeros(shape=(64,), dtype=int)
-    own_words = wp.zeros(shape=(64,), dtype=wp.int64)
-    copy_int64s(times, t, first, n)
-    copy_bytes(signs, p, first, n)
-    copy_uint16s(cols, x, first, n)
-    copy_uint16s(rows, y, first, n)
-    time_block(grid, part, own, windows, window, times, groups, ends)
-    place_block(grid, part, cols, rows, signs, groups, places)
-    word_block(grid, signs, ends, own_words)
-    add_words(words, places, own_words, n)
-
-
-@wp.func
 def add_interval_words(
     grid: Grid, part: Part, own: int, windows: wp.array2d(dtype=wp.int64), window: int, group: int, first: int,
     x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
@@ -531,7 +510,8 @@ def add_event_word_blocks(
     if n == BLOCK and group == group_of(grid, windows, window, t_last) and t_last - t[first] < LONGEST:
         add_interval_words(grid, part, own, windows, window, group, first, x, y, t, p, words)
     else:
-        add_block_words(grid, part, own, windows, window, first, n, x, y, t, p, words)
+        for k in range(n):
+            add_event_word(grid, part, own, windows, window, first + k, x, y, t, p, words)
 
 
 @wp.kernel
