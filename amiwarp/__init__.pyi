@@ -127,6 +127,7 @@ from .simulation.description import Scene as Scene
 from .simulation.description import SensorModel as SensorModel
 from .simulation.description import SimulationValues as SimulationValues
 from .simulation.description import Vibration as Vibration
+from .simulation.event_sensor import EventSensor as EventSensor
 from .simulation.pictures import PictureFolder as PictureFolder
 from .simulation.pictures import Pictures as Pictures
 from .simulation.pictures import PictureStack as PictureStack

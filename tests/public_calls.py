@@ -374,6 +374,8 @@ OWN: dict[str, dict[str, Any]] = {
     "Scene": {"frames": SCENE.frames},
     "Scene.from_picture": {"picture": np.ones((4, 4), np.float32)},
     "SensorModel.preset": {"name": "gen4"},
+    "EventSensor": {"cameras": 2},
+    "EventSensor.step": {"images": np.zeros((2, 3, 4), np.float32), "t_us": 0},
     "PictureFolder": _all(FOLDER),
     "PictureStack": _all(STACK),
     "VideoFile": _all(VIDEO),
@@ -479,6 +481,7 @@ OBJECTS: dict[str, Any] = {
 MADE: dict[str, Callable[[], Any]] = {
     "Compensator": lambda: aw.Compensator(MODEL, _stream()),
     "EncoderStream": _stream,
+    "EventSensor": lambda: aw.EventSensor(2, 3, 4),
     "CornerDetector": lambda: aw.CornerDetector((4, 3)),
     "RecordingWriter": _writer,
     "Reconstruction": lambda: aw.Reconstruction(RECORDING, model=MODEL),

@@ -107,9 +107,9 @@ def rebase(keys: wp.array(dtype=wp.int64), passed: wp.int64):
     keys[i] -= passed
 
 
-@wp.kernel
-def find(keys: wp.array(dtype=wp.int64), n: int, limit: wp.int64, found: wp.array(dtype=int)):
-    """Find the number of sorted keys below ``limit``, by bisection in one thread."""
+@wp.func
+def count_below(keys: wp.array(dtype=wp.int64), n: int, limit: wp.int64) -> int:
+    """Return the number of the first ``n`` keys, which are sorted, that are below ``limit``."""
     low = wp.int32(0)
     high = int(n)
     while low < high:
@@ -118,7 +118,13 @@ def find(keys: wp.array(dtype=wp.int64), n: int, limit: wp.int64, found: wp.arra
             low = middle + 1
         else:
             high = middle
-    found[0] = low
+    return low
+
+
+@wp.kernel
+def find(keys: wp.array(dtype=wp.int64), n: int, limit: wp.int64, found: wp.array(dtype=int)):
+    """Find the number of sorted keys below ``limit``, in one thread."""
+    found[0] = count_below(keys, n, limit)
 
 
 # Readout of the simulated sensor: rows that are read one after the other, and a bus with a queue of finite length.
@@ -135,6 +141,7 @@ class RowScan:
     scan_ps: wp.int64  # time to read all rows [ps]
     origin: wp.int64  # time of a key's tick 0 since the first scan [us]
     width: int  # width of the sensor [px]
+    height: int  # height of the sensor [px]; the pixels of several cameras follow each other
     shift: int  # bit position of the time in a key
 
 
@@ -155,7 +162,7 @@ def stamp_rows(scan: RowScan, keys: wp.array(dtype=wp.int64), start: int):
     key = keys[i]
     t = key >> wp.int64(scan.shift)
     low = key - (t << wp.int64(scan.shift))
-    row = int(low >> wp.int64(LOW_BITS)) / scan.width
+    row = int(low >> wp.int64(LOW_BITS)) / scan.width % scan.height
     read = time_of_row(scan, row, t)
     reversed_lag = (low & wp.int64(LOW_MASK)) >> wp.int64(LAG_BIT)
     shorter = wp.min((read - t) * wp.int64(TICKS), reversed_lag)
@@ -164,34 +171,183 @@ def stamp_rows(scan: RowScan, keys: wp.array(dtype=wp.int64), start: int):
 
 @wp.struct
 class Bus:
-    """Bus of the sensor, which transmits one event at a time."""
+    """Bus of a sensor, which transmits one event at a time."""
 
     event_ps: wp.int64  # time to transmit an event [ps]
     longest_ps: wp.int64  # longest time in the queue [ps]; events that would wait longer are lost
-    row: int  # pixels of a row whose events share a time stamp; 0 if every event has its own
+    rows: int  # 1 if the events of a row that is read share a time stamp; 0 if every event has its own
+    origin: wp.int64  # time from which picoseconds are counted [us]
 
 
 @wp.kernel
 def queue_events(
     bus: Bus,
     t: wp.array(dtype=wp.int64),
-    pixel: wp.array(dtype=int),
+    row: wp.array(dtype=wp.uint16),
+    first: wp.array(dtype=int),
     free: wp.array(dtype=wp.int64),
     stamp: wp.array(dtype=wp.int64),
 ):
-    """Transmit events in order, in one thread: ``stamp`` is the time of transmission [us], or -1 for a lost event.
+    """Transmit events in order, one thread per sensor: ``stamp`` is the time of transmission [us], or -1 if lost.
 
-    ``free`` holds the time at which the bus becomes free [ps].
+    ``first``: index of each sensor's first event, and behind them the number of events. ``free`` holds the time at
+    which each bus becomes free [ps since the origin].
     """
-    until = free[0]
-    for i in range(t.shape[0]):
-        now = t[i] * PS_PER_US
+    sensor = wp.tid()
+    until = free[sensor]
+    for i in range(first[sensor], first[sensor + 1]):
+        now = (t[i] - bus.origin) * PS_PER_US
         stamp[i] = wp.int64(-1)
         if until - now <= bus.longest_ps:
             begin = wp.max(until, now)
-            stamp[i] = begin / PS_PER_US
-            if bus.row > 0 and i > 0:
-                if t[i - 1] == t[i] and pixel[i - 1] / bus.row == pixel[i] / bus.row and stamp[i - 1] >= wp.int64(0):
+            stamp[i] = begin / PS_PER_US + bus.origin
+            if bus.rows > 0 and i > first[sensor]:
+                if t[i - 1] == t[i] and row[i - 1] == row[i] and stamp[i - 1] >= wp.int64(0):
                     stamp[i] = stamp[i - 1]
             until = begin + bus.event_ps
-    free[0] = until
+    free[sensor] = until
+
+
+# Events of many cameras: sorted by camera, then by time.
+#
+# The kernels that simulate pixels write keys whose pixel counts through all cameras. They are converted to keys of
+# ``part | camera | time | pixel | reversed lag | polarity``. The part is 0 for events of the chunk, 1 for later ones,
+# and 2 for those of cameras that start anew, which are dropped.
+
+CAMERA_LOW_BITS = wp.constant(wp.int64(20))  # lowest bits of a key: reversed lag (19) and polarity (1)
+
+
+@wp.struct
+class CameraKeys:
+    """Layout of the keys of the events of many cameras, and the chunk that they belong to."""
+
+    pixels: int  # number of pixels of a camera
+    width: int  # width of a camera [px]
+    shift: int  # bit position of the time in a key that counts through all pixels
+    time: int  # bit position of the time in a key that is sorted by camera
+    camera: int  # bit position of the camera
+    part: int  # bit position of the part
+    length: wp.int64  # length of the chunk [us]
+
+
+@wp.kernel
+def sort_by_camera(layout: CameraKeys, starts: wp.array(dtype=wp.uint8), keys: wp.array(dtype=wp.int64), start: int):
+    """Convert keys that count through the pixels of all cameras to keys that are sorted by camera."""
+    i = start + wp.tid()
+    t = keys[i] >> wp.int64(layout.shift)
+    low = int(keys[i] & wp.int64(LOW_MASK))
+    index = int((keys[i] - (t << wp.int64(layout.shift))) >> wp.int64(LOW_BITS))
+    camera = index / layout.pixels
+    part = wp.where(starts[camera] != wp.uint8(0), 2, wp.where(t < layout.length, 0, 1))
+    key = wp.int64(part) << wp.int64(layout.part) | wp.int64(camera) << wp.int64(layout.camera)
+    key = key | t << wp.int64(layout.time) | wp.int64(index - camera * layout.pixels) << CAMERA_LOW_BITS
+    keys[i] = key | wp.int64((low >> LAG_BIT) << 1 | (low & 1))
+
+
+@wp.func
+def camera_of(layout: CameraKeys, key: wp.int64) -> int:
+    """Return the camera of a key that is sorted by camera."""
+    return int(
+        (key >> wp.int64(layout.camera)) & ((wp.int64(1) << wp.int64(layout.part - layout.camera)) - wp.int64(1))
+    )
+
+
+@wp.func
+def time_of(layout: CameraKeys, key: wp.int64) -> wp.int64:
+    """Return the time of a key that is sorted by camera, since the start of its chunk [us]."""
+    bits = wp.int64(layout.camera - layout.time)
+    return (key >> wp.int64(layout.time)) & ((wp.int64(1) << bits) - wp.int64(1))
+
+
+@wp.func
+def pixel_of(layout: CameraKeys, key: wp.int64) -> int:
+    """Return the pixel of a key that is sorted by camera, in its camera."""
+    bits = wp.int64(layout.time) - CAMERA_LOW_BITS
+    return int((key >> CAMERA_LOW_BITS) & ((wp.int64(1) << bits) - wp.int64(1)))
+
+
+@wp.kernel
+def carry_over(layout: CameraKeys, keys: wp.array(dtype=wp.int64), start: int):
+    """Convert keys that are sorted by camera to keys of the next chunk that count through the pixels of all cameras.
+
+    Counterpart of :func:`sort_by_camera`; the cause is lost.
+    """
+    i = start + wp.tid()
+    key = keys[i]
+    low = int(key & ((wp.int64(1) << CAMERA_LOW_BITS) - wp.int64(1)))
+    index = camera_of(layout, key) * layout.pixels + pixel_of(layout, key)
+    t = time_of(layout, key) - layout.length
+    kept = wp.int64((low >> 1) << LAG_BIT | (low & 1))
+    keys[i] = t << wp.int64(layout.shift) | wp.int64(index) << wp.int64(LOW_BITS) | kept
+
+
+@wp.kernel
+def find_cameras(
+    layout: CameraKeys, keys: wp.array(dtype=wp.int64), n: int, cameras: int, start: int, found: wp.array(dtype=int)
+):
+    """Find the first event of each camera in ``n`` sorted keys, then the end of part 0, then that of part 1."""
+    k = start + wp.tid()
+    limit = wp.int64(k) << wp.int64(layout.camera)
+    if k >= cameras:
+        limit = wp.int64(k - cameras + 1) << wp.int64(layout.part)
+    found[k] = count_below(keys, n, limit)
+
+
+@wp.kernel
+def unpack_cameras(
+    layout: CameraKeys, keys: wp.array(dtype=wp.int64), origin: wp.int64, start: int,
+    x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8),
+):  # fmt: skip
+    """Convert keys that are sorted by camera to events. ``origin``: time of the start of the chunk [us]."""
+    i = start + wp.tid()
+    pixel = pixel_of(layout, keys[i])
+    row = pixel / layout.width
+    x[i] = wp.uint16(pixel - row * layout.width)
+    y[i] = wp.uint16(row)
+    t[i] = time_of(layout, keys[i]) + origin
+    p[i] = wp.uint8(keys[i] & wp.int64(1))
+
+
+# Selection of events on the device.
+
+
+@wp.kernel
+def mark_first_of_pixel(keys: wp.array(dtype=wp.int64), start: int, kept: wp.array(dtype=int)):
+    """Mark the first of the successive keys with the same camera, time and pixel with 1, the others with 0."""
+    i = start + wp.tid()
+    before = keys[wp.max(i - 1, 0)] >> CAMERA_LOW_BITS
+    kept[i] = wp.where(i == 0 or before != keys[i] >> CAMERA_LOW_BITS, 1, 0)
+
+
+@wp.kernel
+def mark_transmitted(stamp: wp.array(dtype=wp.int64), start: int, kept: wp.array(dtype=int)):
+    """Mark the events that the bus transmits with 1, the lost ones with 0."""
+    i = start + wp.tid()
+    kept[i] = wp.where(stamp[i] >= wp.int64(0), 1, 0)
+
+
+@wp.kernel
+def keep_marked(values: wp.array(dtype=Any), ends: wp.array(dtype=int), start: int, out: wp.array(dtype=Any)):
+    """Copy the values that are marked. ``ends``: number of marked values up to and including each one."""
+    i = start + wp.tid()
+    before = int(0)
+    if i > 0:
+        before = ends[i - 1]
+    if ends[i] > before:
+        out[before] = values[i]
+
+
+@wp.kernel
+def count_before(ends: wp.array(dtype=int), start: int, index: wp.array(dtype=int)):
+    """Replace indices of values by the number of marked values before them; see :func:`keep_marked`."""
+    k = start + wp.tid()
+    at = index[k]
+    before = int(0)
+    if at > 0:
+        before = ends[at - 1]
+    index[k] = before
+
+
+for _dtype in (wp.uint8, wp.uint16, wp.int64):
+    wp.overload(keep_marked, {"values": wp.array(dtype=_dtype), "out": wp.array(dtype=_dtype)})

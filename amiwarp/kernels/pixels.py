@@ -70,7 +70,7 @@ class Pixel:
     reference: float  # reference level [log intensity]
     on: float  # ON threshold of this pixel [log intensity]
     off: float  # OFF threshold of this pixel [log intensity]
-    leak: float  # leak of this pixel, without jitter [thresholds per step]
+    leak: float  # leak of this pixel, without jitter, relative to the mean leak; 0 for a dead pixel
     noise: float  # shot noise of this pixel in the dark [events per tick]
     hot: float  # rate of additional random events if the pixel is hot [events per tick], else 0
     rng: wp.uint32  # state of the random number generator
@@ -103,12 +103,12 @@ class Sink:
 
 
 @wp.func
-def whole_step(steps: Steps, p: Pixel) -> Interval:
+def whole_step(steps: Steps, s: SensorParams, p: Pixel) -> Interval:
     """Return one step of a chunk as a time interval, in which the pixel leaks without jitter."""
     span = Interval()
     span.ticks = steps.ticks
     span.per_tick = steps.per_tick
-    span.drift = p.leak * p.on
+    span.drift = s.leak * p.leak * p.on
     span.shift = steps.shift
     return span
 
@@ -267,7 +267,7 @@ def new_pixel(sensor: SensorParams, seed: int, i: int, level: float) -> Pixel:
     p.hot = wp.where(wp.randf(rng) < sensor.hot_fraction, sensor.hot, 0.0)
     factor, rng = rate_factor(sensor, rng)
     p.noise = sensor.noise * factor
-    p.leak = sensor.leak * factor
+    p.leak = factor
     leaked = wp.randf(rng)
     p.reference = p.level - wp.where(sensor.leak > 0.0, leaked * p.on, 0.0)
     p.blind_until = NEVER
@@ -349,7 +349,7 @@ def run_pixels(view: View, steps: Steps, sensor: SensorParams, pixels: wp.array(
     i = start + wp.tid()
     p = pixels[i]
     ray = ray_in_prism_frame(view, i)
-    span = whole_step(steps, p)
+    span = whole_step(steps, sensor, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
         level = see_level(view, steps.at[steps.margin + k + 1], ray)
@@ -370,7 +370,7 @@ def run_pixels_ahead(
     i = start + wp.tid()
     p = pixels[i]
     ray = ray_in_prism_frame(view, i)
-    span = whole_step(steps, p)
+    span = whole_step(steps, sensor, p)
     t0 = wp.int64(0)
     for block in range(steps.ahead.shape[0]):
         n = wp.min(AHEAD, steps.count - block * AHEAD)
@@ -465,7 +465,7 @@ def piece_count(level: float, before: float, after: float, angle: float, toleran
 @wp.func
 def jittered_leak(p: Pixel, s: SensorParams) -> float:
     """Return a pixel's leak [thresholds per step]. It changes with the generator's state, hence at every event."""
-    leak = p.leak
+    leak = s.leak * p.leak
     if s.leak_jitter > 0.0:
         rng = wp.rand_init(int(p.rng), 1)
         leak *= wp.max(1.0 + s.leak_jitter * wp.randn(rng), SMALLEST_LEAK)
@@ -506,7 +506,7 @@ def run_filtered_pixels(
     i = start + wp.tid()
     p = pixels[i]
     before = last_input(seen[i])
-    span = whole_step(steps, p)
+    span = whole_step(steps, sensor, p)
     ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
     for k in range(steps.count):
@@ -528,7 +528,7 @@ def run_filtered_pixels_ahead(
     i = start + wp.tid()
     p = pixels[i]
     before = last_input(seen[i])
-    span = whole_step(steps, p)
+    span = whole_step(steps, sensor, p)
     ray = ray_in_prism_frame(view, i)
     t0 = wp.int64(0)
     for block in range(steps.ahead.shape[0]):
@@ -581,7 +581,7 @@ def run_world_pixels(
     """
     i = start + wp.tid()
     p = pixels[i]
-    span = whole_step(steps, p)
+    span = whole_step(steps, sensor, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
         p = advance_pixel(p, sensor, sink, i, t0, span, table_level(light, sensor, k, i))
@@ -607,7 +607,7 @@ def run_filtered_world_pixels(
     i = start + wp.tid()
     p = pixels[i]
     before = last_input(seen[i])
-    span = whole_step(steps, p)
+    span = whole_step(steps, sensor, p)
     t0 = wp.int64(0)
     for k in range(steps.count):
         after = next_input(table_level(light, sensor, k, i), before)
@@ -617,3 +617,81 @@ def run_filtered_world_pixels(
         reconverge()
     pixels[i] = shift_times(p, t0)
     seen[i] = before.level
+
+
+# Event simulation from images of the log intensity, of many cameras in one launch.
+
+
+@wp.struct
+class Cameras:
+    """Cameras of one size, whose pixels follow each other camera by camera."""
+
+    pixels: int  # number of pixels of a camera
+    seed: wp.array(dtype=int)  # seed of each camera
+    starts: wp.array(dtype=wp.uint8)  # 1 for each camera that begins at the end of the chunk
+
+
+@wp.func
+def starting_pixel(cameras: Cameras, sensor: SensorParams, i: int, level: float) -> Pixel:
+    """Return the state of a pixel whose camera starts at a level; ``i``: number among the pixels of all cameras."""
+    camera = i / cameras.pixels
+    return new_pixel(sensor, cameras.seed[camera], i - camera * cameras.pixels, level)
+
+
+@wp.kernel
+def run_camera_pixels(
+    levels: wp.array2d(dtype=float), cameras: Cameras, steps: Steps, sensor: SensorParams,
+    pixels: wp.array(dtype=Pixel), start: int, sink: Sink,
+):  # fmt: skip
+    """Simulate the pixels of cameras over a chunk, as :func:`run_world_pixels` does.
+
+    ``levels``: log intensity at the end of each step; axes: step, pixel. Cameras that begin take the last row.
+    """
+    i = start + wp.tid()
+    if cameras.starts[i / cameras.pixels] != wp.uint8(0):
+        pixels[i] = starting_pixel(cameras, sensor, i, levels[steps.count - 1, i])
+        return
+    p = pixels[i]
+    span = whole_step(steps, sensor, p)
+    t0 = wp.int64(0)
+    for k in range(steps.count):
+        p = advance_pixel(p, sensor, sink, i, t0, span, levels[k, i])
+        t0 += wp.int64(steps.ticks)
+        reconverge()
+    pixels[i] = shift_times(p, t0)
+
+
+@wp.kernel
+def run_filtered_camera_pixels(
+    levels: wp.array2d(dtype=float), cameras: Cameras, steps: Steps, sensor: SensorParams,
+    pixels: wp.array(dtype=Pixel), seen: wp.array(dtype=float), start: int, sink: Sink,
+):  # fmt: skip
+    """Simulate pixels whose photoreceptors have limited bandwidth; see :func:`run_camera_pixels`.
+
+    ``seen``: last log intensity that entered each photoreceptor.
+    """
+    i = start + wp.tid()
+    if cameras.starts[i / cameras.pixels] != wp.uint8(0):
+        seen[i] = levels[steps.count - 1, i]
+        pixels[i] = starting_pixel(cameras, sensor, i, seen[i])
+        return
+    p = pixels[i]
+    before = last_input(seen[i])
+    span = whole_step(steps, sensor, p)
+    t0 = wp.int64(0)
+    for k in range(steps.count):
+        after = next_input(levels[k, i], before)
+        p = advance_filtered(p, sensor, sink, i, t0, span, before, after)
+        before = after
+        t0 += wp.int64(steps.ticks)
+        reconverge()
+    pixels[i] = shift_times(p, t0)
+    seen[i] = before.level
+
+
+@wp.kernel
+def find_bad_level(levels: wp.array(dtype=float), most: float, step: int, bad: wp.array(dtype=int)):
+    """Find the first log intensity that is not within ``most`` of 0. Thread k looks at every ``step``-th value."""
+    for i in range(wp.tid(), levels.shape[0], step):
+        if not wp.abs(levels[i]) <= most:
+            wp.atomic_min(bad, 0, i)

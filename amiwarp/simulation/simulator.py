@@ -379,15 +379,15 @@ EVENTS_PER_PIXEL = 128
 class KeyBuffer:
     """Buffer for the event keys of a chunk, in segments of pixels. The buffer grows if a chunk has more events."""
 
-    def __init__(self, count: int, device: Any) -> None:
-        """Allocate the buffer for ``count`` pixels."""
+    def __init__(self, count: int, device: Any, per_pixel: int | None = None) -> None:
+        """Allocate the buffer for ``count`` pixels, with room for ``per_pixel`` events of each, or the default."""
         self._pixels, self._device = count, device
         self._segments = -(-count // CPU_RUN) if device.is_cpu else min(CUDA_SEGMENTS, count)
         self._sink = pixels.Sink()
         self._sink.run = CPU_RUN if device.is_cpu else 1
         columns = CACHE_LINE // 4 if device.is_cpu else 1
         self._sink.count = wp.zeros((self._segments, columns), dtype=int, device=device)
-        self._reserve(EVENTS_PER_PIXEL * -(-count // self._segments))
+        self._reserve((per_pixel or EVENTS_PER_PIXEL) * -(-count // self._segments))
 
     def _reserve(self, capacity: int) -> None:
         """Allocate room for ``capacity`` keys per segment."""
@@ -448,32 +448,44 @@ LONGEST_SCAN_US = 10_000.0
 """Longest allowed time to read all rows [us]. The integer keys of events can store a delay of up to 32 ms."""
 
 
+def row_scan(sensor: SensorModel, width: int, height: int) -> Any:
+    """Return the scan of a sensor's rows; raise :class:`AmiwarpError` if reading all rows takes too long."""
+    scan_us = sensor.row_us * height
+    if scan_us > LONGEST_SCAN_US:
+        raise AmiwarpError(
+            f"sensor row_us = {sensor.row_us} makes a scan of {height} rows take {scan_us:.0f} us; "
+            f"the limit is {LONGEST_SCAN_US:.0f} us; give a smaller row_us"
+        )
+    scan = event_keys.RowScan()
+    scan.row_ps = round(sensor.row_us * 1e6)
+    scan.scan_ps, scan.width, scan.height = int(scan.row_ps) * height, width, height
+    return scan
+
+
+def bus_of(sensor: SensorModel) -> Any:
+    """Return the bus of a sensor; it takes no time per event if its rate is unlimited."""
+    bus = event_keys.Bus()
+    bus.event_ps = round(1e6 / sensor.bus_rate_mev_s) if sensor.bus_rate_mev_s else 0
+    bus.longest_ps = round(sensor.bus_queue) * int(bus.event_ps)
+    bus.rows = int(round(sensor.row_us * 1e6) > 0)
+    return bus
+
+
 class Readout:
     """Readout of one simulated sensor. Only the state of the bus is kept between blocks of events."""
 
     def __init__(self, simulation: SimulationValues, device: Any) -> None:
         """Set up the readout; raise :class:`AmiwarpError` if reading all rows takes too long."""
         sensor, camera = simulation.sensor, simulation.camera
-        scan_us = sensor.row_us * camera.height
-        if scan_us > LONGEST_SCAN_US:
-            raise AmiwarpError(
-                f"sensor row_us = {sensor.row_us} makes a scan of {camera.height} rows take {scan_us:.0f} us; "
-                f"the limit is {LONGEST_SCAN_US:.0f} us; give a smaller row_us"
-            )
         self._device, self._width = device, camera.width
         self._duration_us = simulation.duration_us
-        self._row_ps = round(sensor.row_us * 1e6)
-        self._scan_ps = self._row_ps * camera.height
-        self._bus = event_keys.Bus()
-        self._bus.event_ps = round(1e6 / sensor.bus_rate_mev_s) if sensor.bus_rate_mev_s else 0
-        self._bus.longest_ps = round(sensor.bus_queue) * int(self._bus.event_ps)
-        self._bus.row = camera.width if self._row_ps else 0
+        self._scan, self._bus = row_scan(sensor, camera.width, camera.height), bus_of(sensor)
         self._free = wp.zeros(1, dtype=wp.int64, device="cpu")
 
     @property
     def scans_rows(self) -> bool:
         """Whether the sensor reads rows one after the other, instead of every event at once."""
-        return self._row_ps > 0
+        return int(self._scan.row_ps) > 0
 
     @property
     def limits_rate(self) -> bool:
@@ -487,10 +499,8 @@ class Readout:
         """
         if not self.scans_rows or not count:
             return
-        scan = event_keys.RowScan()
-        scan.row_ps, scan.scan_ps, scan.origin = self._row_ps, self._scan_ps, origin_us
-        scan.width, scan.shift = self._width, shift
-        launch.launch(event_keys.stamp_rows, count, [scan, keys], [], device=self._device)
+        self._scan.origin, self._scan.shift = origin_us, shift
+        launch.launch(event_keys.stamp_rows, count, [self._scan, keys], [], device=self._device)
 
     def read(self, keys: wp.array, shift: int, origin_us: int) -> tuple[wp.array, wp.array | None]:
         """Return the keys of the events that are read out, and their time stamps [us].
@@ -517,13 +527,13 @@ class Readout:
     def _transmit(self, keys: NDArray[np.int64], shift: int, origin_us: int) -> NDArray[np.int64]:
         """Return the time at which the bus transmits each event [us]; -1 for events that do not fit into the queue."""
         t = keys >> shift
-        pixel = ((keys - (t << shift)) >> int(pixels.LOW_BITS)).astype(np.int32)
+        row = (((keys - (t << shift)) >> int(pixels.LOW_BITS)) // self._width).astype(np.uint16)
         stamp = wp.empty(len(keys), dtype=wp.int64, device="cpu")
-        arrays = [wp.array(t + origin_us, dtype=wp.int64, device="cpu"), wp.array(pixel, dtype=int, device="cpu")]
+        arrays = [wp.array(t + origin_us, dtype=wp.int64, device="cpu"), wp.array(row, dtype=wp.uint16, device="cpu")]
+        first = wp.array([0, len(keys)], dtype=int, device="cpu")
         launch.load(event_keys.queue_events, wp.get_device("cpu"))
-        wp.launch(
-            event_keys.queue_events, dim=1, inputs=[self._bus, *arrays, self._free], outputs=[stamp], device="cpu"
-        )
+        wp.launch(event_keys.queue_events, dim=1, inputs=[self._bus, *arrays, first, self._free], outputs=[stamp],
+                  device="cpu")  # fmt: skip
         return np.asarray(stamp.numpy())
 
 

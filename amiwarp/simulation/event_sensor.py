@@ -1,0 +1,338 @@
+"""Simulated event sensors that look at images of other programs: a layer between a renderer and a network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_events import NAMES, DeviceEvents, import_array, wait
+from amiwarp.imaging.tensors import Windows
+from amiwarp.kernels import event_keys, launch, pixels, prism_view
+from amiwarp.optics.camera import LARGEST_SIZE
+from amiwarp.simulation.description import SensorModel
+from amiwarp.simulation.simulator import LATEST_US, KeyBuffer, bus_of, row_scan, sensor_params
+from amiwarp.validation import TIME_LIMIT, array, guarded, instance, on_gpu, whole
+
+MOST_CAMERAS = 1 << 16
+"""Largest number of cameras of an :class:`EventSensor`."""
+MOST_PIXELS = 1 << 26
+"""Largest number of pixels of all cameras of an :class:`EventSensor`."""
+EVENTS_PER_PIXEL = 4
+"""Initial capacity of the event buffer of a step [events per pixel]. The buffer grows if necessary."""
+LARGEST_LEVEL = 100.0
+"""Largest magnitude of a log intensity."""
+LARGEST_SEED = (1 << 31) - 1
+THREADS = 1 << 15
+"""Number of CUDA threads that check the images."""
+
+
+@guarded
+class EventSensor:
+    """Event sensors of many cameras, whose images come from another program and stay on the device.
+
+    :meth:`step` takes one image of each camera, and returns the events since the images before. Between two images, log
+    intensity is linear in time. The sensors are those of :func:`simulate`, with the same random numbers: a camera gives
+    the same events, bit for bit, as a simulation with its seed whose time steps end at its images.
+
+    Parameters
+    ----------
+    cameras : int
+        Number of cameras, 1 to 65536.
+    height, width : int
+        Size of the images [px].
+    model : SensorModel, optional
+        Pixels and readout of all cameras.
+    seed : int or sequence of int, default 0
+        Seed of each camera, or one number s for the seeds s, s + 1, s + 2, …
+    device : str or warp.Device, default "cpu"
+        Device of the images and the events.
+
+    Raises
+    ------
+    AmiwarpError
+        If a value is out of range, the seeds are not one for each camera, or all cameras have over 2**26 pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> sensor = amiwarp.EventSensor(2, 1, 3, amiwarp.SensorModel.ideal(contrast=0.25))
+    >>> images = np.zeros((2, 1, 3), np.float32)
+    >>> len(sensor.step(images, 0)[0])  # the first images set the references
+    0
+    >>> images[1, 0, 2] = 0.6
+    >>> events, windows = sensor.step(images, 1000)
+    >>> events.t.numpy().tolist(), windows.start.tolist(), windows.stop.tolist()
+    ([417, 833], [0, 0], [0, 2])
+    """
+
+    def __init__(
+        self,
+        cameras: int,
+        height: int,
+        width: int,
+        model: SensorModel | None = None,
+        *,
+        seed: int | Sequence[int] | NDArray[np.integer[Any]] = 0,
+        device: Any = "cpu",
+    ) -> None:
+        n = whole(cameras, "cameras", 1, MOST_CAMERAS)
+        height, width = (
+            whole(value, name, 1, LARGEST_SIZE, " pixels") for name, value in (("height", height), ("width", width))
+        )
+        self._shape = (n, height, width)
+        self._pixels = height * width
+        if n * self._pixels > MOST_PIXELS:
+            raise AmiwarpError(
+                f"{n} cameras of {width} x {height} have {n * self._pixels} pixels; the limit is {MOST_PIXELS}; "
+                "give fewer cameras at a time"
+            )
+        self._model = instance(SensorModel() if model is None else model, SensorModel, "model")
+        self._scan, self._bus = row_scan(self._model, width, height), bus_of(self._model)
+        self._device = wp.get_device(device)
+        self._cameras = pixels.Cameras()
+        self._cameras.pixels = self._pixels
+        self._cameras.seed = wp.array(_seeds(seed, n), dtype=int, device=self._device)
+        self._starts = np.ones(n, np.uint8)
+        filtered = bool(self._model.cutoff_hz or (self._model.leak_hz and self._model.leak_jitter_fraction))
+        self._kernel = pixels.run_filtered_camera_pixels if filtered else pixels.run_camera_pixels
+        self._state = [wp.empty(n * self._pixels, dtype=pixels.Pixel, device=self._device)]
+        if filtered:
+            self._state.append(wp.empty(n * self._pixels, dtype=float, device=self._device))
+        self._buffer = KeyBuffer(n * self._pixels, self._device, EVENTS_PER_PIXEL)
+        self._nothing: wp.array = wp.empty(0, dtype=wp.int64, device=self._device)
+        self._carry = self._nothing
+        self._free = wp.zeros(n, dtype=wp.int64, device=self._device)
+        self._layout = self._key_layout()
+        self._first_us = self._now_us = -1
+
+    def _key_layout(self) -> Any:
+        """Return the layout of the keys of events."""
+        n = self._shape[0]
+        layout = event_keys.CameraKeys()
+        layout.pixels, layout.width = self._pixels, self._shape[2]
+        layout.shift = int(pixels.LOW_BITS) + (n * self._pixels - 1).bit_length()
+        layout.time = int(event_keys.CAMERA_LOW_BITS) + (self._pixels - 1).bit_length()
+        layout.part = 61  # two bits; the sign stays 0
+        layout.camera = int(layout.part) - (n - 1).bit_length()
+        return layout
+
+    def step(self, images: Any, t_us: int) -> tuple[DeviceEvents, Windows]:
+        """Advance all cameras to their next images, and return the events since the images before.
+
+        The first images, and those after :meth:`reset`, set the reference of each pixel and give no events. Events
+        whose latency ends after ``t_us`` follow in a later step. If the model has a bus, events that wait in its queue
+        may have later times than ``t_us``.
+
+        Parameters
+        ----------
+        images : array
+            Natural log intensity of each pixel, float32, shape (cameras, height, width), of Warp, PyTorch, CuPy, JAX or
+            any other library with DLPack. Arrays in host memory are copied to a GPU. Arrays are not modified.
+            The simulator's scale is ``log(luminance + 0.02)`` with white at 1; the bandwidth and the noise of the model
+            depend on it, thresholds do not.
+        t_us : int
+            Time of the images [us], after that of the images before.
+
+        Returns
+        -------
+        DeviceEvents
+            Events of all cameras, sorted by camera, then by time.
+        Windows
+            One window for each camera: the range of its events, and the times of the two images.
+
+        Raises
+        ------
+        AmiwarpError
+            If the images have another shape, type or device, or a value that is not within -100 .. 100; if the time
+            does not increase, or the step is too long for the number of pixels. The state then stays as it was.
+        """
+        t_us = whole(t_us, "t_us", 0, TIME_LIMIT - 1, " us")
+        length = self._length(t_us)
+        levels = self._levels(images)
+        keys = self._generate(levels, t_us, length)
+        keys, edges = self._arrange(keys, length)
+        found, edges = self._read(keys, edges)
+        self._now_us = t_us
+        start = np.where(self._starts, t_us, t_us - length)
+        self._starts[:] = 0
+        wait(self._device)
+        return found, Windows(edges[:-1].copy(), edges[1:].copy(), start, np.full(len(start), t_us, np.int64))
+
+    def reset(self, which: Any = None) -> None:
+        """Start cameras anew at their next images, with the same random numbers as at first.
+
+        Their events that have not been read out yet are dropped. If all cameras start anew, so do the times.
+
+        Parameters
+        ----------
+        which : int or array_like, optional
+            Number of a camera, or numbers of several cameras, shape (k,), or truth values, shape (cameras,). By
+            default, all cameras.
+
+        Raises
+        ------
+        AmiwarpError
+            If there is no camera of a number.
+        """
+        n = self._shape[0]
+        chosen = array(np.arange(n) if which is None else which, "which", "biu").reshape(-1)
+        if chosen.dtype == bool:
+            if len(chosen) != n:
+                raise AmiwarpError(f"which has {len(chosen)} truth values; expected one for each of {n} cameras")
+            chosen = np.flatnonzero(chosen)
+        if chosen.size and not 0 <= int(chosen.min()) <= int(chosen.max()) < n:
+            raise AmiwarpError(f"which holds cameras {chosen.min()} .. {chosen.max()}; expected 0 .. {n - 1}")
+        chosen = chosen.astype(np.int64)
+        self._starts[chosen] = 1
+        free = self._free.numpy()
+        free[chosen] = 0
+        self._free = wp.array(free, dtype=wp.int64, device=self._device)
+        if self._starts.all():
+            self._carry, self._now_us = self._nothing, -1
+
+    def _length(self, t_us: int) -> int:
+        """Return the duration of the step to a time [us]; 0 for the first step."""
+        if self._now_us < 0:
+            return 0
+        length = t_us - self._now_us
+        longest = (1 << (int(self._layout.camera) - int(self._layout.time))) - LATEST_US
+        longest = min(longest, ((1 << 31) - 1) // int(pixels.TICKS))
+        if not 1 <= length <= longest:
+            raise AmiwarpError(
+                f"t_us is {t_us} after {self._now_us} us; with {self._shape[0] * self._pixels} pixels, a step takes "
+                f"1 .. {longest} us; give a later time, images in between, or fewer cameras"
+            )
+        return length
+
+    def _levels(self, images: Any) -> wp.array:
+        """Return the images as one row of levels on the device, checked."""
+        what = f"float32 of shape {self._shape}, log intensities of all cameras"
+        if on_gpu(images):
+            levels = import_array(images, "images")
+            kind, where = wp.dtype_to_numpy(levels.dtype), levels.device
+        else:
+            host = np.require(array(images, "images"), requirements=["C", "A"])
+            levels, kind, where = host, host.dtype, self._device
+        if kind != np.float32 or levels.shape != self._shape:
+            raise AmiwarpError(f"images are {np.dtype(kind)} of shape {levels.shape}; expected {what}")
+        if where != self._device:
+            raise AmiwarpError(f"images are on {where}, the sensor is on {self._device}; move the images")
+        if isinstance(levels, np.ndarray):
+            levels = wp.array(levels, dtype=float, device=self._device, copy=not self._device.is_cpu)
+        levels = levels.reshape((1, -1))
+        bad = wp.full(1, LARGEST_SEED, dtype=int, device=self._device)
+        threads = 1 if self._device.is_cpu else min(THREADS, levels.size)
+        wp.launch(pixels.find_bad_level, threads, [levels[0], LARGEST_LEVEL, threads], [bad], device=self._device)
+        place = int(bad.numpy()[0])
+        if place < levels.size:
+            camera, row, column = (int(k) for k in np.unravel_index(place, self._shape))
+            raise AmiwarpError(
+                f"the image of camera {camera} has log intensity {levels[0].numpy()[place]} at row {row}, column "
+                f"{column}; expected -{LARGEST_LEVEL:g} .. {LARGEST_LEVEL:g}; take the log of luminance + 0.02"
+            )
+        return levels
+
+    def _generate(self, levels: wp.array, t_us: int, length: int) -> wp.array:
+        """Simulate the pixels over a step. Return the keys of events, with those carried over, unsorted."""
+        steps = prism_view.Steps()
+        steps.count, steps.ticks = 1, length * int(pixels.TICKS)
+        steps.per_tick = 1.0 / max(int(steps.ticks), 1)
+        steps.shift = self._layout.shift
+        if length == 0:
+            self._first_us = self._bus.origin = t_us
+        self._cameras.starts = wp.array(self._starts, dtype=wp.uint8, device=self._device)
+        sensor = sensor_params(self._model, max(length, 1))
+        launch.load(self._kernel, self._device)
+        return self._buffer.run(self._kernel, [levels, self._cameras, steps, sensor], self._state, self._carry)
+
+    def _arrange(self, keys: wp.array, length: int) -> tuple[wp.array, NDArray[np.int64]]:
+        """Return the keys of the events that are read out in this step, sorted by camera, and the cameras' ranges.
+
+        ``keys``: twice the needed length. Later events are kept for the next step.
+        """
+        n, total = self._shape[0], len(keys) // 2
+        self._layout.length = length
+        if not total:  # Warp cannot slice an empty array
+            return self._nothing, np.zeros(n + 1, np.int64)
+        if int(self._scan.row_ps):
+            self._scan.origin, self._scan.shift = self._now_us - self._first_us, self._layout.shift
+            self._launch(event_keys.stamp_rows, total - len(self._carry), [self._scan, keys])
+        self._launch(event_keys.sort_by_camera, total, [self._layout, self._cameras.starts, keys])
+        self._sort(keys, total)
+        found = wp.empty(n + 2, dtype=int, device=self._device)
+        self._launch(event_keys.find_cameras, n + 2, [self._layout, keys, total, n], [found])
+        edges = found.numpy().astype(np.int64)
+        now, later = edges[n:].tolist()
+        self._carry = wp.clone(keys[now:later]) if now < later else self._nothing
+        self._launch(event_keys.carry_over, len(self._carry), [self._layout, self._carry])
+        return keys[:now] if now else self._nothing, edges[: n + 1]
+
+    def _sort(self, keys: wp.array, total: int) -> None:
+        """Sort the first ``total`` keys."""
+        if self._device.is_cpu:
+            keys.numpy()[:total].sort()  # shares the memory of keys
+            return
+        # without a row scan, no two events of a pixel share a microsecond: bits below the pixel's need no sorting
+        lowest = 0 if int(self._scan.row_ps) else int(event_keys.CAMERA_LOW_BITS)
+        order = wp.empty(2 * total, dtype=wp.int32, device=self._device)
+        wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=int(self._layout.part) + 2)
+
+    def _read(self, keys: wp.array, edges: NDArray[np.int64]) -> tuple[DeviceEvents, NDArray[np.int64]]:
+        """Return the events of sorted keys that the sensors read out, and the ranges of the cameras."""
+        if int(self._scan.row_ps) and len(keys):
+            (keys,), edges = self._keep(event_keys.mark_first_of_pixel, [keys], [keys], edges)
+        n = len(keys)
+        columns = [
+            wp.empty(n, dtype=dtype, device=self._device) for dtype in (wp.uint16, wp.uint16, wp.int64, wp.uint8)
+        ]
+        self._launch(event_keys.unpack_cameras, n, [self._layout, keys, self._now_us], columns)
+        if int(self._bus.event_ps) and n:
+            _, y, t, _ = columns
+            first = wp.array(edges, dtype=int, device=self._device)
+            stamp = wp.empty(n, dtype=wp.int64, device=self._device)
+            launch.load(event_keys.queue_events, self._device)
+            wp.launch(event_keys.queue_events, self._shape[0], [self._bus, t, y, first, self._free], [stamp],
+                      device=self._device)  # fmt: skip
+            columns[NAMES.index("t")] = stamp
+            columns, edges = self._keep(event_keys.mark_transmitted, [stamp], columns, edges)
+        return DeviceEvents(*columns), edges
+
+    def _keep(
+        self, mark: Any, inputs: list[wp.array], columns: list[wp.array], edges: NDArray[np.int64]
+    ) -> tuple[list[wp.array], NDArray[np.int64]]:
+        """Return the values of columns that the kernel ``mark`` marks, and the ranges of the cameras in them."""
+        n = len(columns[0])
+        kept = wp.empty(n, dtype=int, device=self._device)
+        self._launch(mark, n, inputs, [kept])
+        ends = wp.empty_like(kept)
+        wp.utils.array_scan(kept, ends, inclusive=True)
+        index = wp.array(edges, dtype=int, device=self._device)
+        self._launch(event_keys.count_before, len(edges), [ends], [index])
+        edges = index.numpy().astype(np.int64)
+        out = [wp.empty(int(edges[-1]), dtype=values.dtype, device=self._device) for values in columns]
+        for values, to in zip(columns, out, strict=True):
+            self._launch(event_keys.keep_marked, n, [values, ends], [to])
+        return out, edges
+
+    def _launch(self, kernel: Any, n: int, inputs: list[Any], outputs: Sequence[wp.array] = ()) -> None:
+        """Run a kernel whose last input is ``start: int`` over ``range(n)``."""
+        launch.launch(kernel, n, inputs, outputs, device=self._device)
+
+
+def _seeds(seed: Any, cameras: int) -> NDArray[np.int32]:
+    """Return the seed of each camera, checked."""
+    if np.ndim(seed) == 0:
+        first = whole(seed, "seed", 0, LARGEST_SEED - cameras + 1)
+        return (first + np.arange(cameras)).astype(np.int32)
+    given = array(seed, "seed", "iu")
+    if given.shape != (cameras,) or int(given.min()) < 0 or int(given.max()) > LARGEST_SEED:
+        raise AmiwarpError(
+            f"seed has shape {given.shape}; expected one number, or one for each of {cameras} cameras, in 0 .. "
+            f"{LARGEST_SEED}"
+        )
+    return given.astype(np.int32)
