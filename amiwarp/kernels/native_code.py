@@ -82,11 +82,6 @@ def copy_int64s(out: wp.array(dtype=wp.int64), values: wp.array(dtype=wp.int64),
     """Copy ``values[first : first + n]`` of contiguous arrays of int64."""
 
 
-@wp.func_native("for (int k = 0; k < n; ++k) ((int*)out.data)[k] = ((const uint16_t*)values.data)[first + k];")
-def copy_uint16s(out: wp.array(dtype=int), values: wp.array(dtype=wp.uint16), first: int, n: int):
-    """Copy ``values[first : first + n]`` of a contiguous array of uint16 to one of int32."""
-
-
 @wp.func_native("""
     const int64_t* value = (const int64_t*)values.data;
     int fall = 0;

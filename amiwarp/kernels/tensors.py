@@ -25,7 +25,6 @@ from amiwarp.kernels.native_code import (
     copy_bytes,
     copy_floats,
     copy_int64s,
-    copy_uint16s,
     count_places,
     descends,
     load_float,
@@ -199,6 +198,19 @@ def group_of(grid: Grid, windows: wp.array2d(dtype=wp.int64), window: int, t: wp
     return window * grid.steps + interval_of(grid, time_at(grid, windows[window, T_START], windows[window, SPAN], t))
 
 
+@wp.func
+def count_event(
+    grid: Grid, part: Part, own: int, windows: wp.array2d(dtype=wp.int64), window: int, i: int,
+    x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
+    counts: wp.array(dtype=int),
+):  # fmt: skip
+    """Count an event at its nearest pixel. ``own``: group that the part's spare group replaces, or -1."""
+    col, row = nearest(x[i]), nearest(y[i])
+    if is_pixel(grid, col, row) == 1:
+        group = group_of(grid, windows, window, t[i])
+        wp.atomic_add(counts, place_of(grid, wp.where(group == own, part.spare, group), p[i], col, row), 1)
+
+
 @wp.kernel
 def count_events(
     x: wp.array(dtype=Any), y: wp.array(dtype=Any), t: wp.array(dtype=wp.int64), p: wp.array(dtype=wp.uint8),
@@ -209,10 +221,7 @@ def count_events(
     window = window_of(windows, wp.tid() / BLOCK)
     i = event_of(windows, t, unsorted, window, wp.tid())
     if i >= 0:
-        col, row = nearest(x[i]), nearest(y[i])
-        if is_pixel(grid, col, row) == 1:
-            group = group_of(grid, windows, window, t[i])
-            wp.atomic_add(counts, place_of(grid, group, p[i], col, row), 1)
+        count_event(grid, part, -1, windows, window, i, x, y, t, p, counts)
 
 
 @wp.kernel
@@ -326,16 +335,15 @@ def find_own(
 
 
 @wp.func
-def copy_nearest(out: wp.array(dtype=int), values: wp.array(dtype=wp.uint16), first: int, n: int):
-    """Copy the coordinates of the pixels of a block."""
-    copy_uint16s(out, values, first, n)
+def load_nearest(values: wp.array(dtype=wp.uint16), i: int) -> int:
+    """Return the coordinate of an event's pixel."""
+    return int(load_uint16(values, i))
 
 
 @wp.func
-def copy_nearest(out: wp.array(dtype=int), values: wp.array(dtype=float), first: int, n: int):
-    """Find the coordinates of the nearest pixels of a block."""
-    for k in range(n):
-        out[k] = nearest(values[first + k])
+def load_nearest(values: wp.array(dtype=float), i: int) -> int:
+    """Return the coordinate of the pixel that is nearest to an event."""
+    return nearest(load_float(values, i))
 
 
 @wp.func
@@ -382,14 +390,14 @@ def time_block(
 
 
 @wp.func
-def place_block(
-    grid: Grid, part: Part, cols: wp.array(dtype=int), rows: wp.array(dtype=int), p: wp.array(dtype=wp.uint8),
-    groups: wp.array(dtype=int), places: wp.array(dtype=int),
+def place_interval(
+    grid: Grid, part: Part, group: int, first: int, x: wp.array(dtype=Any), y: wp.array(dtype=Any),
+    p: wp.array(dtype=wp.uint8), places: wp.array(dtype=int),
 ):  # fmt: skip
-    """Compute the pixel of each event of a block."""
+    """Compute the nearest pixel of each event of a whole block in one time interval."""
     for k in range(BLOCK):
-        col, row = load_int(cols, k), load_int(rows, k)
-        place = place_of(grid, load_int(groups, k), load_uint8(p, k), col, row)
+        col, row = load_nearest(x, first + k), load_nearest(y, first + k)
+        place = place_of(grid, group, load_uint8(p, first + k), col, row)
         store_int(places, k, wp.where(is_pixel(grid, col, row) == 1, place, part.trash))
 
 
@@ -429,21 +437,15 @@ def count_event_blocks(
     counts: wp.array(dtype=int),
 ):  # fmt: skip
     """Count the events of each thread's block at their nearest pixels."""
-    times = wp.zeros(shape=(64,), dtype=wp.int64)
-    signs = wp.zeros(shape=(64,), dtype=wp.uint8)
-    cols = wp.zeros(shape=(64,), dtype=int)
-    rows = wp.zeros(shape=(64,), dtype=int)
-    groups = wp.zeros(shape=(64,), dtype=int)
-    places = wp.zeros(shape=(64,), dtype=int)
     window, first, n = start_block(t, windows, part.block + wp.tid(), unsorted)
-    copy_int64s(times, t, first, n)
-    copy_bytes(signs, p, first, n)
-    own = own_group(grid, windows, t, part)
-    copy_nearest(cols, x, first, n)
-    copy_nearest(rows, y, first, n)
-    time_block(grid, part, own, windows, window, times, groups, places)
-    place_block(grid, part, cols, rows, signs, groups, places)
-    count_places(counts, places, n)
+    own, group = own_group(grid, windows, t, part), group_of(grid, windows, window, t[first])
+    if n == BLOCK and group == group_of(grid, windows, window, t[first + n - 1]):
+        places = wp.zeros(shape=(64,), dtype=int)
+        place_interval(grid, part, wp.where(group == own, part.spare, group), first, x, y, p, places)
+        count_places(counts, places, n)
+    else:
+        for k in range(n):
+            count_event(grid, part, own, windows, window, first + k, x, y, t, p, counts)
 
 
 @wp.kernel
@@ -453,22 +455,13 @@ def keep_latest_blocks(
     latest: wp.array(dtype=wp.int64),
 ):  # fmt: skip
     """Keep the latest times of the events of each thread's block at their nearest pixels."""
-    times = wp.zeros(shape=(64,), dtype=wp.int64)
-    signs = wp.zeros(shape=(64,), dtype=wp.uint8)
-    cols = wp.zeros(shape=(64,), dtype=int)
-    rows = wp.zeros(shape=(64,), dtype=int)
-    groups = wp.zeros(shape=(64,), dtype=int)
-    places = wp.zeros(shape=(64,), dtype=int)
     window, first, n = start_block(t, windows, part.block + wp.tid(), unsorted)
-    copy_int64s(times, t, first, n)
-    copy_bytes(signs, p, first, n)
-    own = own_group(grid, windows, t, part)
-    copy_nearest(cols, x, first, n)
-    copy_nearest(rows, y, first, n)
-    time_block(grid, part, own, windows, window, times, groups, places)
-    place_block(grid, part, cols, rows, signs, groups, places)
-    for k in range(n):
-        latest[places[k]] = wp.max(latest[places[k]], times[k])
+    own, group = own_group(grid, windows, t, part), window * grid.steps
+    used = wp.where(group == own, part.spare, group)
+    for k in range(first, first + n):
+        col, row = nearest(x[k]), nearest(y[k])
+        if is_pixel(grid, col, row) == 1:
+            wp.atomic_max(latest, place_of(grid, used, p[k], col, row), t[k])
 
 
 @wp.func
@@ -486,9 +479,7 @@ def add_interval_words(
     used = wp.where(group == own, part.spare, group)
     interval, t_first = group - window * grid.steps, t[first]
     start, span = wp.float64((t_first - windows[window, T_START]) * wp.int64(grid.rate)), windows[window, SPAN]
-    for k in range(BLOCK):
-        col, row, sign = int(load_uint16(x, first + k)), int(load_uint16(y, first + k)), load_uint8(p, first + k)
-        store_int(places, k, wp.where(is_pixel(grid, col, row) == 1, place_of(grid, used, sign, col, row), part.trash))
+    place_interval(grid, part, used, first, x, y, p, places)
     for k in range(BLOCK):
         elapsed = wp.float64(int(load_int64(t, first + k) - t_first)) * wp.float64(grid.rate)
         end = end_share(in_intervals(grid, start + elapsed, wp.float64(span)), interval)
