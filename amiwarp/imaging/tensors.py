@@ -332,7 +332,8 @@ class _Batch:
             host = self.events.to_host()
             for start, stop in zip(self.windows.start.tolist(), self.windows.stop.tolist(), strict=True):
                 check_order(host[start:stop], where="events", first_index=start)
-        _idle[self.device.is_cpu, wp.int32].append(self.unsorted)
+        else:
+            _idle[self.device.is_cpu, wp.int32].append(self.unsorted)
         found = out.numpy() if self.on_host else out
         return found[0] if self.single else found
 
