@@ -20,7 +20,7 @@ PICTURE = "china.jpg"
 TESTS = (
     "camera", "optics", "iwe", "tiles", "uploads", "sharpness", "calibrate", "photometric", "compensate", "compensator",
     "simulate", "translate", "benchmarks", "worlds", "sensor", "reconstruct", "auto", "arrays", "dataset",
-    "corners", "edge_directions", "page_locked", "tensors",
+    "event_sensor", "corners", "edge_directions", "page_locked", "tensors",
 )  # fmt: skip
 """Names of the test files that use a device and need neither the packages of the command line nor video."""
 PLUGIN = () if importlib.util.find_spec("hdf5plugin") else ("test_file_keeps",)
@@ -39,6 +39,7 @@ def commands(folder: Path, out: Path, limit: float) -> dict[str, list[str]]:
         "chart": [*module, "benchmarks.chart", picture, *device, "--out", str(out / "chart")],
         "stream": [*module, "benchmarks.stream", *device, "--picture", picture, "--out", str(out / "stream_cuda.json")],
         "simulate": [*module, "benchmarks.simulate", *device, "--picture", picture],
+        "event_sensor": [*module, "benchmarks.event_sensor", *device],
         "worlds": [*module, "benchmarks.worlds", *device, "--out", str(out / "worlds_cuda.json")],
         "worlds_calibration": [*module, "benchmarks.worlds_calibration", *device,
                                "--out", str(out / "worlds_calibration_cuda.json")],

@@ -638,7 +638,7 @@ def starting_pixel(cameras: Cameras, sensor: SensorParams, i: int, level: float)
     return new_pixel(sensor, cameras.seed[camera], i - camera * cameras.pixels, level)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def run_camera_pixels(
     levels: wp.array2d(dtype=float), cameras: Cameras, steps: Steps, sensor: SensorParams,
     pixels: wp.array(dtype=Pixel), start: int, sink: Sink,
@@ -661,7 +661,7 @@ def run_camera_pixels(
     pixels[i] = shift_times(p, t0)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def run_filtered_camera_pixels(
     levels: wp.array2d(dtype=float), cameras: Cameras, steps: Steps, sensor: SensorParams,
     pixels: wp.array(dtype=Pixel), seen: wp.array(dtype=float), start: int, sink: Sink,

@@ -326,7 +326,7 @@ class EventSensor:
 
 def _seeds(seed: Any, cameras: int) -> NDArray[np.int32]:
     """Return the seed of each camera, checked."""
-    if np.ndim(seed) == 0:
+    if not isinstance(seed, list | tuple | range | np.ndarray):
         first = whole(seed, "seed", 0, LARGEST_SEED - cameras + 1)
         return (first + np.arange(cameras)).astype(np.int32)
     given = array(seed, "seed", "iu")
