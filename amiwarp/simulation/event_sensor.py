@@ -48,7 +48,7 @@ class EventSensor:
     model : SensorModel, optional
         Pixels and readout of all cameras.
     seed : int or sequence of int, default 0
-        Seed of each camera, or one number s for the seeds s, s + 1, s + 2, …
+        Seed of each camera, or the seed of the first camera, from which those of the others count up.
     device : str or warp.Device, default "cpu"
         Device of the images and the events.
 
