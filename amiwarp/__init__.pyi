@@ -11,6 +11,7 @@ from .calib.result import ModelCandidate as ModelCandidate
 from .calib.result import ModelChoice as ModelChoice
 from .calib.result import PhotometricSummary as PhotometricSummary
 from .calib.result import StageSummary as StageSummary
+from .calib.settings import CalibrationOptions as CalibrationOptions
 from .calib.settings import PhotometricSettings as PhotometricSettings
 from .calib.settings import Settings as Settings
 from .choices import CornerMethod as CornerMethod
@@ -89,6 +90,8 @@ from .lens.board import Corners as Corners
 from .lens.calibration import BoardPose as BoardPose
 from .lens.calibration import LensCalibration as LensCalibration
 from .lens.calibration import calibrate_lens as calibrate_lens
+from .live.compensated import compensate_live as compensate_live
+from .live.queues import Policy as Policy
 from .optics.camera import Camera as Camera
 from .optics.camera import CameraRotation as CameraRotation
 from .optics.camera import Distortion as Distortion

@@ -15,8 +15,8 @@ import warp as wp
 import amiwarp as aw
 
 NAMES = re.findall(r"import (\w+) as \1", Path(aw.__file__).with_suffix(".pyi").read_text())
-NOT_CALLED = {"AmiwarpError", "Model", "NotebookPage"}
-"""Public classes that users catch, receive or derive from, and do not make."""
+NOT_CALLED = {"AmiwarpError", "CalibrationOptions", "Model", "NotebookPage"}
+"""Public classes that users catch, receive, derive from or annotate with, and do not make."""
 
 _count = itertools.count()
 
@@ -221,6 +221,7 @@ OWN: dict[str, dict[str, Any]] = {
     },
     "StageSummary": _all(SUMMARY),
     "StageSummary.of": {"name": "n", "stage": STAGE, "names": ("apex",), "values": [{"apex": 0.1}]},
+    "compensate_live": {"source": "in.h5"},
     "CompensationSummary": {"events": 1, "outside": 1, "seconds": 1.0},
     "Compensated": {"events": EVENTS, "flags": np.zeros(3, np.uint8)},
     "Compensator": {"model": MODEL, "encoder": aw.EncoderStream()},
@@ -230,6 +231,7 @@ OWN: dict[str, dict[str, Any]] = {
     "DeviceMemoryEvents": {"events": ON_DEVICE, "width": 4, "height": 3},
     "DeviceMemoryEvents.find": {"t": 5},
     "Events": _all(EVENTS),
+    "Events.from_structured": {"array": EVENTS.to_structured()},
     "Events.concatenate": {"blocks": [EVENTS, EVENTS[2:]]},
     "MemoryEvents.find": {"t": 5},
     "Encoder": _all(ENCODER),

@@ -583,6 +583,12 @@ def test_a_source_on_a_device_equals_a_source_in_memory(device: str) -> None:
         assert source.find(t) == expected.find(t)
     assert_equal(source.between(20_000, 60_000), expected.between(20_000, 60_000))
     assert_equal(source.slice(-5, 70), expected.slice(-5, 70))
+    for which in (slice(None), slice(100, 200), slice(-7, None), slice(9, 3)):
+        assert isinstance(source[which], DeviceEvents)
+        assert source[which].device == source.device
+        assert_equal(source[which].to_host(), expected[which])
+    assert repr(source[:]).startswith(f"DeviceEvents({len(host):,} events, on {source.device}, t {host.t[0]} .. ")
+    assert repr(source).startswith(f"DeviceMemoryEvents({len(host):,} events, {WIDTH}x{HEIGHT} px, t ")
     for found, block in zip(source.blocks(duration_us=7000), expected.blocks(duration_us=7000), strict=True):
         assert_equal(found, block)
 

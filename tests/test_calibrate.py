@@ -4,6 +4,7 @@ import functools
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from amiwarp import (
     AmiwarpError,
     Calibration,
+    CalibrationOptions,
     Camera,
     Encoder,
     EncoderModel,
@@ -319,6 +321,12 @@ def test_unknown_camera(recording: Recording) -> None:
 def test_bad_settings(recording: Recording, changes: dict[str, object], text: str) -> None:
     with pytest.raises(AmiwarpError, match=text):
         calibrate(recording, **changes)
+
+
+def test_the_typed_options_are_the_settings() -> None:
+    """A type checker knows every keyword argument of ``calibrate``, with the type of the field."""
+    assert get_type_hints(CalibrationOptions) == get_type_hints(Settings)
+    assert not CalibrationOptions.__required_keys__
 
 
 def test_a_drift_that_is_held_still_turns_the_angles(recording: Recording) -> None:

@@ -8,6 +8,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import amiwarp
 from amiwarp import AmiwarpError, DeviceEvents, Events, EventSource, MemoryEvents, Truth
 from amiwarp.events.device_events import device_for
 from amiwarp.events.recording import check_events, regroup
@@ -16,6 +17,11 @@ from amiwarp.events.recording import check_events, regroup
 def make(t: list[int]) -> Events:
     index = np.arange(len(t))
     return Events.from_arrays(index % 64, index % 48, np.array(t, np.int64), index % 2)
+
+
+def floating(**changes) -> Events:
+    arrays = {"x": np.array([1.0, 2.0], np.float32), "y": np.array([-3.0, 99.0], np.float32), **changes}
+    return Events(arrays["x"], arrays["y"], np.array([1, 2]), np.zeros(2, np.uint8))
 
 
 def cut(events: Events, edges: list[int]) -> list[Events]:
@@ -118,17 +124,113 @@ def test_memory_source():
     assert [block.t.tolist() for block in source.blocks(duration_us=15)] == [[10, 20, 20], [30], [45]]
 
 
+@pytest.mark.parametrize("stored", ["memory", "native", "npz"])
+def test_slices_of_sources_are_those_of_arrays(stored, tmp_path):
+    events = make(list(range(10, 110, 10)))
+    source = MemoryEvents(events, 64, 48)
+    if stored != "memory":
+        amiwarp.save_recording(tmp_path / "native.h5", amiwarp.Recording(source))
+        amiwarp.convert(tmp_path / "native.h5", tmp_path / "npz.npz")
+        source = amiwarp.open_recording(next(tmp_path.glob(f"{stored}.*"))).events
+    assert isinstance(source, EventSource)
+    for ends in itertools.product((None, -20, -3, 0, 4, 9, 30), repeat=2):
+        which = slice(*ends)
+        assert_equal(source[which], Events(events.x[which], events.y[which], events.t[which], events.p[which]))
+    for refused, message in ((0, r"\[0:1\] for one event"), (np.int64(-1), r"\[-1:\] for one"), ("a", "slice")):
+        with pytest.raises(AmiwarpError, match=message):
+            source[refused]
+    with pytest.raises(AmiwarpError, match="steps of -1"):
+        source[::-1]
+    with pytest.raises(AmiwarpError, match="blocks"):
+        list(source)
+    with pytest.raises(AmiwarpError, match="for one event"):
+        events[3]
+
+
+EVENT_CD = np.dtype([("x", "<u2"), ("y", "<u2"), ("p", "<i2"), ("t", "<i8")])
+"""Events of Prophesee's Metavision."""
+TONIC = np.dtype([("x", "<i2"), ("y", "<i2"), ("t", "<i8"), ("p", "?")])
+"""Events of tonic."""
+
+
+@pytest.mark.parametrize("dtype", [None, EVENT_CD, TONIC, [("t", "f8"), ("p", "i1"), ("y", "f4"), ("x", "u4")]])
+def test_structured_arrays_in_and_out(dtype):
+    events = make([10, 20, 30, 40])
+    array = events.to_structured(dtype)
+    assert array.dtype == np.dtype(dtype or [("x", "u2"), ("y", "u2"), ("t", "i8"), ("p", "u1")])
+    for name in "xytp":
+        assert array[name].tolist() == getattr(events, name).tolist()
+    if dtype is None or isinstance(dtype, np.dtype):
+        assert_equal(Events.from_structured(array), events)
+
+
+def test_structured_arrays_take_seconds_signs_and_compensated_events():
+    rows = np.array(
+        [(0.5, 1.25, 2.0, -1, 7), (0.6, 3.0, 4.0, 1, 7)], [(n, "f8") for n in ("t", "x", "y", "p", "other")]
+    )
+    before = rows.copy()
+    events = Events.from_structured(rows, t_unit="s")
+    assert np.array_equal(rows, before)
+    assert (events.t.tolist(), events.p.tolist(), events.x.tolist()) == ([500_000, 600_000], [0, 1], [1.25, 3.0])
+    assert_equal(Events.from_structured(events.to_structured()), events)
+    lost = floating(x=np.array([np.nan, 2.0], np.float32))
+    assert np.isnan(lost.to_structured()["x"][0])
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros((3, 4)), "type float64 without fields; field x is missing"),
+        (np.zeros(3, [("x", "i4"), ("y", "i4"), ("ts", "i8"), ("p", "?")]), "fields x, y, ts, p; field t is missing"),
+        ([1, 2, 3], "structured array"),
+    ],
+)
+def test_arrays_without_the_fields_are_refused(array, message):
+    with pytest.raises(AmiwarpError, match=message):
+        Events.from_structured(array)
+
+
+@pytest.mark.parametrize(
+    ("events", "dtype", "message"),
+    [
+        (make([1]), "i4", "fields x, y, t, p"),
+        (make([1]), "nothing", "NumPy data type"),
+        (make([1]), [("x", "u2"), ("y", "u2"), ("t", "i8")], "fields x, y, t, p"),
+        (make([1]), [("x", "u2"), ("y", "u2"), ("t", "i8"), ("p", "U3")], "p of type"),
+        (make([1 << 40]), [("x", "u2"), ("y", "u2"), ("t", "i4"), ("p", "?")], "t of type int32, which cannot hold"),
+        (floating(x=np.array([1.5, np.nan], np.float32)), EVENT_CD, "x of type uint16, which cannot hold 1.5"),
+    ],
+)
+def test_types_that_cannot_hold_the_events_are_refused(events, dtype, message):
+    with pytest.raises(AmiwarpError, match=message):
+        events.to_structured(dtype)
+
+
+def test_representations_are_short(tmp_path):
+    n = 100_000
+    t = np.arange(n) * 10
+    events = Events.from_arrays(np.zeros(n, np.uint16), np.zeros(n, np.uint16), t, np.ones(n, np.uint8))
+    source = MemoryEvents(events, 640, 480)
+    assert repr(events) == "Events(100,000 events, t 0 .. 999990 us, 0.1 Mev/s)"
+    assert repr(source) == "MemoryEvents(100,000 events, 640x480 px, t 0 .. 999990 us, 0.1 Mev/s)"
+    assert repr(Events.empty()) == "Events(0 events)"
+    assert repr(make([5])) == "Events(1 event, t 5 .. 5 us)"
+    assert repr(floating()).startswith("Events(2 events, compensated, ")
+    encoder = amiwarp.Encoder.constant_speed(720.0, 0, 1_000_000)
+    assert repr(encoder).endswith("720 rpm)")
+    recording = amiwarp.Recording(source, encoder=encoder, name="wall")
+    assert repr(recording) == f"Recording('wall', {source!r}, with encoder)"
+    assert repr(amiwarp.Recording(source)).endswith("events only)")
+    amiwarp.save_recording(tmp_path / "a.h5", recording)
+    assert repr(amiwarp.open_recording(tmp_path / "a.h5").events) == repr(source).replace("Memory", "Native")
+
+
 def test_empty_source_has_no_first_time():
     source = MemoryEvents(Events.empty(), 64, 48)
     assert list(source.blocks()) == []
     for name in ("t_first", "t_last"):
         with pytest.raises(AmiwarpError, match="no events"):
             getattr(source, name)
-
-
-def floating(**changes) -> Events:
-    arrays = {"x": np.array([1.0, 2.0], np.float32), "y": np.array([-3.0, 99.0], np.float32), **changes}
-    return Events(arrays["x"], arrays["y"], np.array([1, 2]), np.zeros(2, np.uint8))
 
 
 def test_check_names_the_first_bad_event():

@@ -142,8 +142,8 @@ def without_pixels(events: Events, mask: NDArray[np.bool_]) -> Events:
     return events[~mask[events.y, events.x]] if mask.any() else events
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MaskedEventSource:
+@dataclass(frozen=True, eq=False, repr=False)
+class MaskedEventSource(EventSource):
     """Event source that drops the events of masked pixels on reading. ``len`` still counts them."""
 
     source: EventSource

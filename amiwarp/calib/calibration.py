@@ -15,7 +15,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from amiwarp.calib.photometric import stage
 from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
-from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, Settings
+from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, CalibrationOptions, Settings
 from amiwarp.calib.sharpness import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, check_prisms
@@ -48,7 +48,7 @@ def calibrate(
     *,
     device: Any = "cpu",
     progress: Progress | None = None,
-    **changes: Any,
+    **changes: Unpack[CalibrationOptions],
 ) -> Calibration:
     """Find the prism's parameters in the recording itself.
 

@@ -288,6 +288,20 @@ class Calibration:
     """Path of the prism's angle that was found in the events of a recording without an encoder; None if the speed is
     constant, or if the recording has an encoder."""
 
+    def __repr__(self) -> str:
+        values = ", ".join(map(self._in_words, self.parameters))
+        gain = f"{self.sharpness_name} {self.sharpness_before:.3g} -> {self.sharpness_after:.3g}"
+        warned = f", {len(self.warnings)} warning{'s'[: len(self.warnings) > 1]}" if self.warnings else ""
+        return f"Calibration({self.model_name}: {values};\n            {gain}, {self.events:,} events{warned})"
+
+    def _in_words(self, name: str) -> str:
+        """Return a parameter with its standard deviation and unit, angles in degrees."""
+        unit = units().get(name, "")
+        turned = unit.startswith("rad")
+        scale, unit = (math.degrees(1.0), unit.replace("rad", "deg", 1)) if turned else (1.0, unit)
+        std = f" ± {self.uncertainty[name] * scale:.2g}" if name in self.uncertainty else ""
+        return f"{name} {self.parameters[name] * scale:.5g}{std} {unit}".rstrip()
+
     @property
     def model(self) -> Model:
         """Optical model with the calibrated parameters."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TypedDict
 
 from amiwarp.brightness.solver import SensorTiming
 from amiwarp.calib.nlopt_solver import GLOBAL_ALGORITHMS, LOCAL_ALGORITHMS
@@ -152,6 +153,38 @@ class Settings:
         real(self.smoothing_px, "smoothing_px", 0.0, 1e3, " px")
         check_names(self.free, self.start, self.bounds)
         self.photometric.check()
+
+
+class CalibrationOptions(TypedDict, total=False):
+    """Names and types of the keyword arguments of :func:`calibrate`: the fields of :class:`Settings`.
+
+    Type checkers and editors know the keyword arguments by it. Defaults and meanings are those of :class:`Settings`.
+
+    Examples
+    --------
+    >>> options: amiwarp.CalibrationOptions = {"model": "exact", "events": 100_000}
+    >>> amiwarp.Settings(**options).events
+    100000
+    """
+
+    model: str
+    budget_px: float | None
+    sharpness: Sharpness
+    global_algorithm: str | None
+    local_algorithm: str
+    free: tuple[str, ...] | None
+    start: Mapping[str, float]
+    bounds: Mapping[str, tuple[float, float]]
+    global_evaluations: int
+    local_evaluations: int
+    tolerance_px: float
+    smoothing_px: float
+    per_polarity: bool
+    events: int
+    fold: int
+    seed: int
+    stages: tuple[str, ...]
+    photometric: PhotometricSettings
 
 
 def stage_share(settings: Settings, stage: str, share: float) -> tuple[str, float]:

@@ -17,7 +17,7 @@ from amiwarp import validation
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import recording as checks
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, regroup
+from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, described, regroup, slice_bounds
 from amiwarp.kernels import events as kernels
 from amiwarp.kernels.prism_angle import EncoderParams
 from amiwarp.optics.camera import LARGEST_SIZE
@@ -371,10 +371,13 @@ class DeviceEvents:
 
     def __getitem__(self, which: slice) -> DeviceEvents:
         """Return the events of a slice without steps, as views."""
-        start, stop, step = instance(which, slice, "index of events on a device").indices(len(self))
-        if step != 1:
-            raise AmiwarpError(f"events are sliced in steps of {step}; on a device, slice without steps")
+        start, stop = slice_bounds(which, len(self))
         return DeviceEvents(*(part(getattr(self, name), start, stop) for name in NAMES))
+
+    def __repr__(self) -> str:
+        facts = (f"on {self.device}", *(() if self.whole_pixels else ("compensated",)))
+        ends = [int(part(self.t, at, at + 1).numpy()[0]) for at in (0, len(self) - 1)] if len(self) else None
+        return described("DeviceEvents", *facts, span=None if ends is None else (ends[0], ends[1]), count=len(self))
 
 
 def part(values: wp.array, start: int, stop: int) -> wp.array:
@@ -462,7 +465,8 @@ class DeviceMemoryEvents(EventSource):
     """Source of events that are held on a device, for recordings.
 
     Every function that takes a recording takes one with this source. :func:`reconstruct` reads the events on the
-    device. All others read copies in NumPy arrays, which the methods of :class:`EventSource` return here.
+    device. All others read copies in NumPy arrays, which the methods of :class:`EventSource` return here. A slice
+    ``source[start:stop]`` stays on the device, like :meth:`slice_on_device`.
 
     Parameters
     ----------
@@ -513,6 +517,10 @@ class DeviceMemoryEvents(EventSource):
     def device(self) -> Any:
         """The device that holds the events, a ``warp.Device``."""
         return self._events.device
+
+    def __getitem__(self, which: slice) -> DeviceEvents:  # type: ignore[override]
+        """Return the events of a slice without steps where they are: as views on the device."""
+        return self._events[which]
 
     def slice(self, start: int, stop: int) -> Events:
         return self.slice_on_device(start, stop).to_host()

@@ -830,6 +830,13 @@ class Encoder:
         """Mean speed over all samples [turns/min], negative if the angle decreases."""
         return float((self.angle[-1] - self.angle[0]) / TWO_PI * 60e6 / float(self.t[-1] - self.t[0]))
 
+    def __repr__(self) -> str:
+        index = "" if self.index_t is None else f", {len(self.index_t):,} index pulses"
+        second = "" if self.second is None else f", second {self.second.rpm:.4g} rpm"
+        offset = f", clock offset {self.clock_offset_us:.4g} us" if self.clock_offset_us else ""
+        times = f"t {self.t[0]} .. {self.t[-1]} us"
+        return f"Encoder({self.t.size:,} samples, {times}, {self.rpm:.4g} rpm{second}{index}{offset})"
+
     def _near(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return the encoder times for event times ``t``, and the times and angles of the samples around them.
 

@@ -20,7 +20,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.truth import StoredInstants, Truth
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import NominalPrism
-from amiwarp.validation import TIME_LIMIT, as_times, guarded, instance, whole
+from amiwarp.validation import INT64, TIME_LIMIT, as_times, guarded, instance, shown, whole
 from amiwarp.validation import array as as_numbers
 
 # Conversion and checks of event arrays: types, time limits, frame and order.
@@ -130,6 +130,42 @@ DEFAULT_BLOCK = 1 << 20
 """Default number of events per block."""
 
 
+def slice_bounds(which: object, length: int) -> tuple[int, int]:
+    """Return the start and stop of a slice without steps of ``length`` events: ``0 <= start <= stop <= length``.
+
+    Raises :class:`AmiwarpError` for anything else, such as the index of one event. Python's own iteration over an
+    object with an index ends in this error, too.
+    """
+    if isinstance(which, int | np.integer):
+        one = "[-1:]" if which == -1 else f"[{which}:{which + 1}]"
+        raise AmiwarpError(
+            f"events are indexed by the number {which}; give a slice, such as {one} for one event, and iterate over a "
+            "recording's events by blocks(count=...) or blocks(duration_us=...)"
+        )
+    found = instance(which, slice, "index of events")
+    for end in (found.start, found.stop):
+        if end is not None:
+            whole(end, "index of events", *INT64)
+    start, stop, step = found.indices(length)
+    if step != 1:
+        raise AmiwarpError(f"events are sliced in steps of {step}; slice without steps, then NumPy arrays with them")
+    return start, max(start, stop)
+
+
+def described(kind: str, *facts: str, span: tuple[int, int] | None, count: int) -> str:
+    """Return a representation of at most one line of events: their number, ``facts``, time span and mean rate."""
+    facts = (f"{count:,} event{'' if count == 1 else 's'}", *facts)
+    if span is not None:
+        first, last = span
+        facts = (*facts, f"t {first} .. {last} us")
+        facts = (*facts, f"{count / (last - first):.3g} Mev/s") if last > first else facts
+    return f"{kind}({', '.join(facts)})"
+
+
+COLUMNS = ("x", "y", "t", "p")
+"""Names of the columns of events, also in structured arrays."""
+
+
 @guarded
 @dataclass(frozen=True, slots=True, eq=False)
 class Events:
@@ -214,6 +250,93 @@ class Events:
         return events
 
     @classmethod
+    def from_structured(cls, array: Any, *, t_unit: Literal["us", "s"] = "us") -> Events:
+        """Create events from a structured array with the fields ``x``, ``y``, ``t`` and ``p`` in any order.
+
+        tonic, Prophesee's Metavision and other libraries hold events in such arrays. Other fields are ignored. The
+        values are copied.
+
+        Parameters
+        ----------
+        array : ndarray
+            Structured array, shape (n,), with values as in :meth:`from_arrays`.
+        t_unit : {"us", "s"}, default "us"
+            Unit of ``t``. Times in seconds are rounded to microseconds.
+
+        Returns
+        -------
+        Events
+            The events.
+
+        Raises
+        ------
+        AmiwarpError
+            If the array is not structured or lacks a field; or for values that :meth:`from_arrays` refuses.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> rows = [(0, 10, 5, 1), (100, 11, 5, -1)]
+        >>> array = np.array(rows, dtype=[("t", "i8"), ("x", "i2"), ("y", "i2"), ("p", "i1")])
+        >>> amiwarp.Events.from_structured(array).x.tolist()
+        [10, 11]
+        """
+        fields = instance(array, np.ndarray, "structured array").dtype.names
+        missing = [name for name in COLUMNS if name not in (fields or ())]
+        if fields is None or missing:
+            given = f"fields {', '.join(fields)}" if fields else f"type {array.dtype} without fields"
+            raise AmiwarpError(f"structured array has {given}; field {missing[0]} is missing: give x, y, t and p")
+        return cls.from_arrays(*(array[name] for name in COLUMNS), t_unit=t_unit)
+
+    def to_structured(self, dtype: Any = None) -> NDArray[Any]:
+        """Return the events as a structured array, as tonic, Prophesee's Metavision and other libraries take them.
+
+        Parameters
+        ----------
+        dtype : dtype, optional
+            Structured data type with the fields ``x``, ``y``, ``t`` and ``p`` in any order and of any numeric types,
+            such as ``tonic.io.events_struct`` or ``metavision_sdk_base.EventCD``. By default, these fields in this
+            order, with the types of the events' arrays.
+
+        Returns
+        -------
+        ndarray
+            A copy of the events, shape (n,). ``t`` is in microseconds, ``p`` is 1 or 0.
+
+        Raises
+        ------
+        AmiwarpError
+            If ``dtype`` has other fields, or its types cannot hold the values.
+
+        Examples
+        --------
+        >>> events = amiwarp.Events.from_arrays(x=[10, 11], y=[5, 6], t=[0, 100], p=[1, 0])
+        >>> events.to_structured([("t", "i8"), ("x", "i2"), ("y", "i2"), ("p", "?")])[0].item()
+        (0, 10, 5, True)
+        """
+        own = [(name, getattr(self, name).dtype) for name in COLUMNS]
+        try:
+            wanted = np.dtype(own if dtype is None else dtype)
+        except Exception as error:  # any that converting an unknown object raises
+            raise AmiwarpError(f"dtype is {shown(dtype)}; give a NumPy data type with the fields x, y, t, p") from error
+        if wanted.names is None or sorted(wanted.names) != sorted(COLUMNS):
+            raise AmiwarpError(f"dtype is {shown(wanted)}; give one with the fields x, y, t, p and no other")
+        out = np.empty(len(self), wanted)
+        for name in COLUMNS:
+            values = getattr(self, name)
+            kind = out[name].dtype
+            if kind.kind not in "iufb" or out[name].ndim > 1:
+                raise AmiwarpError(f"dtype has {name} of type {kind}; give an integer, floating or boolean type")
+            with np.errstate(invalid="ignore", over="ignore"):
+                out[name] = values
+            if not np.array_equal(out[name], values, equal_nan=values.dtype.kind == "f" and kind.kind == "f"):
+                at = int(np.argmax(out[name] != values))
+                raise AmiwarpError(
+                    f"dtype has {name} of type {kind}, which cannot hold {values[at]}; give a wider type"
+                )
+        return out
+
+    @classmethod
     def empty(cls) -> Events:
         """Return a block without events, with the types of a sensor.
 
@@ -256,14 +379,35 @@ class Events:
 
     def __getitem__(self, which: slice | NDArray[Any]) -> Events:
         """Return the events at a slice (views), or at an index or boolean array (copies)."""
-        return Events(self.x[which], self.y[which], self.t[which], self.p[which])
+        t = self.t[which]
+        if np.ndim(t) == 0:
+            slice_bounds(which, len(self))  # raises the error with the remedy
+        return Events(self.x[which], self.y[which], t, self.p[which])
+
+    def __repr__(self) -> str:
+        facts = () if self.whole_pixels else ("compensated",)
+        span = (int(self.t[0]), int(self.t[-1])) if len(self) else None
+        return described("Events", *facts, span=span, count=len(self))
 
 
 @runtime_checkable
 class EventSource(Protocol):
-    """Source of sorted events: arrays in memory, an indexed file, or a file that is read from its start."""
+    """Source of sorted events: arrays in memory, an indexed file, or a file that is read from its start.
+
+    A slice ``source[start:stop]`` gives its events in memory: ``source[:]`` all, ``source[-1000:]`` the last thousand.
+    :meth:`between` gives those of a time window, :meth:`blocks` iterates over all by count or by time. Own sources
+    derive from this class.
+    """
 
     def __len__(self) -> int: ...
+
+    def __getitem__(self, which: slice) -> Events:
+        """Return the events of a slice without steps, whose negative indices count from the end."""
+        return self.slice(*slice_bounds(which, len(self)))
+
+    def __repr__(self) -> str:
+        span = (self.t_first, self.t_last) if len(self) else None
+        return described(type(self).__name__, "{}x{} px".format(*self.size), span=span, count=len(self))
 
     @property
     def t_first(self) -> int:
@@ -644,3 +788,8 @@ class Recording:
     """Samples of the camera's inertial measurement unit, or None."""
     frames: ImageStore | None = None
     """Frames that the camera recorded with the events, read on demand, or None."""
+
+    def __repr__(self) -> str:
+        others = ("camera", "encoder", "prism", "truth", "imu", "frames")
+        held = [name for name in others if getattr(self, name) is not None]
+        return f"Recording({self.name!r}, {self.events!r}, {'with ' + ', '.join(held) if held else 'events only'})"

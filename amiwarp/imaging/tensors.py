@@ -1090,12 +1090,7 @@ class ToTensor:
             options = dict(zip(("width", "height"), source.size, strict=True)) | options
             events = source.slice(0, len(source))
         elif isinstance(events, np.ndarray) and events.dtype.names is not None:
-            missing = {"x", "y", "t", "p"} - set(events.dtype.names)
-            if missing:
-                raise AmiwarpError(
-                    f"structured array has fields {events.dtype.names}; field {sorted(missing)[0]} is missing"
-                )
-            events = Events.from_arrays(events["x"], events["y"], events["t"], events["p"])
+            events = Events.from_structured(events)
         if callable(options.get("windows")):
             options["windows"] = options["windows"](events)
         found = self.representation(events, **options)

@@ -19,7 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import DEFAULT_BLOCK, Events, ImuSamples, MetadataValue, as_coordinate, regroup
+from amiwarp.events.recording import (
+    DEFAULT_BLOCK,
+    Events,
+    EventSource,
+    ImuSamples,
+    MetadataValue,
+    as_coordinate,
+    regroup,
+)
 from amiwarp.io.files import errors_name, open_input, register_reader
 from amiwarp.io.reading_process import packets
 from amiwarp.optics.camera import LARGEST_SIZE, check_size
@@ -123,7 +131,7 @@ class PassCounts:
         return f"after {self.count} events (t = {self.t_last} us)" if self.count else "before the first event"
 
 
-class FileEvents:
+class FileEvents(EventSource):
     """Events of a file that can be read only from its start. The constructor makes the first pass over the file.
 
     If the file has more than :data:`KEEP_EVENTS` events, every ``slice`` and ``between`` reads it again. Conversion to

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import recording as checks
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import DEFAULT_BLOCK, Events, ImuSamples, MetadataValue, Recording, regroup
+from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, ImuSamples, MetadataValue, Recording, regroup
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS, FrameTruth, Poses, Truth, WorldLabels, check_truth, rotation_of
 from amiwarp.io.file_scan import FileEvents, Packet, head_limit, read_sensors, smallest_sensor
 from amiwarp.io.files import errors_name, input_path, interrupts_later, register_reader
@@ -834,7 +834,7 @@ DSEC_SIZE = (640, 480)
 """Size of DSEC's sensors [px], which its files do not store."""
 
 
-class NativeEvents:
+class NativeEvents(EventSource):
     """Events of an HDF5 recording, read on demand. Raises :class:`AmiwarpError` for a damaged file."""
 
     def __init__(self, path: Path, file: Hdf5File) -> None:

@@ -73,7 +73,7 @@ print(f"model error {error.rms:.3f} px rms, {error.worst:.3f} px at most")
 # :func:`amiwarp.iwe` counts the events at each pixel. With a model and an encoder
 # it displaces them first.
 
-events = recording.events.slice(0, len(recording.events))
+events = recording.events[:]
 before = amiwarp.iwe(events, 320, 240)
 after = amiwarp.iwe(
     events, 320, 240, model=calibration.model, encoder=recording.encoder

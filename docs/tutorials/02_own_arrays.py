@@ -28,7 +28,7 @@ prism = amiwarp.Prism(apex=math.radians(2.0), index=1.5168)
 simulated = amiwarp.simulate(
     mapfile, camera, prism, duration_s=0.2, motion=600.0, seed=0
 )
-block = simulated.events.slice(0, len(simulated.events))
+block = simulated.events[:]
 x, y, t, p = block.x, block.y, block.t, block.p
 
 events = amiwarp.Events.from_arrays(x, y, t, p)

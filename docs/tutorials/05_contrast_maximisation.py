@@ -32,7 +32,7 @@ recording = amiwarp.simulate(
     motion=amiwarp.PrismMotion(720.0, phase=true_phase),
     seed=0,
 )
-everything = recording.events.slice(0, len(recording.events))
+everything = recording.events[:]
 events = everything[:: max(1, len(everything) // 100_000)]
 print(f"{len(events):,} of {len(everything):,} events")
 

@@ -109,7 +109,7 @@ prism = amiwarp.Prism(math.radians(2.0))
 recording = amiwarp.simulate(
     picture, camera, prism, duration_s=0.2, sensor=sensors["ideal"], seed=1
 )
-events = recording.events.slice(0, len(recording.events))
+events = recording.events[:]
 true_xy = recording.truth.points(0, len(events))
 
 for name, model in (("circle", amiwarp.CircleModel), ("exact", amiwarp.ExactModel)):

@@ -106,7 +106,7 @@ for name in ("file", "split", "labels", "events", "rpm", "licence"):
 def image_of(item):
     """Return the compensated image of a recording."""
     recording = amiwarp.open_recording(folder / "shapes" / item["file"])
-    events = recording.events.slice(0, len(recording.events))
+    events = recording.events[:]
     model = amiwarp.ExactModel.from_prism(recording.camera, recording.prism)
     size = recording.events.size
     return amiwarp.iwe(events, *size, model=model, encoder=recording.encoder)
