@@ -27,6 +27,15 @@ def test_units_are_said(calibration: Calibration) -> None:
     assert apex["std"] > 0
 
 
+def test_the_representation_is_short_and_in_degrees(calibration: Calibration) -> None:
+    first, second = repr(calibration).splitlines()
+    assert first.startswith("Calibration(exact: apex ")
+    assert f"apex {math.degrees(calibration.parameters['apex']):.5g} ± " in first
+    assert first.count(" deg") == 2
+    assert f", {calibration.events:,} events" in second
+    assert len(first) < 120
+
+
 @pytest.mark.parametrize(
     "distortion",
     [None, RadialTangential(-0.3, 0.1, 1e-3, 2e-3, 0.01), RadialTangential(k1=0.3, k6=0.1), Fisheye(0.1, 0.02)],

@@ -86,9 +86,18 @@ def compensate_live(
 
     Examples
     --------
-    >>> with amiwarp.compensate_live("recording.h5", calibration, fast=True) as packets:  # doctest: +SKIP
-    ...     for packet in packets:
-    ...         print(packet.events)
+    >>> camera, prism = amiwarp.Camera.from_fov(64, 48, 1.0), amiwarp.Prism(0.035)
+    >>> calibration = amiwarp.Calibration(
+    ...     model_name="exact", camera=camera, prism=prism, parameters={"apex": 0.026, "phase": 0.4}, uncertainty={},
+    ...     free=("apex", "phase"), sharpness_name="variance", sharpness_before=1.0, sharpness_after=2.0, stages=(),
+    ...     events=300_000, seconds=1.5,
+    ... )
+    >>> source = amiwarp.MemoryEvents(amiwarp.Events.from_arrays([30, 31], [20, 21], [0, 50], [1, 0]), 64, 48)
+    >>> encoder = amiwarp.Encoder.constant_speed(720.0, 0, 1000)
+    >>> amiwarp.save_recording("live.h5", amiwarp.Recording(source, camera, encoder, prism))
+    >>> with amiwarp.compensate_live("live.h5", calibration, fast=True) as packets:
+    ...     sum(len(packet.events) for packet in packets)
+    2
     """
     wait_us = round(1e3 * real(wait_ms, "wait_ms", 0.0, 1e6, " ms"))
     watch_s = real(watch_s, "watch_s", 0.0, 1e9, " s")
