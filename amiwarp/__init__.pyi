@@ -149,6 +149,9 @@ from .simulation.worlds.world import Trajectory as Trajectory
 from .simulation.worlds.world import World as World
 from .simulation.worlds.world import WorldScene as WorldScene
 from .simulation.worlds.world_files import load_world as load_world
+from .studies.dataset.export import ExportFormat as ExportFormat
+from .studies.dataset.export import ExportSummary as ExportSummary
+from .studies.dataset.export import export_dataset as export_dataset
 from .studies.dataset.making import DatasetPlan as DatasetPlan
 from .studies.dataset.making import DatasetSummary as DatasetSummary
 from .studies.dataset.making import make_dataset as make_dataset

@@ -419,6 +419,8 @@ OWN: dict[str, dict[str, Any]] = {
         "processor_seconds": 1.0,
         "workers": 1,
     },
+    "ExportSummary": {"splits": {}, "files": (), "events": 1, "size_bytes": 1, "seconds": 1.0},
+    "export_dataset": {"folder": "none", "out": _new(""), "to": "parquet"},
     "plan_dataset": {"specification": "none.toml", "out": _new("")},
     "make_dataset": {"specification": "none.toml", "out": _new("")},
     "EvaluationSummary": {
@@ -505,6 +507,7 @@ REFUSED = {
     "depth": "depth is not determined",
     "pixel_thresholds": "no pixel fires twice",
     "load_world": "no such file",
+    "export_dataset": "has no manifest.json",
     "plan_dataset": "no such file",
     "make_dataset": "no such file",
     "evaluate": "unknown evaluation",

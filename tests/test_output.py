@@ -214,7 +214,7 @@ def test_every_input_of_every_command_is_in_the_tables() -> None:
         options = list(path_options(command))
         read = {(command, option) for option, writes in options if not writes}
         assert read <= endless
-        if command not in ("chart", "dataset", "demo", "design", "emulate", "evaluate", "info", "truth"):
+        if command not in ("chart", "dataset", "demo", "design", "emulate", "evaluate", "export", "info", "truth"):
             assert read <= over  # these commands write to a folder, or nothing
 
 
@@ -325,6 +325,7 @@ NAMES: dict[tuple[str, str], tuple[str, tuple[str, ...]]] = {
     ("demo", "out"): ("demo --size 64x48 --duration 0.1 --picture pic.png --out {}", FOLDER),
     ("design", "out"): ("design --size 64x48 --apex-deg 1 --rpm 720 --out {}", FOLDER),
     ("evaluate", "out"): ("evaluate --quick --out {}", FOLDER),
+    ("export", "out"): ("export made {} --to webdataset", FOLDER),
     ("stability", "out"): ("stability --quick --out {}", FOLDER),
     ("truth", "out"): ("truth world.h5 {} --poses tum", FOLDER),
 }  # fmt: skip
@@ -570,6 +571,7 @@ ENDLESS = (
     "chart a.h5 --out out --quick --picture {}",
     "compensate a.h5 out.h5 --preset {} --calibration cal.json",
     "dataset {}.toml out",
+    "export {} out --to parquet",
     "design --out out --camera {}.json --apex-deg 1 --rpm 720",
     "emulate --link link --camera unix:camera --recording {}",
     "evaluate --out out --recording {}",

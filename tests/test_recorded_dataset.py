@@ -125,3 +125,15 @@ def test_a_missing_or_changed_recording_is_refused(folder: Path, tmp_path: Path)
         dataset[0]
     with pytest.raises(AmiwarpError, match=r"b.h5: no such file"):
         dataset[1]
+
+
+def test_structured_items_are_those_of_tonic(folder: Path) -> None:
+    """The fields and types are those of ``tonic.io.events_struct``."""
+    events, target = RecordedDataset(folder, "test", structured=True)[0]
+    assert events.dtype == np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", bool)])
+    assert events.tolist() == [(4, 0, 10 * i, True) for i in range(5)]
+    assert target == {"k": 4}
+    made = RecordedDataset(folder, "test", structured=True, transform=len, target_transform=lambda labels: labels["k"])
+    assert list(made) == [(5, 4)]
+    with pytest.raises(AmiwarpError, match="target_transform applies to structured items; give structured = True"):
+        RecordedDataset(folder, target_transform=len)

@@ -69,6 +69,11 @@ COMMANDS = {
         "Make thousands of simulated recordings from a specification, with labels, splits and a manifest.",
         "amiwarp dataset shapes.toml shapes --dry-run",
     ),
+    "export": Command(
+        "studies",
+        "Export a data set to tar files for WebDataset, or to Parquet files for Hugging Face's datasets.",
+        "amiwarp export shapes shapes-tars --to webdataset",
+    ),
     "calibrate": Command(
         "calibration",
         "Find the prism's parameters by contrast maximisation: those that make the image of warped events sharpest.",

@@ -1,4 +1,4 @@
-"""Studies: ``amiwarp demo``, ``dataset``, ``chart``, ``design``, ``stability`` and ``evaluate``."""
+"""Studies: ``amiwarp demo``, ``dataset``, ``export``, ``chart``, ``design``, ``stability`` and ``evaluate``."""
 
 from __future__ import annotations
 
@@ -209,6 +209,38 @@ def _dataset_speed(done: DatasetSummary) -> str:
         f"{done.made:,} made in {done.seconds:,.1f} s: {per_s:.3g} per second, {done.events / done.seconds / 1e6:.3g} "
         f"Mev/s, {done.size_bytes / 1e9:.3g} GB, {done.workers} workers"
     )
+
+
+# ``amiwarp export``: a data set in the layouts of other libraries.
+
+
+def run_export(
+    dataset: Annotated[Path, typer.Argument(help="Folder of the data set, which 'amiwarp dataset' made.")],
+    out: Annotated[Path, typer.Argument(help="Folder to write."), OUTPUT_FOLDER],
+    *,
+    to: Annotated[
+        str, typer.Option(help="Layout: webdataset (tar files) or parquet (a folder for Hugging Face's datasets).")
+    ],
+    shard_mb: Annotated[
+        float, typer.Option(min=0.001, help="Size from which on the next file begins, before compression (MB).")
+    ] = 256.0,
+    common: Common,
+) -> None:
+    """Export the events and labels of a data set to the layout of another library.
+
+    Encoder, camera, prism and ground truth are left out. With --force, the files of an earlier export in the folder are
+    replaced.
+    """
+    from amiwarp.studies.dataset.export import export_dataset
+
+    with progress("reading the manifest") as advance:
+        done = export_dataset(dataset, out, to, shard_mb=shard_mb, progress=advance)
+    splits = ", ".join(f"{name} {count:,}" for name, count in done.splits.items())
+    line = (
+        f"{out}: {sum(done.splits.values()):,} recordings ({splits}) with {done.events:,} events in "
+        f"{len(done.files):,} files, {done.size_bytes / 1e9:.3g} GB, {done.seconds:.1f} s"
+    )
+    report(common, asdict(done) | {"folder": str(out)}, [line])
 
 
 # ``amiwarp chart``: charts of speed against error on this machine, and settings for a budget.

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Recording
+from amiwarp.events.recording import Events, Recording
 from amiwarp.io.files import check_regular, errors_name, name_kind, open_input
 from amiwarp.io.json_files import read_json
 from amiwarp.optics.camera import LARGEST_SIZE
@@ -488,9 +488,11 @@ MOST_BYTES = 1 << 30
 
 
 @dataclass(frozen=True, slots=True)
-class _Item:
+class ManifestItem:
     """Entry of one recording in the manifest."""
 
+    entry: Mapping[str, Any]
+    """All fields of the entry."""
     file: str
     split: str
     labels: Mapping[str, Any]
@@ -513,11 +515,17 @@ class RecordedDataset:
     transform : callable, optional
         Called with the :class:`Recording` and the dict of its labels. Its return value is the item. Without it, an item
         is the tuple of all events and the labels. Worker processes that are spawned need a function of a module.
+    structured : bool, default False
+        Whether items are as those of tonic's data sets: a structured array of the events with the fields x, y, t [us]
+        and p, and a target, the dict of labels. ``transform`` is then called with the array alone.
+    target_transform : callable, optional
+        Called with the dict of labels of structured items. Its return value is the target.
 
     Raises
     ------
     AmiwarpError
-        If the folder has no manifest, the manifest is damaged or of a newer version, or no recording is in the split.
+        If the folder has no manifest, the manifest is damaged or of a newer version, no recording is in the split, or
+        ``target_transform`` is given without ``structured``.
 
     Examples
     --------
@@ -532,6 +540,10 @@ class RecordedDataset:
     >>> events, labels = dataset[0]
     >>> len(dataset), len(events), labels
     (1, 2, {'shape': 'disc'})
+    >>> tonic_like = amiwarp.RecordedDataset(".", structured=True, target_transform=lambda labels: labels["shape"])
+    >>> tonic_like[0]
+    (array([(1, 0,  0,  True), (2, 0, 10, False)],
+          dtype=[('x', '<i2'), ('y', '<i2'), ('t', '<i8'), ('p', '?')]), 'disc')
     """
 
     def __init__(
@@ -539,10 +551,14 @@ class RecordedDataset:
         folder: str | os.PathLike[str],
         split: str | None = None,
         *,
-        transform: Callable[[Recording, dict[str, Any]], Any] | None = None,
+        transform: Callable[..., Any] | None = None,
+        structured: bool = False,
+        target_transform: Callable[[dict[str, Any]], Any] | None = None,
     ) -> None:
+        if target_transform is not None and not structured:
+            raise AmiwarpError("target_transform applies to structured items; give structured = True, or leave it out")
         self.folder = Path(folder)
-        items = _read_manifest(self.folder / MANIFEST)
+        _, items = read_manifest(self.folder / MANIFEST)
         self._items = [item for item in items if split is None or item.split == split]
         if not self._items:
             counts = ", ".join(f"{name} ({n})" for name, n in sorted(Counter(item.split for item in items).items()))
@@ -550,6 +566,8 @@ class RecordedDataset:
                 f"{self.folder}: no recording is in the split {shown(split)}; it has {counts or 'no recordings'}"
             )
         self.transform = transform
+        self.structured = structured
+        self.target_transform = target_transform
 
     @property
     def labels(self) -> list[dict[str, Any]]:
@@ -566,19 +584,44 @@ class RecordedDataset:
         the manifest describes.
         """
         item = self._items[index]
-        path = self.folder / item.file
-        recording = open_recording(path)
-        n = len(recording.events)
-        if n != item.events:
-            given = f"{path}: holds {n} events, the manifest says {item.events}"
-            raise AmiwarpError(f"{given}; make this recording again, or correct the manifest")
+        recording = open_item(self.folder, item)
+        if self.structured:
+            events = _structured(recording.events.slice(0, item.events))
+            target = dict(item.labels)
+            return (
+                events if self.transform is None else self.transform(events),
+                target if self.target_transform is None else self.target_transform(target),
+            )
         if self.transform is not None:
             return self.transform(recording, dict(item.labels))
-        return recording.events.slice(0, n), dict(item.labels)
+        return recording.events.slice(0, item.events), dict(item.labels)
 
 
-def _read_manifest(path: Path) -> list[_Item]:
-    """Return the items of a manifest."""
+def _structured(events: Events) -> NDArray[Any]:
+    """Return events as a structured array of tonic's types; sub-pixel coordinates are float32."""
+    side = np.int16 if events.whole_pixels else np.float32
+    found = np.empty(len(events), [("x", side), ("y", side), ("t", np.int64), ("p", np.bool_)])
+    for name in ("x", "y", "t", "p"):
+        found[name] = getattr(events, name)
+    return found
+
+
+def open_item(folder: Path, item: ManifestItem) -> Recording:
+    """Open a recording of a data set.
+
+    Raises :class:`AmiwarpError` if the file is missing or is not the one that the manifest describes.
+    """
+    path = folder / item.file
+    recording = open_recording(path)
+    n = len(recording.events)
+    if n != item.events:
+        given = f"{path}: holds {n} events, the manifest says {item.events}"
+        raise AmiwarpError(f"{given}; make this recording again, or correct the manifest")
+    return recording
+
+
+def read_manifest(path: Path) -> tuple[dict[str, Any], list[ManifestItem]]:
+    """Return the fields of a manifest without its items, and the items."""
     if not path.is_file():
         raise AmiwarpError(f"{path.parent}: has no {MANIFEST}; give the folder that 'amiwarp dataset' wrote")
     data = read_json(path, "a manifest of a data set", most_bytes=MOST_BYTES)
@@ -589,17 +632,19 @@ def _read_manifest(path: Path) -> list[_Item]:
         if version > VERSION:
             raise AmiwarpError(f"field version is {version}, newer than {VERSION}; update amiwarp")
         items = instance(data.get("items"), list, "field items")
-        return [_item(entry, f"items[{k}]") for k, entry in enumerate(items)]
+        head = {name: value for name, value in data.items() if name != "items"}
+        return head, [_item(entry, f"items[{k}]") for k, entry in enumerate(items)]
 
 
-def _item(entry: Any, where: str) -> _Item:
+def _item(entry: Any, where: str) -> ManifestItem:
     """Return one item of a manifest, checked."""
     fields = instance(entry, dict, f"field {where}")
     file = instance(fields.get("file"), str, f"field {where}.file")
     path = PurePosixPath(file)
     if path.is_absolute() or ".." in path.parts or "\\" in file or not path.parts:
         raise AmiwarpError(f"field {where}.file is {shown(file)}; expected a path below the folder of the manifest")
-    return _Item(
+    return ManifestItem(
+        fields,
         file,
         instance(fields.get("split"), str, f"field {where}.split"),
         instance(fields.get("labels"), dict, f"field {where}.labels"),

@@ -537,16 +537,20 @@ def _row(item: Item, made: Made) -> dict[str, Any]:
 
 
 def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write the entries as Parquet. Each label becomes a column ``label_NAME``; the others keep their name."""
+    """Write the entries as Parquet."""
     pyarrow = require_pyarrow()
     parquet = importlib.import_module("pyarrow.parquet")
+    with NewFile(path, overwrite=True) as new:
+        parquet.write_table(pyarrow.Table.from_pylist(flat_rows(rows)), new.part)
+
+
+def flat_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the entries as rows of a table: each label is a value ``label_NAME``; the others keep their name."""
     labels = sorted({name for row in rows for name in row["labels"]})
-    flat = [
+    return [
         {**{k: v for k, v in row.items() if k != "labels"}, **{f"label_{n}": row["labels"].get(n) for n in labels}}
         for row in rows
     ]
-    with NewFile(path, overwrite=True) as new:
-        parquet.write_table(pyarrow.Table.from_pylist(flat), new.part)
 
 
 MOST_READERS = 8
