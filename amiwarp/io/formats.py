@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.recording import Events, Recording
+from amiwarp.events.recording import Recording
 from amiwarp.io.files import check_regular, errors_name, name_kind, open_input
 from amiwarp.io.json_files import read_json
 from amiwarp.optics.camera import LARGEST_SIZE
@@ -586,7 +586,9 @@ class RecordedDataset:
         item = self._items[index]
         recording = open_item(self.folder, item)
         if self.structured:
-            events = _structured(recording.events.slice(0, item.events))
+            found = recording.events.slice(0, item.events)
+            side = "i2" if found.whole_pixels else "f4"
+            events = found.to_structured([("x", side), ("y", side), ("t", "i8"), ("p", "?")])
             target = dict(item.labels)
             return (
                 events if self.transform is None else self.transform(events),
@@ -595,15 +597,6 @@ class RecordedDataset:
         if self.transform is not None:
             return self.transform(recording, dict(item.labels))
         return recording.events.slice(0, item.events), dict(item.labels)
-
-
-def _structured(events: Events) -> NDArray[Any]:
-    """Return events as a structured array of tonic's types; sub-pixel coordinates are float32."""
-    side = np.int16 if events.whole_pixels else np.float32
-    found = np.empty(len(events), [("x", side), ("y", side), ("t", np.int64), ("p", np.bool_)])
-    for name in ("x", "y", "t", "p"):
-        found[name] = getattr(events, name)
-    return found
 
 
 def open_item(folder: Path, item: ManifestItem) -> Recording:

@@ -108,7 +108,7 @@ def compensate_live(
             link = resources.enter_context(Link(None if port == "find" else port, counts_per_turn=counts_per_turn))
         opened = open_source(source, pace=None if fast else 1.0, wait_s=wait_s, say=say)
         try:
-            if link is None and not opened.has_encoder:
+            if link is None and not opened.encoders:
                 raise AmiwarpError(f"{opened.name}: contains no encoder samples; give the controller's port")
             check_size(calibration, opened.size, opened.name)
             packets = CompensatedPackets(opened)
