@@ -359,7 +359,7 @@ FEW_SEGMENTS = 2048
 """Smallest number of segments of rows for which a second CPU thread counts events."""
 WITHOUT_GLASS = 3
 """Factor of the number of pairs for a mirror or a vibrating camera. Their parameters need a map with several nodes per
-pixel: with a coarser one, one of 30 simulated mirrors was wrong by 0.024 px, with it by 0.003 px."""
+pixel: with a coarser one, the worst of 30 simulated mirrors was wrong by 0.024 px, with it by 0.008 px."""
 GRID = (4, 3)
 """Number of columns and rows into which the image is divided. The tile with most events is chosen from each part."""
 
