@@ -190,11 +190,12 @@ def take_times(
 def find_times(t: wp.array(dtype=wp.int64), times: wp.array(dtype=wp.int64), start: int, out: wp.array(dtype=wp.int64)):
     """Find the index of the first event at or after each time, by bisection."""
     i = start + wp.tid()
+    time = times[i]  # may lie in the host's memory
     low = int(0)
     high = int(t.shape[0])
     while low < high:
         middle = low + (high - low) / 2
-        if t[middle] < times[i]:
+        if t[middle] < time:
             low = middle + 1
         else:
             high = middle
