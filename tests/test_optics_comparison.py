@@ -46,7 +46,6 @@ from amiwarp.studies.optics_comparison import (
     settings,
 )
 from reference import optics as reference
-from tests import test_mirror, test_vibration
 
 GLASS = Prism(0.0)
 CAMERA = Camera.from_fov(160, 120, math.radians(60.0))
@@ -67,14 +66,12 @@ def oracle(setting: Setting, camera: Camera, pixels: np.ndarray, per_turn: int) 
         mount = {"direction": 0.0, "second_direction": np.pi / 2.0, "fold": 0.0, "incidence": np.pi / 4.0}
         tilts = dict(zip(("amplitude", "second_amplitude"), optic.amplitude, strict=True))
         phases = dict(zip(("phase", "second_phase"), optic.phase, strict=True))
-        found = test_mirror.oracle(camera, {**mount, **tilts, **phases}, xy, np.stack([theta, second], axis=1))
+        found = reference.in_mirror(camera, {**mount, **tilts, **phases}, xy, np.stack([theta, second], axis=1))
     elif isinstance(optic, Vibration):
         values = {"amplitude": optic.amplitude, "phase": 0.0, "backward_x": optic.backward[0]}
-        found = test_vibration.oracle(camera, xy, test_vibration.rotations(values, theta))
+        found = reference.turned(camera, reference.vibration(values, theta), xy)
     elif isinstance(optic, Plate):
-        origin, direction = reference.through_plate(optic, rays, theta)
-        point = origin + ((1.0 / setting.inverse_depth - origin[:, 2]) / direction[:, 2])[:, None] * direction
-        found = reference.rays_to_pixels(camera, point / np.linalg.norm(point, axis=1, keepdims=True))
+        found = reference.at_depth(camera, optic, 0.0, xy, theta, np.full(len(xy), setting.inverse_depth))
     else:
         for prism, angle in ((optic, theta), (optic.second, second)):
             rays = rays if prism is None else reference.through_prism(prism, rays, angle, to_scene=True)

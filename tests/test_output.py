@@ -417,7 +417,7 @@ def replacing() -> set[str]:
 
 
 def test_functions_refuse_a_name_that_means_another_format(place: Path) -> None:
-    assert replacing() == set(CALLS)
+    assert replacing() - {"export_dataset"} == set(CALLS)  # that writes a folder
     camera, prism = amiwarp.Camera.from_fov(*SIZE, 1.0), Prism(0.01)
     simulation = amiwarp.Simulation(amiwarp.Scene.from_picture("pic.png"), camera, prism, 0.01)
     maps = {name: np.zeros((3, 4, *shape), dtype) for name, (dtype, shape) in MAPS.items()}

@@ -226,10 +226,10 @@ def run_export(
     ] = 256.0,
     common: Common,
 ) -> None:
-    """Export the events and labels of a data set to the layout of another library.
+    """Export a data set to tar files for WebDataset, or to Parquet files for Hugging Face's datasets.
 
-    Encoder, camera, prism and ground truth are left out. With --force, the files of an earlier export in the folder are
-    replaced.
+    Events and labels are exported. Encoder, camera, prism and ground truth are left out. With --force, the files of an
+    earlier export in the folder are replaced.
     """
     from amiwarp.studies.dataset.export import export_dataset
 
