@@ -95,8 +95,9 @@ def depth(
 
     found = find_depths(costs, model, 1.0 / nearest, report)
     check_still(found, name)
-    known = (found.count >= LEAST_PAIRS) & (found.std < KNOWN_SHARE * found.inverse_depth)
-    if known.sum() < LEAST_KNOWN * (found.count >= LEAST_PAIRS).sum() or not known.any():
+    seen = found.count >= LEAST_PAIRS
+    known = seen & (found.std < KNOWN_SHARE * found.inverse_depth)
+    if known.sum() < max(1.0, LEAST_KNOWN * seen.sum()):
         raise AmiwarpError(
             f"{name}: the events determine no depth: too little texture, or everything is beyond "
             f"{orbit_limit_m(model):.2g} m; record a nearer scene with more texture, or a longer time"

@@ -528,9 +528,9 @@ NOTABLE_BLIND_PX, LARGEST_BLIND_PX = 0.4, 0.5
 """Motion of the image by a vibration or a mirror within the refractory period from which on it is reported, and refused
 [px]. Up to 0.48 px errors were at most 0.025 px, with 0.51 px 0.028 px, and with 0.6 px 0.047 px."""
 NOTABLE_STATED_PX = 0.025
-"""Stated error of a vibration or a mirror from which on it is reported [px rms]. Of 66 simulated ones that were
-accepted, those with an error over 0.02 px state 0.023 to 0.109 px, but for one that is reported for its speed; the
-others 0.009 to 0.024 px, but for four."""
+"""Stated error of a vibration or a mirror from which on it is reported [px rms]. In 66 simulations, every answer with
+an error over 0.02 px stated at least 0.023 px, except one that is reported for its speed. Of the other answers, four
+stated over 0.024 px."""
 MOST_TURNS = 12
 """Turns of the first of two angles in which the largest speed is looked for."""
 LARGEST_CHANGE_OF_SPEED_PX = 0.01
