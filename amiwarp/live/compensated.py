@@ -15,7 +15,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.live.link.link import Link
 from amiwarp.live.queues import BackgroundLoop, Policy
 from amiwarp.live.stream.packets import Source
-from amiwarp.live.stream.session import Session
+from amiwarp.live.stream.session import Session, encoder_count
 from amiwarp.live.stream.sources import open_source
 from amiwarp.validation import guarded, real
 
@@ -108,7 +108,7 @@ def compensate_live(
             link = resources.enter_context(Link(None if port == "find" else port, counts_per_turn=counts_per_turn))
         opened = open_source(source, pace=None if fast else 1.0, wait_s=wait_s, say=say)
         try:
-            if link is None and not opened.encoders:
+            if not encoder_count(opened, link):
                 raise AmiwarpError(f"{opened.name}: contains no encoder samples; give the controller's port")
             check_size(calibration, opened.size, opened.name)
             packets = CompensatedPackets(opened)
