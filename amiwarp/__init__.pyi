@@ -58,6 +58,7 @@ from .imaging.metrics import edge_blur as edge_blur
 from .imaging.metrics import model_error as model_error
 from .imaging.metrics import sharpness as sharpness
 from .imaging.metrics import truth_model as truth_model
+from .imaging.networks import Network as Network
 from .imaging.tensors import ToTensor as ToTensor
 from .imaging.tensors import Windows as Windows
 from .imaging.tensors import collate as collate

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx.parser
 import warp as wp
 
 import amiwarp as aw
@@ -290,6 +291,8 @@ OWN: dict[str, dict[str, Any]] = {
     "stacked_histogram": {"bins": 2},
     "time_surface": {"tau_us": 100.0},
     "ToTensor": {"representation": aw.event_count},
+    "Network": {"path": "sum.onnx"},
+    "Network.over": {"windows": WINDOWS},
     "load_camera": {"path": "none.json"},
     "save_camera": {"path": _new(".json"), "camera": CAMERA},
     "PixelMap": _all(PIXELS),
@@ -488,6 +491,7 @@ MADE: dict[str, Callable[[], Any]] = {
     "EventSensor": lambda: aw.EventSensor(2, 3, 4),
     "CornerDetector": lambda: aw.CornerDetector((4, 3)),
     "RecordingWriter": _writer,
+    "Network": lambda: aw.Network("sum.onnx"),
     "Reconstruction": lambda: aw.Reconstruction(RECORDING, model=MODEL),
 }
 """Makers of objects that a call changes."""
@@ -586,3 +590,6 @@ def write_files() -> None:
     aw.save_recording("in.h5", RECORDING)
     CALIBRATION.save("calibration.json")
     STILL.save_tum("poses.tum")
+    network = "sum (float[1,5,h,w] grid) => (float[1,1,h,w] image) {axes = Constant <value_ints: ints = [1]> ()"
+    network += " image = ReduceSum (grid, axes)}"
+    onnx.save(onnx.parser.parse_model(f'<ir_version: 8, opset_import: ["": 18]> {network}'), "sum.onnx")

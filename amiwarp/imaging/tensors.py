@@ -273,14 +273,14 @@ def collate(blocks: Sequence[Events] | Sequence[DeviceEvents], *, device: Any = 
     ends = np.concatenate([[0], np.cumsum([len(block) for block in blocks])]).astype(np.int64)
     joined = kinds.pop().concatenate(blocks)
     if isinstance(joined, Events) and device is not None:
-        joined = _on_device(joined, wp.get_device(device))
+        joined = on_device(joined, wp.get_device(device))
         wait(joined.device)
     elif isinstance(joined, DeviceEvents):
         device_for(joined, device)
     return joined, _at_indices(joined, ends[:-1], ends[1:])
 
 
-def _on_device(events: Events | DeviceEvents, device: Any) -> DeviceEvents:
+def on_device(events: Events | DeviceEvents, device: Any) -> DeviceEvents:
     """Return events in Warp arrays on the device. On a CPU they are not copied."""
     if isinstance(events, DeviceEvents):
         return events
@@ -359,7 +359,7 @@ def _batch(
     cut = _window(events, t_start, t_end) if cut is None else cut
     if len(cut) and int(cut.stop.max()) > n:
         raise AmiwarpError(f"windows reach to event {int(cut.stop.max())} of {n}; give the events that were cut")
-    found = _on_device(events, there)
+    found = on_device(events, there)
     if model is not None and encoder is not None:
         found = _compensated(found, model, encoder)
     return _Batch(found, cut, single, on_host, _shared(1, wp.int32, there))
@@ -1082,9 +1082,9 @@ class ToTensor:
         self.representation = representation
         self.options = options
 
-    def __call__(self, events: Any, labels: Any = None) -> Any:
-        """Return the tensor of events, or the tensor of a recording's events and the labels."""
-        options = dict(self.options)
+    def __call__(self, events: Any, labels: Any = None, **more: Any) -> Any:
+        """Return the tensor of events, or the tensor of a recording's events and the labels. ``more``: options."""
+        options = self.options | more
         if isinstance(events, Recording):
             source = events.events
             options = dict(zip(("width", "height"), source.size, strict=True)) | options

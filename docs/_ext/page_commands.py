@@ -18,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import linecache
 import math
 import os
 import re
@@ -134,9 +135,11 @@ def shell(command: str, folder: Path) -> str:
 def python(code: str, names: dict[str, Any]) -> str:
     """Run Python code that shares the names of the code before it, and return what it prints."""
     printed = io.StringIO()
+    name = f"<page {len(linecache.cache)}>"
+    linecache.cache[name] = len(code), None, code.splitlines(keepends=True), name  # PyTorch reads it
     try:
         with contextlib.redirect_stdout(printed):
-            exec(compile(code, "<page>", "exec"), names)
+            exec(compile(code, name, "exec"), names)
     except Exception as error:
         raise RuntimeError("".join(traceback.format_exception_only(error)).strip()) from error
     return printed.getvalue()

@@ -1,0 +1,369 @@
+"""Networks that users bring as TorchScript or ONNX files, which make pictures or optical flow of events."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_events import DeviceEvents, device_for, wait
+from amiwarp.events.encoder import Encoder
+from amiwarp.events.recording import Events, Recording
+from amiwarp.imaging.tensors import ToTensor, Windows, on_device, voxel_grid
+from amiwarp.io.formats import check_ending
+from amiwarp.optics.models import Model
+from amiwarp.validation import guarded, instance, whole
+
+ENDINGS = (".pt", ".pth", ".ts", ".onnx")
+"""File suffixes of networks: TorchScript has the first three."""
+LARGEST_MULTIPLE = 1 << 12
+"""Largest number whose multiples the sizes of a network's input can be."""
+
+
+@guarded
+class Network:
+    """Network from a TorchScript or ONNX file, which is called with events: for pictures, optical flow or other images.
+
+    The defaults are those of E2VID [1]_. An instance keeps the states of a recurrent network from call to call.
+
+    Parameters
+    ----------
+    path : str or os.PathLike
+        TorchScript file (``.pt``, ``.pth``, ``.ts``), which needs PyTorch, or ONNX file (``.onnx``), which needs
+        onnxruntime.
+    input : callable, optional
+        Function that makes the network's input of one window, shape ``(channels, height, width)``. It is called as
+        ``input(events, width=..., height=...)`` with :class:`DeviceEvents` on the network's device, and also with
+        ``t_start``, ``t_end``, ``model`` and ``encoder`` if they are given. By default, it is
+        ``ToTensor(voxel_grid, bins=5, normalize=True)``.
+    multiple : int, default 8
+        The input is padded by zeros to a height and a width that are multiples of this number [px], and the output is
+        cropped. It is 2 to the power of the number of the network's encoders that halve the size.
+    states : sequence of array, optional
+        States before the first window, one for each input of the network after the first. By default, they are zero for
+        ONNX, with the shapes in the file, and None for TorchScript.
+    device : str or warp.Device, default "cpu"
+        Device of the network.
+
+    Raises
+    ------
+    AmiwarpError
+        If the file cannot be read, the package that reads it is missing or cannot use the device, or the states do not
+        fit.
+
+    Notes
+    -----
+    The first input has the shape ``(1, channels, height, width)``. The first output is the result. If the network has
+    more inputs, the outputs after the first are its states: they are the other inputs of the next window, in this
+    order.
+
+    References
+    ----------
+    .. [1] Rebecq et al., "High speed and high dynamic range video with an event camera", TPAMI 2021.
+
+    Examples
+    --------
+    >>> import onnx.parser
+    >>> text = '''<ir_version: 8, opset_import: ["": 18]>
+    ... running_sum (float[1,2,2,3] counts, float[1,2,2,3] before) => (float[1,2,2,3] total, float[1,2,2,3] after) {
+    ...   total = Add (counts, before)
+    ...   after = Identity (total)
+    ... }'''
+    >>> onnx.save(onnx.parser.parse_model(text), "running_sum.onnx")
+    >>> to_counts = amiwarp.ToTensor(amiwarp.polarity_histogram)
+    >>> network = amiwarp.Network("running_sum.onnx", input=to_counts, multiple=1)
+    >>> events = amiwarp.Events.from_arrays([1, 1, 2], [0, 0, 1], [0, 10, 20], [0, 1, 1])
+    >>> network(events, 3, 2).sum(), network(events, 3, 2).sum()
+    (np.float32(3.0), np.float32(6.0))
+    >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, 3, 2))
+    >>> [float(total.sum()) for total in network.over(recording, amiwarp.windows(events, count=1))]
+    [1.0, 2.0, 3.0]
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        input: Callable[..., Any] | None = None,
+        *,
+        multiple: int = 8,
+        states: Sequence[object] | None = None,
+        device: Any = "cpu",
+    ) -> None:
+        file = Path(path)
+        self._input = ToTensor(voxel_grid, bins=5, normalize=True) if input is None else input
+        self._multiple = whole(multiple, "multiple", 1, LARGEST_MULTIPLE, " px")
+        self._device = wp.get_device(device)
+        ending = check_ending(file, "networks are read", ENDINGS, "export the network to TorchScript or ONNX")
+        if not file.is_file():
+            raise AmiwarpError(f"{file}: no such file; give the TorchScript or ONNX file of a network")
+        self._file = _OnnxFile(file, self._device) if ending == ".onnx" else _TorchFile(file, self._device)
+        self._first = None if states is None else [_as_array(state, self._device, "a state") for state in states]
+        if self._first is not None and len(self._first) != self._file.extra:
+            raise AmiwarpError(f"{file}: takes {self._file.extra} states, not {len(self._first)}; give one for each")
+        self._states: Any = None
+
+    def __call__(
+        self,
+        events: Events | DeviceEvents,
+        width: int,
+        height: int,
+        *,
+        t_start: int | None = None,
+        t_end: int | None = None,
+        model: Model | None = None,
+        encoder: Encoder | None = None,
+    ) -> NDArray[Any] | wp.array:
+        """Return the network's result for the next window of events, and keep its states for the window after that.
+
+        Parameters
+        ----------
+        events : Events or DeviceEvents
+            Events of the window, raw or compensated, sorted by time; those on a device on that of the network.
+        width, height : int
+            Size of the image [px].
+        t_start, t_end : int, optional
+            First and last time of the window [us]. By default, those of the first and last event.
+        model : Model, optional
+            Optical model. Events are first moved to their positions without the optic. Requires ``encoder``.
+        encoder : Encoder, optional
+            Encoder that covers the events. Requires ``model``.
+
+        Returns
+        -------
+        ndarray or warp.array
+            The first output, shape ``(channels, height, width)``, such as a picture with one channel, or flow along x
+            and y. A Warp array on the same device for :class:`DeviceEvents`.
+
+        Raises
+        ------
+        AmiwarpError
+            If the events are on another device, or the network does not fit its input or gives no such output.
+        """
+        options = {"t_start": t_start, "t_end": t_end, "model": model, "encoder": encoder}
+        out, self._states = self._run(events, width, height, self._states, options)
+        return out
+
+    def over(
+        self,
+        recording: Recording,
+        windows: Windows,
+        *,
+        model: Model | None = None,
+        encoder: Encoder | None = None,
+    ) -> Iterator[NDArray[Any] | wp.array]:
+        """Iterate over the network's results for windows of a recording, from the first states on.
+
+        The events of one window at a time are read. The states of calls are neither used nor changed.
+
+        Parameters
+        ----------
+        recording : Recording
+            Recording with the events. Those of :class:`DeviceMemoryEvents` stay on their device.
+        windows : Windows
+            Windows of the recording's events, in order of time.
+        model : Model, optional
+            Optical model. Events are first moved to their positions without the optic. Requires ``encoder``.
+        encoder : Encoder, optional
+            Encoder that covers the events. Requires ``model``.
+
+        Returns
+        -------
+        iterator of ndarray or warp.array
+            The result of each window, as that of a call.
+
+        Raises
+        ------
+        AmiwarpError
+            As for a call, or if the windows reach beyond the events.
+        """
+        last = int(windows.stop.max(initial=0))
+        if last > len(recording.events):
+            raise AmiwarpError(f"windows reach to event {last} of {len(recording.events)}; cut the recording's events")
+        return self._iterate(recording, windows, {"model": model, "encoder": encoder})
+
+    def reset(self) -> None:
+        """Forget the states of earlier calls: the next window is the first one of a sequence."""
+        self._states = None
+
+    def _iterate(self, recording: Recording, windows: Windows, optic: dict[str, Any]) -> Iterator[Any]:
+        states = None
+        rows = (windows.start, windows.stop, windows.t_start, windows.t_end)
+        for start, stop, t_start, t_end in zip(*(row.tolist() for row in rows), strict=True):
+            options = {"t_start": t_start, "t_end": t_end, **optic}
+            out, states = self._run(recording.events[start:stop], *recording.events.size, states, options)
+            yield out
+
+    def _run(self, events: Any, width: int, height: int, states: Any, options: dict[str, Any]) -> tuple[Any, Any]:
+        """Return the result for a window and the states after it. ``states``: those before it, None for the first."""
+        device_for(events, self._device if isinstance(events, DeviceEvents) else None)
+        known = {name: value for name, value in options.items() if value is not None}
+        found = self._input(on_device(events, self._device), width=width, height=height, **known)
+        grid = _as_array(found, self._device, "the input function's result")
+        if grid.ndim != 3 or grid.shape[1:] != (height, width):
+            raise AmiwarpError(
+                f"the input function gives shape {grid.shape}; expected (channels, {height}, {width}), one window"
+            )
+        rows, columns = (-(-size // self._multiple) * self._multiple for size in (height, width))
+        top, left = (rows - height + 1) // 2, (columns - width + 1) // 2  # as E2VID pads
+        padded = wp.zeros((1, grid.shape[0], rows, columns), dtype=self._file.dtype, device=self._device)
+        wp.utils.array_cast(grid, padded[0, :, top : top + height, left : left + width])
+        if states is None:
+            states = self._file.start(self._first)
+        wait(self._device)
+        try:
+            out, states = self._file.run(padded, states)
+        except AmiwarpError:
+            raise
+        except Exception as error:  # both libraries raise many kinds of errors
+            hint = "check the bins of the input and multiple, and call reset() before images of another size"
+            raise AmiwarpError(f"{self._file.path}: fails for input {padded.shape}: {_cause(error)}; {hint}") from error
+        if out.ndim != 4 or out.shape[0] != 1 or out.shape[2:] != (rows, columns):
+            raise AmiwarpError(
+                f"{self._file.path}: its first output has shape {out.shape}; expected "
+                f"(1, channels, {rows}, {columns}), the size of the input"
+            )
+        result = wp.clone(out[0, :, top : top + height, left : left + width])
+        wait(self._device)
+        return result if isinstance(events, DeviceEvents) else result.numpy(), states
+
+
+def _as_array(values: Any, device: Any, what: str) -> wp.array:
+    """Return an array of any library as a Warp array on the device, without a copy if it is there."""
+    try:
+        if isinstance(values, wp.array) or (hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)):
+            found = values if isinstance(values, wp.array) else wp.from_dlpack(values)
+            return found.to(device)
+        numbers = np.ascontiguousarray(values)
+        return wp.array(numbers, dtype=wp.dtype_from_numpy(numbers.dtype), device=device)
+    except Exception as error:  # libraries raise many kinds of errors
+        raise AmiwarpError(f"{what} cannot be read as an array: {_cause(error)}; give an array of numbers") from error
+
+
+def _cause(error: Exception) -> str:
+    """Return the line of a library's message that says the most: the last one."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip().rstrip(".;")
+
+
+class _TorchFile:
+    """TorchScript file, run by PyTorch."""
+
+    dtype = wp.float32
+
+    def __init__(self, path: Path, device: Any) -> None:
+        try:
+            import torch
+        except ImportError as error:
+            raise AmiwarpError(
+                f"{path}: a TorchScript file needs PyTorch; run: pip install 'amiwarp[torch]'"
+            ) from error
+        self.path, self._torch = path, torch
+        if device.is_cuda and not torch.cuda.is_available():
+            raise AmiwarpError(f"{path}: PyTorch has no CUDA here; install its CUDA version, or give device='cpu'")
+        try:
+            with warnings.catch_warnings():  # PyTorch recommends other formats, which it cannot read on all versions
+                warnings.simplefilter("ignore", DeprecationWarning)
+                self._module = torch.jit.load(path, map_location=wp.device_to_torch(device)).eval()
+        except Exception as error:  # RuntimeError, ValueError and others
+            remedy = "write it by torch.jit.script(network).save(path); weights alone are no network"
+            raise AmiwarpError(f"{path}: not a TorchScript file: {str(error).partition('.')[0]}; {remedy}") from error
+        arguments = self._module.forward.schema.arguments[2:]  # without self and the input
+        self.extra = len(arguments)
+        self._needed = sum(not argument.has_default_value() for argument in arguments)
+
+    def start(self, first: list[wp.array] | None) -> tuple[Any, ...]:
+        """Return the states before the first window."""
+        if first is None:
+            return (None,) * self._needed
+        return tuple(self._torch.from_dlpack(wp.clone(state)) for state in first)
+
+    def run(self, grid: wp.array, states: tuple[Any, ...]) -> tuple[wp.array, tuple[Any, ...]]:
+        """Return the first output and the states after a window."""
+        with self._torch.no_grad():
+            found = self._module(self._torch.from_dlpack(grid), *states)
+        outputs = found if isinstance(found, tuple | list) else (found,)
+        instance(outputs[0] if outputs else None, self._torch.Tensor, f"{self.path}: the first output")
+        return wp.from_dlpack(outputs[0].contiguous()), tuple(outputs[1 : 1 + self.extra])
+
+
+TYPES = {"tensor(float)": wp.float32, "tensor(float16)": wp.float16, "tensor(double)": wp.float64}
+"""Types of inputs and outputs, by their names in onnxruntime."""
+
+
+class _OnnxFile:
+    """ONNX file, run by onnxruntime."""
+
+    def __init__(self, path: Path, device: Any) -> None:
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise AmiwarpError(f"{path}: an ONNX file needs onnxruntime; run: pip install 'amiwarp[onnx]'") from error
+        self.path, self._device = path, device
+        self._place = ("cuda", device.ordinal) if device.is_cuda else ("cpu", 0)
+        provider = "CUDAExecutionProvider" if device.is_cuda else "CPUExecutionProvider"
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 4  # errors are raised
+        try:
+            chosen = [(provider, {"device_id": device.ordinal} if device.is_cuda else {})]
+            available = provider in onnxruntime.get_available_providers()
+            session = onnxruntime.InferenceSession(path, options, chosen if available else ["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime raises many kinds of errors
+            raise AmiwarpError(f"{path}: not an ONNX file that can be read: {_cause(error)}; export it anew") from error
+        if provider not in session.get_providers():
+            raise AmiwarpError(f"{path}: onnxruntime has no CUDA here; install onnxruntime-gpu, or give device='cpu'")
+        self._session, self._inputs = session, session.get_inputs()
+        self._outputs = [output.name for output in session.get_outputs()]
+        self.extra = len(self._inputs) - 1
+        if len(self._outputs) <= self.extra:
+            raise AmiwarpError(
+                f"{path}: has {self.extra} inputs after the first and {len(self._outputs) - 1} outputs after the first"
+                "; export the network with one output for each state"
+            )
+        self.dtype = self._type(self._inputs[0].type)
+
+    def _type(self, name: str) -> Any:
+        if name not in TYPES:
+            raise AmiwarpError(f"{self.path}: has a {name}; expected {', '.join(TYPES)}; export the network so")
+        return TYPES[name]
+
+    def start(self, first: list[wp.array] | None) -> list[Any]:
+        """Return the states before the first window."""
+        if first is not None:
+            return first
+        for wanted in self._inputs[1:]:
+            if not all(isinstance(size, int) for size in wanted.shape):
+                raise AmiwarpError(
+                    f"{self.path}: {wanted.name} has the shape {wanted.shape}; give its first value in states"
+                )
+        return [wp.zeros(one.shape, dtype=self._type(one.type), device=self._device) for one in self._inputs[1:]]
+
+    def run(self, grid: wp.array, states: list[Any]) -> tuple[wp.array, list[Any]]:
+        """Return the first output and the states after a window."""
+        wanted, given = list(self._inputs[0].shape), list(grid.shape)
+        known = [k for k, size in enumerate(wanted) if isinstance(size, int)]  # others have names
+        if len(wanted) != 4 or [wanted[k] for k in known] != [given[k] for k in known]:
+            remedy = "multiple" if wanted[:2] == given[:2] else "the bins of the input"
+            raise AmiwarpError(f"{self.path}: takes inputs of shape {wanted}, not {given}; change {remedy}")
+        binding = self._session.io_binding()
+        for wanted, value in zip(self._inputs, [grid, *states], strict=True):
+            if isinstance(value, wp.array):
+                kind = wp.dtype_to_numpy(value.dtype)
+                binding.bind_input(wanted.name, *self._place, kind, value.shape, value.ptr)
+            else:
+                binding.bind_ortvalue_input(wanted.name, value)
+        for name in self._outputs:
+            binding.bind_output(name, *self._place)
+        self._session.run_with_iobinding(binding)
+        binding.synchronize_outputs()
+        out, *others = binding.get_outputs()
+        image = wp.array(
+            ptr=out.data_ptr(), shape=tuple(out.shape()), dtype=self._type(out.data_type()), device=self._device
+        )
+        image.owner = out  # which keeps the memory
+        return image, others[: self.extra]

@@ -1,0 +1,338 @@
+"""Networks of TorchScript and ONNX files: results against NumPy, states, padding, devices and refusals."""
+
+import math
+import re
+import sys
+import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnx.numpy_helper
+import onnx.parser
+import onnxruntime
+import pytest
+import warp as wp
+from scipy.signal import correlate2d
+
+from amiwarp import (
+    AmiwarpError,
+    Camera,
+    DeviceEvents,
+    Encoder,
+    Events,
+    ExactModel,
+    MemoryEvents,
+    Network,
+    Prism,
+    Recording,
+    ToTensor,
+    compensate_events,
+    polarity_histogram,
+    time_surface,
+    voxel_grid,
+    windows,
+)
+from amiwarp.events.device_events import DeviceMemoryEvents
+
+WIDTH, HEIGHT, BINS = 37, 22, 3
+RNG = np.random.default_rng(5)
+WEIGHTS = RNG.normal(0.0, 0.3, (3, BINS + 1, 3, 3)).astype(np.float32)
+"""Of a convolution of a voxel grid and a state, to two images and the next state."""
+GRID = ToTensor(voxel_grid, bins=BINS, normalize=True)
+
+
+def some_events(n: int = 900, seed: int = 0) -> Events:
+    rng = np.random.default_rng(seed)
+    x, y, p = rng.integers(0, WIDTH, n), rng.integers(0, HEIGHT, n), rng.integers(0, 2, n)
+    return Events.from_arrays(x, y, np.sort(rng.integers(1_000, 31_000, n)), p)
+
+
+EVENTS = some_events()
+
+
+def step(grid: Any, state: Any) -> tuple[Any, Any]:
+    """The network in float64: the images, shape (2, rows, columns), and the next state, shape (rows, columns)."""
+    layers = np.concatenate([grid, [state]]).astype(np.float64)
+    pairs = [[correlate2d(one, w, "same") for one, w in zip(layers, kernel, strict=True)] for kernel in WEIGHTS]
+    sums = [np.sum(pair, axis=0) for pair in pairs]
+    return np.stack(sums[:2]), np.tanh(sums[2])
+
+
+def padded(grid: Any, multiple: int) -> tuple[Any, tuple[slice, ...]]:
+    """The grid between zeros, of which there are more above and on the left, and the place of the image in it."""
+    more = [-size % multiple for size in grid.shape[1:]]
+    before = [math.ceil(0.5 * number) for number in more]
+    inside = tuple(slice(b, b + size) for b, size in zip(before, grid.shape[1:], strict=True))
+    return np.pad(grid, [(0, 0), *((b, m - b) for b, m in zip(before, more, strict=True))]), (slice(None), *inside)
+
+
+def expected(grids: list[Any], multiple: int = 8) -> list[Any]:
+    """The results for the tensors of successive windows."""
+    found, state = [], None
+    for grid in grids:
+        values, inside = padded(grid, multiple)
+        images, state = step(values, np.zeros(values.shape[1:]) if state is None else state)
+        found.append(images[inside])
+    return found
+
+
+def torch_file(path: Path, kind: str = "Recurrent") -> Path:
+    """A TorchScript file: the network of :func:`step`, or another one."""
+    torch = pytest.importorskip("torch")
+    weights = torch.from_numpy(WEIGHTS.copy())
+
+    class Recurrent(torch.nn.Module):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__()
+            self.weights = torch.nn.Parameter(weights)
+
+        def forward(self, grid: torch.Tensor, before: torch.Tensor | None):  # type: ignore[no-untyped-def]
+            if before is None:
+                before = torch.zeros_like(grid[:, :1])
+            sums = torch.nn.functional.conv2d(torch.cat([grid, before], 1), self.weights, padding=1)
+            return sums[:, :2], torch.tanh(sums[:, 2:])
+
+    class Nested(Recurrent):  # as E2VID: one state of several layers, each of two tensors
+        def forward(self, grid: torch.Tensor, before: list[tuple[torch.Tensor, torch.Tensor]] | None):  # type: ignore
+            state = torch.zeros_like(grid[:, :1]) if before is None else before[0][0] + before[0][1]
+            sums = torch.nn.functional.conv2d(torch.cat([grid, state], 1), self.weights, padding=1)
+            state = torch.tanh(sums[:, 2:])
+            return sums[:, :2], [(0.25 * state, 0.75 * state)]
+
+    class Positions(torch.nn.Module):  # type: ignore[misc]
+        def forward(self, grid: torch.Tensor):  # type: ignore[no-untyped-def]
+            row = torch.arange(grid.shape[2])[:, None].expand(grid.shape[2:])
+            column = torch.arange(grid.shape[3])[None].expand(grid.shape[2:])
+            image = torch.stack([row, column, torch.full_like(row, grid.shape[2]), torch.full_like(row, grid.shape[3])])
+            return [image[None].to(grid), grid[:, :, ::2, ::2]]  # as EV-FlowNet: flow in several sizes
+
+    class InPlace(torch.nn.Module):  # type: ignore[misc]
+        def forward(self, grid: torch.Tensor, before: torch.Tensor):  # type: ignore[no-untyped-def]
+            before += grid
+            grid *= 0.0
+            return before, before
+
+    class Half(torch.nn.Module):  # type: ignore[misc]
+        def forward(self, grid: torch.Tensor):  # type: ignore[no-untyped-def]
+            return grid[:, :, ::2, ::2]
+
+    class Text(torch.nn.Module):  # type: ignore[misc]
+        def forward(self, grid: torch.Tensor) -> str:
+            return "flow"
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        made = {one.__name__: one for one in (Recurrent, Nested, Positions, InPlace, Half, Text)}
+        torch.jit.script(made[kind]()).save(path)
+    return path
+
+
+def onnx_file(path: Path, rows: Any = 24, columns: Any = 40, outputs: int = 2) -> Path:
+    """An ONNX file with the network of :func:`step`."""
+    size = f"{rows},{columns}"
+    after = f", float[1,1,{size}] after" if outputs > 1 else ""
+    text = f"""<ir_version: 8, opset_import: ["": 18]>
+    recurrent (float[1,{BINS},{size}] grid, float[1,1,{size}] before) => (float[1,2,{size}] images{after}) {{
+        layers = Concat <axis = 1> (grid, before)
+        sums = Conv <pads = [1, 1, 1, 1]> (layers, weights)
+        images, next = Split <axis = 1> (sums, sizes)
+        after = Tanh (next)
+    }}"""
+    model = onnx.parser.parse_model(text)
+    arrays = {"weights": WEIGHTS, "sizes": np.array([2, 1], np.int64)}
+    model.graph.initializer.extend(onnx.numpy_helper.from_array(values, name) for name, values in arrays.items())
+    onnx.save(model, path)
+    return path
+
+
+@pytest.fixture(params=["recurrent.pt", "nested.pt", "recurrent.onnx"])
+def recurrent(request: pytest.FixtureRequest, tmp_path: Path, device: str) -> Network:
+    """The network of :func:`step` from a file of each kind, on each device."""
+    path = tmp_path / request.param
+    if path.suffix == ".pt":
+        return Network(torch_file(path, path.stem.capitalize()), GRID, device=device)
+    if device != "cpu" and "CUDAExecutionProvider" not in onnxruntime.get_available_providers():
+        pytest.skip("onnxruntime without CUDA")
+    return Network(onnx_file(path), GRID, device=device)
+
+
+def test_states_are_carried_until_reset(recurrent: Network) -> None:
+    blocks = [some_events(seed=k) for k in range(3)]
+    wanted = expected([voxel_grid(one, WIDTH, HEIGHT, BINS, normalize=True) for one in blocks])
+    found = [recurrent(one, WIDTH, HEIGHT) for one in blocks]
+    for images, truth in zip(found, wanted, strict=True):
+        assert isinstance(images, np.ndarray)
+        assert images.dtype == np.float32
+        np.testing.assert_allclose(images, truth, rtol=0, atol=1e-5)
+    assert np.abs(wanted[1] - expected([voxel_grid(blocks[1], WIDTH, HEIGHT, BINS, normalize=True)])[0]).max() > 0.1
+    np.testing.assert_allclose(found[0], wanted[0], rtol=0, atol=1e-5)  # later calls do not write to it
+    recurrent.reset()
+    np.testing.assert_allclose(recurrent(blocks[0], WIDTH, HEIGHT), wanted[0], rtol=0, atol=1e-5)
+
+
+def test_events_on_a_device_give_arrays_there(recurrent: Network, device: str) -> None:
+    there = DeviceEvents.from_arrays(EVENTS.x, EVENTS.y, EVENTS.t, EVENTS.p, device=device)
+    found = recurrent(there, WIDTH, HEIGHT)
+    assert isinstance(found, wp.array)
+    assert found.device == wp.get_device(device)
+    wanted = expected([voxel_grid(EVENTS, WIDTH, HEIGHT, BINS, normalize=True)])[0]
+    np.testing.assert_allclose(found.numpy(), wanted, rtol=0, atol=1e-5)
+
+
+def test_windows_of_a_recording_raw_and_compensated(recurrent: Network, device: str) -> None:
+    camera, prism = Camera.from_fov(WIDTH, HEIGHT, 1.0), Prism(0.03)
+    encoder = Encoder.constant_speed(1200.0, 0, 40_000)
+    recording = Recording(MemoryEvents(EVENTS, WIDTH, HEIGHT), camera, encoder, prism)
+    there = DeviceEvents.from_arrays(EVENTS.x, EVENTS.y, EVENTS.t, EVENTS.p, device=device)
+    on_device = Recording(DeviceMemoryEvents(there, WIDTH, HEIGHT), camera, encoder, prism)
+    cut = windows(EVENTS, duration_us=9_000, incomplete=True)
+    optic: dict[str, Any] = {"model": ExactModel(camera, prism), "encoder": encoder}
+    options: dict[str, Any]
+    for options in ({}, optic):
+        grids = voxel_grid(EVENTS, WIDTH, HEIGHT, BINS, normalize=True, windows=cut, **options)
+        wanted = expected(list(grids))
+        first, second = recurrent.over(recording, cut, **options), recurrent.over(on_device, cut, **options)
+        for truth, images, warp_images in zip(wanted, first, second, strict=True):  # each with its own states
+            np.testing.assert_allclose(images, truth, rtol=0, atol=2e-5)
+            np.testing.assert_allclose(warp_images.numpy(), truth, rtol=0, atol=2e-5)
+    places = compensate_events(EVENTS, optic["model"], encoder)
+    compensated = Events(places[:, 0].copy(), places[:, 1].copy(), EVENTS.t, EVENTS.p)
+    whole = recurrent(compensated, WIDTH, HEIGHT)  # no iteration has left states
+    wanted = expected([voxel_grid(EVENTS, WIDTH, HEIGHT, BINS, normalize=True, **optic)])
+    np.testing.assert_allclose(whole, wanted[0], rtol=0, atol=2e-5)
+    with pytest.raises(AmiwarpError, match="windows reach to event 900 of 500"):
+        recurrent.over(Recording(MemoryEvents(EVENTS[:500], WIDTH, HEIGHT)), cut)
+
+
+@pytest.mark.parametrize(("multiple", "height", "width", "top", "left"), [
+    (1, 22, 37, 0, 0), (2, 22, 38, 0, 1), (8, 24, 40, 1, 2), (16, 32, 48, 5, 6), (64, 64, 64, 21, 14),
+])  # fmt: skip
+def test_padding_and_cropping(tmp_path: Path, multiple: int, height: int, width: int, top: int, left: int) -> None:
+    network = Network(torch_file(tmp_path / "n.pt", "Positions"), GRID, multiple=multiple)
+    rows, columns, heights, widths = network(EVENTS, WIDTH, HEIGHT)
+    np.testing.assert_array_equal(rows[:, 0], top + np.arange(HEIGHT))
+    np.testing.assert_array_equal(columns[0], left + np.arange(WIDTH))
+    assert (heights == height).all()
+    assert (widths == width).all()
+
+
+def test_what_is_given_is_not_changed_and_results_are_own(tmp_path: Path, device: str) -> None:
+    kept = RNG.random((2, HEIGHT, WIDTH)).astype(np.float32)
+    first = RNG.random((1, 2, HEIGHT, WIDTH)).astype(np.float32)
+    tensor, state = wp.array(kept, device=device), wp.array(first, device=device)
+    path = torch_file(tmp_path / "n.pt", "InPlace")
+    network = Network(path, lambda events, width, height: tensor, multiple=1, states=[state], device=device)
+    for _ in range(2):
+        found = [network(EVENTS, WIDTH, HEIGHT) for _ in range(3)]
+        for k, images in enumerate(found):
+            np.testing.assert_allclose(images, first[0] + (k + 1) * kept, rtol=0, atol=1e-6)
+        network.reset()
+    np.testing.assert_array_equal(tensor.numpy(), kept)
+    np.testing.assert_array_equal(state.numpy(), first)
+
+
+def test_own_input_of_counts_and_times(tmp_path: Path, device: str) -> None:
+    """EV-FlowNet takes the counts of ON and OFF events, then the times of the latest ones in the window."""
+    torch = pytest.importorskip("torch")
+    seen = []
+
+    def counts_and_times(events: DeviceEvents, **options: Any) -> Any:
+        seen.append((events, options))
+        duration = options["t_end"] - options["t_start"]
+        parts = polarity_histogram(events, **options), time_surface(events, tau_us=duration, linear=True, **options)
+        return torch.cat([torch.from_dlpack(part).flip(0) for part in parts])
+
+    path = torch_file(tmp_path / "n.pt", "InPlace")
+    first = np.zeros((1, 4, HEIGHT, WIDTH))
+    network = Network(path, counts_and_times, multiple=1, states=[first.astype(np.float32)], device=device)
+    found = network(EVENTS, WIDTH, HEIGHT, t_start=5_000, t_end=25_000)
+    for t, x, y, p in zip(EVENTS.t, EVENTS.x, EVENTS.y, EVENTS.p, strict=True):
+        if 5_000 <= t <= 25_000:
+            first[0, 1 - p, y, x] += 1
+            first[0, 3 - p, y, x] = (t - 5_000) / 20_000
+    np.testing.assert_allclose(found, first[0], rtol=0, atol=1e-5)
+    assert seen[0][0].device == wp.get_device(device)
+    assert seen[0][1] == {"width": WIDTH, "height": HEIGHT, "t_start": 5_000, "t_end": 25_000}
+
+
+def test_whole_numbers_and_numpy_arrays_are_taken(tmp_path: Path) -> None:
+    path = torch_file(tmp_path / "n.pt", "Half")
+    whole = partial(np.ones, (1, HEIGHT, WIDTH), np.int32)
+    with pytest.raises(AmiwarpError, match=r"output has shape \(1, 1, 11, 19\); expected \(1, channels, 22, 37\)"):
+        Network(path, lambda events, width, height: whole(), multiple=1)(EVENTS, WIDTH, HEIGHT)
+    first = np.zeros((1, 2, HEIGHT, WIDTH), np.float32)
+    network = Network(torch_file(path, "InPlace"), ToTensor(polarity_histogram), multiple=1, states=[first])
+    np.testing.assert_array_equal(network(EVENTS, WIDTH, HEIGHT), polarity_histogram(EVENTS, WIDTH, HEIGHT))
+
+
+def test_states_of_onnx_files_of_any_size(tmp_path: Path) -> None:
+    path = onnx_file(tmp_path / "n.onnx", "rows", "columns")
+    with pytest.raises(AmiwarpError, match=r"before has the shape \[1, 1, 'rows', 'columns'\]; give .* in states"):
+        Network(path, GRID)(EVENTS, WIDTH, HEIGHT)
+    network = Network(path, GRID, states=[np.zeros((1, 1, 24, 40), np.float32)])
+    wanted = expected([voxel_grid(EVENTS, WIDTH, HEIGHT, BINS, normalize=True)] * 2)
+    for truth in wanted:
+        np.testing.assert_allclose(network(EVENTS, WIDTH, HEIGHT), truth, rtol=0, atol=1e-5)
+    with pytest.raises(AmiwarpError, match="call reset"):
+        network(EVENTS, 60, 50)
+
+
+def make(folder: Path, name: str, **options: Any) -> Network:
+    """A network of a file that is made by its name."""
+    path = folder / name
+    if path.suffix == ".onnx":
+        onnx_file(path, outputs=1 if path.stem == "stateless" else 2)
+    elif path.suffix == ".pt":
+        torch_file(path, path.stem)
+    return Network(path, **{"input": GRID, **options})
+
+
+WRONG = partial(ToTensor, voxel_grid)
+
+REFUSALS: dict[str, Callable[[Path], Any]] = {
+    "none.jpg: networks are read as .pt, .pth, .ts or .onnx": lambda folder: Network(folder / "none.jpg"),
+    "none.pt: no such file": lambda folder: Network(folder / "none.pt"),
+    "torch.jit.script": lambda folder: broken(folder / "broken.pt"),
+    "broken.onnx: not an ONNX file": lambda folder: broken(folder / "broken.onnx"),
+    "Text.pt: the first output": lambda folder: make(folder, "Text.pt")(EVENTS, WIDTH, HEIGHT),
+    "to have 4 channels, but got 6": lambda folder: make(folder, "Recurrent.pt", input=WRONG(bins=5))(EVENTS, 37, 22),
+    "change the bins of the input": lambda folder: make(folder, "n.onnx", input=WRONG(bins=5))(EVENTS, WIDTH, HEIGHT),
+    "not [1, 3, 22, 37]; change multiple": lambda folder: make(folder, "n.onnx", multiple=1)(EVENTS, WIDTH, HEIGHT),
+    "has 1 inputs after the first and 0 outputs": lambda folder: make(folder, "stateless.onnx"),
+    "takes 1 states, not 2": lambda folder: make(folder, "n.onnx", states=[np.zeros(1), np.zeros(1)]),
+    "a state cannot be read as an array": lambda folder: make(folder, "n.onnx", states=["zero"]),
+    "multiple = 0": lambda folder: make(folder, "n.onnx", multiple=0),
+    "gives shape (5, 22, 30)": lambda folder: make(
+        folder, "n.onnx", input=lambda events, width, height: np.zeros((5, 22, 30))
+    )(EVENTS, WIDTH, HEIGHT),
+    "only one of model and encoder": lambda folder: make(folder, "n.onnx")(
+        EVENTS, WIDTH, HEIGHT, encoder=Encoder.constant_speed(600.0, 0, 40_000)
+    ),
+}  # fmt: skip
+
+
+def broken(path: Path) -> Network:
+    path.write_bytes(b"no network")
+    return Network(path)
+
+
+@pytest.mark.parametrize("message", REFUSALS)
+def test_refusals(tmp_path: Path, message: str) -> None:
+    with pytest.raises(AmiwarpError, match=re.escape(message)):
+        REFUSALS[message](tmp_path)
+
+
+@pytest.mark.parametrize(("name", "package", "extra"), [
+    ("Half.pt", "torch", "amiwarp[torch]"), ("n.onnx", "onnxruntime", "amiwarp[onnx]"),
+])  # fmt: skip
+def test_a_missing_package_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str, extra: str
+) -> None:
+    make(tmp_path, name)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(AmiwarpError, match=re.escape(f"pip install '{extra}'")):
+        Network(tmp_path / name)
