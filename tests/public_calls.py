@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx.parser
 import warp as wp
 
 import amiwarp as aw
+from tests.networks import write_network
 
 NAMES = re.findall(r"import (\w+) as \1", Path(aw.__file__).with_suffix(".pyi").read_text())
 NOT_CALLED = {"AmiwarpError", "CalibrationOptions", "Model", "NotebookPage"}
@@ -590,6 +590,4 @@ def write_files() -> None:
     aw.save_recording("in.h5", RECORDING)
     CALIBRATION.save("calibration.json")
     STILL.save_tum("poses.tum")
-    network = "sum (float[1,5,h,w] grid) => (float[1,1,h,w] image) {axes = Constant <value_ints: ints = [1]> ()"
-    network += " image = ReduceSum (grid, axes)}"
-    onnx.save(onnx.parser.parse_model(f'<ir_version: 8, opset_import: ["": 18]> {network}'), "sum.onnx")
+    write_network(Path("sum.onnx"))

@@ -1,5 +1,6 @@
 """Networks of TorchScript and ONNX files: results against NumPy, states, padding, devices and refusals."""
 
+import json
 import math
 import re
 import sys
@@ -9,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import onnx
 import onnx.numpy_helper
@@ -16,10 +18,13 @@ import onnx.parser
 import onnxruntime
 import pytest
 import warp as wp
+from PIL import Image
 from scipy.signal import correlate2d
+from typer.testing import CliRunner
 
 from amiwarp import (
     AmiwarpError,
+    Calibration,
     Camera,
     DeviceEvents,
     Encoder,
@@ -30,12 +35,15 @@ from amiwarp import (
     Prism,
     Recording,
     ToTensor,
+    Windows,
     compensate_events,
     polarity_histogram,
+    save_recording,
     time_surface,
     voxel_grid,
     windows,
 )
+from amiwarp.cli.app import app
 from amiwarp.events.device_events import DeviceMemoryEvents
 
 WIDTH, HEIGHT, BINS = 37, 22, 3
@@ -131,19 +139,19 @@ def torch_file(path: Path, kind: str = "Recurrent") -> Path:
     return path
 
 
-def onnx_file(path: Path, rows: Any = 24, columns: Any = 40, outputs: int = 2) -> Path:
-    """An ONNX file with the network of :func:`step`."""
+def onnx_file(path: Path, rows: Any = 24, columns: Any = 40, outputs: int = 2, images: int = 2) -> Path:
+    """An ONNX file with the network of :func:`step`, or with its last images only."""
     size = f"{rows},{columns}"
     after = f", float[1,1,{size}] after" if outputs > 1 else ""
     text = f"""<ir_version: 8, opset_import: ["": 18]>
-    recurrent (float[1,{BINS},{size}] grid, float[1,1,{size}] before) => (float[1,2,{size}] images{after}) {{
+    recurrent (float[1,{BINS},{size}] grid, float[1,1,{size}] before) => (float[1,{images},{size}] images{after}) {{
         layers = Concat <axis = 1> (grid, before)
         sums = Conv <pads = [1, 1, 1, 1]> (layers, weights)
         images, next = Split <axis = 1> (sums, sizes)
         after = Tanh (next)
     }}"""
     model = onnx.parser.parse_model(text)
-    arrays = {"weights": WEIGHTS, "sizes": np.array([2, 1], np.int64)}
+    arrays = {"weights": WEIGHTS[2 - images :], "sizes": np.array([images, 1], np.int64)}
     model.graph.initializer.extend(onnx.numpy_helper.from_array(values, name) for name, values in arrays.items())
     onnx.save(model, path)
     return path
@@ -336,3 +344,98 @@ def test_a_missing_package_is_named(
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(AmiwarpError, match=re.escape(f"pip install '{extra}'")):
         Network(tmp_path / name)
+
+
+# The command ``amiwarp reconstruct --network``.
+
+CAMERA, PRISM = Camera.from_fov(WIDTH, HEIGHT, 1.0), Prism(0.03)
+ENCODER = Encoder.constant_speed(6000.0, 0, 40_000)  # 10 ms a turn
+TRACKED = Recording(MemoryEvents(EVENTS, WIDTH, HEIGHT), CAMERA, ENCODER, PRISM)
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Network:
+    """Make the folder of a recording, its calibration and a network the current one; return the network."""
+    monkeypatch.chdir(tmp_path)
+    save_recording("r.h5", TRACKED)
+    SMALL_CALIBRATION.save("c.json")
+    onnx_file(Path("two.onnx"))
+    onnx_file(Path("n.onnx"), images=1)
+    return Network("n.onnx", GRID)
+
+
+SMALL_CALIBRATION = Calibration(
+    model_name="exact", camera=CAMERA, prism=PRISM, parameters={"apex": 0.03, "phase": 0.5}, uncertainty={},
+    free=("phase",), sharpness_name="variance", sharpness_before=1.0, sharpness_after=2.0, stages=(), events=10,
+    seconds=1.0,
+)  # fmt: skip
+
+
+def run(*arguments: str) -> Any:
+    given = ["reconstruct", "r.h5", *arguments, "--bins", str(BINS), "--device", "cpu", "--json"]
+    return CliRunner().invoke(app, given)
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_the_command_makes_a_picture(files: Network, calibrated: bool) -> None:
+    more = ["--calibration", "c.json"] if calibrated else []
+    optic: dict[str, Any] = {}
+    if calibrated:
+        optic = {"model": SMALL_CALIBRATION.model, "encoder": SMALL_CALIBRATION.encoder_for(ENCODER, 0, 1)}
+    done = run("p.npy", "--network", "n.onnx", *more, "--start", "0.02", "--length", "0.005")
+    assert done.exit_code == 0, done.stderr
+    data = json.loads(done.stdout)
+    first = EVENTS.t[0]
+    edges = first + 5_000 * np.arange(6)
+    at = np.searchsorted(EVENTS.t, edges)
+    *_, (last,) = files.over(TRACKED, Windows(at[:-1], at[1:], edges[:-1], edges[1:]), **optic)
+    np.testing.assert_array_equal(np.load("p.npy"), last)
+    assert data["start_us"] == first + 20_000
+    assert data["length_us"] == 5_000
+    assert data["windows"] == 5
+    assert data["events"] == at[-1] - at[0]
+    for tone, dark, bright in (("mapped", *np.percentile(last, [0.5, 99.5])), ("linear", 0.0, 1.0)):
+        grey = ["--start", "0.02", "--length", "0.005", "--tone", tone, "--bits", "16"]
+        assert run(f"{tone}.png", "--network", "n.onnx", *more, *grey).exit_code == 0
+        values = np.asarray(Image.open(f"{tone}.png")) / 65535.0
+        np.testing.assert_allclose(values, np.clip((last - dark) / (bright - dark), 0.0, 1.0), rtol=0, atol=2e-5)
+
+
+def test_the_command_makes_a_video(files: Network) -> None:
+    done = run("v.mp4", "--network", "n.onnx", "--fps", "200")
+    assert done.exit_code == 0, done.stderr
+    data = json.loads(done.stdout)
+    lasts = int(EVENTS.t[-1] - EVENTS.t[0])
+    assert data["frames"] == lasts // 5_000
+    assert data["length_us"] == 5_000
+    with av.open("v.mp4") as film:
+        assert sum(1 for _ in film.decode(video=0)) == data["frames"]
+    assert run("turn.npy", "--network", "n.onnx").exit_code == 0  # the picture of the second turn
+    edges = EVENTS.t[0] + 10_000 * np.arange(3)
+    at = np.searchsorted(EVENTS.t, edges)
+    *_, (last,) = files.over(TRACKED, Windows(at[:-1], at[1:], edges[:-1], edges[1:]))
+    np.testing.assert_array_equal(np.load("turn.npy"), last)
+
+
+@pytest.mark.parametrize(("more", "said"), [
+    ((), "--calibration is missing; give a calibration file, or a network"),
+    (("--network", "n.onnx", "--fill", "edge"), "--mask, --fill and --omega apply to the solver"),
+    (("--network", "two.onnx"), "two.onnx: makes 2 channels"),
+    (("--network", "none.onnx"), "none.onnx: no such file"),
+    (("--network", "n.onnx", "--start", "9"), "no events in"),
+])  # fmt: skip
+@pytest.mark.usefixtures("files")
+def test_the_command_refuses(more: tuple[str, ...], said: str) -> None:
+    before = {path.name for path in Path().iterdir()}
+    done = run("p.png", *more)
+    assert done.exit_code == 1
+    assert said in done.stderr
+    assert {path.name for path in Path().iterdir()} == before
+
+
+def test_windows_without_events_are_taken(files: Network) -> None:
+    empty = np.array([5, 5], np.int64)
+    optic: dict[str, Any] = {"model": ExactModel(CAMERA, PRISM), "encoder": ENCODER}
+    for options in ({}, optic):
+        for images in files.over(TRACKED, Windows(empty, empty, 100 * empty, 200 * empty), **options):
+            np.testing.assert_array_equal(images, 0.0)

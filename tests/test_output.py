@@ -53,6 +53,7 @@ from amiwarp.io.files import NewFile, check_output, own_folder, remove_abandoned
 from amiwarp.io.json_files import read_json
 from amiwarp.io.native_writer import LiveWriter
 from reference.calibration_sample import exact_calibration
+from tests.networks import write_network
 
 SPECIFICATION = """
 format = "amiwarp-dataset-specification"
@@ -119,6 +120,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         'format = "amiwarp-world"\nversion = 1\nsky = {panorama = "pic.png"}\ncamera = {trajectory = "tr.tum"}\n'
         'bodies = [{name = "tile", mesh = "tile.obj"}]\n'
     )
+    write_network(folder / "sum.onnx")
     return folder
 
 
@@ -151,6 +153,7 @@ OVER_INPUTS = (
     ("compensate a.h5 {} --calibration cal.json --encoder enc.csv --second-encoder enc2.csv", "enc2.csv"),
     ("reconstruct a.h5 {} --calibration cal.json", "a.h5"),
     ("reconstruct a.h5 out.png --calibration cal.json --mask {}", "cal.json"),
+    ("reconstruct a.h5 {} --network sum.onnx", "sum.onnx"),
     ("pixels a.h5 cal.json {}", "a.h5"),
     ("pixels a.h5 cal.json {}", "cal.json"),
     ("depth a.h5 cal.json {}", "a.h5"),
@@ -264,6 +267,7 @@ def test_no_command_writes_over_what_it_reads(place: Path, line: str, read: str,
         "compensate a.h5 new.h5 --calibration cal.json --iwe {}.png",
         "compensate a.h5 new.h5 --calibration cal.json --iwe {}.npy",
         "reconstruct a.h5 {}.png --calibration cal.json",
+        "reconstruct a.h5 {}.png --network sum.onnx",
         "reconstruct a.h5 new.png --calibration cal.json --mask {}.png",
         "simulate {}.h5 --picture pic.png --duration 0.01",
         "translate v.npy {}.h5 --fps 100",
@@ -551,6 +555,7 @@ ENDLESS = (
     "compensate a.h5 out.h5 --calibration cal.json --encoder enc.csv --second-encoder {}",
     "reconstruct {} out.png --calibration cal.json",
     "reconstruct a.h5 out.png --calibration {}",
+    "reconstruct a.h5 out.png --network {}.onnx",
     "simulate out.h5 --picture {}",
     "pixels {} cal.json out.npz",
     "pixels a.h5 {} out.npz",

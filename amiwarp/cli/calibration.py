@@ -583,11 +583,17 @@ class WindowOptions:
         ),
     ] = None
 
-    def span(self, work: Reconstruction, *, video: bool) -> tuple[int, int]:
-        """Return the start and the length of the time window [us]. A video begins with the recording."""
+    def span(self, recording: Recording, turn_us: float | None, *, video: bool) -> tuple[int, int]:
+        """Return the start and the length of the time window [us]. A video begins with the recording.
+
+        ``turn_us``: duration of a turn [us], None if nothing turns.
+        """
+        from amiwarp.reconstruction.picture import window_span
+
         after = 0.0 if self.start is None and video else self.start
-        start = None if after is None else work.recording.events.t_first + round(after * 1e6)
-        return work.span(start, None if self.length is None else max(1, round(self.length * 1e6)), self.turns)
+        start = None if after is None else recording.events.t_first + round(after * 1e6)
+        length = None if self.length is None else max(1, round(self.length * 1e6))
+        return window_span(recording, turn_us, start, length, self.turns)
 
     def camera_rotation(self) -> CameraRotation | None:
         """Return the camera's rotation given by an option, or None."""
@@ -609,7 +615,11 @@ class PictureOptions:
         ),
     ] = Fill.SMOOTH
     tone: Annotated[
-        Tone, _in_picture(help="Grey values. mapped: contrast stretched, gamma 2.2; linear: proportional to intensity.")
+        Tone,
+        _in_picture(
+            help="Grey values. mapped: contrast stretched, gamma 2.2; linear: proportional to intensity. Of a network, "
+            "mapped: contrast stretched; linear: its values from 0 to 1."
+        ),
     ] = Tone.MAPPED
     bits: Annotated[int, _in_picture(help="Bits per pixel of a .png: 8 or 16. A .tif has 16.")] = 8
     contrast: Annotated[
@@ -625,21 +635,50 @@ class PictureOptions:
     ] = None
 
 
+_in_network = partial(typer.Option, rich_help_panel="Network")
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Options for the reconstruction by a network."""
+
+    network: Annotated[
+        Path | None,
+        _in_network(
+            help="TorchScript (.pt) or ONNX (.onnx) file of a network that makes pictures from normalised voxel grids, "
+            "such as E2VID, to use instead of the solver. Needs the extra torch or onnx.",
+            metavar="<path>",
+        ),
+    ] = None
+    bins: Annotated[int, _in_network(min=1, help="Time bins of the network's voxel grids.")] = 5
+    multiple: Annotated[
+        int, _in_network(min=1, help="The network's height and width are multiples of this number (px).")
+    ] = 8
+
+
 def run_reconstruct(
     recording: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     out: Annotated[
         Path, typer.Argument(help="File to write: .png, .tif (16 bit), .npy (log intensity) or .mp4."), OUTPUT
     ],
     *,
-    calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="Calibration file from 'amiwarp calibrate' (.json). May be left out with --network: the network then "
+            "takes the events as recorded."
+        ),
+    ] = None,
     window: WindowOptions,
     picture: PictureOptions,
+    by: NetworkOptions,
     common: Common,
 ) -> None:
     """Reconstruct a picture of the scene from the events of a window, or a video from a sliding window.
 
     A window needs at least a quarter turn of the prism. Intensity is relative, because events do not hold absolute
-    brightness.
+    brightness. With --network, the windows of a video follow one another by default, and up to 24 windows before that
+    of a picture give a recurrent network its states.
     """
     from amiwarp.calib import Calibration
     from amiwarp.reconstruction.picture import MASK_SUFFIXES, VIDEO, Reconstruction, check_path
@@ -653,11 +692,19 @@ def run_reconstruct(
     if not video and window.fps is not None:
         raise AmiwarpError(f"{out}: --fps applies to a video; give a name that ends in {VIDEO}")
     device = choose_device(common.device)
+    given = None if calibration is None else Calibration.load(calibration)
+    began = time.perf_counter()
+    if by.network is not None:
+        data = _by_network(open_recording(recording), given, out, window, picture, by, device)
+        data = {"file": str(out), **data, "seconds": time.perf_counter() - began, "device": device}
+        report(common, data, [_network_line(data)])
+        return
+    if given is None:
+        raise AmiwarpError(f"{out}: --calibration is missing; give a calibration file, or a network by --network")
     work = Reconstruction(
-        open_recording(recording), Calibration.load(calibration), camera_rotation=window.camera_rotation(),
-        fill=picture.fill, device=device,
-    )  # fmt: skip
-    start, length = window.span(work, video=video)
+        open_recording(recording), given, camera_rotation=window.camera_rotation(), fill=picture.fill, device=device
+    )
+    start, length = window.span(work.recording, work.turn_us, video=video)
     began = time.perf_counter()
     with progress("reconstructing") as advance:
         if video:
@@ -711,6 +758,78 @@ def _reconstructed_line(d: dict[str, Any]) -> str:
     if "fps" in d:
         return f"{d['file']}: {d['frames']} frames of {window} at {d['fps']:g}/s, {speed}"
     return f"{d['file']}: {window}, {speed}; {100.0 * d['known']:.0f} % of the picture determined by events"
+
+
+EARLIER_WINDOWS = 24
+"""Largest number of windows before a picture's from which a network has its states."""
+
+
+def _by_network(
+    recording: Recording, calibration: Calibration | None, out: Path, window: WindowOptions, picture: PictureOptions,
+    by: NetworkOptions, device: str,
+) -> dict[str, Any]:  # fmt: skip
+    """Write a picture or a video that a network makes, and return the facts about it."""
+    from amiwarp.compensation.recordings import check_size
+    from amiwarp.events.encoder import turn_between
+    from amiwarp.imaging.networks import Network
+    from amiwarp.imaging.tensors import ToTensor, Windows, voxel_grid
+    from amiwarp.reconstruction.picture import VIDEO, save_network_picture, save_network_video
+
+    if picture.mask is not None or picture.fill is not Fill.SMOOTH or window.omega is not None:
+        raise AmiwarpError("--mask, --fill and --omega apply to the solver; leave them out with --network")
+    events = recording.events
+    if not len(events):
+        raise AmiwarpError(f"{recording.name}: has no events; give a recording with events")
+    assert by.network is not None
+    network = Network(
+        by.network, ToTensor(voxel_grid, bins=by.bins, normalize=True), multiple=by.multiple, device=device
+    )
+    optic: dict[str, Any] = {}
+    encoder = recording.encoder
+    if calibration is not None:
+        check_size(calibration, events.size, recording.name)
+        encoder = calibration.encoder_for(encoder, events.t_first, events.t_last)
+        optic = {"model": calibration.model, "encoder": encoder}
+    turn_us = None if encoder is None else turn_between(encoder, events.t_first, events.t_last)
+    video, fps = out.suffix.lower() == VIDEO, window.fps or 25.0
+    if video and window.length is None and window.turns is None:
+        window = replace(window, length=1.0 / fps)
+    start, length = window.span(recording, turn_us, video=video)
+    if video:
+        count = max(1, math.floor((events.t_last + 1 - start - length) * fps / 1e6) + 1)
+        starts = start + np.rint(np.arange(count) * (1e6 / fps)).astype(np.int64)
+    else:
+        earlier = min(EARLIER_WINDOWS, (start - events.t_first) // length)
+        starts = start - length * np.arange(earlier, -1, -1, dtype=np.int64)
+    first, after = (np.array([events.find(int(t)) for t in times]) for times in (starts, starts + length))
+    cut = Windows(first, after, starts, starts + length)
+    with progress("reconstructing") as advance:
+
+        def images() -> Iterator[Any]:
+            for k, image in enumerate(network.over(recording, cut, **optic)):
+                if len(image) != 1:
+                    raise AmiwarpError(f"{by.network}: makes {len(image)} channels; give a network that makes pictures")
+                yield image[0]
+                advance("reconstructing", (k + 1) / len(cut))
+
+        if video:
+            save_network_video(images(), out, fps=fps, tone=picture.tone)
+        else:
+            *_, last = images()
+            save_network_picture(last, out, tone=picture.tone, bits=picture.bits)
+    facts = {"frames": len(cut), "fps": fps} if video else {"frames": 1}
+    return {
+        "start_us": start, "length_us": length, **facts, "network": str(by.network), "windows": len(cut),
+        "events": int((after - first).sum()),
+    }  # fmt: skip
+
+
+def _network_line(d: dict[str, Any]) -> str:
+    speed = f"{d['events'] / 1e6:.2f} million events in {d['seconds']:.2f} s on {d['device']} by {d['network']}"
+    window = f"{d['length_us'] / 1e3:.1f} ms"
+    if "fps" in d:
+        return f"{d['file']}: {d['frames']} frames of {window} at {d['fps']:g}/s, {speed}"
+    return f"{d['file']}: {window} after {d['windows'] - 1} earlier windows, {speed}"
 
 
 # ``amiwarp pixels``: thresholds of every pixel, hot and dead pixels.

@@ -17,6 +17,7 @@ from amiwarp.events.device_events import DeviceEvents, device_for, wait
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
 from amiwarp.imaging.tensors import ToTensor, Windows, on_device, voxel_grid
+from amiwarp.io.files import input_path
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import Model
 from amiwarp.validation import guarded, instance, whole
@@ -101,8 +102,7 @@ class Network:
         self._multiple = whole(multiple, "multiple", 1, LARGEST_MULTIPLE, " px")
         self._device = wp.get_device(device)
         ending = check_ending(file, "networks are read", ENDINGS, "export the network to TorchScript or ONNX")
-        if not file.is_file():
-            raise AmiwarpError(f"{file}: no such file; give the TorchScript or ONNX file of a network")
+        input_path(file)
         self._file = _OnnxFile(file, self._device) if ending == ".onnx" else _TorchFile(file, self._device)
         self._first = None if states is None else [_as_array(state, self._device, "a state") for state in states]
         if self._first is not None and len(self._first) != self._file.extra:

@@ -163,6 +163,25 @@ def settled_span(source: EventSource, turn_us: float | None, length_us: int | No
     return max(first, min(first + beginning, last + 1 - length)), length
 
 
+def window_span(
+    recording: Recording, turn_us: float | None, start_us: int | None, length_us: int | None, turns: float | None
+) -> tuple[int, int]:
+    """Return start and length [us] of a time window, see :meth:`Reconstruction.span`. ``turn_us``: as above."""
+    first, last = recording.events.t_first, recording.events.t_last
+    if turns is not None:
+        if length_us is not None:
+            raise AmiwarpError("turns and length_us are both given; give one of them")
+        if turn_us is None:
+            raise AmiwarpError("turns is given, but the prism does not turn; give a length")
+        length_us = round(turns * turn_us)
+    settled, length = settled_span(recording.events, turn_us, length_us)
+    start = settled if start_us is None else start_us
+    if length < 1 or start > last or start + length <= first:
+        where = f"{start} .. {start + length} us"
+        raise AmiwarpError(f"{recording.name}: no events in {where}; give a window that overlaps {first} .. {last} us")
+    return start, length
+
+
 def map_tile(model: Model, camera_rotation: CameraRotation, length_us: int) -> tuple[int, int, Tiles]:
     """Return the map's margin left of and above the image (columns, rows), and the map of all that pixels see.
 
@@ -450,21 +469,7 @@ class Reconstruction:
         AmiwarpError
             If the window has no events, or both lengths are given, or ``turns`` is given and the prism does not turn.
         """
-        first, last = self.recording.events.t_first, self.recording.events.t_last
-        if turns is not None:
-            if length_us is not None:
-                raise AmiwarpError("turns and length_us are both given; give one of them")
-            if self.turn_us is None:
-                raise AmiwarpError("turns is given, but the prism does not turn; give a length")
-            length_us = round(turns * self.turn_us)
-        settled, length = settled_span(self.recording.events, self.turn_us, length_us)
-        start = settled if start_us is None else start_us
-        if length < 1 or start > last or start + length <= first:
-            where = f"{start} .. {start + length} us"
-            raise AmiwarpError(
-                f"{self.recording.name}: no events in {where}; give a window that overlaps {first} .. {last} us"
-            )
-        return start, length
+        return window_span(self.recording, self.turn_us, start_us, length_us, turns)
 
     def window(self, start_us: int, length_us: int, *, last: Picture | None = None) -> Picture:
         """Reconstruct the picture of one time window.
@@ -755,16 +760,37 @@ def save_picture(
 
     A .npy file holds the natural log intensity, float32, NaN where it is not filled.
     """
+    _save_still(path, bits, array=lambda: contrast * picture.log, grey=lambda: tones(picture, tone, contrast=contrast))
+
+
+def save_network_picture(image: NDArray[np.float32], path: Path, *, tone: Tone = Tone.MAPPED, bits: int = 8) -> None:
+    """Write the picture of a network, shape (height, width), as .png, .tif or .npy, which holds its values."""
+    _save_still(path, bits, array=lambda: image, grey=lambda: _network_tones(image, tone, _network_limits(image)))
+
+
+def _save_still(path: Path, bits: int, *, array: Callable[[], Any], grey: Callable[[], NDArray[np.float32]]) -> None:
+    """Write a picture: ``array`` as .npy, or the pixel values 0 .. 1 of ``grey`` as .png or .tif."""
     check_path(path, STILL_SUFFIXES)
-    tone = choice(Tone, tone, "tone")
     if bits not in (8, 16):
         raise AmiwarpError(f"{path}: {bits} bits per pixel; expected 8 or 16")
     ending = path.suffix.lower()
     if ending == ".npy":
         with NewFile(path) as new, open(new.part, "wb") as file:
-            np.save(file, (contrast * picture.log).astype(np.float32))
+            np.save(file, array().astype(np.float32))
         return
-    save_grey(tones(picture, tone, contrast=contrast), path, bits=bits if ending == ".png" else 16)
+    save_grey(grey(), path, bits=bits if ending == ".png" else 16)
+
+
+def _network_limits(image: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the values of a network's picture that are shown black and white."""
+    dark, bright = np.percentile(np.nan_to_num(image), [DARK, BRIGHT])
+    return float(dark), float(bright)
+
+
+def _network_tones(image: NDArray[np.float32], tone: Tone, between: tuple[float, float]) -> NDArray[np.float32]:
+    """Return a network's picture as pixel values 0 .. 1. Networks learn from pictures that have a gamma already."""
+    dark, bright = (0.0, 1.0) if choice(Tone, tone, "tone") is Tone.LINEAR else between
+    return np.clip((np.nan_to_num(image) - dark) / max(bright - dark, 1e-6), 0.0, 1.0).astype(np.float32)
 
 
 def save_mask(picture: Picture, path: Path) -> None:
@@ -790,16 +816,37 @@ def save_video(
 
     Black and white levels follow the scene slowly.
     """
+    return _save_steady(
+        pictures, path, fps,
+        levels=lambda picture: limits(picture, contrast),
+        grey=lambda picture, between: tones(picture, tone, contrast=contrast, between=between),
+    )  # fmt: skip
+
+
+def save_network_video(
+    images: Iterable[NDArray[np.float32]], path: Path, *, fps: float, tone: Tone = Tone.MAPPED
+) -> int:
+    """Write the pictures of a network as :func:`save_video` does, and return their number."""
+    return _save_steady(
+        images, path, fps, levels=_network_limits, grey=lambda image, between: _network_tones(image, tone, between)
+    )
+
+
+def _save_steady(
+    pictures: Iterable[Any], path: Path, fps: float, *, levels: Callable[[Any], tuple[float, float]],
+    grey: Callable[[Any, tuple[float, float]], NDArray[np.float32]],
+) -> int:  # fmt: skip
+    """Write pictures as video, by functions of a picture's black and white levels, and of its values between them."""
 
     def frames() -> Iterator[NDArray[np.uint8]]:
         between: tuple[float, float] | None = None
         for picture in pictures:
-            dark, bright = limits(picture, contrast)
+            dark, bright = levels(picture)
             if between is not None:
                 dark = between[0] + LIMITS_UPDATE * (dark - between[0])
                 bright = between[1] + LIMITS_UPDATE * (bright - between[1])
             between = (dark, bright)
-            yield np.rint(255.0 * tones(picture, tone, contrast=contrast, between=between)).astype(np.uint8)
+            yield np.rint(255.0 * grey(picture, between)).astype(np.uint8)
 
     return save_film(frames(), path, fps=fps)
 
