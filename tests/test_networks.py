@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -45,6 +46,7 @@ from amiwarp import (
 )
 from amiwarp.cli.app import app
 from amiwarp.events.device_events import DeviceMemoryEvents
+from amiwarp.imaging import networks
 
 WIDTH, HEIGHT, BINS = 37, 22, 3
 RNG = np.random.default_rng(5)
@@ -344,6 +346,19 @@ def test_a_missing_package_is_named(
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(AmiwarpError, match=re.escape(f"pip install '{extra}'")):
         Network(tmp_path / name)
+
+
+@pytest.mark.parametrize(("name", "said"), [
+    ("Half.pt", "PyTorch has no CUDA here"), ("n.onnx", "onnxruntime has no CUDA here; install onnxruntime-gpu"),
+])  # fmt: skip
+def test_a_package_without_cuda_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, said: str) -> None:
+    torch = pytest.importorskip("torch")
+    make(tmp_path, name)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    kind = networks._TorchFile if name.endswith(".pt") else networks._OnnxFile
+    with pytest.raises(AmiwarpError, match=said):
+        kind(tmp_path / name, SimpleNamespace(is_cuda=True, ordinal=0))
 
 
 # The command ``amiwarp reconstruct --network``.
