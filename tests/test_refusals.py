@@ -22,7 +22,7 @@ from amiwarp import (
 )
 from amiwarp.calib.calibration import prepare
 from amiwarp.calib.checks import check_pulses, check_texture
-from amiwarp.calib.first_guess import encoder_turns_per_period
+from amiwarp.calib.first_guess import _period, encoder_turns_per_period
 from amiwarp.calib.model_choice import LARGEST_MOTION_PX, in_pixels
 from amiwarp.calib.photometric.stage import judge_optimum
 from amiwarp.cli.common import interval, number
@@ -244,3 +244,10 @@ def test_bounds_that_are_none() -> None:
     for text in ("1:4", "1deg:4", "4deg", ":4deg", "nan:4deg", "0:infdeg"):
         with pytest.raises(AmiwarpError, match="--bound apex: "):
             interval(text, "rad", "--bound apex")
+
+
+def test_a_correlation_without_a_second_peak_keeps_the_first_period() -> None:
+    lag = np.arange(200.0)
+    falling = 0.6 - 1e-3 * lag - 1e-7 * lag**2  # no peak, and a parabola whose top is far away
+    correlation = falling + 0.4 * np.exp(-(((lag - 20.3) / 2.0) ** 2))
+    assert _period(correlation, "recording") == pytest.approx(20.3, rel=0.25)

@@ -134,13 +134,16 @@ def _first_period(correlation: NDArray[np.float64], name: str, mover: str, least
 
 
 def _peak_near(correlation: NDArray[np.float64], lag: float, reach: float) -> float:
-    """Return the lag of the largest correlation within ``reach`` bins of ``lag``, refined by a parabola."""
+    """Return the lag of the largest correlation within ``reach`` bins of ``lag``, refined by a parabola.
+
+    The top of a parabola through a peak is within half a bin; at the end of the range there may be no peak.
+    """
     low = max(1, int(np.floor(lag - reach)))
     high = min(len(correlation) - 2, int(np.ceil(lag + reach)))
     k = low + int(np.argmax(correlation[low : high + 1]))
     before, here, after = correlation[k - 1 : k + 2]
     bend = before - 2.0 * here + after
-    return float(k + (0.5 * (before - after) / bend if bend < 0.0 else 0.0))
+    return float(k + np.clip(0.5 * (before - after) / bend, -0.5, 0.5) if bend < 0.0 else k)
 
 
 # Time at which the camera is calmest: there the events of one turn repeat those of the turn before.
