@@ -168,7 +168,13 @@ def distance(found: amiwarp.Calibration, shake: amiwarp.Vibration) -> float:
 
 @pytest.fixture(scope="module")
 def calibrated(shaken: amiwarp.Recording) -> amiwarp.Calibration:
-    return amiwarp.calibrate(shaken, model="vibration", events=100_000)
+    prompt = amiwarp.PhotometricSettings(sensor=amiwarp.SensorTiming(refractory_us=1.0))
+    return amiwarp.calibrate(shaken, model="vibration", events=100_000, photometric=prompt)
+
+
+def test_an_unknown_refractory_period_is_refused_with_the_remedy(shaken: amiwarp.Recording) -> None:
+    with pytest.raises(amiwarp.AmiwarpError, match=r"within 0\.0\d+ px only.*give the sensor's refractory period"):
+        amiwarp.calibrate(shaken, model="vibration", events=100_000)
 
 
 def test_it_is_calibrated_without_start_values(calibrated: amiwarp.Calibration) -> None:
