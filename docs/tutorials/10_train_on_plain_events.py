@@ -2,11 +2,11 @@
 Train a network on the events of a plain camera
 ===============================================
 
-No prism is needed to train on simulated events. This tutorial makes a data set of an
-ordinary event camera that turns in one of six ways, turns the events into voxel
-grids, and trains a small network of PyTorch to tell how the camera moves. Then it
-trains the same network on plain counts of events, which lack the order in time. It
-needs ``pip install 'amiwarp[dataset,torch]'``.
+No prism is needed to train on simulated events. This tutorial makes a data set of
+an ordinary event camera that turns in one of six ways, makes voxel grids of the
+events, and trains a small network of PyTorch to tell how the camera moves. Then it
+trains the same network on counts of events, which lack the order in time. It needs
+``pip install 'amiwarp[dataset,torch]'``.
 
 A data set without a prism
 --------------------------
@@ -44,12 +44,13 @@ for name in CLASSES:
         picture = np.full((96, 96), 110, np.uint8)
         for _ in range(14):
             row, column, size = rng.integers([0, 0, 8], [90, 90, 30])
-            picture[row : row + size, column : column + size] = rng.integers(20, 250)
+            square = np.s_[row : row + size, column : column + size]
+            picture[square] = rng.integers(20, 250)
         Image.fromarray(picture).save(folder / "pictures" / name / f"{k:02}.png")
 
 # %%
-# ``no_prism = true`` makes recordings of an ordinary event camera. A still camera in
-# front of a still picture would see only noise, so ``rotate_deg_s`` turns it.
+# ``no_prism = true`` makes recordings of an ordinary event camera. A still camera
+# in front of a still picture would see only noise, so ``rotate_deg_s`` turns it.
 # ``stratify`` divides the pictures of each class in the same way, so that each
 # split has all classes.
 
@@ -85,8 +86,8 @@ print(f"{done.made} recordings, {done.events:,} events")
 #
 # :class:`amiwarp.RecordedDataset` is a data set for the ``DataLoader`` of PyTorch.
 # :func:`amiwarp.collate` joins the events of a batch and copies them to the device,
-# and :func:`amiwarp.voxel_grid` makes all tensors of the batch in one call. This data
-# set is small, so its tensors are made once and kept.
+# and :func:`amiwarp.voxel_grid` makes all tensors of the batch in one call. This
+# data set is small, so its tensors are made once and kept.
 # ``examples/train_from_files.py`` reads the files anew in every epoch, in worker
 # processes.
 
@@ -100,7 +101,8 @@ def tensors(split):
     loader = torch.utils.data.DataLoader(dataset, batch_size=32, collate_fn=list)
     grids, counts, classes = [], [], []
     for batch in loader:
-        events, windows = amiwarp.collate([found for found, _ in batch], device=device)
+        blocks = [found for found, _ in batch]
+        events, windows = amiwarp.collate(blocks, device=device)
         made = amiwarp.voxel_grid(
             events, SIDE, SIDE, BINS, windows=windows, normalize=True
         )
@@ -138,8 +140,8 @@ plt.show()
 # A network
 # ---------
 #
-# Three layers of convolutions and one linear layer. So small a network is fastest on
-# one core.
+# Three layers of convolutions and one linear layer. Such a small network is fastest
+# on one core.
 
 torch.set_num_threads(1)
 
@@ -194,9 +196,10 @@ for name, inputs, test_inputs in (
     print(f"{name:11} {np.trace(table) / table.sum():.0%} of {table.sum()} right")
 
 # %%
-# Counts show along which axis the camera turned: edges across the motion make more
-# events than those along it. They cannot show the direction, because a bright square
-# that moves to the left looks like a bright or dark one that moves to the right.
+# Counts show the axis of the turn at best: edges across the motion make more events
+# than those along it. They do not show the direction: an edge that moves left
+# passes the same pixels as one that moves to the right. The network takes each turn
+# mostly for itself or for the opposite one.
 
 figure, axes = plt.subplots(1, 3, figsize=(8.0, 3.0), width_ratios=(1.2, 1, 1))
 for ax, (name, (losses, table)) in zip(axes[1:], results.items(), strict=True):
