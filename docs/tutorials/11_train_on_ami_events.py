@@ -222,7 +222,8 @@ for ax, name in zip(axes[1:], other, strict=True):
             ax.text(j, i, value, ha="center", va="center", color=colour, fontsize=8)
     ax.set_xticks(range(len(CLASSES)), CLASSES)
     ax.set_yticks(range(len(CLASSES)), CLASSES)
-    ax.set(title=f"{name}, other wedge", xlabel="found", ylabel="true")
+    ax.set(xlabel="found", ylabel="true")
+    ax.set_title(f"{name}, other wedge", fontsize=9)
 plt.show()
 
 assert (

@@ -1,0 +1,183 @@
+"""Train a network from event files, and measure the share of the time in which it waits for its batches.
+
+Worker processes read events and cut windows. A thread copies the events of a batch to the device and makes voxel grids
+there, while the network trains on the batch before. ``--data`` takes a folder that ``amiwarp dataset`` wrote, with the
+label ``class``; by default, recordings of moving gratings are made first. Needs ``pip install 'amiwarp[torch]'``.
+
+On a GPU: ``python examples/train_from_files.py --device cuda:0 --recordings 512 --batch 8 --epochs 4``
+"""
+
+import argparse
+import json
+import math
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+import amiwarp
+
+BINS, WINDOW_US = 5, 25_000
+SIDE, DIRECTIONS, DURATION_US, STEP_US, AT_ONCE = 128, 4, 204_000, 2_000, 16  # of the recordings that are made
+
+
+def make_data(folder: Path, recordings: int, device: str) -> None:
+    """Write recordings of plain cameras, each of which sees a grating that moves in one of several directions."""
+    items = []
+    y, x = torch.meshgrid(*2 * [torch.arange(SIDE, device=device, dtype=torch.float32)], indexing="ij")
+    for first in range(0, recordings, AT_ONCE):
+        n = min(AT_ONCE, recordings - first)
+        random = torch.rand((4, n, 1, 1), generator=torch.Generator().manual_seed(first)).to(device)
+        labels = [k % DIRECTIONS for k in range(first, first + n)]
+        angle = (torch.tensor(labels, device=device)[:, None, None] + 0.4 * random[0] - 0.2) * (math.tau / DIRECTIONS)
+        length, contrast, speed = 8.0 + 24.0 * random[1], 0.2 + 0.25 * random[2], 0.1 + 0.2 * random[3]  # px, 1, px/ms
+        sensor = amiwarp.EventSensor(
+            n, SIDE, SIDE, amiwarp.SensorModel.preset("davis346"), seed=list(range(first, first + n)), device=device
+        )
+        parts: list[list[amiwarp.Events]] = [[] for _ in range(n)]
+        for t_us in range(0, DURATION_US + 1, STEP_US):
+            place = x * torch.cos(angle) + y * torch.sin(angle) - speed * (1e-3 * t_us)
+            luminance = 0.5 + contrast * torch.sin(place * (math.tau / length))
+            events, cameras = sensor.step(torch.log(luminance + 0.02), t_us)
+            host = events.to_host()
+            for part, start, stop in zip(parts, cameras.start.tolist(), cameras.stop.tolist(), strict=True):
+                part.append(host[start:stop])
+        for k, (part, label) in enumerate(zip(parts, labels, strict=True), first):
+            found = amiwarp.Events.concatenate(part)
+            amiwarp.save_recording(folder / f"{k}.h5", amiwarp.Recording(amiwarp.MemoryEvents(found, SIDE, SIDE)))
+            items.append({"file": f"{k}.h5", "split": "train", "labels": {"class": label}, "events": len(found)})
+    manifest = {"format": "amiwarp-dataset", "version": 1, "items": items}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+def cut(recording: amiwarp.Recording, labels: dict[str, Any]) -> tuple[list[amiwarp.Events], Any, tuple[int, int]]:
+    """Return the events of all windows of a recording, its class, and the size of its sensor.
+
+    Opening a file takes longer than reading a window, so every window of an opened file is used.
+    """
+    events = recording.events[:]
+    windows = amiwarp.windows(events, duration_us=WINDOW_US)
+    blocks = [events[start:stop] for start, stop in zip(windows.start.tolist(), windows.stop.tolist(), strict=True)]
+    return blocks, labels["class"], recording.events.size
+
+
+def join(items: list[Any]) -> tuple[list[torch.Tensor], amiwarp.Windows, list[Any]]:
+    """Return the events of several recordings, their windows, and the class of each window, in a worker process.
+
+    PyTorch passes its tensors to the main process in shared memory, without a copy.
+    """
+    events, windows = amiwarp.collate([block for blocks, _, _ in items for block in blocks])
+    classes = [label for blocks, label, _ in items for _ in blocks]
+    return [torch.from_numpy(getattr(events, name)) for name in ("x", "y", "t", "p")], windows, classes
+
+
+class Block(nn.Module):
+    """Residual block of two convolutions."""
+
+    def __init__(self, before: int, after: int, stride: int = 1) -> None:
+        super().__init__()
+        self.body = nn.Sequential(
+            nn.Conv2d(before, after, 3, stride, 1, bias=False), nn.BatchNorm2d(after), nn.ReLU(),
+            nn.Conv2d(after, after, 3, 1, 1, bias=False), nn.BatchNorm2d(after),
+        )  # fmt: skip
+        same = before == after and stride == 1
+        self.skip = nn.Identity() if same else nn.Conv2d(before, after, 1, stride, bias=False)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the output of the block."""
+        return torch.relu(self.body(x) + self.skip(x))
+
+
+def make_network(classes: int) -> nn.Module:
+    """Return a residual network of 1.1 million parameters."""
+    return nn.Sequential(
+        nn.Conv2d(BINS, 32, 7, 2, 3, bias=False), nn.BatchNorm2d(32), nn.ReLU(), Block(32, 32), Block(32, 32),
+        Block(32, 64, 2), Block(64, 64), Block(64, 128, 2), Block(128, 128), Block(128, 160, 2),
+        nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(160, classes),
+    )  # fmt: skip
+
+
+def prepared(batches: Iterator[Any], names: list[Any], size: tuple[int, int], device: str) -> Iterator[Any]:
+    """Return an iterator over voxel grids and classes on the device. A thread makes the next ones meanwhile."""
+
+    def make() -> tuple[torch.Tensor, torch.Tensor] | None:
+        batch = next(batches, None)
+        if batch is None:
+            return None
+        columns, windows, classes = batch
+        events, _ = amiwarp.collate([amiwarp.Events(*(column.numpy() for column in columns))], device=device)
+        grids = amiwarp.voxel_grid(events, *size, BINS, windows=windows, normalize=True, device=device)
+        return torch.from_dlpack(grids), torch.tensor([names.index(c) for c in classes], device=device)
+
+    with ThreadPoolExecutor(1) as thread:
+        following = thread.submit(make)
+        while (batch := following.result()) is not None:
+            following = thread.submit(make)
+            yield batch
+
+
+def main() -> None:
+    """Train, and print the share of the time after the first epoch in which the network waited."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--data", type=Path, help="folder of a data set; by default one is made")
+    parser.add_argument("--recordings", type=int, default=2, help="number of recordings to make")
+    parser.add_argument("--batch", type=int, default=1, help="recordings in a batch")
+    parser.add_argument("--epochs", type=int, default=2, help="epochs; the first one is not measured")
+    parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 1) - 2), help="reading processes")
+    parser.add_argument("--device", default="cuda:0" if torch.cuda.is_available() else "cpu")
+    given = parser.parse_args()
+    if given.epochs < 2:
+        parser.error(f"--epochs is {given.epochs}; give at least 2, because the first one is not measured")
+    with tempfile.TemporaryDirectory() as made:
+        if given.data is None:
+            make_data(Path(made), given.recordings, given.device)
+        train(given.data or Path(made), given)
+
+
+def train(folder: Path, given: argparse.Namespace) -> None:
+    """Train on a data set."""
+    dataset = amiwarp.RecordedDataset(folder, split="train", transform=cut)
+    names = sorted({labels["class"] for labels in dataset.labels})
+    size = dataset[0][2]
+    # One pass over the loader for all epochs, so that the workers go on reading from one epoch to the next.
+    epoch = max(1, len(dataset) // given.batch)  # batches
+    torch.manual_seed(0)
+    order = torch.utils.data.RandomSampler(dataset, num_samples=given.epochs * epoch * given.batch)
+    loader = torch.utils.data.DataLoader(
+        dataset, given.batch, sampler=order, collate_fn=join, num_workers=given.workers,
+        multiprocessing_context="spawn" if given.workers else None,
+    )  # fmt: skip
+    network = make_network(len(names)).to(given.device)
+    optimiser = torch.optim.Adam(network.parameters(), 1e-3)
+    # On a stream of its own, the network does not wait for the copies and tensors that the thread makes.
+    stream = torch.cuda.Stream(given.device) if given.device.startswith("cuda") else None
+    waited, windows, losses = 0.0, 0, []
+    begun = start = time.perf_counter()
+    with torch.cuda.stream(stream):
+        for step, (grids, classes) in enumerate(prepared(iter(loader), names, size, given.device)):
+            waited += time.perf_counter() - start
+            loss = nn.functional.cross_entropy(network(grids), classes)
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            losses.append(loss.item())  # waits for the network, so that its time does not count as waiting for data
+            windows += len(grids)
+            start = time.perf_counter()
+            if step + 1 == epoch:
+                begun, waited, windows = start, 0.0, 0
+    total = start - begun
+    print(f"{sum(p.numel() for p in network.parameters()) / 1e6:.2f} million parameters, {size[0]}x{size[1]} px")
+    first, last = (sum(part) / len(part) for part in (losses[:epoch], losses[-epoch:]))
+    print(f"mean loss {first:.2f} in the first epoch, {last:.2f} in the last one")
+    print(f"{windows} windows in {total:.2f} s on {given.device}, {windows / total:.3g} per second")
+    print(f"waiting for data: {waited / total:.2%} of the time, {1e3 * waited / (len(losses) - epoch):.2f} ms a batch")
+
+
+if __name__ == "__main__":
+    main()
