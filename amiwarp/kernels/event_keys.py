@@ -179,6 +179,14 @@ class Bus:
     origin: wp.int64  # time from which picoseconds are counted [us]
 
 
+@wp.func
+def transmission(bus: Bus, now: wp.int64, until: wp.int64) -> wp.int64:
+    """Return the time at which a bus that is busy ``until`` transmits an event of time ``now`` [ps], or -1 if lost."""
+    if until - now > bus.longest_ps:
+        return wp.int64(-1)
+    return wp.max(until, now)
+
+
 @wp.kernel
 def queue_events(
     bus: Bus,
@@ -198,14 +206,60 @@ def queue_events(
     for i in range(first[sensor], first[sensor + 1]):
         now = (t[i] - bus.origin) * PS_PER_US
         stamp[i] = wp.int64(-1)
-        if until - now <= bus.longest_ps:
-            begin = wp.max(until, now)
+        begin = transmission(bus, now, until)
+        if begin >= wp.int64(0):
             stamp[i] = begin / PS_PER_US + bus.origin
             if bus.rows > 0 and i > first[sensor]:
                 if t[i - 1] == t[i] and row[i - 1] == row[i] and stamp[i - 1] >= wp.int64(0):
                     stamp[i] = stamp[i - 1]
             until = begin + bus.event_ps
     free[sensor] = until
+
+
+@wp.kernel
+def queue_keys(
+    bus: Bus,
+    shift: int,
+    width: int,
+    origin: wp.int64,
+    duration: wp.int64,
+    keys: wp.array(dtype=wp.int64),
+    free: wp.array(dtype=wp.int64),
+    stamp: wp.array(dtype=wp.int64),
+    kept: wp.array(dtype=int),
+):
+    """Transmit the events of one sensor in order, as :func:`queue_events` does, given as ``keys``; one thread.
+
+    ``keys`` and ``stamp`` keep the events that are transmitted before ``duration`` [us]; ``kept`` is their number.
+    ``shift``: bit position of the time in a key; ``width``: width of the sensor [px]; ``origin``: time from which the
+    times of keys are counted [us].
+    """
+    until = free[0]
+    n = int(0)
+    t_before = wp.int64(-1)
+    row_before = wp.int64(-1)
+    stamp_before = wp.int64(-1)
+    for i in range(keys.shape[0]):
+        key = keys[i]
+        t = key >> wp.int64(shift)
+        begin = transmission(bus, (t + origin) * PS_PER_US, until)
+        at = wp.int64(-1)
+        if begin >= wp.int64(0):
+            at = begin / PS_PER_US
+            until = begin + bus.event_ps
+        if bus.rows > 0:
+            row = ((key - (t << wp.int64(shift))) >> wp.int64(LOW_BITS)) / wp.int64(width)
+            if at >= wp.int64(0) and t == t_before and row == row_before and stamp_before >= wp.int64(0):
+                at = stamp_before
+            t_before = t
+            row_before = row
+            stamp_before = at
+        if at >= wp.int64(0) and at < duration:
+            keys[n] = key
+            stamp[n] = at
+            n += 1
+    free[0] = until
+    kept[0] = n
 
 
 # Events of many cameras: sorted by camera, then by time.

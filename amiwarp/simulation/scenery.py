@@ -205,15 +205,17 @@ def seen_bearings(simulation: SimulationValues) -> NDArray[np.float64]:
         [np.stack([x * right, y * bottom], 1) for x, y in ((along, zero), (along, one), (zero, along), (one, along))]
     )
     border = np.round(border)
-    turn = np.arange(24) * (2.0 * np.pi / 24)
-    others = turn if simulation.motion.second is not None else np.zeros(1)
+    motion, moved = simulation.motion, simulation.prism if isinstance(simulation.prism, Moved) else None
+    turns = moved is not None or simulation.glass.apex > 0.0 or any(motion.cylinder) or motion.second is not None
+    turn = np.arange(24) * (2.0 * np.pi / 24) if turns else np.zeros(1)
+    others = turn if motion.second is not None else np.zeros(1)
     theta = np.stack([m.ravel() for m in np.meshgrid(turn, others)], axis=1)
-    if isinstance(simulation.prism, Moved):
+    if moved is not None:
         rays = np.asarray(camera.pixels_to_rays(border), np.float64)
         rays = rays[np.isfinite(rays).all(axis=1)]
-        model = simulation.prism.model(camera)
-        shakes = mirrored(simulation) @ model.rotations(theta if model.ANGLES > 1 else theta[:, 0])
-        return np.concatenate([rays @ turned.T for turned in shakes])
+        model = moved.model(camera)
+        turned = mirrored(simulation) @ model.rotations(theta if model.ANGLES > 1 else theta[:, 0])
+        return np.concatenate([rays @ each.T for each in turned])
     xy = wp.array(np.repeat(border, len(theta), axis=0).astype(np.float32), dtype=wp.vec2, device=device)
     angles = wp.array(np.tile(theta.astype(np.float32), (len(border), 1)), dtype=wp.vec2, device=device)
     out = wp.empty(len(xy), dtype=wp.vec3, device=device)
@@ -221,6 +223,10 @@ def seen_bearings(simulation: SimulationValues) -> NDArray[np.float64]:
     launch(prism_view.scene_bearings, len(xy), inputs, [out], device=device)
     bearings = out.numpy().astype(np.float64)
     return np.asarray(bearings[np.isfinite(bearings).all(axis=1)])
+
+
+ORIENTATIONS = 25
+"""Number of orientations of the camera for which :func:`place_scene` turns all directions at a time."""
 
 
 def place_scene(simulation: SimulationValues) -> Placement:
@@ -232,17 +238,19 @@ def place_scene(simulation: SimulationValues) -> Placement:
     if not len(bearings):
         raise AmiwarpError("no pixel at the image's border has a valid ray; check the distortion and the prism")
     duration = simulation.duration_s
-    at = simulation.camera_motion.orientation(duration)(np.linspace(0.0, duration, 400))
+    orientations = simulation.camera_motion.orientation(duration)(np.linspace(0.0, duration, 400))
+    if not simulation.camera_motion.largest_rates.any():
+        orientations = orientations[:1]
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for orientation in at if simulation.camera_motion.largest_rates.any() else at[:1]:
-        x, y, z = orientation @ bearings.T
+    for some in np.array_split(orientations, -(-len(orientations) // ORIENTATIONS)):
+        x, y, z = np.moveaxis(some @ bearings.T, 1, 0)
         if z.min() < SMALLEST_COSINE:
             angle = math.degrees(math.acos(max(-1.0, float(z.min()))))
             limit = math.degrees(math.acos(SMALLEST_COSINE))
             raise AmiwarpError(f"the camera looks up to {angle:.0f} deg away from the picture's centre; the limit is "
                                f"{limit:.0f} deg; turn the camera less far, or narrow its field of view")  # fmt: skip
         plane = np.stack([x / z, y / z])
-        low, high = np.minimum(low, plane.min(axis=1)), np.maximum(high, plane.max(axis=1))
+        low, high = np.minimum(low, plane.min(axis=(1, 2))), np.maximum(high, plane.max(axis=(1, 2)))
     focal = max(simulation.camera.fx, simulation.camera.fy)
     margin = 2.0 / focal
     view = (*(low - margin).tolist(), *(high + margin).tolist())

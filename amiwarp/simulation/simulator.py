@@ -516,25 +516,31 @@ class Readout:
         if self.scans_rows:
             of_pixel = values >> int(pixels.LOW_BITS)
             values = values[np.diff(of_pixel, prepend=of_pixel[0] - 1) != 0]
-        stamps = None
-        if self.limits_rate:
-            stamp = self._transmit(values, shift, origin_us)
-            kept = (stamp >= 0) & (stamp < self._duration_us)
-            values = values[kept]
-            stamps = wp.array(stamp[kept], dtype=wp.int64, device=self._device)
-        return wp.array(values, dtype=wp.int64, device=self._device), stamps
+        if not self.limits_rate:
+            return wp.array(values, dtype=wp.int64, device=self._device), None
+        values, stamps = self._transmit(values, shift, origin_us)
+        copy = not self._device.is_cpu
+        return (
+            wp.array(values, dtype=wp.int64, device=self._device, copy=copy),
+            wp.array(stamps, dtype=wp.int64, device=self._device, copy=copy),
+        )
 
-    def _transmit(self, keys: NDArray[np.int64], shift: int, origin_us: int) -> NDArray[np.int64]:
-        """Return the time at which the bus transmits each event [us]; -1 for events that do not fit into the queue."""
-        t = keys >> shift
-        row = (((keys - (t << shift)) >> int(pixels.LOW_BITS)) // self._width).astype(np.uint16)
-        stamp = wp.empty(len(keys), dtype=wp.int64, device="cpu")
-        arrays = [wp.array(t + origin_us, dtype=wp.int64, device="cpu"), wp.array(row, dtype=wp.uint16, device="cpu")]
-        first = wp.array([0, len(keys)], dtype=int, device="cpu")
-        launch.load(event_keys.queue_events, wp.get_device("cpu"))
-        wp.launch(event_keys.queue_events, dim=1, inputs=[self._bus, *arrays, first, self._free], outputs=[stamp],
-                  device="cpu")  # fmt: skip
-        return np.asarray(stamp.numpy())
+    def _transmit(
+        self, keys: NDArray[np.int64], shift: int, origin_us: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the keys of the events that the bus transmits, and the times at which it does [us].
+
+        The memory of ``keys`` is overwritten. Events that do not fit into the queue, or leave it after the end of the
+        recording, are left out.
+        """
+        host = wp.get_device("cpu")
+        stamp, kept = wp.empty(len(keys), dtype=wp.int64, device=host), wp.zeros(1, dtype=int, device=host)
+        launch.load(event_keys.queue_keys, host)
+        inputs = [self._bus, shift, self._width, origin_us, self._duration_us]
+        outputs = [wp.array(keys, dtype=wp.int64, device=host, copy=False), self._free, stamp, kept]
+        wp.launch(event_keys.queue_keys, dim=1, inputs=inputs, outputs=outputs, device=host)
+        n = int(kept.numpy()[0])
+        return keys[:n], stamp.numpy()[:n]
 
 
 # Engine of the event simulator: tables on the host, kernel launches, sorting of events.
