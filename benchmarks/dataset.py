@@ -1,13 +1,15 @@
-"""Speed of data sets in bulk, with the checksums of all recordings compared between numbers of workers.
+"""Speed of data sets in bulk, of recordings and of tensors, with the answers compared in the same run.
 
     python -m benchmarks.dataset [--device cuda] [--items 400] [--limit-s 240] [--folder FOLDER] [--out FILE.json]
 
-Each row makes the same recordings of random pictures in a new folder, with another number of workers. Its speed is
-that after each worker has made its second recording, so that start and compilation do not count. ``--device cuda``
-compares one GPU with all GPUs of the machine, with one and with several workers each. ``stages`` says what one
-recording spends its time on. ``plan`` computes 100,000 recordings on 16 GPUs, or on 32 CPU cores. Without pyarrow the
-tables are left out. Writes benchmarks/results/dataset_cpu.json or dataset_cuda.json. The exit status is 1 if a
-recording differs.
+Each row makes the same recordings of random pictures in a new folder, with another number of workers: ``recordings``
+writes them, ``voxel_grid`` writes a voxel grid of 5 bins for each, by the table ``output`` of the specification. The
+two alternate. The checksums of all files are compared between numbers of workers, and tensors with those computed from
+the events of the recordings, bit for bit. The speed of a row is that after each worker has made its second recording,
+so that start and compilation do not count. ``--device cuda`` compares one GPU with all GPUs of the machine, with one
+and with several workers each. ``stages`` says what one recording spends its time on. ``plan`` computes 100,000
+recordings on 16 GPUs, or on 32 CPU cores. Without pyarrow the tables are left out. Writes
+benchmarks/results/dataset_cpu.json or dataset_cuda.json. The exit status is 1 if a file differs.
 """
 
 from __future__ import annotations
@@ -30,13 +32,13 @@ import numpy as np
 import warp as wp
 from PIL import Image
 
-from amiwarp import DatasetSummary, make_dataset
+from amiwarp import DatasetSummary, ToTensor, make_dataset, open_recording, voxel_grid
 from amiwarp.io.json_files import read_journal
 from amiwarp.kernels.launch import start_quietly
 from amiwarp.simulation.simulator import Engine
 from amiwarp.studies.cluster import ANY_GPU, machine, threads_of_worker, versions
 from amiwarp.studies.dataset import making
-from amiwarp.studies.dataset.making import Item, list_items, simulation_of
+from amiwarp.studies.dataset.making import Item, list_items, simulation_of, write_recording
 from amiwarp.studies.dataset.specification import content_digest, load_specification
 from amiwarp.tasks import cpu_threads, limited_cpu_threads
 
@@ -50,9 +52,14 @@ speeds_rpm = [720.0, 1440.0]
 sensors = ["davis346"]
 seeds = {seeds}
 camera = {{size = [320, 240], fov_deg = 60.0}}
+{output}
 [[sources]]
 {source}
 """
+OUTPUTS = {"recordings": "", "voxel_grid": 'output = {representation = "voxel_grid", bins = 5}'}
+"""What is written, and the line of the specification that says so."""
+CHECKED = 20
+"""Number of recordings whose tensors are computed from their events, for comparison."""
 PICTURES = 5
 """Number of pictures; with two prisms and two speeds, each seed adds 20 recordings."""
 DURATION_S = {"cpu": 0.05, "cuda": 0.3}
@@ -64,17 +71,22 @@ SMI = ("nvidia-smi", "--query-gpu=utilization.gpu", "--format=csv,noheader,nouni
 
 
 def write_inputs(folder: Path, seeds: int, duration: float) -> dict[str, Path]:
-    """Write pictures of random blocks and two specifications: of the pictures, and of a world."""
+    """Write pictures of random blocks and specifications: of the pictures for each output, and of a world."""
     rng = np.random.default_rng(0)
     (folder / "pictures").mkdir(parents=True)
     for k in range(PICTURES):
         light = sum(np.kron(rng.integers(0, 64, (480 // n, 640 // n)), np.ones((n, n))) for n in (8, 20, 40, 80))
         Image.fromarray(np.asarray(light, np.uint8)).save(folder / "pictures" / f"{k}.png")
-    sources = {"pictures": 'pictures = "pictures/*.png"', "world": 'worlds = ["room"]'}
-    for name, source in sources.items():
-        text = SPECIFICATION.format(duration=duration, seeds=seeds if name == "pictures" else 1, source=source)
-        (folder / f"{name}.toml").write_text(text)
-    return {name: folder / f"{name}.toml" for name in sources}
+    paths = {}
+    for name, source, output in (
+        *(("pictures" if not line else name, 'pictures = "pictures/*.png"', line) for name, line in OUTPUTS.items()),
+        ("world", 'worlds = ["room"]', ""),
+    ):
+        some = 1 if name == "world" else seeds
+        text = SPECIFICATION.format(duration=duration, seeds=some, source=source, output=output)
+        paths[name] = folder / f"{name}.toml"
+        paths[name].write_text(text)
+    return paths
 
 
 class BusyMeter:
@@ -130,6 +142,19 @@ def measure(specification: Path, out: Path, device: str, workers: int) -> tuple[
     return row, {item["file"]: item["sha256"] for item in found["items"]}
 
 
+def equal_tensors(recordings: Path, tensors: Path) -> bool:
+    """Return whether tensors are those of the events of the recordings in the other folder, bit for bit."""
+    to_grid = ToTensor(voxel_grid, bins=5)
+    items = [json.loads((folder / making.MANIFEST).read_text())["items"] for folder in (recordings, tensors)]
+    events = {item["seed"]: item for item in items[0]}
+    for item in items[1][:CHECKED]:
+        expected = to_grid(open_recording(recordings / events[item["seed"]]["file"]))
+        with np.load(tensors / item["file"]) as arrays:
+            if not (arrays["tensor"].dtype == expected.dtype and np.array_equal(arrays["tensor"], expected)):
+                return False
+    return True
+
+
 def runs(device: str) -> Iterator[tuple[str, int]]:
     """Yield devices and numbers of workers. The first is the reference of the checksums."""
     if device == "cpu":
@@ -143,15 +168,23 @@ def runs(device: str) -> Iterator[tuple[str, int]]:
 
 
 def add_scaling(rows: list[dict[str, Any]]) -> None:
-    """Add the speed relative to that of one GPU with as many workers each, or to that of one worker on the CPU."""
+    """Add the speed relative to other rows.
+
+    ``scaling`` is relative to one GPU with as many workers each, or to one worker on the CPU; ``speed_up`` to writing
+    recordings with the same workers.
+    """
     for row in rows:
         each = row["workers"] // max(1, row["gpus"])
-        base = [r for r in rows if r["gpus"] <= 1 and r["workers"] == (each if row["gpus"] else 1)]
+        alike = [r for r in rows if r["output"] == row["output"]]
+        base = [r for r in alike if r["gpus"] <= 1 and r["workers"] == (each if row["gpus"] else 1)]
         row["scaling"] = row["items_per_s"] / base[0]["items_per_s"]
         if not row["gpus"]:  # what free cores would give
             row["scaling_of_processor_time"] = (
                 row["workers"] * base[0]["processor_s_per_item"] / row["processor_s_per_item"]
             )
+        same = [r for r in rows if all(r[k] == row[k] for k in ("gpus", "workers")) and r["output"] == "recordings"]
+        row["speed_up"] = row["items_per_s"] / same[0]["items_per_s"]
+        row["speed_up_by_processor_time"] = same[0]["processor_s_per_item"] / row["processor_s_per_item"]
 
 
 def stages(item: Item, folder: Path, device: str) -> dict[str, float]:
@@ -159,7 +192,7 @@ def stages(item: Item, folder: Path, device: str) -> dict[str, float]:
 
     On the CPU, it is the processor time, so that other programs do not count.
     """
-    path = folder / "stages.h5"
+    path = folder / f"stages{Path(item.file).suffix}"
     clock = time.process_time if device == "cpu" else time.perf_counter
     times: dict[str, float] = {}
     with limited_cpu_threads(threads_of_worker(device, 1)):
@@ -168,10 +201,11 @@ def stages(item: Item, folder: Path, device: str) -> dict[str, float]:
             simulation = simulation_of(item, device)
             times["prepare"] = clock() - began
             times["simulate"] = passed(simulation, device, clock, to_host=False)
-            times["copy to the host"] = passed(simulation, device, clock, to_host=True) - times["simulate"]
+            to_host = 0.0 if item.output else passed(simulation, device, clock, to_host=True) - times["simulate"]
+            times["copy to the host"] = to_host
             began = clock()
-            simulation.write(path, overwrite=True)
-            rest = clock() - began - times["simulate"] - times["copy to the host"]
+            write_recording(item, path, device)
+            rest = clock() - began - times["prepare"] - times["simulate"] - times["copy to the host"]
             times["encode and write"] = rest
             began = clock()
             content_digest(path)
@@ -197,6 +231,7 @@ def plan(rows: list[dict[str, Any]], of: list[dict[str, Any]], kind: str) -> dic
     GPUs take the speed of the fastest row with all GPUs; CPU cores the processor time of the row with most workers.
     """
     units = PLANNED_DEVICES[kind]
+    rows = [row for row in rows if row["output"] == "recordings"]
     most = max(row["gpus"] or row["workers"] for row in rows)
     best = max((row for row in rows if (row["gpus"] or row["workers"]) == most), key=lambda row: row["items_per_s"])
     rate = units * (best["items_per_s"] / best["gpus"] if best["gpus"] else 1.0 / best["processor_s_per_item"])
@@ -242,17 +277,22 @@ def main() -> int:
             for kind, path in inputs.items()
         ]
         print(json.dumps(of), flush=True)
-        reference: dict[str, str] = {}
+        reference: dict[str, dict[str, str]] = {}
         for where, workers in runs(args.device):
             if rows and time.perf_counter() - began > args.limit_s:
                 print(f"left out after {args.limit_s:g} s: {workers} workers on {where}", flush=True)
                 continue
-            row, found = measure(inputs["pictures"], folder / "out", where, workers)
-            shutil.rmtree(folder / "out")
-            reference = reference or found
-            row["equal_to_one_worker"] = found == reference
-            rows.append(row)
-            print(json.dumps(row), flush=True)
+            for output in OUTPUTS:
+                path = inputs["pictures" if output == "recordings" else output]
+                row, found = measure(path, folder / output, where, workers)
+                row["equal_to_one_worker"] = found == reference.setdefault(output, found)
+                row["output"], row["tensors_equal"] = output, None
+                if output != "recordings":
+                    row["tensors_equal"] = equal_tensors(folder / "recordings", folder / output)
+                rows.append(row)
+                print(json.dumps(row), flush=True)
+            for output in OUTPUTS:
+                shutil.rmtree(folder / output)
     add_scaling(rows)
     result = {
         "benchmark": "dataset", "date": time.strftime("%Y-%m-%d"), "machine": machine(device),
@@ -263,7 +303,10 @@ def main() -> int:
     out = args.out or RESULTS / f"dataset_{args.device}.json"
     out.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result["plan"], indent=1))
-    right = all(row["equal_to_one_worker"] and not row["failed"] and row["items"] == 20 * seeds for row in rows)
+    right = all(
+        row["equal_to_one_worker"] and row["tensors_equal"] is not False and not row["failed"] and
+        row["items"] == 20 * seeds for row in rows
+    )  # fmt: skip
     return 0 if right else 1
 
 

@@ -267,11 +267,15 @@ def test_the_page_shows_the_files() -> None:
 def test_the_plan_of_data_sets_follows_from_the_fastest_row() -> None:
     counts = [(1, 1, 4.0), (2, 2, 6.0), (1, 4, 10.0), (2, 8, 18.0)]
     rows = [
-        {"gpus": gpus, "workers": workers, "items_per_s": rate, "bytes_per_item": 2e6, "events_per_item": 1e6}
+        {"output": output, "gpus": gpus, "workers": workers, "items_per_s": faster * rate, "bytes_per_item": 2e6,
+         "events_per_item": 1e6, "processor_s_per_item": 1.0 / faster}
+        for output, faster in (("recordings", 1.0), ("voxel_grid", 4.0))
         for gpus, workers, rate in counts
-    ]
+    ]  # fmt: skip
     dataset.add_scaling(rows)
-    assert [row["scaling"] for row in rows] == [1.0, 1.5, 1.0, 1.8]
+    assert [row["scaling"] for row in rows] == [1.0, 1.5, 1.0, 1.8] * 2
+    assert [row["speed_up"] for row in rows] == [1.0] * 4 + [4.0] * 4
+    assert [row["speed_up_by_processor_time"] for row in rows] == [1.0] * 4 + [4.0] * 4
     planned = dataset.plan(rows, [{"source": "pictures", "simulate": 0.1, "encode and write": 0.3}], "cuda")
     assert (planned["recordings"], planned["devices"], planned["workers_per_device"]) == (100_000, 16, 4)
     assert planned["hours"] == pytest.approx(100_000 / (16 * 9.0) / 3600.0, rel=1e-12)
@@ -285,6 +289,8 @@ def test_the_results_of_data_sets_have_equal_files() -> None:
     assert len(results) == 2
     for result in results:
         assert {row["equal_to_one_worker"] for row in result["rows"]} == ({True} if result["measured"] else {None})
+        tensors = [row["tensors_equal"] for row in result["rows"] if row.get("output") == "voxel_grid"]
+        assert all(tensors)
 
 
 def test_mutants_know_which_tests_read_files_with_a_module(tmp_path: Path) -> None:

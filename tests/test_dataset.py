@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Callable
 from glob import glob
 from pathlib import Path
@@ -416,6 +417,199 @@ def test_plain_cameras_have_neither_prism_nor_encoder(place: Path) -> None:
         np.testing.assert_array_equal(
             getattr(made.events.slice(0, 10**9), name), getattr(expected.events.slice(0, 10**9), name)
         )
+
+
+GRIDS = 'output = {representation = "voxel_grid", bins = 3, normalize = true}\n'
+
+
+def test_tensors_are_those_of_the_recordings(place: Path, device: str) -> None:
+    (place / "spec.toml").write_text(HEAD + PLAIN)
+    kind = "cpu" if device == "cpu" else ANY_GPU
+    assert make(place, device=kind).failed == {}
+    (place / "grids.toml").write_text(HEAD + GRIDS + PLAIN)
+    done = make_dataset(place / "grids.toml", place / "grids", workers=1, device=kind)
+    assert (done.made, done.failed) == (6, {})
+    recorded = {item["seed"]: item for item in manifest(place)["items"]}
+    to_grid = amiwarp.ToTensor(amiwarp.voxel_grid, bins=3, normalize=True)
+    made = json.loads((place / "grids" / MANIFEST).read_text())["items"]
+    for item, (tensor, labels) in zip(made, amiwarp.RecordedDataset(place / "grids"), strict=True):
+        other = recorded[item["seed"]]
+        assert (item["representation"], other["representation"]) == ("voxel_grid", None)
+        assert [item[k] for k in ("events", "split", "source")] == [other[k] for k in ("events", "split", "source")]
+        assert labels == other["labels"]
+        expected = to_grid(amiwarp.open_recording(place / "out" / other["file"]))
+        assert (tensor.dtype, tensor.shape) == (np.float32, (3, 18, 24))
+        np.testing.assert_array_equal(tensor, expected)
+        assert np.abs(tensor).max() > 0.0
+        digest = hashlib.sha256((place / "grids" / item["file"]).read_bytes()).hexdigest()
+        assert item["sha256"] == digest
+    assert make_dataset(place / "grids.toml", place / "grids", workers=1, device=kind).kept == 6
+
+
+MOVING = """
+format = "amiwarp-world"
+version = 1
+ambient = 1.0
+[[bodies]]
+name = "wall"
+mesh = "tile.obj"
+scale = 4.0
+position = [0.0, 0.0, 6.0]
+material = {reflectance = 0.2}
+[[bodies]]
+name = "sliding"
+mesh = "tile.obj"
+material = {reflectance = 0.9}
+trajectory = [{t = 0.0, position = [-0.9, -0.1, 3.0]}, {t = 0.1, position = [-0.7, 0.0, 2.8]}]
+[[bodies]]
+name = "turning"
+mesh = "tile.obj"
+material = {reflectance = 0.6}
+trajectory = [
+    {t = 0.0, position = [0.7, 0.1, 3.0], rotation = [0.0, 0.0, 0.0, 1.0]},
+    {t = 0.1, position = [0.7, 0.0, 3.0], rotation = [0.08, 0.05, 0.30, 0.9488]},
+]
+[camera]
+trajectory = [{t = 0.0, position = [0.0, 0.0, 0.0]}, {t = 0.1, position = [0.05, 0.02, 0.1]}]
+"""
+TRUTH_HZ = 50.0
+
+
+@pytest.fixture
+def moving(place: Path) -> Path:
+    """Folder with a world in which a tile slides, another one turns, and the camera moves."""
+    corners = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)]
+    faces = "f 1 2 3\nf 1 3 4\nf 3 2 1\nf 4 3 1\n"
+    (place / "tile.obj").write_text("".join(f"v {x} {y} 0\n" for x, y in corners) + faces)
+    (place / "moving.toml").write_text(MOVING)
+    (place / "spec.toml").write_text(
+        HEAD + f"duration_s = 0.05\nno_prism = true\ntruth_hz = {TRUTH_HZ}\nsensors = ['ideal']\n"
+        "camera = {size = [64, 48], fov_deg = 60.0}\n[[sources]]\nworld_files = 'moving.toml'\n"
+    )
+    return place
+
+
+def pose_at(name: str, t: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotation matrix and position of a body or of the camera of :data:`MOVING` at a time [s]."""
+    world = tomllib.loads(MOVING)
+    entry = next((body for body in world["bodies"] if body["name"] == name), world["camera"])
+    if "trajectory" not in entry:
+        return np.eye(3), np.array(entry["position"])
+    first, last = entry["trajectory"]
+    share = t / 0.1
+    axis, w = np.array(last.get("rotation", (0.0, 0.0, 0.0, 1.0)))[:3], last.get("rotation", (0.0, 0.0, 0.0, 1.0))[3]
+    sine = np.linalg.norm(axis)
+    angle = 2.0 * np.arctan2(sine, w) * share
+    x, y, z = axis / max(sine, 1e-30)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    rotation = np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    return rotation, (1.0 - share) * np.array(first["position"]) + share * np.array(last["position"])
+
+
+def recording_of(recording: amiwarp.Recording, labels: dict[str, Any]) -> amiwarp.Recording:
+    return recording
+
+
+def test_flow_of_moving_bodies_is_what_finite_differences_say(moving: Path, device: str) -> None:
+    """Points of tiles, seen without a prism, are projected a moment before and after each instant, in float64."""
+    assert make(moving, device="cpu" if device == "cpu" else ANY_GPU).failed == {}
+    (recording,) = amiwarp.RecordedDataset(moving / "out", transform=recording_of)
+    assert recording.truth is not None
+    truth, camera = recording.truth, recording.camera
+    assert truth.frames is not None
+    assert truth.labels is not None
+    assert truth.stored_instances is not None
+    assert camera is not None
+    instances = truth.stored_instances[0 : len(recording.events)]
+    assert truth.frames.t.tolist() == [0, 20_000, 40_000]
+    x, y = np.meshgrid(np.arange(64.0), np.arange(48.0))
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
+    rotations = {}
+    for k, t_us in enumerate(truth.frames.t[1:].tolist(), 1):
+        frame, t, h = truth.frames[k], t_us * 1e-6, 1e-5
+        for number, name in enumerate(truth.labels.instances, 1):
+            on = frame.instance == number
+            assert on.sum() > 50
+            camera_rotation, camera_position = pose_at("camera", t)
+            points = camera_position + (rays[on] * frame.depth[on][:, None].astype(float)) @ camera_rotation.T
+            rotation, position = pose_at(name, t)
+            local = (points - position) @ rotation
+            np.testing.assert_allclose(local[:, 2], 0.0, rtol=0, atol=1e-5)  # m: on the tile
+            ends = []
+            for later in (t - h, t + h):
+                rotation, position = pose_at(name, later)
+                camera_rotation, camera_position = pose_at("camera", later)
+                seen = (local @ rotation.T + position - camera_position) @ camera_rotation
+                ends.append(seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy])
+            expected = (ends[1] - ends[0]) / (2.0 * h)
+            np.testing.assert_allclose(frame.flow[on], expected, rtol=0, atol=0.05)  # px/s
+            np.testing.assert_allclose(frame.flow_with_prism[on], expected, rtol=0, atol=0.05)
+            rotations[name] = np.ptp(expected, axis=0).max()
+            assert np.abs(expected).max() > 5.0
+        # the events of about that time lie on the bodies where the frame shows them
+        events = recording.events.slice(0, len(recording.events))
+        near = np.abs(events.t - t_us) < 2000
+        assert near.sum() > 20
+        patches = np.pad(frame.instance, 1, mode="edge")
+        shown = [instances[i] in patches[events.y[i] : events.y[i] + 3, events.x[i] : events.x[i] + 3]
+                 for i in np.flatnonzero(near)]  # fmt: skip
+        assert np.mean(shown) == 1.0
+    assert rotations["turning"] > 3.0 * rotations["wall"]
+
+
+def test_tensors_of_windows_with_the_truth_of_a_world(moving: Path, recording: amiwarp.Recording) -> None:
+    output = 'output = {representation = "event_count", window_us = 9000}\n'
+    text = (moving / "spec.toml").read_text().replace("[[sources]]", output + "[[sources]]", 1)
+    (moving / "spec.toml").write_text(text + "[[sources]]\nrecordings = 'a.h5'\n")
+    amiwarp.save_recording(moving / "a.h5", recording)
+    assert make(moving).failed == {}
+    rows = manifest(moving)["items"]
+    dataset = amiwarp.RecordedDataset(moving / "out", transform=arrays_of)
+    items = {item.file: item for item in list_items(load_specification(moving / "spec.toml"))}
+    for row, arrays in zip(rows, dataset, strict=True):
+        events = recording.events.slice(0, 10**9)
+        if row["source_kind"] != "recordings":
+            simulated = simulation_of(items[row["file"]], "cpu").run(truth_hz=TRUTH_HZ)
+            events = simulated.events.slice(0, 10**9)
+            assert simulated.truth is not None
+            assert simulated.truth.frames is not None
+            assert arrays["truth_t"].tolist() == [0, 20_000, 40_000]
+            for k in range(3):
+                for name in ("depth", "flow", "instance", "intensity"):
+                    np.testing.assert_array_equal(arrays[name][k], getattr(simulated.truth.frames[k], name))
+        edges = np.arange(events.t[0], events.t[-1] + 1, 9000)
+        assert arrays["t_start"].tolist() == edges[:-1].tolist()
+        assert arrays["t_end"].tolist() == edges[1:].tolist()
+        expected = np.zeros((len(edges) - 1, row["height"], row["width"]), int)
+        whole = events.t < edges[-1]
+        np.add.at(expected, ((events.t[whole] - edges[0]) // 9000, events.y[whole], events.x[whole]), 1)
+        np.testing.assert_array_equal(arrays["tensor"], expected)
+        assert expected.sum() > 100
+
+
+def arrays_of(arrays: dict[str, np.ndarray], labels: dict[str, Any]) -> dict[str, np.ndarray]:
+    return arrays
+
+
+@pytest.mark.parametrize(
+    ("output", "message"),
+    [
+        ('"voxel_grid"', "field output is 'voxel_grid'; expected an object"),
+        ("{bins = 3}", "field output.representation is missing; add this field"),
+        ('{representation = "voxels"}', "field output.representation is 'voxels'; choose among event_count"),
+        ('{representation = "voxel_grid"}', "field output.bins is missing; voxel_grid needs it"),
+        ('{representation = "voxel_grid", bins = 0}', "field output.bins = 0 is not a whole number"),
+        ('{representation = "event_count", bins = 3}', "field output.bins does not apply to event_count; remove it"),
+        ('{representation = "stacked_histogram", bins = 3, limit = 300}', "field output.limit = 300 is not"),
+        ('{representation = "time_surface", tau_us = 0.0}', r"field output.tau_us = 0\.0 is not"),
+        ('{representation = "event_count", window_us = 9, window_events = 9}', "has window_us and window_events; give"),
+        ('{representation = "event_count", window_us = 9, t_end = 9}', "has window_us and t_end; give one kind of"),
+    ],
+)  # fmt: skip
+def test_a_wrong_output_is_named(place: Path, output: str, message: str) -> None:
+    (place / "spec.toml").write_text(BASE + f"output = {output}\n" + PICTURES)
+    with pytest.raises(AmiwarpError, match=message):
+        load_specification(place / "spec.toml")
 
 
 def test_plain_cameras_and_prisms_see_the_same_world(place: Path) -> None:

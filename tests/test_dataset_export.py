@@ -156,6 +156,56 @@ def test_exports_are_equal_and_replaced_only_if_asked(made: Path, tmp_path: Path
     assert len(after) < len(before)
 
 
+def test_an_interrupted_export_says_so_and_is_repeated(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    export_dataset(made, out, "webdataset")
+    (out / "notes.txt").write_text("mine")
+    moved = list[Path]()
+
+    def stop_at_third(part: Path, path: Path, *, overwrite: bool) -> None:
+        if len(moved) == 2:
+            raise KeyboardInterrupt
+        moved.append(path)
+        part.rename(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(export, "put_in_place", stop_at_third)
+        with pytest.raises(KeyboardInterrupt):
+            export_dataset(made, out, "webdataset", shard_mb=0.001, overwrite=True)
+    index = json.loads((out / "export.json").read_text())
+    present = {path.name for path in out.iterdir()}
+    assert index["complete"] is False
+    assert {path.name for path in moved} | present - {"notes.txt", "export.json"} <= set(index["files"])
+    assert "export.json: exists; give another name, or --force" in run(made, out, "--to", "webdataset").stderr
+    done = export_dataset(made, out, "webdataset", overwrite=True)
+    assert {path.name for path in out.iterdir()} == {*done.files, "export.json", "notes.txt"}
+    assert json.loads((out / "export.json").read_text())["complete"] is True
+
+
+def test_tensors_go_into_tar_files_with_all_their_arrays(tmp_path: Path) -> None:
+    root = tmp_path / "made"
+    (root / "train").mkdir(parents=True)
+    arrays = {"tensor": np.arange(12.0).reshape(2, 3, 2), "truth_t": np.array([5])}
+    np.savez(root / "train" / "a.npz", **arrays)
+    item = {"file": "train/a.npz", "split": "train", "labels": {}, "events": 9, "representation": "voxel_grid"}
+    (root / "manifest.json").write_text(json.dumps({"format": "amiwarp-dataset", "version": 1, "items": [item]}))
+    done = export_dataset(root, tmp_path / "out", "webdataset")
+    with tarfile.open(tmp_path / "out" / done.files[0]) as archive:
+        assert archive.getnames() == ["train_a.npz", "train_a.json"]
+        with np.load(io.BytesIO((archive.extractfile("train_a.npz") or io.BytesIO()).read())) as found:
+            assert set(found) == set(arrays)
+            for name, values in arrays.items():
+                np.testing.assert_array_equal(found[name], values)
+    with pytest.raises(AmiwarpError, match=r"holds tensors \(voxel_grid\), .* export to webdataset"):
+        export_dataset(root, tmp_path / "rows", "parquet")
+    (root / "train" / "a.npz").unlink()
+    with pytest.raises(AmiwarpError, match=r"a\.npz: no such file"):
+        export_dataset(root, tmp_path / "again", "webdataset")
+    assert not (tmp_path / "again").exists()
+
+
 def test_what_cannot_be_exported_is_named(made: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(AmiwarpError, match=r"to is 'zip'; choose among webdataset, parquet"):

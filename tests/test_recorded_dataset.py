@@ -137,3 +137,26 @@ def test_structured_items_are_those_of_tonic(folder: Path) -> None:
     assert list(made) == [(5, 4)]
     with pytest.raises(AmiwarpError, match="target_transform applies to structured items; give structured = True"):
         RecordedDataset(folder, target_transform=len)
+
+
+def test_tensors_are_no_events_and_a_damaged_archive_is_refused(tmp_path: Path) -> None:
+    item = {"file": "a.npz", "split": "train", "labels": {}, "events": 3, "representation": "event_count"}
+    write_manifest(tmp_path, items=[item])
+    with pytest.raises(
+        AmiwarpError, match=r"holds tensors \(event_count\), but structured items are events; leave out"
+    ):
+        RecordedDataset(tmp_path, structured=True)
+    write_manifest(tmp_path, items=[{**item, "representation": 3}])
+    with pytest.raises(AmiwarpError, match="representation is 3; expected a str"):
+        RecordedDataset(tmp_path)
+    write_manifest(tmp_path, items=[item])
+    dataset = RecordedDataset(tmp_path)
+    np.savez(tmp_path / "a.npz", other=np.zeros(3))
+    with pytest.raises(AmiwarpError, match=r"a\.npz: .*has no array tensor, but other; make this recording again"):
+        dataset[0]
+    np.savez(tmp_path / "a.npz", tensor=np.array([{}], object))
+    with pytest.raises(AmiwarpError, match=r"a\.npz: .*array tensor is object"):
+        dataset[0]
+    (tmp_path / "a.npz").write_bytes(b"no archive")
+    with pytest.raises(AmiwarpError, match=r"a\.npz: "):
+        dataset[0]

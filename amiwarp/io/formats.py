@@ -497,11 +497,13 @@ class ManifestItem:
     split: str
     labels: Mapping[str, Any]
     events: int
+    representation: str | None
+    """Representation of the tensors that the file holds; None for a recording."""
 
 
 @guarded
 class RecordedDataset:
-    """Recordings of a data set with their labels, for PyTorch's ``DataLoader`` or any other loop.
+    """Recordings of a data set, or their tensors, with their labels, for PyTorch's ``DataLoader`` or any other loop.
 
     It has a length and an index, as the data sets of PyTorch, but does not need PyTorch. Only the manifest is held in
     memory, so that the processes of a ``DataLoader`` share the object however they are started.
@@ -514,7 +516,9 @@ class RecordedDataset:
         Name of the part to use, such as "train"; by default all parts.
     transform : callable, optional
         Called with the :class:`Recording` and the dict of its labels. Its return value is the item. Without it, an item
-        is the tuple of all events and the labels. Worker processes that are spawned need a function of a module.
+        is the tuple of all events and the labels. If the data set holds tensors instead of recordings, ``transform`` is
+        called with a dict of arrays and the labels; without it, an item is the array ``tensor`` and the labels.
+        Worker processes that are spawned need a function of a module.
     structured : bool, default False
         Whether items are as those of tonic's data sets: a structured array of the events with the fields x, y, t [us]
         and p, and a target, the dict of labels. ``transform`` is then called with the array alone.
@@ -524,8 +528,8 @@ class RecordedDataset:
     Raises
     ------
     AmiwarpError
-        If the folder has no manifest, the manifest is damaged or of a newer version, no recording is in the split, or
-        ``target_transform`` is given without ``structured``.
+        If the folder has no manifest, the manifest is damaged or of a newer version, no recording is in the split,
+        ``target_transform`` is given without ``structured``, or ``structured`` for a data set of tensors.
 
     Examples
     --------
@@ -565,6 +569,12 @@ class RecordedDataset:
             raise AmiwarpError(
                 f"{self.folder}: no recording is in the split {shown(split)}; it has {counts or 'no recordings'}"
             )
+        tensors = [item for item in self._items if item.representation is not None]
+        if structured and tensors:
+            raise AmiwarpError(
+                f"{self.folder}: holds tensors ({tensors[0].representation}), but structured items are events; leave "
+                "out structured, or make the data set without [output]"
+            )
         self.transform = transform
         self.structured = structured
         self.target_transform = target_transform
@@ -578,12 +588,16 @@ class RecordedDataset:
         return len(self._items)
 
     def __getitem__(self, index: int) -> Any:
-        """Return an item: the value that ``transform`` returns, or its events and labels.
+        """Return an item: the value that ``transform`` returns, or its events or tensor, and its labels.
 
         Raises IndexError after the last item, and :class:`AmiwarpError` if the file is missing or is not the one that
         the manifest describes.
         """
         item = self._items[index]
+        if item.representation is not None:
+            arrays = io_function("plain_files:read_tensors")(self.folder / item.file)
+            labels = dict(item.labels)
+            return (arrays["tensor"], labels) if self.transform is None else self.transform(arrays, labels)
         recording = open_item(self.folder, item)
         if self.structured:
             found = recording.events.slice(0, item.events)
@@ -636,10 +650,12 @@ def _item(entry: Any, where: str) -> ManifestItem:
     path = PurePosixPath(file)
     if path.is_absolute() or ".." in path.parts or "\\" in file or not path.parts:
         raise AmiwarpError(f"field {where}.file is {shown(file)}; expected a path below the folder of the manifest")
+    made = fields.get("representation")
     return ManifestItem(
         fields,
         file,
         instance(fields.get("split"), str, f"field {where}.split"),
         instance(fields.get("labels"), dict, f"field {where}.labels"),
         whole(fields.get("events"), f"field {where}.events", 0, 1 << 62),
+        None if made is None else instance(made, str, f"field {where}.representation"),
     )

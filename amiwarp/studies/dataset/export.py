@@ -40,7 +40,7 @@ from amiwarp.tasks import Progress, silent
 from amiwarp.validation import choice, guarded, real
 
 INDEX = "export.json"
-"""Name of the file that lists the files of an export. It is written last, so an unfinished export has none."""
+"""Name of the file that lists the files of an export. Its field ``complete`` is false while they are put in place."""
 FORMAT = "amiwarp-export"
 """Value of the index's field ``format``."""
 GROUP_EVENTS = 2_000_000
@@ -102,8 +102,9 @@ def export_dataset(
 ) -> ExportSummary:
     """Export the events and labels of a data set to the layout of another library.
 
-    Only the events and the manifest's values are exported, no encoder, camera, prism or ground truth. The recordings of
-    a split are in an order that is random, but the same every time. One recording is in memory at a time.
+    Only the events and the manifest's values are exported, no encoder, camera, prism or ground truth. A data set of
+    tensors is exported to WebDataset only, each file with all its arrays. The recordings of a split are in an order
+    that is random, but the same every time. One recording is in memory at a time.
 
     Parameters
     ----------
@@ -157,6 +158,11 @@ def _export(
     head, items = read_manifest(folder / MANIFEST)
     if not items:
         raise AmiwarpError(f"{folder}: has no recordings to export; make some with 'amiwarp dataset'")
+    tensors = [item for item in items if item.representation is not None]
+    if tensors and chosen is ExportFormat.PARQUET:
+        raise AmiwarpError(
+            f"{folder}: holds tensors ({tensors[0].representation}), the columns are for events; export to webdataset"
+        )
     old = _files_of_earlier(out, overwrite)
     items.sort(key=lambda item: hashlib.sha256(item.file.encode()).digest())
     splits = Counter(item.split for item in items)
@@ -166,32 +172,38 @@ def _export(
         nonlocal count
         for item in items:
             if item.split == split:
-                yield item, open_item(folder, item)
+                yield item, open_item(folder, item) if item.representation is None else None
                 count += 1
                 report(f"{count:,} of {len(items):,} recordings", count / len(items))
 
     with scratch_folder(out) as scratch:
         if chosen is ExportFormat.WEBDATASET:
-            names = [name for split in splits for name in _write_tars(scratch, split, opened(split), limit)]
+            names = [name for split in splits for name in _write_tars(folder, scratch, split, opened(split), limit)]
         else:
             names = _write_parquet(scratch, list(splits), opened, items, limit)
             (scratch / "README.md").write_text(_card(head.get("name") or "Events", items), encoding="utf-8")
         size = sum((scratch / name).stat().st_size for name in names)
         files = [*names, *(["README.md"] if chosen is ExportFormat.PARQUET else [])]
+        index = {
+            "format": FORMAT, "version": 1, "to": chosen.value, "amiwarp": __version__, "name": head.get("name", ""),
+            "splits": dict(splits), "complete": True, "files": files,
+        }  # fmt: skip
+        # If this process is killed meanwhile, the index says so, and the next export removes all these files.
+        _write_index(out, index | {"complete": False, "files": sorted(old | set(files))}, overwrite=overwrite)
         for inner in {Path(name).parent for name in files}:
             make_folder(out / inner)
         for name in files:
             put_in_place(scratch / name, out / name, overwrite=overwrite)
     for name in old - set(files):
         (out / name).unlink(missing_ok=True)
-    index = {
-        "format": FORMAT, "version": 1, "to": chosen.value, "amiwarp": __version__, "name": head.get("name", ""),
-        "splits": dict(splits), "files": files,
-    }  # fmt: skip
-    write_text(out / INDEX, json.dumps(index, indent=1) + "\n", overwrite=overwrite)
+    _write_index(out, index, overwrite=True)
     return ExportSummary(
         dict(splits), tuple(names), sum(item.events for item in items), size, time.perf_counter() - began
     )
+
+
+def _write_index(out: Path, index: Mapping[str, Any], *, overwrite: bool) -> None:
+    write_text(out / INDEX, json.dumps(index, indent=1) + "\n", overwrite=overwrite)
 
 
 @contextlib.contextmanager
@@ -236,8 +248,14 @@ def _name(item: ManifestItem) -> str:
 # WebDataset: tar files in which the members of one sample have the same name up to the first dot.
 
 
-def _write_tars(scratch: Path, split: str, opened: Iterator[tuple[ManifestItem, Any]], limit: int) -> Iterator[str]:
-    """Write the recordings of a split as tar files of at least ``limit`` bytes. Yield the name of each."""
+def _write_tars(
+    folder: Path, scratch: Path, split: str, opened: Iterator[tuple[ManifestItem, Any]], limit: int
+) -> Iterator[str]:
+    """Write the recordings of a split as tar files of at least ``limit`` bytes. Yield the name of each.
+
+    The data set lies in ``folder``, unfinished files in ``scratch``. Tensors are stored instead of recordings that are
+    None.
+    """
     count, archive = 0, None
     with contextlib.ExitStack() as stack:
         for item, recording in opened:
@@ -247,13 +265,16 @@ def _write_tars(scratch: Path, split: str, opened: Iterator[tuple[ManifestItem, 
                 archive = stack.enter_context(tarfile.open(scratch / name, "w", format=tarfile.PAX_FORMAT))
                 count += 1
                 yield name
-            events = scratch / "events.npz"
-            export(
-                recording.events, events, OutputFormat.NPZ, recording.events.size,
-                codec=Codec.BLOSC, progress=None, overwrite=True,
-            )  # fmt: skip
-            with open_input(events, noted=False) as file:
-                _add(archive, f"{_name(item)}.npz", file, events.stat().st_size)
+            if recording is None:  # the tensors of one, which are such an archive already
+                arrays = folder / item.file
+            else:
+                arrays = scratch / "events.npz"
+                export(
+                    recording.events, arrays, OutputFormat.NPZ, recording.events.size,
+                    codec=Codec.BLOSC, progress=None, overwrite=True,
+                )  # fmt: skip
+            with open_input(arrays, noted=False) as file:
+                _add(archive, f"{_name(item)}.npz", file, arrays.stat().st_size)
             text = json.dumps(item.entry).encode()
             _add(archive, f"{_name(item)}.json", io.BytesIO(text), len(text))
 

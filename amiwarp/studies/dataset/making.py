@@ -24,17 +24,25 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_events import DeviceEvents
+from amiwarp.events.recording import Events
+from amiwarp.events.truth import MAPS, FrameTruth
+from amiwarp.imaging.tensors import windows
 from amiwarp.io import convert, open_recording
 from amiwarp.io.files import NewFile, errors_name, put_in_place, scratch_folder, write_text
 from amiwarp.io.formats import FORMAT, MANIFEST, VERSION, make_folder
 from amiwarp.io.json_files import LARGEST_INTEGER, append_line, build, create_journal, read_journal
+from amiwarp.io.plain_files import save_tensors
 from amiwarp.kernels import launch
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import Prism
 from amiwarp.simulation.description import CameraMotion, PrismMotion, Scene, SensorModel
-from amiwarp.simulation.simulator import Simulation
+from amiwarp.simulation.simulator import Engine, RecordedTruth, Simulation, chosen_instants
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.simulation.worlds.world_files import POSE_FILES, open_world
 from amiwarp.studies import cluster
@@ -78,14 +86,23 @@ class Item:
 
     @property
     def seed(self) -> int:
-        """Seed of all random numbers except those of a named world. It depends on the recipe alone."""
-        return int(self.key, 16) & spec.LARGEST_SEED
+        """Seed of all random numbers except those of a named world. It depends on the recipe alone.
+
+        Tensors are those of the recording that the same specification gives without output, so they have its seed.
+        """
+        recorded = {name: value for name, value in self.recipe.items() if name != "output"}
+        return int(_digest(recorded)[:16], 16) & spec.LARGEST_SEED
 
     @property
     def file(self) -> str:
         """Path of the recording, relative to the folder of the data set."""
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", Path(self.source).stem)[:60]
-        return f"{self.split}/{stem}-{self.key}.h5"
+        return f"{self.split}/{stem}-{self.key}{'.npz' if 'output' in self.recipe else '.h5'}"
+
+    @property
+    def output(self) -> spec.OutputEntry | None:
+        """Tensors that are written instead of a recording; None for a recording."""
+        return spec.OutputEntry(**self.recipe["output"]) if "output" in self.recipe else None
 
 
 def _digest(data: Any) -> str:
@@ -142,6 +159,8 @@ def _recipes(
     """Yield what determines each recording of one source."""
     entry = source.entry
     base: dict[str, Any] = {"source": {"kind": entry.kind, "name": source.name, "sha256": source.digest}}
+    if specification.output is not None:
+        base |= {"output": specification.output.given}
     if entry.kind == "recordings":
         yield base
         return
@@ -258,7 +277,7 @@ class Made:
 
     key: Annotated[str, partial(_of_pattern, "[0-9a-f]{16}")]
     """Key of the item."""
-    file: Annotated[str, partial(_of_pattern, "[A-Za-z0-9_-]+/[A-Za-z0-9_-]*-[0-9a-f]{16}[.]h5")]
+    file: Annotated[str, partial(_of_pattern, "[A-Za-z0-9_-]+/[A-Za-z0-9_-]*-[0-9a-f]{16}[.](h5|npz)")]
     """Path, relative to the folder of the data set."""
     bytes: Annotated[int, partial(whole, low=0, high=LARGEST_INTEGER)]
     """Size [bytes]."""
@@ -326,7 +345,8 @@ def make(job: Job) -> Made | Failed:
 def _make(job: Job) -> Made:
     began, began_processor = time.perf_counter(), time.process_time()
     item, device = job.item, "cuda:0" if job.device == cluster.ANY_GPU else job.device
-    part, path = job.scratch / f"{item.key}.h5", job.out / item.file
+    path = job.out / item.file
+    part = job.scratch / path.name
     written = write_recording(item, part, device)
     digest = spec.content_digest(part, noted=False)
     make_folder(path.parent)
@@ -340,18 +360,66 @@ def _make(job: Job) -> Made:
 def write_recording(
     item: Item, path: Path, device: str, duration_s: float | None = None
 ) -> tuple[int, float, int, int]:
-    """Write a recording to ``path``, replacing it. ``duration_s`` shortens a simulated recording.
+    """Write a recording or its tensors to ``path``, replacing it. ``duration_s`` shortens a simulated recording.
 
     Return its number of events, its duration (as simulated, or from the first event to the last) [s], and the width and
     height of the sensor [px].
     """
     if item.kind == "recordings":
-        done = convert(item.folder / item.source, path, overwrite=True)
-        length = 0 if done.t_first is None or done.t_last is None else done.t_last - done.t_first
-        return done.events, length * 1e-6, done.width, done.height
+        return _write_existing(item, path, device)
     simulation = simulation_of(item, device, duration_s)
-    events = simulation.write(path, truth_hz=item.recipe.get("truth_hz"), overwrite=True)
-    return events, simulation.duration_s, simulation.camera.width, simulation.camera.height
+    rate, size = item.recipe.get("truth_hz"), (simulation.camera.width, simulation.camera.height)
+    if item.output is None:
+        events = simulation.write(path, truth_hz=rate, overwrite=True)
+    else:
+        events = _write_simulated_tensors(simulation, item.output, path, rate)
+    return events, simulation.duration_s, *size
+
+
+def _write_existing(item: Item, path: Path, device: str) -> tuple[int, float, int, int]:
+    """Write what a source of the kind ``recordings`` gives, as :func:`write_recording` does."""
+    source = item.folder / item.source
+    if item.output is None:
+        done = convert(source, path, overwrite=True)
+        count, first, last, size = done.events, done.t_first, done.t_last, (done.width, done.height)
+    else:
+        events = open_recording(source).events
+        count, size = len(events), events.size
+        first, last = (events.t_first, events.t_last) if count else (None, None)
+        save_tensors(path, _tensors(events.slice(0, count), size, item.output, device=device))
+    return count, 0.0 if first is None or last is None else (last - first) * 1e-6, *size
+
+
+def _write_simulated_tensors(
+    simulation: Simulation, output: spec.OutputEntry, path: Path, truth_hz: float | None
+) -> int:
+    """Simulate a recording and write its tensors, which are made on the device. Return the number of events.
+
+    The ground truth of instants is written too, if there is some. That of the events is not computed.
+    """
+    recorded = RecordedTruth(simulation, chosen_instants(simulation.duration_us, truth_hz))
+    blocks, frames = list[DeviceEvents](), list[FrameTruth]()
+    engine = Engine(simulation)
+    for block in engine.run():
+        blocks.append(block.on_device()[0])
+        frames.extend(recorded.frames_before(engine.now_us))
+    events = DeviceEvents.concatenate(blocks)
+    arrays = _tensors(events, (simulation.camera.width, simulation.camera.height), output)
+    if frames:
+        arrays["truth_t"] = np.array([frame.t_us for frame in frames], np.int64)
+        arrays |= {name: np.stack([getattr(frame, name) for frame in frames]) for name in MAPS}
+    save_tensors(path, arrays)
+    return len(events)
+
+
+def _tensors(
+    events: Events | DeviceEvents, size: tuple[int, int], output: spec.OutputEntry, **options: Any
+) -> dict[str, NDArray[Any]]:
+    """Return the tensors of a recording by name: ``tensor``, and the times of its windows if there are several."""
+    found = windows(events, **output.windows) if output.windows else None
+    tensor = output.function(events, *size, windows=found, **output.options, **options)
+    times = {} if found is None else {"t_start": found.t_start, "t_end": found.t_end}
+    return {"tensor": tensor if isinstance(tensor, np.ndarray) else tensor.numpy(), **times}
 
 
 def simulation_of(item: Item, device: str, duration_s: float | None = None) -> Simulation:
@@ -531,6 +599,7 @@ def _row(item: Item, made: Made) -> dict[str, Any]:
         "sensor": (recipe.get("sensor") or {}).get("name"),
         "variant": recipe.get("seed"),
         "trajectory": recipe.get("trajectory"),
+        "representation": (recipe.get("output") or {}).get("representation"),
         "device": made.device,
         "amiwarp": made.amiwarp,
     }
@@ -991,7 +1060,7 @@ def _whole_cost(item: Item, scratch: Path, device: str) -> _Cost:
 
 def _cost(item: Item, scratch: Path, device: str, duration_s: float | None) -> _Cost:
     """Make a recording, and return its computing time and its size."""
-    path = scratch / f"{item.key}.h5"
+    path = scratch / Path(item.file).name
     began = time.perf_counter()
     events, *_ = write_recording(item, path, device, duration_s)
     spec.content_digest(path, noted=False)

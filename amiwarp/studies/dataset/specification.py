@@ -5,17 +5,20 @@ import csv
 import fnmatch
 import glob
 import hashlib
+import inspect
 import io
 import itertools
 import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from amiwarp.errors import AmiwarpError
+from amiwarp.imaging import tensors
 from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.json_files import LARGEST_INTEGER, at_field, build, fields_of, read_json, read_toml
 from amiwarp.optics.camera import Camera
@@ -65,6 +68,60 @@ class PrismEntry:
     def build(self) -> Prism:
         """Return the prism."""
         return Prism(math.radians(self.apex_deg), self.index, self.flat_side)  # type: ignore[arg-type]  # checked there
+
+
+def _from_one(value: Any, name: str) -> Any:
+    """Return a positive number; raise :class:`AmiwarpError` for another one."""
+    return whole(value, name, 1, LARGEST_INTEGER)
+
+
+@dataclass(frozen=True)
+class OutputEntry:
+    """Fields of ``output``: tensors that are written instead of recordings.
+
+    The fields without a docstring are parameters of the function in :mod:`amiwarp.imaging.tensors`.
+    """
+
+    representation: Literal[
+        "event_count", "polarity_histogram", "voxel_grid", "stacked_histogram", "time_surface", "latest_times"
+    ]
+    """Name of the function."""
+    bins: Annotated[int, _from_one] | None = None
+    end_bin: bool | None = None
+    normalize: bool | None = None
+    limit: Annotated[int, partial(whole, low=1, high=255)] | None = None
+    tau_us: Annotated[float, partial(real, low=1e-6)] | None = None
+    linear: bool | None = None
+    per_polarity: bool | None = None
+    carry: bool | None = None
+    t_start: int | None = None
+    t_end: int | None = None
+    window_us: Annotated[int, _from_one] | None = None
+    """Length of the windows, which give one tensor each [us]; None for one tensor of all events."""
+    window_events: Annotated[int, _from_one] | None = None
+    """Number of events in a window, instead of its length."""
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """Fields that are given, by name."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+    @property
+    def function(self) -> Callable[..., Any]:
+        """Function that makes the tensors."""
+        return getattr(tensors, self.representation)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Arguments of the function that are given."""
+        other = ("representation", "window_us", "window_events")
+        return {name: value for name, value in self.given.items() if name not in other}
+
+    @property
+    def windows(self) -> dict[str, Any]:
+        """Arguments of :func:`amiwarp.windows`; none for one tensor of all events."""
+        found = {"duration_us": self.window_us, "count": self.window_events}
+        return {name: value for name, value in found.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -121,6 +178,8 @@ class _Plain:
     stratify: str | None = None
     """Label whose values, the classes, are each divided among the splits by their shares; None: a draw per source."""
     truth_hz: float | None = None
+    output: OutputEntry | None = None
+    """Tensors to write instead of recordings; None: recordings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,6 +252,8 @@ def _check(values: _Plain) -> None:
         at_field(f"speeds_rpm[{k}]", lambda rpm=rpm: PrismMotion(rpm))  # type: ignore[misc]
     if values.truth_hz is not None:
         real(values.truth_hz, "field truth_hz", 1e-3, 1e6, " Hz")
+    if values.output is not None:
+        _check_output(values.output)
     if len(values.splits) > MOST_SPLITS:
         raise AmiwarpError(f"field splits has {len(values.splits):,} names; give at most {MOST_SPLITS}")
     for name, share in values.splits.items():
@@ -202,6 +263,20 @@ def _check(values: _Plain) -> None:
     total = math.fsum(values.splits.values())
     if abs(total - 1.0) > 1e-6:
         raise AmiwarpError(f"field splits has shares that sum to {total:g}; change them so that they sum to 1")
+
+
+def _check_output(output: OutputEntry) -> None:
+    """Raise :class:`AmiwarpError` for fields that the function does not have, and for one that it needs."""
+    known = inspect.signature(output.function).parameters
+    for name in output.options:
+        if name not in known:
+            raise AmiwarpError(f"field output.{name} does not apply to {output.representation}; remove it")
+    for name, parameter in known.items():
+        if parameter.default is parameter.empty and name not in ("events", "width", "height", *output.options):
+            raise AmiwarpError(f"field output.{name} is missing; {output.representation} needs it")
+    both = [name for name in ("window_us", "window_events", "t_start", "t_end") if name in output.given]
+    if output.windows and len(both) > 1:
+        raise AmiwarpError(f"field output has {' and '.join(both)}; give one kind of windows, or t_start and t_end")
 
 
 def _check_motion(sources: tuple[SourceGroup, ...]) -> None:
