@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import amiwarp
 from amiwarp import AmiwarpError, Events, MemoryEvents, RecordedDataset, Recording, save_recording
 
 COUNTS = (3, 1, 4, 0, 5)
@@ -128,15 +129,58 @@ def test_a_missing_or_changed_recording_is_refused(folder: Path, tmp_path: Path)
 
 
 def test_structured_items_are_those_of_tonic(folder: Path) -> None:
-    """The fields and types are those of ``tonic.io.events_struct``."""
+    """The fields and types are those of ``tonic.io.events_struct``, except p, which can become -1."""
     events, target = RecordedDataset(folder, "test", structured=True)[0]
-    assert events.dtype == np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", bool)])
-    assert events.tolist() == [(4, 0, 10 * i, True) for i in range(5)]
+    assert events.dtype == np.dtype([("x", np.int16), ("y", np.int16), ("t", np.int64), ("p", np.int8)])
+    assert events.tolist() == [(4, 0, 10 * i, 1) for i in range(5)]
     assert target == {"k": 4}
     made = RecordedDataset(folder, "test", structured=True, transform=len, target_transform=lambda labels: labels["k"])
     assert list(made) == [(5, 4)]
     with pytest.raises(AmiwarpError, match="target_transform applies to structured items; give structured = True"):
         RecordedDataset(folder, target_transform=len)
+
+
+def test_tonic_s_transforms_and_caches_take_structured_items(tmp_path: Path) -> None:
+    """tonic needs librosa and Numba, so it is not among the packages of the tests."""
+    tonic = pytest.importorskip("tonic")
+    from torch.utils.data import DataLoader
+
+    rng = np.random.default_rng(3)
+    items = []
+    for k in range(3):
+        t = np.sort(rng.integers(0, 30_000 + 5000 * k, 400))
+        events = Events.from_arrays(rng.integers(0, 8, 400), rng.integers(0, 6, 400), t, rng.integers(0, 2, 400))
+        save_recording(tmp_path / f"{k}.h5", Recording(MemoryEvents(events, 8, 6)))
+        items.append({"file": f"{k}.h5", "split": "train", "labels": {"k": k}, "events": 400})
+    write_manifest(tmp_path, items=items)
+    size = (8, 6, 2)
+    make = {
+        "frames": tonic.transforms.ToFrame(size, time_window=5000),
+        "grid": tonic.transforms.Compose([tonic.transforms.ToVoxelGrid(size, n_time_bins=4)]),
+    }
+    ours = RecordedDataset(tmp_path)
+    for name, transform in make.items():
+        options = {"transform": transform, "target_transform": target_of, "structured": True}
+        dataset = tonic.DiskCachedDataset(RecordedDataset(tmp_path, **options), cache_path=str(tmp_path / name))
+        for k, (events, labels) in enumerate(ours):
+            for _ in range(2):  # made, then from the cache
+                found, target = dataset[k]
+                assert target == labels["k"]
+                if name == "frames":
+                    cut = amiwarp.windows(events, duration_us=5000)
+                    expected = amiwarp.polarity_histogram(events, 8, 6, windows=cut)
+                    np.testing.assert_array_equal(found, expected)
+                else:
+                    expected = amiwarp.voxel_grid(events, 8, 6, 4, end_bin=False)
+                    np.testing.assert_allclose(found[:, 0], expected, rtol=0, atol=1e-5)
+                    assert found.min() < 0.0 < found.max()
+        batches = DataLoader(dataset, batch_size=3, collate_fn=tonic.collation.PadTensors(batch_first=True))
+        ((padded, targets),) = batches
+        assert (len(padded), targets.tolist()) == (3, [0, 1, 2])
+
+
+def target_of(labels: dict[str, Any]) -> int:
+    return int(labels["k"])
 
 
 def test_tensors_are_no_events_and_a_damaged_archive_is_refused(tmp_path: Path) -> None:

@@ -521,7 +521,7 @@ class RecordedDataset:
         Worker processes that are spawned need a function of a module.
     structured : bool, default False
         Whether items are as those of tonic's data sets: a structured array of the events with the fields x, y, t [us]
-        and p, and a target, the dict of labels. ``transform`` is then called with the array alone.
+        and p (1 is ON, 0 is OFF), and a target, the dict of labels. ``transform`` is then called with the array alone.
     target_transform : callable, optional
         Called with the dict of labels of structured items. Its return value is the target.
 
@@ -546,8 +546,8 @@ class RecordedDataset:
     (1, 2, {'shape': 'disc'})
     >>> tonic_like = amiwarp.RecordedDataset(".", structured=True, target_transform=lambda labels: labels["shape"])
     >>> tonic_like[0]
-    (array([(1, 0,  0,  True), (2, 0, 10, False)],
-          dtype=[('x', '<i2'), ('y', '<i2'), ('t', '<i8'), ('p', '?')]), 'disc')
+    (array([(1, 0,  0, 1), (2, 0, 10, 0)],
+          dtype=[('x', '<i2'), ('y', '<i2'), ('t', '<i8'), ('p', 'i1')]), 'disc')
     """
 
     def __init__(
@@ -602,7 +602,8 @@ class RecordedDataset:
         if self.structured:
             found = recording.events.slice(0, item.events)
             side = "i2" if found.whole_pixels else "f4"
-            events = found.to_structured([("x", side), ("y", side), ("t", "i8"), ("p", "?")])
+            # tonic's own polarities are bool, of which its ToVoxelGrid makes ON events only: bool has no -1
+            events = found.to_structured([("x", side), ("y", side), ("t", "i8"), ("p", "i1")])
             target = dict(item.labels)
             return (
                 events if self.transform is None else self.transform(events),
