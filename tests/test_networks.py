@@ -34,7 +34,10 @@ from amiwarp import (
     MemoryEvents,
     Network,
     Prism,
+    PrismMotion,
     Recording,
+    Scene,
+    Simulation,
     ToTensor,
     Windows,
     compensate_events,
@@ -47,6 +50,8 @@ from amiwarp import (
 from amiwarp.cli.app import app
 from amiwarp.events.device_events import DeviceMemoryEvents
 from amiwarp.imaging import networks
+from amiwarp.imaging.metrics import picture_quality
+from reference import optics as reference
 
 WIDTH, HEIGHT, BINS = 37, 22, 3
 RNG = np.random.default_rng(5)
@@ -454,3 +459,75 @@ def test_windows_without_events_are_taken(files: Network) -> None:
     for options in ({}, optic):
         for images in files.over(TRACKED, Windows(empty, empty, 100 * empty, 200 * empty), **options):
             np.testing.assert_array_equal(images, 0.0)
+
+
+# amiwarp's own network.
+
+
+@pytest.fixture(scope="module")
+def quarter(texture: np.ndarray) -> tuple[Any, Events, dict[str, Any], dict[str, int]]:
+    """Simulation of a texture, the events of a quarter turn, the optic, and the window's times."""
+    camera = Camera.from_fov(160, 120, math.radians(40.0))
+    prism, motion = Prism(math.radians(1.0)), PrismMotion(720.0, 0.4)
+    simulation = Simulation(Scene.from_picture(texture), camera, prism, 0.12, motion)
+    recording = simulation.run()
+    window = {"t_start": 84_000, "t_end": 104_833}
+    events = recording.events.between(*window.values())
+    return simulation, events, {"model": ExactModel(camera, prism, 0.4), "encoder": recording.encoder}, window
+
+
+def test_own_sums_are_the_gradient_of_polarities(quarter: Any) -> None:
+    pytest.importorskip("torch")
+    _, events, optic, window = quarter
+    here = DeviceEvents.from_arrays(events.x, events.y, events.t, events.p)
+    found = networks.quarter_turn_sums(here, 160, 120, **window, **optic).numpy()
+
+    n = networks.BINS
+    ends = window["t_start"] + np.arange(n + 1) * (window["t_end"] - window["t_start"]) // n
+    xy = compensate_events(events, optic["model"], optic["encoder"]).astype(np.float64)
+    counts = np.zeros((n, 2, 122, 162))
+    part = np.clip(np.searchsorted(ends, events.t, side="right") - 1, 0, n - 1)
+    base = np.floor(xy).astype(int)
+    for dx, dy in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        share = np.abs(1 - dx - xy[:, 0] + base[:, 0]) * np.abs(1 - dy - xy[:, 1] + base[:, 1])
+        x, y = base[:, 0] + dx, base[:, 1] + dy
+        inside = (x >= 0) & (x < 160) & (y >= 0) & (y < 120)
+        np.add.at(counts, (part[inside], events.p[inside], y[inside], x[inside]), share[inside])
+    counts = counts[:, :, :120, :160]
+
+    theta = optic["encoder"].angles_at(ends)
+    path = reference.move(optic["model"].camera, optic["model"].prism, np.tile([79.5, 59.5], (n + 1, 1)), theta,
+                          to_scene=True, phase=0.4)  # fmt: skip
+    chord = np.diff(path, axis=0)
+    signed, total = counts[:, 1] - counts[:, 0], counts.sum(1)
+    gradient = np.linalg.lstsq(chord, signed.reshape(n, -1), rcond=None)[0].reshape(2, 120, 160)
+    np.testing.assert_allclose(found[:2], gradient, atol=2e-3)
+    late = np.linspace(-1.0, 1.0, n)
+    length, twice = np.hypot(*chord.T).sum(), 2.0 * np.arctan2(chord[:, 1], chord[:, 0])
+    for k, weight in enumerate((np.ones(n), np.cos(twice), np.sin(twice), late)):
+        np.testing.assert_allclose(found[4 + k], np.tensordot(weight / length, total, 1), atol=2e-3)
+    towards = np.linalg.pinv(chord) * late
+    np.testing.assert_allclose(found[2:4], np.tensordot(towards, signed, 1), atol=2e-3)
+
+
+def test_own_network_shows_the_scene(quarter: Any, device: str) -> None:
+    torch = pytest.importorskip("torch")
+    if device != "cpu" and not torch.cuda.is_available():
+        pytest.skip("PyTorch without CUDA")
+    simulation, events, optic, window = quarter
+    found = Network.quarter_turn(device=device)(events, 160, 120, **window, **optic)
+    assert found.shape == (1, 120, 160)
+    quality = picture_quality(found[0], simulation.log_view())
+    assert quality.correlation > 0.85
+    assert 0.1 < quality.gain < 0.5  # the threshold is 0.25, and the network's picture is in thresholds
+    half = {**window, "t_start": window["t_start"] - 21_000}
+    with pytest.raises(AmiwarpError, match=r"turns by 0\.5 of a turn in the window.*turns=0\.25"):
+        Network.quarter_turn(device=device)(events, 160, 120, **half, **optic)
+    with pytest.raises(AmiwarpError, match="give model and encoder"):
+        Network.quarter_turn(device=device)(events, 160, 120, **window)
+
+
+def test_own_network_is_small() -> None:
+    pytest.importorskip("torch")
+    assert networks.OWN.stat().st_size < 500_000
+    assert sum(p.numel() for p in Network.quarter_turn()._file._module.parameters()) < 100_000

@@ -1,7 +1,8 @@
-"""Networks that users bring as TorchScript or ONNX files, which make pictures or optical flow of events."""
+"""Networks that make pictures or optical flow of events: amiwarp's own, and those that users bring as files."""
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +17,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, device_for, wait
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
-from amiwarp.imaging.tensors import ToTensor, Windows, on_device, voxel_grid
+from amiwarp.imaging.tensors import ToTensor, Windows, on_device, polarity_histogram, voxel_grid
 from amiwarp.io.files import input_path
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import Model
@@ -108,6 +109,43 @@ class Network:
         if self._first is not None and len(self._first) != self._file.extra:
             raise AmiwarpError(f"{file}: takes {self._file.extra} states, not {len(self._first)}; give one for each")
         self._states: Any = None
+
+    @classmethod
+    def quarter_turn(cls, device: Any = "cpu") -> Network:
+        """Return amiwarp's own network, which makes pictures of compensated events. It needs PyTorch.
+
+        It is called with the events of a quarter turn, their model and encoder, and returns log intensity in units of
+        the contrast threshold, up to a constant, shape ``(1, height, width)``. It was trained on simulated events of
+        flat worlds, half of them with moving bodies, for deflections of 1.5 to 6 px (``benchmarks/network.py``).
+
+        Parameters
+        ----------
+        device : str or warp.Device, default "cpu"
+            Device of the network.
+
+        Returns
+        -------
+        Network
+            The network.
+
+        Raises
+        ------
+        AmiwarpError
+            If PyTorch is missing or cannot use the device.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> scene = np.random.default_rng(0).random((64, 64)).astype(np.float32)
+        >>> camera, prism = amiwarp.Camera.from_fov(64, 48, 1.0), amiwarp.Prism(0.05)
+        >>> recording = amiwarp.simulate(scene, camera, prism, duration_s=0.1)
+        >>> optic = {"model": amiwarp.ExactModel(camera, prism), "encoder": recording.encoder}
+        >>> turns = amiwarp.windows(recording.events[:], encoder=recording.encoder, turns=0.25)
+        >>> network = amiwarp.Network.quarter_turn()
+        >>> next(network.over(recording, turns, **optic)).shape
+        (1, 48, 64)
+        """
+        return cls(OWN, input=quarter_turn_sums, multiple=OWN_MULTIPLE, device=device)
 
     def __call__(
         self,
@@ -232,6 +270,85 @@ class Network:
         result = wp.clone(out[0, :, top : top + height, left : left + width])
         wait(self._device)
         return result if isinstance(events, DeviceEvents) else result.numpy(), states
+
+
+# amiwarp's own network.
+
+OWN, OWN_MULTIPLE = Path(__file__).with_name("quarter_turn.pt"), 32
+"""File of amiwarp's own network, and the number whose multiples its sizes are [px]."""
+BINS, INPUTS = 6, 8
+"""Equal parts of the quarter turn in which events are counted, and sums of these counts."""
+LEAST_TURNS, MOST_TURNS = 0.2, 0.3
+"""Turns of the first angle in a window that amiwarp's own network takes."""
+
+
+def quarter_turn_sums(
+    events: DeviceEvents,
+    width: int,
+    height: int,
+    *,
+    t_start: int | None = None,
+    t_end: int | None = None,
+    model: Model | None = None,
+    encoder: Encoder | None = None,
+) -> Any:
+    """Return the inputs of amiwarp's own network: a PyTorch tensor of shape (INPUTS, height, width).
+
+    Raises :class:`AmiwarpError` without an optic, or if it does not turn by about a quarter in the window.
+    """
+    import torch
+
+    if model is None or encoder is None:
+        raise AmiwarpError("amiwarp's own network compensates events: give model and encoder")
+    t = torch.from_dlpack(events.t)
+    if not len(t):
+        return torch.zeros(INPUTS, height, width, device=t.device)
+    first, last = (int(t[k]) if given is None else given for k, given in ((0, t_start), (-1, t_end)))
+    ends = first + np.arange(BINS + 1) * (last - first) // BINS
+    turns = float(np.abs(np.diff(encoder.angles_at(ends[[0, -1]]).reshape(2, -1)[:, 0]))[0]) / math.tau
+    if not LEAST_TURNS <= turns <= MOST_TURNS:
+        raise AmiwarpError(
+            f"the optic turns by {turns:.2g} of a turn in the window of {last - first} us; amiwarp's own network takes "
+            "a quarter turn: cut the events by windows(events, encoder=encoder, turns=0.25)"
+        )
+    index = torch.searchsorted(t, torch.tensor(ends, device=t.device)).tolist()
+    parts = Windows(np.array(index[:-1]), np.array([*index[1:-1], len(t)]), ends[:-1], ends[1:])
+    counts = torch.from_dlpack(
+        polarity_histogram(events, width, height, windows=parts, model=model, encoder=encoder, device=events.device)
+    )
+    return sums_of_parts(counts[None], torch.tensor(chords_of(model, encoder, ends), device=counts.device))[0]
+
+
+def chords_of(model: Model, encoder: Encoder, times: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Return how far the middle of the compensated view moves between successive times [px], shape (n, 2)."""
+    camera = model.camera
+    middle = np.array([[0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]])
+    path = model.compensate_points(np.repeat(middle, len(times), axis=0), encoder.angles_at(times))
+    return np.diff(np.asarray(path), axis=0).astype(np.float32)
+
+
+def sums_of_parts(counts: Any, chords: Any) -> Any:
+    """Return sums over the counts of the parts of a quarter turn, shape (n, INPUTS, height, width).
+
+    ``counts``: tensor of OFF and ON events in each part, shape (n, BINS, 2, height, width). ``chords``: tensor of how
+    far the view moves in each part [px], shape (BINS, 2).
+
+    Where the view moves along a chord, ON minus OFF events add up to the gradient times the chord, in units of the
+    threshold. So the first two sums are the least-squares gradient of all parts. The next two are its change over
+    time, and the last four the number of events per pixel of the path, how it depends on the direction of the chord,
+    and its change.
+    """
+    import torch
+
+    polarity, count = counts[:, :, 1] - counts[:, :, 0], counts.sum(2)
+    towards = torch.linalg.solve(chords.T @ chords, chords.T)
+    late = torch.linspace(-1.0, 1.0, len(chords), device=chords.device)
+    twice = 2.0 * torch.atan2(chords[:, 1], chords[:, 0])
+    shares = torch.ones_like(late) / chords.norm(dim=1).sum()
+    signed = torch.stack([*towards, *(towards * late)])
+    unsigned = torch.stack([shares, shares * twice.cos(), shares * twice.sin(), shares * late])
+    pairs = ((signed, polarity), (unsigned, count))
+    return torch.cat([torch.einsum("cb,nbhw->nchw", weights, given) for weights, given in pairs], 1)
 
 
 def _as_array(values: Any, device: Any, what: str) -> wp.array:
