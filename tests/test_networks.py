@@ -6,6 +6,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -525,6 +526,35 @@ def test_own_network_shows_the_scene(quarter: Any, device: str) -> None:
         Network.quarter_turn(device=device)(events, 160, 120, **half, **optic)
     with pytest.raises(AmiwarpError, match="give model and encoder"):
         Network.quarter_turn(device=device)(events, 160, 120, **window)
+
+
+def test_the_command_uses_the_own_network(quarter: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("torch")
+    simulation, _, optic, window = quarter
+    monkeypatch.chdir(tmp_path)
+    save_recording("r.h5", simulation.run())
+    model = optic["model"]
+    calibration = replace(
+        SMALL_CALIBRATION, camera=model.camera, prism=model.prism,
+        parameters={"apex": model.prism.apex, "phase": model.phase},
+    )  # fmt: skip
+    calibration.save("c.json")
+    own = "--network", "quarter-turn", "--start", str(1e-6 * window["t_start"])
+    refused = run("p.npy", *own)
+    assert refused.exit_code == 1
+    assert "--calibration is missing" in refused.stderr
+    for name in ("p.npy", "p.png", "p.mp4"):
+        more = ["--length", "0.0208", "--fps", "100"] if name == "p.mp4" else []
+        done = run(name, *own, *more, "--calibration", "c.json")
+        assert done.exit_code == 0, done.stderr
+    truth = simulation.log_view()
+    quality = picture_quality(np.load("p.npy"), truth)
+    assert quality.correlation > 0.85
+    assert 0.4 < quality.gain < 2.0  # both are natural logarithms
+    shown = np.asarray(Image.open("p.png"), np.float64)
+    assert picture_quality(shown, np.exp(truth / 2.2)).correlation > 0.85
+    data = json.loads(done.stdout)
+    assert data["frames"] == 2
 
 
 def test_own_network_is_small() -> None:

@@ -645,9 +645,10 @@ class NetworkOptions:
     network: Annotated[
         Path | None,
         _in_network(
-            help="TorchScript (.pt) or ONNX (.onnx) file of a network that makes pictures from normalised voxel grids, "
-            "such as E2VID, to use instead of the solver. Needs the extra torch or onnx.",
-            metavar="<path>",
+            help="Network to use instead of the solver: 'quarter-turn' for amiwarp's own, which makes a picture of the "
+            "compensated events of a quarter turn, or a TorchScript (.pt) or ONNX (.onnx) file of a network that takes "
+            "normalised voxel grids, such as E2VID. Needs the extra torch or onnx.",
+            metavar="quarter-turn|<path>",
         ),
     ] = None
     bins: Annotated[int, _in_network(min=1, help="Time bins of the network's voxel grids.")] = 5
@@ -760,6 +761,8 @@ def _reconstructed_line(d: dict[str, Any]) -> str:
     return f"{d['file']}: {window}, {speed}; {100.0 * d['known']:.0f} % of the picture determined by events"
 
 
+OWN_NETWORK = "quarter-turn"
+"""Value of ``--network`` for amiwarp's own network."""
 EARLIER_WINDOWS = 24
 """Largest number of windows before a picture's from which a network has its states."""
 
@@ -781,8 +784,15 @@ def _by_network(
     if not len(events):
         raise AmiwarpError(f"{recording.name}: has no events; give a recording with events")
     assert by.network is not None
-    network = Network(
-        by.network, ToTensor(voxel_grid, bins=by.bins, normalize=True), multiple=by.multiple, device=device
+    own = str(by.network) == OWN_NETWORK
+    if own and calibration is None:
+        raise AmiwarpError(f"{out}: --calibration is missing; amiwarp's own network takes compensated events")
+    network = (
+        Network.quarter_turn(device)
+        if own
+        else Network(
+            by.network, ToTensor(voxel_grid, bins=by.bins, normalize=True), multiple=by.multiple, device=device
+        )
     )
     optic: dict[str, Any] = {}
     encoder = recording.encoder
@@ -792,14 +802,14 @@ def _by_network(
         optic = {"model": calibration.model, "encoder": encoder}
     turn_us = None if encoder is None else turn_between(encoder, events.t_first, events.t_last)
     video, fps = out.suffix.lower() == VIDEO, window.fps or 25.0
-    if video and window.length is None and window.turns is None:
-        window = replace(window, length=1.0 / fps)
+    if window.length is None and window.turns is None and (own or video):
+        window = replace(window, turns=0.25) if own else replace(window, length=1.0 / fps)
     start, length = window.span(recording, turn_us, video=video)
     if video:
         count = max(1, math.floor((events.t_last + 1 - start - length) * fps / 1e6) + 1)
         starts = start + np.rint(np.arange(count) * (1e6 / fps)).astype(np.int64)
     else:
-        earlier = min(EARLIER_WINDOWS, (start - events.t_first) // length)
+        earlier = 0 if own else min(EARLIER_WINDOWS, (start - events.t_first) // length)
         starts = start - length * np.arange(earlier, -1, -1, dtype=np.int64)
     first, after = (np.array([events.find(int(t)) for t in times]) for times in (starts, starts + length))
     cut = Windows(first, after, starts, starts + length)
@@ -809,7 +819,7 @@ def _by_network(
             for k, image in enumerate(network.over(recording, cut, **optic)):
                 if len(image) != 1:
                     raise AmiwarpError(f"{by.network}: makes {len(image)} channels; give a network that makes pictures")
-                yield image[0]
+                yield _own_picture(image[0], out, picture) if own else image[0]
                 advance("reconstructing", (k + 1) / len(cut))
 
         if video:
@@ -822,6 +832,18 @@ def _by_network(
         "start_us": start, "length_us": length, **facts, "network": str(by.network), "windows": len(cut),
         "events": int((after - first).sum()),
     }  # fmt: skip
+
+
+def _own_picture(log: Any, out: Path, picture: PictureOptions) -> Any:
+    """Return what a file shows of log intensity in thresholds: that in natural units, or a picture like a camera's."""
+    from amiwarp.reconstruction.picture import BRIGHT, GAMMA
+
+    log = picture.contrast * log
+    if out.suffix.lower() == ".npy":
+        return log
+    if picture.tone is Tone.LINEAR:
+        return np.exp(log - np.percentile(log, BRIGHT))
+    return np.exp((log - np.median(log)) / GAMMA)
 
 
 def _network_line(d: dict[str, Any]) -> str:
