@@ -252,9 +252,8 @@ def samples(cameras: int, side: int, seed: int, device: str) -> Iterator[tuple[T
                 counts = polarity_histogram(events, side, side, windows=found, model=model, encoder=encoder)
                 parts[:, b] += torch.from_dlpack(counts)
         ends = np.arange(BINS + 1) * quarter // BINS + k * quarter
-        chords = torch.tensor(chords_of(model, encoder, ends), device=device)
         target = truth(scene, camera, (k + 0.5) * quarter) / contrast
-        yield sums_of_parts(parts, chords), target - target.mean((1, 2), keepdim=True)
+        yield sums_of_parts(parts, chords_of(model, encoder, ends)), target - target.mean((1, 2), keepdim=True)
 
 
 def similarity(found: Tensor, true: Tensor) -> Tensor:

@@ -316,7 +316,7 @@ def quarter_turn_sums(
     counts = torch.from_dlpack(
         polarity_histogram(events, width, height, windows=parts, model=model, encoder=encoder, device=events.device)
     )
-    return sums_of_parts(counts[None], torch.tensor(chords_of(model, encoder, ends), device=counts.device))[0]
+    return sums_of_parts(counts[None], chords_of(model, encoder, ends))[0]
 
 
 def chords_of(model: Model, encoder: Encoder, times: NDArray[np.int64]) -> NDArray[np.float32]:
@@ -327,11 +327,11 @@ def chords_of(model: Model, encoder: Encoder, times: NDArray[np.int64]) -> NDArr
     return np.diff(np.asarray(path), axis=0).astype(np.float32)
 
 
-def sums_of_parts(counts: Any, chords: Any) -> Any:
+def sums_of_parts(counts: Any, chords: NDArray[np.float32]) -> Any:
     """Return sums over the counts of the parts of a quarter turn, shape (n, INPUTS, height, width).
 
-    ``counts``: tensor of OFF and ON events in each part, shape (n, BINS, 2, height, width). ``chords``: tensor of how
-    far the view moves in each part [px], shape (BINS, 2).
+    ``counts``: tensor of OFF and ON events in each part, shape (n, BINS, 2, height, width). ``chords``: how far the
+    view moves in each part [px], shape (BINS, 2).
 
     Where the view moves along a chord, ON minus OFF events add up to the gradient times the chord, in units of the
     threshold. So the first two sums are the least-squares gradient of all parts. The next two are its change over
@@ -340,15 +340,14 @@ def sums_of_parts(counts: Any, chords: Any) -> Any:
     """
     import torch
 
-    polarity, count = counts[:, :, 1] - counts[:, :, 0], counts.sum(2)
-    towards = torch.linalg.solve(chords.T @ chords, chords.T)
-    late = torch.linspace(-1.0, 1.0, len(chords), device=chords.device)
-    twice = 2.0 * torch.atan2(chords[:, 1], chords[:, 0])
-    shares = torch.ones_like(late) / chords.norm(dim=1).sum()
-    signed = torch.stack([*towards, *(towards * late)])
-    unsigned = torch.stack([shares, shares * twice.cos(), shares * twice.sin(), shares * late])
-    pairs = ((signed, polarity), (unsigned, count))
-    return torch.cat([torch.einsum("cb,nbhw->nchw", weights, given) for weights, given in pairs], 1)
+    late, twice = np.linspace(-1.0, 1.0, len(chords)), 2.0 * np.arctan2(chords[:, 1], chords[:, 0])
+    towards = np.linalg.pinv(chords)
+    signed = np.concatenate([towards, towards * late])
+    length = np.hypot(chords[:, 0], chords[:, 1]).sum()
+    unsigned = np.stack([np.ones_like(late), np.cos(twice), np.sin(twice), late]) / length
+    weights = np.concatenate([signed[:, :, None] * [-1.0, 1.0], unsigned[:, :, None] * [1.0, 1.0]])
+    given = torch.tensor(weights.astype(np.float32), device=counts.device)
+    return torch.einsum("cbp,nbphw->nchw", given, counts)
 
 
 def _as_array(values: Any, device: Any, what: str) -> wp.array:
