@@ -851,7 +851,8 @@ def _network_line(d: dict[str, Any]) -> str:
     window = f"{d['length_us'] / 1e3:.1f} ms"
     if "fps" in d:
         return f"{d['file']}: {d['frames']} frames of {window} at {d['fps']:g}/s, {speed}"
-    return f"{d['file']}: {window} after {d['windows'] - 1} earlier windows, {speed}"
+    earlier = f" after {d['windows'] - 1} earlier windows" if d["windows"] > 1 else ""
+    return f"{d['file']}: {window}{earlier}, {speed}"
 
 
 # ``amiwarp pixels``: thresholds of every pixel, hot and dead pixels.
