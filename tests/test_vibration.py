@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 import amiwarp
 from amiwarp.cli.app import app
 from reference import optics as reference
+from tests.conftest import COARSE
 
 VALUES = {
     "amplitude": 0.012, "phase": 0.7, "backward_x": 0.005, "backward_y": -0.003, "roll_x": 0.002, "roll_y": 0.004,
@@ -174,7 +175,7 @@ def calibrated(shaken: amiwarp.Recording) -> amiwarp.Calibration:
 
 def test_an_unknown_refractory_period_is_refused_with_the_remedy(shaken: amiwarp.Recording) -> None:
     with pytest.raises(amiwarp.AmiwarpError, match=r"within 0\.0\d+ px only.*give the sensor's refractory period"):
-        amiwarp.calibrate(shaken, model="vibration", events=100_000)
+        amiwarp.calibrate(shaken, model="vibration", events=100_000, photometric=COARSE)
 
 
 def test_it_is_calibrated_without_start_values(calibrated: amiwarp.Calibration) -> None:
