@@ -44,7 +44,6 @@ from amiwarp import (
     ExactModel,
     Model,
     Network,
-    Prism,
     PrismMotion,
     Reconstruction,
     Recording,
@@ -56,6 +55,7 @@ from amiwarp import (
 )
 from amiwarp.imaging.metrics import TRUTH_PERCENTILES, picture_quality
 from amiwarp.imaging.networks import BINS, INPUTS, chords_of, quarter_turn_sums, sums_of_parts
+from benchmarks.reconstruct import CAMERA, PHASE, PRISM, textured
 
 STEPS = 4
 """Images that are drawn in each part of a quarter turn."""
@@ -333,8 +333,7 @@ def train(options: argparse.Namespace) -> None:
 
 # Comparison with the solver.
 
-CAMERA = Camera.from_fov(346, 260, math.radians(60.0))
-PRISM, PHASE, TURN_US = Prism(math.radians(1.0)), 1.0, 83_328
+TURN_US = 83_328
 """Turns of 83.3 ms, a multiple of the parts and of the images that are drawn."""
 START_US = TURN_US
 CASES = ((0.25, 0.0), (0.25, 10.0), (0.25, 30.0), (0.1, 0.0), (0.5, 0.0))
@@ -389,8 +388,7 @@ def compared(
     assert isinstance(recording.events, DeviceMemoryEvents)
     events = recording.events.between_on_device(START_US, START_US + TURN_US // 4)
     device = str(events.t.device)
-    spread = ndimage.uniform_filter(true**2, 9) - ndimage.uniform_filter(true, 9) ** 2
-    areas = {"all": np.ones(true.shape, bool), "textured": spread > 0.05**2}
+    areas = {"all": np.ones(true.shape, bool), "textured": textured(true)}
     if moving is not None:
         areas["moving"] = moving
     row: dict[str, Any] = {"events": len(events)}

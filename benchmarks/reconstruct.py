@@ -156,11 +156,16 @@ def integrate(recording: Recording, model: ExactModel, length_us: int, *, decay_
     return image[: CAMERA.height, : CAMERA.width].astype(np.float32)
 
 
+def textured(truth: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return where a picture has texture, see :data:`TEXTURED`."""
+    spread = ndimage.uniform_filter(truth**2, 9) - ndimage.uniform_filter(truth, 9) ** 2
+    return np.asarray(spread > TEXTURED**2)
+
+
 def judged(log: NDArray[np.float32], truth: NDArray[np.float32]) -> dict[str, dict[str, float]]:
     """Return the quality of a picture in textured areas and in the whole image; SSIM after fitting gain and offset."""
-    spread = ndimage.uniform_filter(truth**2, 9) - ndimage.uniform_filter(truth, 9) ** 2
     out = {}
-    for area, where in (("textured", spread > TEXTURED**2), ("all", np.ones(truth.shape, np.bool_))):
+    for area, where in (("textured", textured(truth)), ("all", np.ones(truth.shape, np.bool_))):
         quality = picture_quality(log, truth, where)
         fitted = (quality.gain * log + quality.offset).astype(np.float64)
         span = float(np.ptp(np.percentile(truth, TRUTH_PERCENTILES)))

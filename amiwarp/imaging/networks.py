@@ -17,7 +17,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.device_events import DeviceEvents, device_for, wait
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
-from amiwarp.imaging.tensors import ToTensor, Windows, on_device, polarity_histogram, voxel_grid
+from amiwarp.imaging.tensors import ToTensor, Windows, find_indices, on_device, polarity_histogram, voxel_grid
 from amiwarp.io.files import input_path
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import Model
@@ -305,14 +305,16 @@ def quarter_turn_sums(
         return torch.zeros(INPUTS, height, width, device=t.device)
     first, last = (int(t[k]) if given is None else given for k, given in ((0, t_start), (-1, t_end)))
     ends = first + np.arange(BINS + 1) * (last - first) // BINS
-    turns = float(np.abs(np.diff(encoder.angles_at(ends[[0, -1]]).reshape(2, -1)[:, 0]))[0]) / math.tau
+    begin, end = encoder.angle_at(ends[[0, -1]]).tolist()
+    turns = abs(end - begin) / math.tau
     if not LEAST_TURNS <= turns <= MOST_TURNS:
         raise AmiwarpError(
             f"the optic turns by {turns:.2g} of a turn in the window of {last - first} us; amiwarp's own network takes "
             "a quarter turn: cut the events by windows(events, encoder=encoder, turns=0.25)"
         )
-    index = torch.searchsorted(t, torch.tensor(ends, device=t.device)).tolist()
-    parts = Windows(np.array(index[:-1]), np.array([*index[1:-1], len(t)]), ends[:-1], ends[1:])
+    index = find_indices(events, ends)
+    index[-1] = len(events)  # the last event may be at the end
+    parts = Windows(index[:-1], index[1:], ends[:-1], ends[1:])
     counts = torch.from_dlpack(
         polarity_histogram(events, width, height, windows=parts, model=model, encoder=encoder, device=events.device)
     )

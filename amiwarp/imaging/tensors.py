@@ -160,7 +160,7 @@ def windows(
         edges = first + np.arange(number + 1, dtype=np.int64) * duration_us
     else:
         edges = _turn_edges(encoder, first, last, real(turns, "turns", 1e-6), incomplete)
-    found = _find(events, edges)
+    found = find_indices(events, edges)
     if incomplete:
         found[-1] = n
     return Windows(found[:-1], found[1:], edges[:-1], edges[1:])
@@ -194,7 +194,7 @@ def _times_at(events: Events | DeviceEvents, indices: NDArray[np.int64]) -> NDAr
     return _look_up(take_times, events.t, indices)
 
 
-def _find(events: Events | DeviceEvents, times: NDArray[np.int64]) -> NDArray[np.int64]:
+def find_indices(events: Events | DeviceEvents, times: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the index of the first event at or after each time."""
     if isinstance(events, Events) or events.device.is_cpu:
         return np.searchsorted(events.t if isinstance(events, Events) else events.t.numpy(), times).astype(np.int64)
@@ -379,7 +379,7 @@ def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | Non
         low = high = t_start if t_end is None else t_end
     start, stop = 0, len(events)
     if t_start is not None or t_end is not None:
-        start, stop = _find(events, np.array([low, high + 1])).tolist() if len(events) else (0, 0)
+        start, stop = find_indices(events, np.array([low, high + 1])).tolist() if len(events) else (0, 0)
     return Windows(*(np.array([value], np.int64) for value in (start, stop, low, high)))
 
 
@@ -577,7 +577,7 @@ def _fullest(batch: _Batch, grid: _Grid) -> int:
     if most < CAPACITY or not grid.rate:
         return most
     edges = [-(-k * (cut.t_end - cut.t_start) // grid.rate) for k in range(1, grid.rate)]
-    inside = np.clip(_find(batch.events, (cut.t_start + np.reshape(edges, (-1, len(cut)))).ravel()), 0, None)
+    inside = np.clip(find_indices(batch.events, (cut.t_start + np.reshape(edges, (-1, len(cut)))).ravel()), 0, None)
     found = np.stack([cut.start, *np.clip(inside.reshape(-1, len(cut)), cut.start, cut.stop), cut.stop])
     return int(np.diff(found, axis=0).max())
 

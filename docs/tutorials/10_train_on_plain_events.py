@@ -198,8 +198,8 @@ for name, inputs, test_inputs in (
 # %%
 # Counts show the axis of the turn at best: edges across the motion make more events
 # than those along it. They do not show the direction: an edge that moves left
-# passes the same pixels as one that moves to the right. The network takes each turn
-# mostly for itself or for the opposite one.
+# passes the same pixels as one that moves to the right. So the network often
+# confuses a turn with the opposite one.
 
 figure, axes = plt.subplots(1, 3, figsize=(8.0, 3.0), width_ratios=(1.2, 1, 1))
 for ax, (name, (losses, table)) in zip(axes[1:], results.items(), strict=True):

@@ -266,7 +266,7 @@ def _check(values: _Plain) -> None:
 
 
 def _check_output(output: OutputEntry) -> None:
-    """Raise :class:`AmiwarpError` for fields that the function does not have, and for one that it needs."""
+    """Raise :class:`AmiwarpError` for a field that the function does not take, or if one is missing that it needs."""
     known = inspect.signature(output.function).parameters
     for name in output.options:
         if name not in known:
