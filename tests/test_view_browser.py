@@ -200,6 +200,7 @@ def page(kept: tuple[Any, Any, dict[str, Any]], tabs: Tabs, nothing_fails: None)
 def ready(page: Any) -> None:
     """Wait until the page shows a window, and no part of it waits for an update."""
     page.locator("#curve-text, #sharpness").first.wait_for()
+    page.evaluate("trame.trigger('answer')")  # the server has taken what the test has changed
     page.wait_for_function(
         "document.querySelector('#updating').style.display === 'none'"
         " && Number(document.querySelector('.clouds canvas')?.dataset.frames) > 0"
