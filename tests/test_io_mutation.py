@@ -47,7 +47,15 @@ def test_mutants_are_read_or_refused(tmp_path, checker, name):
 
 
 MEANINGS = {
-    np.nan: {"truth/x", "truth/y", "truth/events/place", "truth/frames/flow", "truth/frames/flow_with_prism"},
+    np.nan: {
+        "truth/x",
+        "truth/y",
+        "truth/events/place",
+        "truth/frames/flow",
+        "truth/frames/flow_with_prism",
+        "truth/frames/displacement",
+        "truth/frames/displacement_with_prism",
+    },
     np.inf: {"truth/events/depth", "truth/frames/depth"},
     -np.inf: set(),
 }

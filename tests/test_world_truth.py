@@ -252,7 +252,7 @@ def test_the_page_names_every_dataset(stored: Path) -> None:
     named: list[str] = []
     with h5py.File(stored) as file:
         file["truth"].visititems(lambda name, found: named.append(name) if isinstance(found, h5py.Dataset) else None)
-    assert len(named) == 24
+    assert len(named) == 28
     assert [name for name in named if f"`/truth/{name}`" not in page.replace("`/truth/x`, ", "`/truth/x` ")] == []
 
 
@@ -423,8 +423,12 @@ def test_flow_as_dsec_stores_it(recording: amiwarp.Recording, tmp_path: Path) ->
     with Image.open(pictures[1]) as found:  # an independent reader accepts the file
         assert found.size == SIZE
     moved = (stored[..., :2].astype(np.float64) - 2**15) / 128.0
-    expected = frames[1].flow * 0.01
+    expected = frames[1].displacement
     known = np.isfinite(expected).all(axis=2)
+    assert np.abs(expected[known]).max() > 1.0
+    with Image.open(tmp_path / "flow" / "occlusion" / "000001.png") as occluded:
+        np.testing.assert_array_equal(np.asarray(occluded), frames[1].occlusion)
+    assert set(np.unique(frames[1].occlusion)) == {0, 1}
     np.testing.assert_array_equal(stored[..., 2], known)
     np.testing.assert_allclose(moved[known], expected[known], rtol=0, atol=0.5 / 128 + 1e-6)
     with pytest.raises(AmiwarpError, match="exists"):
@@ -448,12 +452,14 @@ def test_flow_as_mvsec_stores_it(recording: amiwarp.Recording, tmp_path: Path) -
     assert amiwarp.save_flow_mvsec(path, frames, with_prism=True, progress=lambda _, share: shares.append(share)) == 5
     np.testing.assert_allclose(shares, np.arange(1, 11) / 10)
     with np.load(tmp_path / "gt_flow_dist.npz") as found:
-        assert sorted(found) == ["timestamps", "x_flow_dist", "y_flow_dist"]
+        assert sorted(found) == ["occlusion", "timestamps", "x_flow_dist", "y_flow_dist"]
+        np.testing.assert_array_equal(found["occlusion"], [frames[k].occlusion_with_prism for k in range(5)])
         np.testing.assert_array_equal(found["timestamps"], frames.t * 1e-6)
         for axis, name in enumerate(("x_flow_dist", "y_flow_dist")):
             assert found[name].shape == (5, SIZE[1], SIZE[0])
-            expected = np.nan_to_num(frames[2].flow_with_prism[..., axis], nan=0.0) * 0.01
-            np.testing.assert_allclose(found[name][2], expected, rtol=1e-6, atol=1e-6)
+            expected = np.nan_to_num(frames[2].displacement_with_prism[..., axis], nan=0.0)
+            np.testing.assert_array_equal(found[name][2], expected)
+            assert not found[name][4].any()
     one = simulation().run(truth_times_us=[0])
     with pytest.raises(AmiwarpError, match="needs ground truth of two instants, but there are 1"):
         amiwarp.save_flow_mvsec(tmp_path / "one.npz", frames_of(one))
@@ -585,7 +591,8 @@ def test_the_truth_command_exports(named: Path, stored: Path) -> None:
     assert (data["flow_maps"], data["pose_files"]) == (4, 2)
     names = sorted(path.relative_to("out").as_posix() for path in Path("out").rglob("*") if path.is_file())
     assert names == [*(f"flow/forward/{k:06d}.png" for k in range(4)), "flow/forward_timestamps.txt",
-                     "poses/body___square.txt", "poses/camera.txt"]  # fmt: skip
+                     *(f"flow/occlusion/{k:06d}.png" for k in range(4)), "poses/body___square.txt",
+                     "poses/camera.txt"]  # fmt: skip
     assert ok("truth", stored, "out", "--flow", "mvsec", "--with-prism")["flow_maps"] == 5
     assert Path("out/world_gt_flow_dist.npz").exists()
     assert "exists" in run("truth", stored, "out", "--poses", "tum").stderr
@@ -609,10 +616,10 @@ from tests import test_world_truth as made
 from amiwarp.simulation.simulator import Simulation
 long = made.simulation()
 kept = made.amiwarp.TruthRenderer.at
-def at(self, t_us):
+def at(self, t_us, *later):
     if t_us:
         os.kill(os.getpid(), signal.SIGINT)
-    return kept(self, t_us)
+    return kept(self, t_us, *later)
 made.amiwarp.TruthRenderer.at = at
 try:
     long.write({path!r}, truth_hz=100.0)

@@ -209,6 +209,44 @@ def test_flow_through_the_prism_is_what_finite_differences_say() -> None:
     assert np.linalg.norm(flow, axis=1).mean() > 30.0
 
 
+@pytest.mark.parametrize("prism", [False, True])
+def test_displacements_and_occlusion_until_the_next_instant(prism: bool, device: str) -> None:
+    world, path, t, later = random_world(3), moving_camera(), 0.4, 0.55
+    simulation = Simulation(WorldScene(world, path), CAMERA, Prism(math.radians(1.0)), 1.0, device=device)
+    truth = TruthRenderer(simulation).at(round(t * 1e6), round(later * 1e6))
+    pixels = np.stack(np.meshgrid(np.arange(64), np.arange(48)), axis=-1).reshape(-1, 2).astype(np.float64)
+
+    def moved(xy: NDArray[np.float64], at: float, *, to_scene: bool) -> NDArray[np.float64]:
+        theta = np.full(len(xy), float(simulation.motion.angle([1e6 * at])[0]))
+        return oracle.move(CAMERA, simulation.prism, xy, theta, to_scene=to_scene) if prism else xy
+
+    (turn, end_turn), (place, end_place) = path.poses([t, later])
+    rays = CAMERA.pixels_to_rays(moved(pixels, t, to_scene=True))
+    distance, instance, _ = cast(world, t, place, rays @ turn.T)
+    seen = place + np.where(instance > 0, distance, 1.0)[:, None] * (rays @ turn.T)
+    away = carried(world, seen, instance, t, later) - end_place
+    away[instance == 0] = (rays @ turn.T)[instance == 0]  # the sky is at infinity
+    ahead = away @ end_turn
+    ends = np.array([CAMERA.fx, CAMERA.fy]) * ahead[:, :2] / ahead[:, 2:] + np.array([CAMERA.cx, CAMERA.cy])
+    ends = moved(ends, later, to_scene=False)
+    far = np.where(instance > 0, np.linalg.norm(away, axis=1), np.inf)
+    nearest, _, _ = cast(world, later, end_place, away / np.linalg.norm(away, axis=1, keepdims=True))
+    inside = ((ends > -0.5) & (ends < [63.5, 47.5])).all(axis=1)
+    becomes = np.where(inside, nearest < far * (1.0 - 1e-3), 2)
+    suffix = "_with_prism" if prism else ""
+    found = getattr(truth, f"displacement{suffix}").reshape(-1, 2) - (ends - pixels)
+    assert np.quantile(np.abs(found), 0.99) < 2e-3  # a ray along an edge may go either way
+    speed = truth.flow_with_prism if prism else truth.flow  # which is not the displacement divided by the interval
+    assert np.quantile(np.abs(speed.reshape(-1, 2) * (later - t) - (ends - pixels)), 0.9) > 0.05
+    occlusion = getattr(truth, f"occlusion{suffix}").ravel()
+    assert (occlusion == becomes).mean() > 0.995
+    assert min(np.bincount(becomes)) > 20
+    assert becomes.max() == (2 if prism else 1)
+    alone = TruthRenderer(simulation).at(round(t * 1e6))
+    assert np.isnan(getattr(alone, f"displacement{suffix}")).all()
+    assert (getattr(alone, f"occlusion{suffix}") == 2).all()
+
+
 def counts(
     simulation: Simulation, chunk_us: int | None = None
 ) -> tuple[NDArray[np.float64], Engine, list[tuple[Any, Any]]]:

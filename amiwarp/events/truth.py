@@ -159,6 +159,20 @@ class FrameTruth:
     """Optical flow without the prism [px/s], shape ``(height, width, 2)``; NaN where a point cannot be projected."""
     flow_with_prism: NDArray[np.float32]
     """Optical flow that the pixels see through the turning prism [px/s], shape ``(height, width, 2)``."""
+    displacement: NDArray[np.float32]
+    """Displacement to the next instant, without the prism, of the points that the pixels see without the prism [px].
+
+    Shape ``(height, width, 2)``; NaN where a point cannot be projected, and if there is no next instant.
+    """
+    displacement_with_prism: NDArray[np.float32]
+    """The same of the points that the pixels see through the prism, whose angle changes meanwhile."""
+    occlusion: NDArray[np.uint8]
+    """What becomes of these points at the next instant, without the prism, shape ``(height, width)``.
+
+    0: visible; 1: hidden by another surface; 2: outside the image, or there is no next instant.
+    """
+    occlusion_with_prism: NDArray[np.uint8]
+    """The same of the points that the pixels see through the prism, through the prism."""
     intensity: NDArray[np.float32]
     """Linear luminance without the prism, shape ``(height, width)``."""
     intensity_with_prism: NDArray[np.float32]
@@ -177,6 +191,10 @@ MAPS = {
     "instance": (np.uint16, ()),
     "flow": (np.float32, (2,)),
     "flow_with_prism": (np.float32, (2,)),
+    "displacement": (np.float32, (2,)),
+    "displacement_with_prism": (np.float32, (2,)),
+    "occlusion": (np.uint8, ()),
+    "occlusion_with_prism": (np.uint8, ()),
     "intensity": (np.float32, ()),
     "intensity_with_prism": (np.float32, ()),
 }
@@ -184,8 +202,10 @@ MAPS = {
 
 
 NOT_FINITE: dict[str, Callable[[Any], Any]] = {
-    "depth": np.isposinf, **dict.fromkeys(("x", "y", "place", "flow", "flow_with_prism"), np.isnan)
-}  # fmt: skip
+    "depth": np.isposinf,
+    **dict.fromkeys(("x", "y", "place"), np.isnan),
+    **{f"{name}{seen}": np.isnan for name in ("flow", "displacement") for seen in ("", "_with_prism")},
+}
 """Tests for the values that are not finite and have a meaning, such as the depth of the sky, by the last part of a
 dataset's name."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import itertools
 import os
 import struct
@@ -373,7 +374,7 @@ def save_flow_dsec(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> int:
-    """Write optical flow in the DSEC format: ``forward/000000.png`` ... and ``forward_timestamps.txt``.
+    """Write displacements in the DSEC format: ``forward/000000.png`` ... and ``forward_timestamps.txt``.
 
     Parameters
     ----------
@@ -382,7 +383,7 @@ def save_flow_dsec(
     frames : FrameStore
         Ground truth of at least two instants.
     with_prism : bool, default False
-        Whether to write the flow that the pixels see through the turning prism.
+        Whether to write the displacements that the pixels see through the turning prism.
     overwrite : bool, default False
         Whether existing files may be replaced.
     progress : callable, optional
@@ -400,9 +401,9 @@ def save_flow_dsec(
 
     Notes
     -----
-    A picture has three channels of 16 bits: x and y displacement, each times 128 plus 2¹⁵, and 1 for known pixels. The
-    displacement over an interval is the flow at the first instant times the length of the interval. Displacements of
-    256 px and more do not fit into the format and count as unknown.
+    A picture has three channels of 16 bits: x and y displacement, each times 128 plus 2¹⁵, and 1 for known pixels.
+    Displacements of 256 px and more do not fit into the format and count as unknown. ``occlusion/000000.png`` ... hold
+    :attr:`FrameTruth.occlusion` of the same intervals, with 8 bits.
 
     Examples
     --------
@@ -415,15 +416,22 @@ def save_flow_dsec(
     >>> amiwarp.save_flow_dsec("flow", recording.truth.frames)
     2
     """
+    from PIL import Image
+
     intervals = _intervals(frames)
     folder = Path(folder)
     formats.make_folder(folder / "forward")
+    formats.make_folder(folder / "occlusion")
     with contextlib.ExitStack() as files:  # either all files appear at the end, or no file
         lines = ["# from_timestamp_us, to_timestamp_us"]
         for index, (start, stop) in enumerate(intervals):
-            moved = _displacement(frames, index, stop - start, with_prism=with_prism)
+            moved, occlusion = _displacement(frames, index, with_prism=with_prism)
             new = files.enter_context(NewFile(folder / "forward" / f"{index:06d}.png", overwrite=overwrite))
             new.part.write_bytes(encode_png16(dsec_picture(moved)))
+            new = files.enter_context(NewFile(folder / "occlusion" / f"{index:06d}.png", overwrite=overwrite))
+            buffer = io.BytesIO()  # Pillow may not notice a full disk
+            Image.fromarray(occlusion).save(buffer, format="PNG")
+            new.part.write_bytes(buffer.getbuffer())
             lines.append(f"{start}, {stop}")
             if progress is not None:
                 progress("writing flow", (index + 1) / len(intervals))
@@ -441,7 +449,7 @@ def save_flow_mvsec(
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> int:
-    """Write optical flow in the MVSEC format: arrays ``timestamps``, ``x_flow_dist``, ``y_flow_dist`` in a .npz file.
+    """Write displacements in the MVSEC format: ``timestamps``, ``x_flow_dist``, ``y_flow_dist`` in a .npz file.
 
     Parameters
     ----------
@@ -450,7 +458,7 @@ def save_flow_mvsec(
     frames : FrameStore
         Ground truth of at least two instants.
     with_prism : bool, default False
-        Whether to write the flow that the pixels see through the turning prism.
+        Whether to write the displacements that the pixels see through the turning prism.
     overwrite : bool, default False
         Whether an existing file may be replaced.
     progress : callable, optional
@@ -469,8 +477,8 @@ def save_flow_mvsec(
     Notes
     -----
     ``timestamps`` are in seconds, shape (k,). The flow maps have shape (k, height, width) and hold displacements [px]
-    from an instant to the next: the flow at the instant, times the interval. For the last instant, the last interval is
-    used again. Unknown pixels hold 0, which evaluations on MVSEC ignore.
+    from an instant to the next. Unknown pixels, and all of the last instant, hold 0, which evaluations on MVSEC ignore.
+    The array ``occlusion`` holds :attr:`FrameTruth.occlusion`.
 
     Examples
     --------
@@ -486,8 +494,7 @@ def save_flow_mvsec(
     path = Path(path)
     formats.check_ending(path, "the flow of MVSEC is written", [".npz"])
     intervals = _intervals(frames)
-    lengths = [stop - start for start, stop in intervals]
-    lengths.append(lengths[-1])
+    count = len(intervals) + 1
     with NewFile(path, overwrite=overwrite) as new, zipfile.ZipFile(new.part, "w", zipfile.ZIP_DEFLATED) as archive:
         seconds = np.asarray(frames.t, np.float64) * 1e-6
         _write_array(archive, "timestamps", seconds.shape, seconds.dtype, iter([seconds]))
@@ -495,15 +502,17 @@ def save_flow_mvsec(
         for axis, name in enumerate(("x_flow_dist", "y_flow_dist")):
 
             def maps(axis: int = axis) -> Iterator[NDArray[np.float32]]:
-                for index, length in enumerate(lengths):
-                    moved = _displacement(frames, index, length, with_prism=with_prism)
+                for index in range(count):
+                    moved, _ = _displacement(frames, index, with_prism=with_prism)
                     known = np.isfinite(moved).all(axis=2)
                     yield np.where(known, moved[..., axis], 0.0).astype(np.float32)
                     if progress is not None:
-                        progress("writing flow", (axis + (index + 1) / len(lengths)) / 2.0)
+                        progress("writing flow", (axis + (index + 1) / count) / 2.0)
 
-            _write_array(archive, name, (len(lengths), height, width), np.dtype(np.float32), maps())
-    return len(lengths)
+            _write_array(archive, name, (count, height, width), np.dtype(np.float32), maps())
+        occlusion = (_displacement(frames, index, with_prism=with_prism)[1] for index in range(count))
+        _write_array(archive, "occlusion", (count, height, width), np.dtype(np.uint8), occlusion)
+    return count
 
 
 @guarded
@@ -558,16 +567,15 @@ def _intervals(frames: FrameStore) -> list[tuple[int, int]]:
     return list(itertools.pairwise(t))
 
 
-def _displacement(frames: FrameStore, index: int, length_us: int, *, with_prism: bool) -> NDArray[np.float64]:
-    """Return the displacement [px] of the point that each pixel sees, within ``length_us`` [us].
-
-    The shape is (height, width, 2).
-    """
+def _displacement(frames: FrameStore, index: int, *, with_prism: bool) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Return the displacement to the next instant [px], shape (height, width, 2), and the occlusion of the points."""
     frame = frames[index]
-    return np.asarray((frame.flow_with_prism if with_prism else frame.flow).astype(np.float64) * (length_us * 1e-6))
+    if with_prism:
+        return frame.displacement_with_prism, frame.occlusion_with_prism
+    return frame.displacement, frame.occlusion
 
 
-def dsec_picture(displacement: NDArray[np.float64]) -> NDArray[np.uint16]:
+def dsec_picture(displacement: NDArray[np.float32]) -> NDArray[np.uint16]:
     """Encode displacements [px], shape (height, width, 2), as a flow picture of DSEC, shape (height, width, 3)."""
     known: NDArray[np.bool_] = np.asarray(np.isfinite(displacement).all(axis=2))
     levels = np.rint(np.where(known[..., None], displacement, 0.0) * DSEC_SCALE) + DSEC_ZERO

@@ -105,9 +105,10 @@ COLUMNS = {
     "truth/y": "f",
     **{f"truth/events/{name}": "iu" for name in ("cause", "instance")},
     **{f"truth/events/{name}": "f" for name in ("depth", "place")},
-    **{f"truth/frames/{name}": "iu" for name in ("t", "instance")},
-    **{f"truth/frames/{name}": "f" for name in ("pose", "joints", "depth", "normal", "intensity", "flow")},
-    **{f"truth/frames/{name}_with_prism": "f" for name in ("intensity", "flow")},
+    **{f"truth/frames/{name}": "iu" for name in ("t", "instance", "occlusion", "occlusion_with_prism")},
+    **{f"truth/frames/{name}": "f" for name in ("pose", "joints", "depth", "normal")},
+    **{f"truth/frames/{name}": "f" for name in ("intensity", "flow", "displacement")},
+    **{f"truth/frames/{name}_with_prism": "f" for name in ("intensity", "flow", "displacement")},
     **{f"truth/known/{name}": "iu" for name in ("t", "mask")},
     "truth/poses/t": "iu",
     "truth/poses/camera": "f",
@@ -125,10 +126,12 @@ DIMENSIONS = {
     **{f"truth/{name}": 2 for name in ("events/place", "frames/pose", "poses/camera")},
     **{f"truth/{name}": 3 for name in ("frames/joints", "poses/bodies", "joints/position")},
     **{f"truth/frames/{name}": 3 for name in ("depth", "instance", "intensity", "intensity_with_prism")},
+    **{f"truth/frames/{name}": 3 for name in ("occlusion", "occlusion_with_prism")},
     "truth/known/mask": 3,
     **{f"imu/{name}": 2 for name in ("angular_velocity", "acceleration")},
     "frames/image": 3,
     **{f"truth/frames/{name}": 4 for name in ("normal", "flow", "flow_with_prism")},
+    **{f"truth/frames/{name}": 4 for name in ("displacement", "displacement_with_prism")},
 }
 """Numbers of dimensions of the datasets that do not have exactly one dimension."""
 

@@ -50,6 +50,10 @@ ANGLE = 1e-3
 """Half of the angle over which derivatives with respect to direction are difference quotients [rad]."""
 DEFLECTING_STEPS = 4
 """Number of steps of the fixed-point iteration that finds the pixel that sees a point through a plate."""
+NEARER = 1e-3
+"""Relative difference of depth from which a surface hides a point."""
+OUTSIDE = 2
+"""Value of :attr:`amiwarp.FrameTruth.occlusion` for points outside the image."""
 MOMENT_S = 1e-4
 """Half of the time over which optical flow is computed as a difference quotient [s]."""
 
@@ -89,26 +93,28 @@ class TruthRenderer:
             self._sight_at_rest = WorldSight(simulation.at_rest, self._scene, self._world)
         self._rays = scenery.pixel_rays(simulation.camera)
 
-    def at(self, t_us: int) -> FrameTruth:
+    def at(self, t_us: int, next_us: int | None = None) -> FrameTruth:
         """Return the ground truth of all pixels at a time.
 
         Parameters
         ----------
         t_us : int
             Time from the start of the recording [us].
+        next_us : int, optional
+            Time of the next instant [us], to which displacements and occlusion refer. Without it, they are unknown.
 
         Returns
         -------
         FrameTruth
-            Depth, normals, instances, optical flow and luminance of all pixels, the pose of the camera, and the
-            positions of the joints.
+            Depth, normals, instances, optical flow, displacement and luminance of all pixels, the pose of the camera,
+            and the positions of the joints.
         """
         t = t_us * 1e-6
         scene, camera, model = self._scene, self._simulation.camera, self._simulation.moving_model
         (rotation,), (position,) = self._poses([t])
-        self._world.set_instants(np.array([t]))
+        self._world.set_instants(np.array([t if at is None else at * 1e-6 for at in (t_us, next_us)]))
         pixels = camera.rays_to_pixels(self._rays)
-        theta = np.repeat(wrap_angle(self._simulation.motion.angles([t_us])), len(pixels), axis=0)
+        theta = self._angles(t_us)
         bare = scenery.surfaces_at(self._world, self._rays, rotation, position)
         if self._simulation.plate is None:
             places = model.compensate_points(pixels, theta)
@@ -116,8 +122,11 @@ class TruthRenderer:
             speed = self._flow(through, places, t)
             prism_flow = self._prism_flow(model, places, speed, theta, t_us)
         else:
-            prism_flow = self._plate_flow(self._simulation.plate, pixels, t, rotation, position)
+            through, places = self._through_plate(t, rotation, position)
+            prism_flow = self._plate_flow(self._simulation.plate, through, places, t)
         size = (camera.height, camera.width)
+        moved, occluded = self._moved(bare, pixels, t_us, next_us, prism=False)
+        moved_through, occluded_through = self._moved(through, places, t_us, next_us, prism=True)
         return FrameTruth(
             t_us,
             bare.depth.reshape(size),
@@ -125,6 +134,10 @@ class TruthRenderer:
             bare.instance.reshape(size).astype(np.uint16),
             self._flow(bare, pixels, t).astype(np.float32).reshape(*size, 2),
             prism_flow.astype(np.float32).reshape(*size, 2),
+            moved.astype(np.float32).reshape(*size, 2),
+            moved_through.astype(np.float32).reshape(*size, 2),
+            occluded.reshape(size),
+            occluded_through.reshape(size),
             self._intensity(t_us, prism=False).reshape(size),
             self._intensity(t_us, prism=True).reshape(size),
             rotation @ scenery.mirrored(self._simulation).T,
@@ -142,7 +155,7 @@ class TruthRenderer:
 
         ``seen``: surfaces that appear at ``pixels`` [px] in the image without the prism.
         """
-        rays = [self._ray_at(seen, pixels, t, t + h) for h in (-MOMENT_S, MOMENT_S)]
+        rays = [self._ray_at(seen, pixels, t, t + h)[0] for h in (-MOMENT_S, MOMENT_S)]
         change = (rays[1] - rays[0]) / (2.0 * MOMENT_S)
         middle = (rays[0] + rays[1]) / 2.0
         rate = np.linalg.norm(change, axis=1, keepdims=True)
@@ -153,10 +166,10 @@ class TruthRenderer:
 
     def _ray_at(
         self, seen: scenery.SurfaceView, pixels: NDArray[np.float64], t: float, later: float
-    ) -> NDArray[np.float64]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return unit rays from the camera at time ``later`` [s] to the points that pixels see at time ``t`` [s].
 
-        The rays are in the camera's frame, shape (n, 3).
+        The rays are in the camera's frame, shape (n, 3). The second array has the depths of the points [m], shape (n,).
         """
         (r0, r1), (p0, p1) = self._poses([t, later])
         rays = self._simulation.camera.pixels_to_rays(pixels).astype(np.float64)
@@ -169,7 +182,40 @@ class TruthRenderer:
                 (b0, b1), (q0, q1) = body.trajectory.poses([t, later])
                 points[on] = (points[on] - q0) @ b0 @ b1.T + q1
         directions = np.where(sky[:, None], points - p0, points - p1) @ r1  # the sky is at infinity
-        return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+        depth = np.where(sky, np.inf, directions[:, 2])
+        return directions / np.linalg.norm(directions, axis=1, keepdims=True), depth
+
+    def _angles(self, t_us: int) -> NDArray[np.float64]:
+        """Return the prism angle of all pixels at a time [rad], shape (n,), or (n, 2) for two prisms."""
+        return np.repeat(wrap_angle(self._simulation.motion.angles([t_us])), len(self._rays), axis=0)
+
+    def _moved(
+        self, seen: scenery.SurfaceView, places: NDArray[np.float64], t_us: int, next_us: int | None, *, prism: bool
+    ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        """Return the displacement of what the pixels see until ``next_us`` [px], shape (n, 2), and its occlusion, (n,).
+
+        ``seen``: surfaces that appear at ``places`` [px] in the image without the prism; ``prism``: whether the pixels
+        see them through the prism.
+        """
+        simulation, camera, n = self._simulation, self._simulation.camera, len(self._rays)
+        if next_us is None:
+            return np.full((n, 2), np.nan), np.full(n, OUTSIDE, np.uint8)
+        later, centres = next_us * 1e-6, None
+        rays, depth = self._ray_at(seen, places, t_us * 1e-6, later)
+        ends = camera.rays_to_pixels(rays)
+        if prism and simulation.plate is None:
+            ends = simulation.moving_model.deflect_points(ends, self._angles(next_us))
+        elif prism and simulation.plate is not None:
+            ends = self._plate_pixels(simulation.plate, rays, depth, later)
+            known = np.isfinite(ends).all(axis=1, keepdims=True)
+            rays = np.where(known, camera.pixels_to_rays(ends), self._rays)
+            centres = self._plate_centres(rays, later)
+        (rotation,), (position,) = self._poses([later])
+        hit = scenery.surfaces_at(self._world, rays, rotation, position, instant=1, centres=centres)
+        hidden = hit.depth < depth * (1.0 - NEARER)
+        inside = ((ends > -0.5) & (ends < np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
+        pixels = camera.rays_to_pixels(self._rays)
+        return ends - pixels, np.where(inside, hidden, OUTSIDE).astype(np.uint8)
 
     def _prism_flow(
         self,
@@ -196,29 +242,46 @@ class TruthRenderer:
             flow = flow + (turned[1] - turned[0]) / (20.0 * ANGLE) * rate
         return np.asarray(flow)
 
-    def _plate_flow(
-        self,
-        model: PlateModel,
-        pixels: NDArray[np.float64],
-        t: float,
-        rotation: NDArray[np.float64],
-        position: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        """Return the optical flow [px/s] that ``pixels`` see through the turning plate at time ``t`` [s], (n, 2)."""
-        motion = self._simulation.motion
-        centres = self._sight.centres(self._rays, motion.phase + float(motion.angle([t * 1e6])[0]))
-        seen = scenery.surfaces_at(self._world, self._rays, rotation, position, centres=centres)
+    def _through_plate(
+        self, t: float, rotation: NDArray[np.float64], position: NDArray[np.float64]
+    ) -> tuple[scenery.SurfaceView, NDArray[np.float64]]:
+        """Return the surfaces that the pixels see through the turning plate at time ``t`` [s], and where they appear
+        without it [px], shape (n, 2)."""
+        seen = scenery.surfaces_at(
+            self._world, self._rays, rotation, position, centres=self._plate_centres(self._rays, t)
+        )
         away = np.where(np.isfinite(seen.depth)[:, None], (seen.place - position) @ rotation, self._rays)
-        places = self._simulation.camera.rays_to_pixels(away)
-        ends = []
-        for later in (t - MOMENT_S, t + MOMENT_S):
-            rays = self._ray_at(seen, places, t, later)
-            theta = np.full(len(pixels), float(motion.angle([later * 1e6])[0]))
-            at, observed = self._simulation.camera.rays_to_pixels(rays), pixels
-            for _ in range(DEFLECTING_STEPS):
-                observed = observed - (model.compensate_at(observed, theta, 1.0 / seen.depth) - at)
-            ends.append(observed)
-        return np.asarray((ends[1] - ends[0]) / (2.0 * MOMENT_S))
+        return seen, self._simulation.camera.rays_to_pixels(away)
+
+    def _plate_centres(self, rays: NDArray[np.float64], t: float) -> NDArray[np.float32]:
+        """Return where rays of the camera begin through the plate at time ``t`` [s]: places [m], shape (n, 3)."""
+        motion = self._simulation.motion
+        return self._sight.centres(rays, motion.phase + float(motion.angle([t * 1e6])[0]))
+
+    def _plate_pixels(
+        self, model: PlateModel, rays: NDArray[np.float64], depth: NDArray[np.float64], later: float
+    ) -> NDArray[np.float64]:
+        """Return the pixels that see points through the plate at time ``later`` [s], shape (n, 2).
+
+        ``rays``, ``depth``: directions and depths [m] of the points from the camera at this time.
+        """
+        theta = np.full(len(rays), float(self._simulation.motion.angle([later * 1e6])[0]))
+        at, observed = self._simulation.camera.rays_to_pixels(rays), self._simulation.camera.rays_to_pixels(self._rays)
+        for _ in range(DEFLECTING_STEPS):
+            observed = observed - (model.compensate_at(observed, theta, 1.0 / depth) - at)
+        return observed
+
+    def _plate_flow(
+        self, model: PlateModel, seen: scenery.SurfaceView, places: NDArray[np.float64], t: float
+    ) -> NDArray[np.float64]:
+        """Return the optical flow [px/s] that the pixels see through the turning plate at time ``t`` [s], (n, 2).
+
+        ``seen``, ``places``: from :meth:`_through_plate`.
+        """
+        before, after = (
+            self._plate_pixels(model, *self._ray_at(seen, places, t, at), at) for at in (t - MOMENT_S, t + MOMENT_S)
+        )
+        return np.asarray((after - before) / (2.0 * MOMENT_S))
 
     def _intensity(self, t_us: int, *, prism: bool) -> NDArray[np.float32]:
         """Return the luminance of all pixels at a time, through the prism or without the prism, shape (n,)."""
@@ -308,7 +371,8 @@ class RecordedTruth:
             self._instants[self._next_instant] < t_us or t_us >= self._duration_us
         ):
             assert self._renderer is not None
-            yield self._renderer.at(int(self._instants[self._next_instant]))
+            first, *later = self._instants[self._next_instant : self._next_instant + 2].tolist()
+            yield self._renderer.at(first, *later)
             self._next_instant += 1
 
     def poses_before(self, t_us: int) -> Poses | None:
