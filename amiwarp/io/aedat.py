@@ -19,7 +19,7 @@ from amiwarp.io import file_scan
 from amiwarp.io.file_scan import GRAVITY, FileEvents, Packet, only_counted, read_sensors
 from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.formats import Outline
-from amiwarp.io.reading_process import Reply, noting_progress, packets, run
+from amiwarp.io.reading_process import Reply, faery_module, noting_progress, packets, run
 
 # Reader of AEDAT 2.0 files of jAER: DVS128 and the DAVIS cameras.
 #
@@ -407,8 +407,7 @@ def _check_header(path: Path, header: bytes) -> int:
 
 def _decoder(path: str) -> Any:
     """Open a file with faery, which loads slowly. Called in the reading process."""
-    from faery.extension import aedat
-
+    aedat = faery_module("aedat")
     return aedat.Decoder(path)
 
 
@@ -493,8 +492,7 @@ LAST_BYTES = 1 << 16
 
 def write_aedat4(part: Path, blocks: Iterable[Events], about: Outline) -> None:
     """Write all events, then count them in the file."""
-    from faery.extension import aedat
-
+    aedat = faery_module("aedat")
     written = 0
     with aedat.Encoder(part, _description(about), ("lz4", 1)) as encoder:
         for events in blocks:
@@ -514,8 +512,7 @@ def write_aedat4(part: Path, blocks: Iterable[Events], about: Outline) -> None:
 
 def _description(about: Outline) -> list[Any]:
     """Return the description of the stream in the header, as iniVation's recorder writes it."""
-    from faery.extension import aedat
-
+    aedat = faery_module("aedat")
     attribute, node = aedat.DescriptionAttribute, aedat.DescriptionNode
     size = {"sizeX": about.width, "sizeY": about.height}
     texts = {

@@ -15,12 +15,12 @@ from amiwarp.events.recording import DEFAULT_BLOCK, Events, Recording
 from amiwarp.io.file_scan import FileEvents, Packet, last_word, nearest, read_pieces, read_words, unwrapped
 from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.formats import LONGEST_US, Outline
-from amiwarp.io.reading_process import Reply, noting_progress, packets, run
+from amiwarp.io.reading_process import Reply, faery_module, has_faery, noting_progress, packets, run
 
 # Decoders of Prophesee's EVT words with NumPy: EVT 2.0, 2.1 and 3.0, for streams that arrive in pieces.
 #
-# The words are those of Prophesee's documentation of the formats. The decoder of RAW files (faery) reads whole files
-# only, and not EVT 2.1. Messages of ROS hold pieces of a stream.
+# The words are those of Prophesee's documentation of the formats. The faster decoder of RAW files (faery) reads whole
+# files only, not EVT 2.1, and is not available for every platform. Messages of ROS hold pieces of a stream.
 
 Columns: TypeAlias = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 """Arrays x, y [px], t [us], p of events; or channel, 0, t [us] and 1 for a rising edge, of triggers."""
@@ -145,10 +145,13 @@ class Evt3Decoder:
         return base, polarity
 
 
-# Readers of Prophesee's files: RAW with faery (EVT 2.0, 3.0) or NumPy (EVT 2.1), and DAT with NumPy.
+# Readers of Prophesee's files: RAW with faery (EVT 2.0, 3.0) or NumPy (EVT 2.1, or without faery), DAT with NumPy.
 
-EVT21_BLOCK = 1 << 16
-"""Number of EVT 2.1 words that are decoded at once, with up to 32 events each."""
+EVT_BLOCK = 1 << 16
+"""Number of EVT words that NumPy decodes at once, with up to 32 events each."""
+
+VERSION_OF = {2: "3", 4: "2", 8: "2.1"}
+"""Version of EVT by the size of its words [bytes]."""
 
 WIDEST = (2048, 2048)
 """Largest width and height that EVT coordinates can represent [px]. The decoder is given this size, so that it accepts
@@ -182,21 +185,32 @@ def _read_header(path: Path) -> tuple[dict[str, str], int]:
 def open_evt(path: Path) -> Recording:
     """Open a RAW file. The decoder raises each time to the largest so far, without reporting how often."""
     fields, offset = _read_header(path)
-    version = fields.get("evt") or fields.get("format", "").removeprefix("EVT").partition(";")[0]
-    word = {"2.0": 4, "2": 4, "2.1": 8, "21": 8, "3.0": 2, "3": 2}.get(version)
-    if word is None:
-        raise AmiwarpError(f"{path}: EVT version in the header is '{version[:40]}'; expected 2.0, 2.1 or 3.0")
+    version, word = _evt_version(path, fields)
     swapped = word == 8 and _is_swapped(path, offset, fields.get("format", ""))
-    source: Callable[[dict[str, int]], Iterator[Packet]]
-    if word == 8:
-        version, source = "2.1", partial(_evt21_packets, path, offset, swapped, False)
-    else:
-        source = partial(packets, read_evt_packets, path.absolute(), False)
+    source = _evt_source(path, offset, word, swapped, False)
     last = None if word == 2 else partial(_last_evt_time, path, offset, word, swapped)
     events = FileEvents(path, source, size=_evt_size(fields), last_time=last)
     truncated = (path.stat().st_size - offset) % word
     noted = {"truncated_bytes": truncated} if truncated else {}
     return Recording(events=events, metadata={"format": f"evt{version}", **noted, **events.metadata}, name=path.stem)
+
+
+def _evt_version(path: Path, fields: dict[str, str]) -> tuple[str, int]:
+    """Return the version of EVT in a header, and the size of its words [bytes]."""
+    version = fields.get("evt") or fields.get("format", "").removeprefix("EVT").partition(";")[0]
+    word = {"2.0": 4, "2": 4, "2.1": 8, "21": 8, "3.0": 2, "3": 2}.get(version)
+    if word is None:
+        raise AmiwarpError(f"{path}: EVT version in the header is '{version[:40]}'; expected 2.0, 2.1 or 3.0")
+    return "2.1" if word == 8 else version, word
+
+
+def _evt_source(
+    path: Path, offset: int, word: int, swapped: bool, triggers: bool
+) -> Callable[[dict[str, int]], Iterator[Packet]]:
+    """Return the function that yields the events, or the triggers, of a RAW file: with faery if it can read them."""
+    if word == 8 or not has_faery():
+        return partial(_numpy_packets, path, offset, word, swapped, triggers)
+    return partial(packets, read_evt_packets, path.absolute(), triggers)
 
 
 def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
@@ -214,8 +228,7 @@ def _evt_size(fields: dict[str, str]) -> tuple[int, int] | None:
 
 def read_evt_packets(notes: dict[str, int], path: str, triggers: bool) -> Iterator[Packet]:
     """Yield packets of events, or of triggers, of a RAW file. Runs in the reading process."""
-    from faery.extension import evt
-
+    evt = faery_module("evt")
     notes["triggers"] = 0
     with evt.Decoder(path, WIDEST, "evt3") as decoder:
         for packet in noting_progress(decoder, path, notes):
@@ -231,17 +244,21 @@ def read_evt_packets(notes: dict[str, int], path: str, triggers: bool) -> Iterat
 def trigger_packets(path: Path) -> Iterator[Packet]:
     """Yield the edges of the external triggers of a RAW file."""
     fields, offset = _read_header(path)
-    if fields.get("evt", fields.get("format", "")).startswith(("2.1", "EVT21")):
-        return _evt21_packets(path, offset, _is_swapped(path, offset, fields.get("format", "")), True, {})
-    return packets(read_evt_packets, path.absolute(), True, {})
+    _, word = _evt_version(path, fields)
+    swapped = word == 8 and _is_swapped(path, offset, fields.get("format", ""))
+    return _evt_source(path, offset, word, swapped, True)({})
 
 
-def _evt21_packets(path: Path, offset: int, swapped: bool, triggers: bool, notes: dict[str, int]) -> Iterator[Packet]:
-    """Yield the events, or the triggers, of EVT 2.1, which faery does not read."""
-    decoder = Evt2Decoder(vectors=True)
-    for data in read_pieces(path, offset, 8 * EVT21_BLOCK, notes):
-        words = words_of(data, "2.1")
-        events, edges = decoder.decode(swap_halves(words) if swapped else words)
+def _numpy_packets(
+    path: Path, offset: int, word: int, swapped: bool, triggers: bool, notes: dict[str, int]
+) -> Iterator[Packet]:
+    """Yield the events, or the triggers, of words of a size [bytes]."""
+    decoder = Evt3Decoder() if word == 2 else Evt2Decoder(vectors=word == 8)
+    for data in read_pieces(path, offset, word * EVT_BLOCK, notes):
+        words: NDArray[Any] = words_of(data, VERSION_OF[word])
+        if swapped:
+            words = swap_halves(words)
+        events, edges = decoder.decode(words)
         notes["triggers"] = notes.get("triggers", 0) + len(edges[0])
         yield edges if triggers else events
 
@@ -250,8 +267,8 @@ def _last_evt_time(path: Path, offset: int, word: int, swapped: bool, estimate: 
     """Return the time of the last event of a file of EVT 2.0 or 2.1 [us]. Times of EVT 3.0 wrap after 17 s."""
     count = (path.stat().st_size - offset) // word
     with open_input(path) as file:
-        file.seek(offset + max(count - EVT21_BLOCK, 0) * word)
-        words = words_of(file.read(word * EVT21_BLOCK), "2" if word == 4 else "2.1")
+        file.seek(offset + max(count - EVT_BLOCK, 0) * word)
+        words = words_of(file.read(word * EVT_BLOCK), VERSION_OF[word])
     t = Evt2Decoder(vectors=word == 8).decode(swap_halves(words) if swapped else words)[0][2]
     return nearest(int(t[-1]), 34, estimate) if t.size else None
 
@@ -262,7 +279,7 @@ def _is_swapped(path: Path, offset: int, layout: str) -> bool:
         return "endianness=legacy" in layout
     with open_input(path) as file:
         file.seek(offset)
-        return _halves_are_swapped(words_of(file.read(8 * EVT21_BLOCK), "2.1"))
+        return _halves_are_swapped(words_of(file.read(8 * EVT_BLOCK), "2.1"))
 
 
 def _halves_are_swapped(words: NDArray[np.uint64]) -> bool:
@@ -419,8 +436,7 @@ def open_es(path: Path) -> Recording:
 
 def _es_decoder(path: str) -> Any:
     """Open a file with faery, which loads slowly. Called in the reading process."""
-    from faery.extension import es
-
+    es = faery_module("es")
     return es.Decoder(path, 0)
 
 

@@ -8,6 +8,7 @@ this file runs in the process.
 
 import contextlib
 import importlib
+import importlib.util
 import json
 import os
 import signal
@@ -363,6 +364,23 @@ def _next_packets(source: Iterator[tuple[NDArray[Any], ...]]) -> Iterator[tuple[
         yield packet
         if count >= PACKET or time.process_time() - began > PACKET_S:
             return
+
+
+def has_faery() -> bool:
+    """Return whether the compiled decoders of faery are installed, without importing them."""
+    return importlib.util.find_spec("faery") is not None
+
+
+def faery_module(name: str) -> Any:
+    """Import the compiled decoder and encoder of a format, which load slowly: ``aedat``, ``es`` or ``evt``."""
+    try:
+        from faery import extension
+    except ImportError as error:
+        raise AmiwarpError(
+            "AEDAT 4 and Event Stream files need faery, for which Macs with an Apple chip have no package before "
+            "macOS 26: install Rust and run 'pip install faery', or convert the file to .h5 on another computer"
+        ) from error
+    return getattr(extension, name)
 
 
 def noting_progress(decoder: Iterator[Any], path: str, notes: dict[str, int]) -> Iterator[Any]:
