@@ -1,5 +1,6 @@
 """Entry point of ``python -m amiwarp`` and of the ``amiwarp`` command."""
 
+import io
 import os
 import signal
 import sys
@@ -38,6 +39,8 @@ def _end_loading(number: int, frame: Any) -> None:
 def _main() -> None:
     """Load the command line, which takes some time, and run the command."""
     try:
+        if isinstance(sys.stdout, io.TextIOWrapper):  # of Windows, it may lack characters of a file's name
+            sys.stdout.reconfigure(errors="backslashreplace")
         # a signal that nohup ignores stays ignored
         ending = [n for n in ENDING if signal.getsignal(n) in (signal.SIG_DFL, signal.default_int_handler)]
         for number in ending:

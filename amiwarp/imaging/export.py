@@ -193,9 +193,8 @@ class IweFiles:
         """Write the remaining windows and rename all files to their final names."""
         while self._window < self._count:
             self._write_window()
-        for stack in self._stacks.values():
-            stack.flush()
-        self._stacks.clear()
+        while self._stacks:  # Windows does not rename a file that is mapped
+            self._stacks.popitem()[1].flush()
         for new in self._unfinished:
             new.commit()
             self.written.append(new.path)

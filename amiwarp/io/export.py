@@ -436,7 +436,7 @@ def save_flow_dsec(
             if progress is not None:
                 progress("writing flow", (index + 1) / len(intervals))
         new = files.enter_context(NewFile(folder / "forward_timestamps.txt", overwrite=overwrite))
-        new.part.write_text("\n".join(lines) + "\n")
+        new.part.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
     return len(intervals)
 
 
@@ -551,7 +551,7 @@ def save_poses_tum(
     known = sorted(instance(None if isinstance(given, np.ndarray) else given[:0], Poses, "poses[:0]").bodies)
     if body is not None and not (isinstance(body, str) and body in known):
         raise AmiwarpError(f"body {shown(body)} has no poses; choose among {', '.join(known) or 'none: no body moves'}")
-    with NewFile(path, overwrite=overwrite) as new, open(new.part, "w") as file:
+    with NewFile(path, overwrite=overwrite) as new, open(new.part, "w", encoding="ascii", newline="\n") as file:
         file.write("# timestamp tx ty tz qx qy qz qw\n")
         for start in range(0, len(poses), POSE_ROWS):
             block = poses[start : start + POSE_ROWS]

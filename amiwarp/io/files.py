@@ -20,12 +20,12 @@ import stat
 import threading
 import weakref
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Any
 
 from amiwarp.errors import WORD_HEAD, AmiwarpError, printable
 
@@ -431,7 +431,8 @@ def link_new(part: Path, target: Path) -> None:
     except OSError:  # a file system without hard links
         os.replace(part, target)
     else:
-        part.unlink()
+        with contextlib.suppress(PermissionError):  # Windows, if the file is open: the name is removed at the exit
+            part.unlink()
 
 
 def allocate(handle: int, start: int, count: int) -> None:
@@ -445,6 +446,30 @@ def allocate(handle: int, start: int, count: int) -> None:
         except OSError as error:
             if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EOPNOTSUPP):
                 raise
+
+
+_seeking = threading.Lock()  # on systems without os.pread, a place is reached by moving the file's position
+
+
+def read_at(handle: int, buffer: Any, place: int) -> int:
+    """Read bytes at a place of a file [bytes] into ``buffer``, and return their number. Any thread may call it."""
+    if hasattr(os, "preadv"):
+        return os.preadv(handle, [buffer], place)
+    view = memoryview(buffer).cast("B")
+    with _seeking:
+        os.lseek(handle, place, os.SEEK_SET)
+        data = os.read(handle, len(view))
+    view[: len(data)] = data
+    return len(data)
+
+
+def write_at(handle: int, parts: Sequence[Any], place: int) -> int:
+    """Write parts one after the other at a place of a file [bytes], and return how many bytes were written."""
+    if hasattr(os, "pwritev"):
+        return os.pwritev(handle, parts, place)
+    with _seeking:
+        os.lseek(handle, place, os.SEEK_SET)
+        return os.write(handle, parts[0])
 
 
 @contextlib.contextmanager
@@ -500,7 +525,7 @@ def _lock_path(folder: Path, owner: str) -> Path:
 def _system() -> str:
     """Return 12 digits for the running system. Locks on a network drive may be unknown to other systems."""
     with contextlib.suppress(OSError):
-        return Path("/proc/sys/kernel/random/boot_id").read_text().replace("-", "")[:12]
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").replace("-", "")[:12]
     import uuid
 
     return f"{uuid.getnode():012x}"
@@ -537,7 +562,7 @@ if hasattr(os, "register_at_fork"):
 def write_text(path: Path, text: str, *, overwrite: bool = False) -> None:
     """Write a text file, complete or not at all. Raises :class:`AmiwarpError` as :class:`NewFile` does."""
     with NewFile(path, overwrite=overwrite) as new:
-        new.part.write_text(text)
+        new.part.write_text(text, encoding="utf-8", newline="\n")
 
 
 @cache

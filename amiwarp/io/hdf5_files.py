@@ -27,7 +27,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, ImuSamples, MetadataValue, Recording, regroup
 from amiwarp.events.truth import EVENT_COLUMNS, MAPS, FrameTruth, Poses, Truth, WorldLabels, check_truth, rotation_of
 from amiwarp.io.file_scan import FileEvents, Packet, head_limit, read_sensors, smallest_sensor
-from amiwarp.io.files import errors_name, input_path, interrupts_later, register_reader
+from amiwarp.io.files import errors_name, input_path, interrupts_later, read_at, register_reader, write_at
 from amiwarp.io.formats import Codec
 from amiwarp.io.json_files import LARGEST_INTEGER
 from amiwarp.io.reading_process import ReadingProcess, borrow, give_back, packets, run
@@ -420,7 +420,7 @@ class _Output(io.RawIOBase):
     """
 
     def __init__(self, path: Path) -> None:
-        self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        self._handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
         self._position = 0
         self._token = os.urandom(16)
         self._stand_in = memoryview(self._token)
@@ -450,7 +450,7 @@ class _Output(io.RawIOBase):
         """Write data in several parts, one after the other, at a place [bytes]. Any thread may call it."""
         rest = [memoryview(part) for part in parts]
         while rest:
-            done = os.pwritev(self._handle, rest, place)
+            done = write_at(self._handle, rest, place)
             place += done
             while rest and done >= len(rest[0]):
                 done -= len(rest.pop(0))
@@ -477,7 +477,7 @@ class _Output(io.RawIOBase):
         self._unwritten.append((self._position, bytes(data)))
 
     def readinto(self, buffer: Any) -> int:
-        count = os.preadv(self._handle, [buffer], self._position)
+        count = read_at(self._handle, buffer, self._position)
         view = memoryview(buffer).cast("B")
         for at, data in self._unwritten:
             first, last = max(at - self._position, 0), min(at - self._position + len(data), len(view))

@@ -210,7 +210,7 @@ def _open(path: str) -> tuple[Any, bool]:
         access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
         # HDF5 reads a block with a wrong checksum again, 100 times by default, and doubles the pause each time, which
         # takes forever. h5py does not expose this setting.
-        with contextlib.suppress(AttributeError):
+        with contextlib.suppress(AttributeError, OSError):
             attempts = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
             attempts(ctypes.c_int64(access.id), ctypes.c_uint(ATTEMPTS))
         with contextlib.suppress(OSError):

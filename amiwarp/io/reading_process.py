@@ -306,7 +306,7 @@ def _limit(cpu_s: int, memory_bytes: int) -> None:
         hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
         soft = int(used.ru_utime + used.ru_stime) + 1 + cpu_s
         resource.setrlimit(resource.RLIMIT_CPU, (soft if hard < 0 else min(soft, hard), hard))
-        with open("/proc/self/statm") as sizes:
+        with open("/proc/self/statm", encoding="ascii") as sizes:
             taken = int(sizes.read().split()[0]) * resource.getpagesize()
         hard = resource.getrlimit(resource.RLIMIT_AS)[1]
         soft = taken + memory_bytes
@@ -388,7 +388,10 @@ def noting_progress(decoder: Iterator[Any], path: str, notes: dict[str, int]) ->
     number = _open_file(path)
     for packet in decoder:
         if number is not None:
-            with contextlib.suppress(OSError, ValueError), open(f"/proc/self/fdinfo/{number}") as about:
+            with (
+                contextlib.suppress(OSError, ValueError),
+                open(f"/proc/self/fdinfo/{number}", encoding="ascii") as about,
+            ):
                 notes["read"] = int(about.readline().split()[1])
                 notes["total"] = os.path.getsize(path)
         yield packet

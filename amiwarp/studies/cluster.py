@@ -177,7 +177,7 @@ def result_of(future: Future[Result]) -> Result:
 def processor() -> str:
     """Return the name of this machine's CPU."""
     info = Path("/proc/cpuinfo")
-    found = re.search(r"^model name\s*: (.*)$", info.read_text(), re.M) if info.exists() else None
+    found = re.search(r"^model name\s*: (.*)$", info.read_text(encoding="utf-8"), re.M) if info.exists() else None
     return (found.group(1) if found else platform.processor() or platform.machine()).strip()
 
 

@@ -41,10 +41,14 @@ class Unreachable(AmiwarpError):
 def ready(file: Any, timeout_s: float, *, to_write: bool = False) -> bool:
     """Wait until a file or socket can be read (or written) without blocking, or is broken; return False on time-out.
 
-    Unlike ``select.select``, this supports file descriptors above 1023.
+    Unlike ``select.select``, this supports file descriptors above 1023. Windows can wait for sockets only: there a pipe
+    counts as ready, and its reader or writer waits.
     """
     if not hasattr(select, "poll"):
-        return any(select.select([] if to_write else [file], [file] if to_write else [], [], timeout_s))
+        try:
+            return any(select.select([] if to_write else [file], [file] if to_write else [], [], timeout_s))
+        except OSError:
+            return True
     poll = select.poll()
     poll.register(file, select.POLLOUT if to_write else select.POLLIN)
     return bool(poll.poll(round(1e3 * timeout_s)))
