@@ -463,7 +463,7 @@ def test_too_few_poses_and_still_prisms_are_refused(recordings: list[amiwarp.Rec
 def test_a_moving_board_is_refused(tmp_path: Path) -> None:
     world = BOARD.world([0, 0, 0, 1], [0.0, 0.0, 0.4])
     path = amiwarp.Trajectory([0.0, 0.25], [[0, 0, 0], [0.06, 0.0, 0.0]], np.tile([0, 0, 0, 1.0], (2, 1)))
-    camera = amiwarp.Camera.from_fov(160, 120, 1.0)
+    camera = amiwarp.Camera.from_fov(96, 72, 1.0)
     recording = amiwarp.simulate(amiwarp.WorldScene(world, path), camera, PRISM, duration_s=0.25, seed=1)
     with pytest.raises(amiwarp.AmiwarpError, match="no turn of the prism repeats the one before: hold the board"):
         amiwarp.calibrate_lens([recording], BOARD)
@@ -483,7 +483,7 @@ def moved() -> amiwarp.Recording:
     world = BOARD.world([0, 0, 0, 1], [0.0, 0.0, 0.4])
     at = [[0, 0, 0], [0, 0, 0], [0.05, 0.02, -0.05], [0.05, 0.02, -0.05]]
     path = amiwarp.Trajectory([0.0, 0.35, 0.65, 1.0], at, np.tile([0, 0, 0, 1.0], (4, 1)))
-    camera = amiwarp.Camera.from_fov(160, 120, 1.0)
+    camera = amiwarp.Camera.from_fov(128, 96, 1.0)
     return amiwarp.simulate(amiwarp.WorldScene(world, path), camera, PRISM, duration_s=1.0, seed=1)
 
 
@@ -586,6 +586,8 @@ def test_a_stream_gives_a_lens_once_its_poses_are_enough(
     monkeypatch.setattr(lens_live, "GOOD_POSES", 4)
     monkeypatch.setattr(corner_fit, "LARGEST_FOCAL_DEVIATION", 0.02)
     monkeypatch.setattr(calibration, "MOST_PASSES", 1)
+    monkeypatch.setattr(calibration, "PAIRS", calibration.PAIRS // 3)
+    monkeypatch.setattr(calibration, "FINE_PAIRS", calibration.FINE_PAIRS // 3)
     result = CliRunner().invoke(app, ["lens", str(stream), str(tmp_path / "camera.json"), "--fast", *LIVE])
     assert result.exit_code == 0, result.output
     data = json.loads(result.stdout)
