@@ -41,7 +41,7 @@ from tests.conftest import TRUE_PRISM
 
 CAMERA = Camera.from_fov(140, 105, math.radians(50.0))
 SMALL = Camera.from_fov(100, 75, math.radians(50.0))
-KNOWN = PhotometricSettings(pairs=75_000, density=1.0, sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
+KNOWN = PhotometricSettings(pairs=40_000, density=1.0, sensor=SensorTiming(latency_us=100.0, refractory_us=100.0))
 MORE, ALL = (replace(KNOWN, pairs=pairs) for pairs in (300_000, 600_000))
 FREE = ("apex", "phase", "motion")
 
@@ -68,7 +68,7 @@ def rates_of(c: Calibration) -> NDArray[np.float64]:
 def test_the_camera_turns(texture: NDArray[np.uint8], axis: int, speed: float) -> None:
     rate = np.eye(3)[axis] * math.radians(speed)
     recording = turned(texture, tuple(rate))
-    c = calibrate(recording, free=FREE, photometric=KNOWN, events=100_000)
+    c = calibrate(recording, free=FREE, photometric=KNOWN, events=40_000)
     assert c.photometric is not None
     assert c.photometric.accepted
     assert np.linalg.norm(rates_of(c) - rate) <= 0.02 * np.linalg.norm(rate)
@@ -83,7 +83,7 @@ def test_it_turns_ever_faster_and_the_picture_follows(texture: NDArray[np.uint8]
         camera_motion=CameraMotion([[0.0, 0.0, 0.2, 0.0], [0.2, 0.0, 1.2, 0.0]]),
     )  # fmt: skip
     recording = simulation.run()
-    c = calibrate(recording, free=(*FREE, "change_y"), photometric=KNOWN, events=100_000)
+    c = calibrate(recording, free=(*FREE, "change_y"), photometric=KNOWN, events=40_000)
     assert c.parameters["change_y"] == pytest.approx(5.0, rel=0.05)
     assert c.camera_rotation is not None
     assert c.camera_rotation.about(0).angular_velocity[1] == pytest.approx(0.2, abs=0.02)
@@ -119,7 +119,7 @@ def test_what_the_events_do_not_determine_is_held_and_named(recording: Recording
 
 def test_index_and_focal_length(recording: Recording) -> None:
     """Index, focal length and apex make nearly the same motion."""
-    c = calibrate(recording, free=("apex", "phase", "index", "focal_length"), photometric=KNOWN, events=100_000)
+    c = calibrate(recording, free=("apex", "phase", "index", "focal_length"), photometric=KNOWN, events=40_000)
     assert c.photometric is not None
     assert c.photometric.accepted
     assert error_px(c, recording) < 0.02
@@ -202,7 +202,7 @@ class Film:
 def outcome(film: Film) -> tuple[Recording, Calibration | None]:
     recording = Simulation(Scene(film), CAMERA, TRUE_PRISM, film.seconds, seed=6).run()
     try:
-        return recording, calibrate(recording, photometric=KNOWN, events=100_000)
+        return recording, calibrate(recording, photometric=KNOWN, events=40_000)
     except AmiwarpError:
         return recording, None
 
@@ -258,6 +258,6 @@ def test_a_hand_trembles(texture: NDArray[np.uint8]) -> None:
     t = np.linspace(0.0, 0.2, 201)
     rates = np.stack([0.1 * np.cos(18.0 * t), 0.08 * np.sin(18.0 * t + 0.5), np.zeros(len(t))], axis=1)
     recording = turned(texture, np.column_stack([t, rates]))
-    c = calibrate(recording, free=FREE, photometric=replace(KNOWN, density=2.0, pairs=20_000), events=100_000)
+    c = calibrate(recording, free=FREE, photometric=replace(KNOWN, density=2.0, pairs=20_000), events=30_000)
     assert {*RATES, "apex", "phase"} <= {*c.free} & {*c.uncertainty}
     assert error_px(c, recording) <= 0.01
