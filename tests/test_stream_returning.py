@@ -204,7 +204,7 @@ def test_a_sender_that_connects_may_return(tmp_path: Path) -> None:
 def test_files_and_pipes_do_not_return(tmp_path: Path, spec: str) -> None:
     done = CliRunner().invoke(app, ["record", spec, str(tmp_path / "o.h5"), "--wait-for-source", "5"])
     assert done.exit_code == 1
-    assert f"{spec}: --wait-for-source applies to sockets only" in done.stderr
+    assert f"{spec}: --wait-for-source applies to sockets and camera: only" in done.stderr
     assert done.stderr.count("\n") == 1
 
 

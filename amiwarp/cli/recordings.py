@@ -50,7 +50,9 @@ HEAD_EVENTS = 1 << 22
 
 
 def run_info(
-    file: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
+    file: Annotated[
+        Path, typer.Argument(help="Recording in any supported format, or camera: to list the connected cameras.")
+    ],
     *,
     count: Annotated[
         bool, typer.Option("--count", help="Read all of a large file, to count its events instead of estimating them.")
@@ -63,11 +65,27 @@ def run_info(
     Files of up to 256 MiB are read once, in blocks. Of larger files only the first 4 million events and the end are
     read, unless --count is given. Figures that are then estimates are marked as such.
     """
+    if str(file) == "camera:":
+        _report_cameras(common)
+        return
     large = not count and _file_bytes(file) > LARGE_BYTES
     with head_only(HEAD_EVENTS) if large else contextlib.nullcontext():
         recording = open_recording(file, topic=topic)
     data = describe(recording, str(file), head=large)
     report(common, data, [table(_rows(data))])
+
+
+def _report_cameras(common: Common) -> None:
+    """Print the connected cameras, and the names under which ``amiwarp record`` and ``live`` open them."""
+    from amiwarp.live.stream.sources import list_cameras
+
+    data = [
+        {"source": each.serial and f"camera:{each.serial}", "model": each.name.value,
+         "connection": each.connection.value, "error": each.error}
+        for each in list_cameras()
+    ]  # fmt: skip
+    rows = [(d["model"], d["source"] or f"cannot be opened: {d['error']}", d["connection"]) for d in data]
+    report(common, {"cameras": data}, [table(rows)] if rows else ["no camera is connected"])
 
 
 def _file_bytes(path: Path) -> int:

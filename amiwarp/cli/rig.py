@@ -83,7 +83,8 @@ class SourceOptions:
         float,
         _in_source(
             min=0.0,
-            help="Longest wait for the sender to return after a socket's stream breaks off (s); 0: do not wait.",
+            help="Longest wait for the sender of a socket, or for a camera:, to return after its stream breaks off "
+            "(s); 0: do not wait.",
         ),
     ] = 0.0
 
@@ -222,8 +223,8 @@ def check_whole(source: Source, status: SessionStatus) -> None:
     problem = getattr(source, "problem", None)
     if problem is None:
         return
-    socket = source.name.partition(":")[0].removesuffix("-listen") in ("tcp", "unix")
-    hint = "; --wait-for-source S waits for the sender to return" if socket and not hasattr(source, "returns") else ""
+    reopens = source.name.partition(":")[0].removesuffix("-listen") in ("camera", "tcp", "unix")
+    hint = "; --wait-for-source S waits for it to return" if reopens and not hasattr(source, "returns") else ""
     kept = f"the {status.events:,} events received until then are kept"
     raise AmiwarpError(f"{source.name}: the stream broke off: {problem}; {kept}{hint}")
 
@@ -234,7 +235,7 @@ def session_summary(s: SessionStatus, source: Source) -> dict[str, Any]:
         "seconds": s.seconds, "events": s.events, "mev_per_s": s.events / max(s.seconds, 1e-9) / 1e6,
         "compensated": s.done, "outside": s.outside, "extrapolated": s.guessed, "without_angle": s.unknown,
         "dropped": s.dropped, "late": s.late, "returns": getattr(source, "returns", 0),
-        "broke_off": getattr(source, "problem", None),
+        "lost_usb_packets": getattr(source, "lost", 0), "broke_off": getattr(source, "problem", None),
     }  # fmt: skip
 
 
@@ -333,7 +334,8 @@ def run_live(
     source: Annotated[
         str,
         typer.Argument(
-            help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
+            help="Source: camera:, camera:SERIAL or camera:MODEL (then biases: camera:evk4,diff_on=20), dv, prophesee, "
+            "tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
         ),
     ],
     *,
@@ -480,12 +482,17 @@ def _writer(
     path: Path, source: Source, found: Calibration, *, compensated: bool, encoders: int, offset_us: float = 0.0
 ) -> LiveWriter:
     width, height = source.size
-    metadata: dict[str, Any] = {"recorded_from": source.name}
+    metadata: dict[str, Any] = _recorded_from(source)
     if compensated:
         metadata["compensated_with"] = found.model_name
     return LiveWriter(path, width=width, height=height, camera=found.camera, prism=source.prism or _prism(found),
                       metadata=metadata, compensated=compensated, encoders=encoders,
                       clock_offset_us=offset_us)  # fmt: skip
+
+
+def _recorded_from(source: Source) -> dict[str, Any]:
+    """Return the metadata of a recording that name the source and its camera."""
+    return {"recorded_from": source.name, **getattr(source, "metadata", {})}
 
 
 def _live_lines(d: dict[str, Any]) -> list[str]:
@@ -507,7 +514,8 @@ def run_record(
     source: Annotated[
         str,
         typer.Argument(
-            help="Source: dv, prophesee, tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
+            help="Source: camera:, camera:SERIAL or camera:MODEL (then biases: camera:evk4,diff_on=20), dv, prophesee, "
+            "tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
         ),
     ],
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
@@ -534,7 +542,7 @@ def run_record(
         width, height = opened.size
         writer = LiveWriter(
             out, width=width, height=height, camera=camera.build(width, height) or opened.camera,
-            prism=prism.build(opened.prism), metadata={"recorded_from": opened.name}, encoders=encoders,
+            prism=prism.build(opened.prism), metadata=_recorded_from(opened), encoders=encoders,
             clock_offset_us=clock_offset(opened, link),
         )  # fmt: skip
         with stopped_by_interrupt(stop), writer:  # in this order, so that Ctrl-C leaves no unfinished file

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import socket
 import threading
@@ -10,14 +11,16 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from datetime import timedelta
+from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError
+from amiwarp.events.encoder import TWO_PI
 from amiwarp.events.recording import Events, Recording
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
@@ -230,7 +233,7 @@ class StreamSource:
         return make_packet(now, message)
 
 
-# Stream over a socket that continues when a lost sender returns.
+# Stream over a socket, or of a camera, that continues when the lost sender or camera returns.
 
 LATE_US = 10_000
 """Largest step backwards of the event time when a sender returns [us]: events are sorted across a smaller step."""
@@ -244,31 +247,38 @@ SOCKETS = ("tcp", "unix", "tcp-listen", "unix-listen")
 
 
 class ReturningSource:
-    """Source for a stream that is opened again after a break, if its sender returns within ``wait_s`` [s].
+    """Source for a stream that is opened again after a break, if its sender or camera returns within ``wait_s`` [s].
 
-    The sender must be the same camera, and its clock must have continued. Otherwise events of the two parts could not
-    be ordered, and :class:`AmiwarpError` is raised. ``say`` is called with a message when the stream breaks off, when
-    it returns, and when the durations of the gap on the camera's and the host's clock disagree. Raises
-    :class:`AmiwarpError` for a source other than a socket, or if no sender is there at first.
+    It must be the same camera. The clock of a sender must have continued: otherwise events of the two parts could not
+    be ordered, and :class:`AmiwarpError` is raised. The clock of ``camera:`` begins anew: its later times are shifted,
+    so that the gap is as long as on the host's clock. ``say`` is called with a message when the stream breaks off, when
+    it returns, and when the durations of the gap on the sender's and the host's clock disagree. Raises
+    :class:`AmiwarpError` for a source other than a socket or ``camera:``, or if no sender is there at first.
     """
 
     def __init__(self, spec: str, wait_s: float, say: Callable[[str], None]) -> None:
         kind = spec.partition(":")[0]
-        if kind not in SOCKETS:
-            what = "give tcp:, unix:, tcp-listen: or unix-listen:, or omit the option"
+        if kind not in (*SOCKETS, "camera"):
+            what = "give camera:, tcp:, unix:, tcp-listen: or unix-listen:, or omit the option"
             raise AmiwarpError(
-                f"{spec}: --wait-for-source applies to sockets only, because a file or pipe cannot be reopened; {what}"
+                f"{spec}: --wait-for-source applies to sockets and camera: only, because other sources cannot be "
+                f"reopened; {what}"
             )
-        self._wait_s, self._say = wait_s, say
-        source = self._source = open_stream(spec)
-        self.name, self.size, self.camera, self.prism = spec, source.size, source.camera, source.prism
+        self._wait_s, self._say, self._restarts = wait_s, say, kind == "camera"
+        self._source: StreamSource | CameraSource = CameraSource(spec, say) if self._restarts else open_stream(spec)
+        source = self._source
+        self.name, self.size, self.camera, self.prism = source.name, source.size, source.camera, source.prism
         self.encoders = source.encoders
+        self.metadata = getattr(source, "metadata", {})
+        self.lost = 0
+        """Number of USB packets that were lost, see :attr:`CameraSource.lost`."""
         self.problem: str | None = None
         """How the stream ended, in one line; None if it ended with its end message."""
         self.returns = 0
         """Number of times that the sender returned."""
         self._events = 0
         self._last: tuple[int, int] | None = None  # latest event time, and the host's time of its arrival [us]
+        self._shift_us = 0
 
     def packets(self) -> Iterator[Packet]:
         """Yield packets, see :meth:`Source.packets`."""
@@ -279,13 +289,14 @@ class ReturningSource:
                 return
             self._say(
                 f"{self.name}: the stream broke off after {self._events:,} events ({self.problem}); "
-                f"waiting up to {self._wait_s:g} s for its sender"
+                f"waiting up to {self._wait_s:g} s for {self._awaited}"
             )
+            self._source.close()  # or the library holds the camera
             began = time.monotonic()
             before = self.returns
             yield from self._wait(began + self._wait_s)
             if self.returns == before:
-                self.problem = f"{self.problem}, and its sender was not back in {time.monotonic() - began:.1f} s"
+                self.problem = f"{self.problem}, and {self._awaited} was not back in {time.monotonic() - began:.1f} s"
                 return
             self._say(f"{self.name}: the stream is back after {time.monotonic() - began:.1f} s")
 
@@ -296,7 +307,11 @@ class ReturningSource:
     def _part(self) -> Iterator[Packet]:
         """Yield packets of one connection until the stream ends or breaks off."""
         fresh = unchecked = self.returns > 0
+        lost_before = self.lost
         for packet in self._source.packets():
+            self.lost = lost_before + getattr(self._source, "lost", 0)
+            if self._restarts:
+                packet, unchecked = self._shifted(packet, unchecked), unchecked and packet.empty
             if len(packet.events):
                 if unchecked:
                     self._check_clock(packet)
@@ -306,6 +321,25 @@ class ReturningSource:
                 self._last = max(newest, self._last[0] if self._last else newest), packet.arrived_us
             yield replace(packet, returned=True) if fresh else packet
             fresh = False
+
+    @property
+    def _awaited(self) -> str:
+        return "the camera" if self._restarts else "its sender"
+
+    def _shifted(self, packet: Packet, first: bool) -> Packet:
+        """Return the packet on the clock of the packets before the break. ``first``: none came since the return."""
+        times = np.concatenate([packet.events.t, packet.triggers])
+        if first and times.size and self._last is not None:
+            last, then = self._last
+            by_host = last + packet.arrived_us - then - int(times.max())
+            self._shift_us = max(by_host, last + 1 - int(times.min()))
+        if not (self._shift_us and times.size):
+            return packet
+        events = Events(packet.events.x, packet.events.y, packet.events.t + self._shift_us, packet.events.p)
+        return replace(
+            packet, events=events, triggers=packet.triggers + self._shift_us,
+            encoder_t=packet.encoder_t + self._shift_us,
+        )  # fmt: skip
 
     def _check_clock(self, packet: Packet) -> None:
         if self._last is None:
@@ -324,23 +358,20 @@ class ReturningSource:
 
         :attr:`problem` is None if the sender returned.
         """
-        attempts = _attempts(self.name)
-        try:
-            for connection in attempts:
-                if connection is not None:
+        with contextlib.closing(_attempts(self.name, self._say)) as attempts:
+            for reopen in attempts:
+                if reopen is not None:
                     try:
                         left = max(until - time.monotonic(), 1.0)
-                        self._continue_with(open_connection(self.name, connection, hello_s=min(HELLO_S, left)))
+                        self._continue_with(reopen(hello_s=min(HELLO_S, left)))
                         return
                     except Unreachable:  # the sender left before its hello message: wait for its next connection
                         pass
                 if time.monotonic() >= until:
                     return
                 yield make_packet(monotonic_us())
-        finally:
-            attempts.close()
 
-    def _continue_with(self, source: StreamSource) -> None:
+    def _continue_with(self, source: StreamSource | CameraSource) -> None:
         """Continue with a new connection, if it comes from the same camera."""
         if source.size != self.size:
             source.close()
@@ -352,18 +383,27 @@ class ReturningSource:
                 f"{self.name}: is back with another camera, prism or number of encoders; record this camera to another "
                 "file"
             )
-        self._source.close()
         self._source, self.problem = source, None
         self.returns += 1
 
 
-def _attempts(spec: str) -> Generator[socket.socket | None, None, None]:
-    """Yield the connections of a socket's senders; None at least every second while there is none."""
+def _attempts(
+    spec: str, say: Callable[[str], None]
+) -> Generator[Callable[..., StreamSource | CameraSource] | None, None, None]:
+    """Yield functions of ``hello_s`` that open a socket's sender or a camera again; None at least every second."""
+    if spec.partition(":")[0] == "camera":
+        while True:
+            for _ in range(round(REOPEN_S / IDLE_S)):
+                yield None
+                time.sleep(IDLE_S)
+            yield lambda hello_s: CameraSource(spec, say)
     iterate = iter_accepted if spec.partition(":")[0].endswith("-listen") else iter_connected
-    return iterate(spec.replace("-listen", "", 1))
+    for connection in iterate(spec.replace("-listen", "", 1)):
+        yield None if connection is None else partial(open_connection, spec, connection)
 
 
-# Cameras: iniVation's through dv-processing, Prophesee's through Metavision or OpenEB. Both libraries are optional.
+# Cameras: most through neuromorphic-drivers, iniVation's also through dv-processing, Prophesee's also through
+# Metavision or OpenEB. These libraries are optional.
 #
 # Tested with substitutes for these libraries, not yet with cameras.
 
@@ -379,7 +419,7 @@ def _library(name: str, camera: str, remedy: str) -> Any:
 
 
 @contextlib.contextmanager
-def _named(camera: str, doing: str) -> Iterator[None]:
+def _named(camera: str, doing: str, kind: type[AmiwarpError] = AmiwarpError) -> Iterator[None]:
     """Turn any exception of a camera's library into an :class:`AmiwarpError` of one line."""
     try:
         yield
@@ -387,7 +427,7 @@ def _named(camera: str, doing: str) -> Iterator[None]:
         raise
     except BaseException as error:
         lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
-        raise AmiwarpError(f"{camera}: {doing}: {lines[0][:200]}; check cable, power and access rights") from error
+        raise kind(f"{camera}: {doing}: {lines[0][:200]}; check cable, power and access rights") from error
 
 
 class _CameraSource:
@@ -397,6 +437,166 @@ class _CameraSource:
     encoders = 0
     size: tuple[int, int]
     name: str
+
+
+RAW_PACKETS = 8
+"""Largest number of USB packets, of 128 KiB each, that the camera's driver decodes at once: about a million events."""
+
+
+def list_cameras() -> list[Any]:
+    """Return the cameras that neuromorphic-drivers finds, each with ``name``, ``connection``, ``serial`` and ``error``.
+
+    Raises :class:`AmiwarpError` if the library is missing or cannot list the cameras.
+    """
+    remedy = "pip install 'amiwarp[camera]', or give dv or prophesee, which use other libraries"
+    drivers = _library("neuromorphic_drivers", "camera", remedy)
+    with _named("camera", "the cameras cannot be listed", Unreachable):
+        return list(drivers.list_devices())
+
+
+def _find_camera(which: str) -> Any:
+    """Return the camera with the serial number ``which``, or the only one whose model's name contains it."""
+    cameras = list_cameras()
+    found = [each for each in cameras if which == each.serial or _squeezed(which) in _squeezed(each.name.value)]
+    name = f"camera:{which}"
+    if not cameras:
+        raise Unreachable(f"{name}: no camera is connected, or none that neuromorphic-drivers knows; plug it in")
+    if len(found) != 1:
+        listed = ", ".join(
+            f"camera:{each.serial} ({each.name.value})" if each.serial else f"{each.name.value} ({each.error})"
+            for each in found or cameras
+        )
+        raise Unreachable(f"{name}: {len(found)} such cameras are connected; choose one of these: {listed}")
+    if found[0].serial is None:
+        remedy = "on Linux, 'neuromorphic-drivers-install-udev-rules' gives access rights"
+        raise Unreachable(f"{name}: {found[0].name.value} cannot be opened: {found[0].error}; {remedy}")
+    return found[0]
+
+
+def _squeezed(name: str) -> str:
+    """Return the letters and digits of a name in lower case."""
+    return "".join(filter(str.isalnum, name)).lower()
+
+
+class CameraSource(_CameraSource):
+    """Source of events from a camera by Prophesee, iniVation, CenturyArks or Lucid, read through neuromorphic-drivers.
+
+    ``spec``: ``camera:``, then the serial number or a part of the model's name if several cameras are connected, then
+    settings, separated by commas: values of biases, and ``counts_per_turn=N`` if rising edges at the trigger input are
+    counts of the prism's encoder, N per turn; negative: backwards. Without it, rising edges become triggers only.
+    ``say`` gets a message if USB packets are lost. The library puts the times of a device on one clock of 64 bits.
+    Raises :class:`Unreachable` if the camera is not there, and :class:`AmiwarpError` for a missing library and wrong
+    settings.
+    """
+
+    def __init__(self, spec: str, say: Callable[[str], None] = lambda _: None) -> None:
+        which, settings = _settings(spec)
+        found = _find_camera(which)
+        drivers, model = import_module("neuromorphic_drivers"), found.name.value
+        self.name = ",".join([f"camera:{found.serial}", *(f"{key}={value}" for key, value in settings.items())])
+        """Name with the serial number, under which the same camera can be opened again."""
+        self.metadata = {"camera_name": model}
+        """What a recording shall store about the camera."""
+        self.problem: str | None = None
+        """Why the camera stopped, in one line; None while it runs."""
+        self.lost = 0
+        """Number of USB packets that were lost, because the computer was too slow."""
+        self._say, self._count = say, 0
+        self._counts_per_turn = settings.pop("counts_per_turn", 0)
+        self.encoders = int(self._counts_per_turn != 0)
+        module = getattr(drivers, found.name.name.lower())
+        biases = _biases(self.name, model, module.Biases, settings)
+        with _named(self.name, "cannot be opened", Unreachable):
+            self._device = drivers.open(
+                module.Configuration(biases=biases), iterator_timeout=IDLE_S, serial=found.serial,
+                iterator_maximum_raw_packets=RAW_PACKETS,
+            )  # fmt: skip
+        try:
+            with _named(self.name, "cannot be opened", Unreachable):
+                properties, bounds = self._device.properties(), self._device.biases_bounds()
+            self.size = int(properties.width), int(properties.height)
+            for bias, value in settings.items():
+                limits = getattr(bounds, bias, None)  # those of the device; equal if they are unknown
+                if limits is not None and limits.minimum < limits.maximum:
+                    _check_limits(self.name, bias, value, limits.minimum, limits.maximum)
+        except BaseException:
+            self.close()
+            raise
+
+    def packets(self) -> Iterator[Packet]:
+        """Yield packets, see :meth:`Source.packets`. Ends when the camera stops; :attr:`problem` then says why."""
+        try:
+            while True:
+                try:
+                    with _named(self.name, "the camera stopped"):
+                        status, packet = next(self._device)
+                except AmiwarpError as error:
+                    self.problem = str(error).removeprefix(f"{self.name}: ")
+                    return
+                self._count_lost(status.ring)
+                yield self._packet(packet)
+        finally:
+            if self.lost:
+                self._say(f"{self.name}: {self.lost:,} USB packets with events were lost")
+
+    def close(self) -> None:
+        """Release the camera, see :meth:`Source.close`."""
+        with contextlib.suppress(Exception):  # a camera that was unplugged
+            self._device.close()
+
+    def _count_lost(self, ring: Any) -> None:
+        lost = self.lost if ring is None else int(ring.dropped_packets)
+        if lost and not self.lost:
+            self._say(f"{self.name}: this computer is too slow: USB packets with events are lost")
+        self.lost = lost
+
+    def _packet(self, packet: Any) -> Packet:
+        now, rows, edges = monotonic_us(), packet.polarity_events, packet.trigger_events
+        events = None if rows is None else _events(rows["x"], rows["y"], rows["t"], rows["on"])
+        if edges is None:
+            return make_packet(now, events)
+        # The polarity of an edge of the DAVIS346 is 0 for a falling edge, 1 for a rising one, and 2 for a pulse.
+        rising = edges["rising" if "rising" in edges.dtype.names else "polarity"] > 0
+        t = edges["t"][rising].astype(np.int64)
+        if not self._counts_per_turn:
+            return make_packet(now, events, t)
+        angle = np.arange(self._count, self._count + t.size) * (TWO_PI / self._counts_per_turn)
+        self._count += t.size
+        return make_packet(now, events, t, t, angle)
+
+
+def _settings(spec: str) -> tuple[str, dict[str, int]]:
+    """Return the serial number or model in the name of a camera, and its settings."""
+    parts = [part.strip() for part in spec.partition(":")[2].split(",")]
+    which = "" if "=" in parts[0] else parts.pop(0)
+    settings = {}
+    for part in parts:
+        name, _, value = part.partition("=")
+        try:
+            settings[name] = int(value, 0)
+        except ValueError as error:
+            raise AmiwarpError(f"{spec}: setting {part!r}; write NAME=WHOLE_NUMBER, as in diff_on=20") from error
+    if settings.get("counts_per_turn") == 0:
+        raise AmiwarpError(f"{spec}: counts_per_turn is 0; give the trigger edges per turn, negative for backwards")
+    return which, settings
+
+
+def _biases(name: str, model: str, kind: Any, values: dict[str, int]) -> Any:
+    """Return the biases of a camera model, with ``values`` in place of their defaults."""
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    for bias, value in values.items():
+        if bias not in fields:
+            known = ", ".join(f"{each} ({field.default:d})" for each, field in fields.items())
+            raise AmiwarpError(f"{name}: {model} has no bias {bias!r}; its biases, with their defaults, are {known}")
+        whole = get_args(fields[bias].type)  # of the type's NumPy and Python names; none for a switch
+        low, high = (np.iinfo(whole[0]).min, np.iinfo(whole[0]).max) if whole else (0, 1)
+        _check_limits(name, bias, value, low, high)
+    return kind(**{bias: type(fields[bias].default)(value) for bias, value in values.items()})
+
+
+def _check_limits(name: str, bias: str, value: int, low: int, high: int) -> None:
+    if not low <= value <= high:
+        raise AmiwarpError(f"{name}: bias {bias} = {value}; expected {low} .. {high}")
 
 
 class DvSource(_CameraSource):
@@ -610,10 +810,11 @@ def open_source(
 
     The name of a file replays a recording at ``pace`` times its speed (None: as fast as possible), in packets of
     ``packet_us`` [us]. ``-``, ``tcp:HOST:PORT`` and ``unix:PATH`` read a stream (``docs/reference/stream-format.md``);
-    ``tcp-listen:HOST:PORT`` and ``unix-listen:PATH`` wait for its sender to connect. ``dv``, ``dv:SERIAL``,
-    ``prophesee`` and ``prophesee:SERIAL`` open a camera. ``wait_s``: how long to wait for the sender of a socket to
-    return after its stream broke off [s]; ``say`` then gets messages.
-    Raises :class:`AmiwarpError` if the source cannot be opened, or if ``wait_s`` is given for other than a socket.
+    ``tcp-listen:HOST:PORT`` and ``unix-listen:PATH`` wait for its sender to connect. ``camera:``, ``camera:SERIAL`` and
+    ``camera:MODEL`` open a camera, with settings as :class:`CameraSource` takes them; ``dv``, ``dv:SERIAL``,
+    ``prophesee`` and ``prophesee:SERIAL`` open one through other libraries. ``wait_s``: how long to wait for the sender
+    of a socket, or for a ``camera:``, to return after its stream broke off [s]; ``say`` gets messages.
+    Raises :class:`AmiwarpError` if the source cannot be opened, or if ``wait_s`` is given for another source.
     """
     kind, _, rest = spec.partition(":")
     if wait_s > 0.0:
@@ -623,6 +824,8 @@ def open_source(
         return StreamSource("standard input", open(0, "rb", buffering=0, closefd=False))
     if kind in SOCKETS:
         return open_stream(spec)
+    if kind == "camera":
+        return CameraSource(spec, say)
     if kind == "dv":
         return DvSource(rest or None, packet_us=packet_us)
     if kind == "prophesee":
@@ -637,14 +840,14 @@ def reopen_source(spec: str, stop: threading.Event) -> Source | None:
     """
     kind = spec.partition(":")[0]
     if kind in SOCKETS:
-        with contextlib.closing(_attempts(spec)) as attempts:
-            for connection in attempts:
-                if connection is not None:
+        with contextlib.closing(_attempts(spec, lambda _: None)) as attempts:
+            for reopen in attempts:
+                if reopen is not None:
                     with contextlib.suppress(Unreachable):  # the sender left before its hello message
-                        return open_connection(spec, connection, hello_s=REOPEN_S)
+                        return reopen(hello_s=REOPEN_S)
                 if stop.is_set():
                     return None
-    while kind in ("dv", "prophesee") and not stop.wait(REOPEN_S):
+    while kind in ("camera", "dv", "prophesee") and not stop.wait(REOPEN_S):
         with contextlib.suppress(AmiwarpError):
             return open_source(spec)
     return None

@@ -1,0 +1,126 @@
+"""Cameras without hardware: neuromorphic-drivers' own Python code above a substitute for its compiled part."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+PACKAGE = "neuromorphic_drivers"
+POLARITY = np.dtype([("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("on", "?")])
+"""Rows of ``polarity_events``, as the package's README states."""
+TRIGGER = np.dtype([("t", "<u8"), ("id", "<u1"), ("rising", "?")])
+"""Rows of ``trigger_events`` of Prophesee's cameras, as the package's README states."""
+DAVIS_TRIGGER = np.dtype([("t", "<u8"), ("id", "<u1"), ("polarity", "<u1")])
+"""Rows of ``trigger_events`` of iniVation's cameras; the polarities are described in the package's ``packet.py``."""
+
+
+@dataclass
+class Part:
+    """What one call of ``__next__`` delivers. Without rows, the call returns after its time-out."""
+
+    events: NDArray[Any] | None = None
+    triggers: NDArray[Any] | None = None
+    dropped: int = 0
+    """Number of USB packets dropped since the device was opened."""
+
+
+@dataclass
+class StubCamera:
+    """Camera on a bus that does not exist."""
+
+    serial: str | None = "00051497"
+    name: str = "Prophesee EVK4"
+    parts: list[Iterable[Part | Exception]] = field(default_factory=list)
+    """What the camera delivers, one item for each time that it is opened. Exceptions are raised."""
+    error: str | None = None
+    most_openings: int = 100
+    """Number of times that the camera can be opened; it is gone afterwards."""
+    limits: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Limits of biases, by their names."""
+    opened: list[dict[str, Any]] = field(default_factory=list)
+    """Arguments of each opening, with the configuration as the package's object."""
+    closed: int = 0
+
+
+class StubDevice:
+    """As much of the compiled ``Device`` as the package's ``Device`` and amiwarp call."""
+
+    cameras: list[StubCamera]
+
+    def __new__(
+        cls, raw: Any, iterator_maximum_raw_packets: Any, device_type: Any, configuration: Any, serial: Any,
+        address: Any, ring_configuration: Any, iterator_timeout: Any,
+    ) -> StubDevice:  # fmt: skip
+        for camera in cls.cameras:
+            package = sys.modules[PACKAGE]
+            name = package.Name(camera.name)
+            present = len(camera.opened) < camera.most_openings
+            if present and serial == camera.serial and device_type == name.name.lower() and not raw and address is None:
+                self = super().__new__(cls)
+                camera.opened.append({
+                    "configuration": package.deserialize_configuration(name, configuration),
+                    "maximum": iterator_maximum_raw_packets, "timeout": iterator_timeout, "ring": ring_configuration,
+                })  # fmt: skip
+                self._camera, self._name = camera, name
+                self._parts = iter(camera.parts.pop(0) if camera.parts else ())
+                self._timeout = iterator_timeout
+                return self
+        raise RuntimeError("device with serial not found")
+
+    def __exit__(self, *_: object) -> None:
+        self._camera.closed += 1
+
+    def __next__(self) -> tuple[Any, ...]:
+        part = next(self._parts, None)
+        if isinstance(part, Exception):
+            raise part
+        now = time.time()
+        packet: Any = SimpleNamespace(
+            polarity_events=None, trigger_events=None, polarity_events_overflow_indices=None,
+            trigger_events_overflow_indices=None,
+        )  # fmt: skip
+        if part is None or (part.events is None and part.triggers is None):
+            time.sleep(self._timeout if part is None else 0.0)
+            return now, None, packet
+        packet.polarity_events, packet.trigger_events = part.events, part.triggers
+        return now, (now, 0, 1, False, [], 0, part.dropped), packet
+
+    def name(self) -> str:
+        return self._camera.name
+
+    def biases_bounds(self) -> bytes:
+        package = sys.modules[PACKAGE]
+        module = getattr(package, self._name.name.lower())
+        bounds = {name: module.Bounds(*limits) for name, limits in self._camera.limits.items()}
+        return package.serde.bincode.serialize(module.BiasesBounds(**bounds), module.BiasesBounds)
+
+
+@contextlib.contextmanager
+def connected(*cameras: StubCamera) -> Iterator[None]:
+    """Let neuromorphic-drivers find these cameras in a ``with`` block."""
+    importlib.import_module(PACKAGE)
+    kept = {name: module for name, module in sys.modules.items() if name.partition(".")[0] == PACKAGE}
+    extension: Any = ModuleType(f"{PACKAGE}.{PACKAGE}")
+    extension.Device = type("Device", (StubDevice,), {"cameras": list(cameras)})
+    extension.list_devices = lambda: [
+        (each.name, "USB 3.0 SuperSpeed (5.0 Gb/s)", "1:2", each.serial, each.error) for each in cameras
+    ]
+    for name in kept:
+        del sys.modules[name]
+    sys.modules[extension.__name__] = extension
+    try:
+        importlib.import_module(PACKAGE)
+        yield
+    finally:
+        for name in [name for name in sys.modules if name.partition(".")[0] == PACKAGE]:
+            del sys.modules[name]
+        sys.modules.update(kept)
