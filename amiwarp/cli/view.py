@@ -147,7 +147,7 @@ class StreamOptions:
             say(text)
 
         with SourceOptions(port=self.controller).link() as link:
-            stream = open_source(source)
+            stream = open_source(source, say=tell)
             check_angles(stream, link)
             recent = RecentEvents(stream)
             with followed(stream, link, recent, tell, partial(reopen_source, source)):

@@ -583,7 +583,7 @@ def _settings(spec: str) -> tuple[str, dict[str, int]]:
 
 def _biases(name: str, model: str, kind: Any, values: dict[str, int]) -> Any:
     """Return the biases of a camera model, with ``values`` in place of their defaults."""
-    fields = {field.name: field for field in dataclasses.fields(kind)}
+    fields: dict[str, Any] = {field.name: field for field in dataclasses.fields(kind)}
     for bias, value in values.items():
         if bias not in fields:
             known = ", ".join(f"{each} ({field.default:d})" for each, field in fields.items())
