@@ -454,7 +454,7 @@ def test_a_disk_that_is_full_at_the_end_is_noticed(tmp_path, monkeypatch):
 
 
 def test_a_missing_rosbags_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     source = save(tmp_path / "source.h5", make_events(10))
     with pytest.raises(AmiwarpError, match=r"out\.mcap: ROS bags need rosbags; .* pip install 'amiwarp\[ros\]'"):
         convert(source, tmp_path / "out.mcap")

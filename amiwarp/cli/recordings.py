@@ -4,7 +4,8 @@ import contextlib
 import math
 import re
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,6 +24,7 @@ from amiwarp.cli.common import (
     NominalPrismOptions,
     Round,
     Topic,
+    choose_device,
     format_notes,
     progress,
     report,
@@ -362,13 +364,49 @@ def _encoder_text(e: dict[str, Any] | None) -> str:
     return "; ".join(parts)
 
 
-# ``amiwarp convert``: conversion of recordings to the native format and to others.
+# ``amiwarp convert``: conversion of recordings to the native format and to others, and files for viewers.
+
+_in_viewers = partial(typer.Option, rich_help_panel="Viewers")
+
+
+@dataclass(frozen=True)
+class ViewerOptions:
+    """Options for the files of the viewers Rerun and Foxglove."""
+
+    foxglove: Annotated[
+        bool, _in_viewers("--foxglove", help="Write .mcap for Foxglove, with images, not as a ROS 2 bag.")
+    ] = False
+    calibration: Annotated[
+        Path | None,
+        _in_viewers(help="Calibration file (.json), to show compensated events too. Default: only recorded ones."),
+    ] = None
+    frame_ms: Annotated[
+        float | None, _in_viewers(min=0.001, help="Time window of the events in an image (ms). Default: 33.333.")
+    ] = None
+
+    def chosen(self, out: Path) -> bool:
+        """Return whether ``out`` is a file for a viewer. Raises :class:`AmiwarpError` for options without one."""
+        if out.suffix.lower() == ".rrd" or (self.foxglove and out.suffix.lower() == ".mcap"):
+            return True
+        if self.foxglove:
+            raise AmiwarpError(f"{out}: files for Foxglove end in .mcap, not '{out.suffix}'; leave --foxglove out")
+        if self != ViewerOptions():
+            raise AmiwarpError(
+                f"{out}: --calibration and --frame-ms are for viewers: .rrd, or .mcap with --foxglove; to compensate a "
+                "recording, run 'amiwarp compensate'"
+            )
+        return False
 
 
 def run_convert(
     source: Annotated[Path, typer.Argument(help="Recording in any supported format.")],
     out: Annotated[
-        Path, typer.Argument(help=f"File to write. Its extension gives the format: {EXTENSION_HELP}."), OUTPUT
+        Path,
+        typer.Argument(
+            help=f"File to write. Its extension gives the format: {EXTENSION_HELP}; .rrd (Rerun), or .mcap with "
+            "--foxglove, for viewers."
+        ),
+        OUTPUT,
     ],
     *,
     format: Format = None,
@@ -377,6 +415,7 @@ def run_convert(
     encoder: EncoderOptions,
     camera: CameraOptions,
     prism: NominalPrismOptions,
+    viewers: ViewerOptions,
     topic: Topic = None,
     common: Common,
 ) -> None:
@@ -384,9 +423,23 @@ def run_convert(
 
     Other formats hold the events only; the command lists what it leaves out. From a ROS 2 bag to a ROS 2 bag, all other
     topics are copied. Memory use does not depend on the length of the recording.
+
+    Files for the viewers Rerun and Foxglove show images of the events, recorded and, with --calibration, compensated,
+    and the prism's angle.
     """
     began = time.perf_counter()
+    for_viewer = viewers.chosen(out)
+    if for_viewer and (format, codec, round, camera, prism) != (
+        None, Codec.BLOSC, None, CameraOptions(), NominalPrismOptions()
+    ):  # fmt: skip
+        raise AmiwarpError(
+            f"{out}: is a file for a viewer; leave out --format, --codec, --round, and the camera's and prism's options"
+        )
     log = encoder.build(source, topic)
+    if for_viewer:
+        opened = open_recording(source, topic=topic)
+        _write_for_viewer(opened if log is None else replace(opened, encoder=log), out, viewers, common, began)
+        return
     lens = wedge = None
     if camera != CameraOptions() or prism != NominalPrismOptions():  # opening may read the whole file
         recording = open_recording(source, topic=topic)
@@ -404,6 +457,32 @@ def run_convert(
     slip = data.pop("index_slip")
     data["slip_deg"] = None if slip is None else math.degrees(slip)
     report(common, data, _convert_lines(data))
+
+
+def _write_for_viewer(recording: Recording, out: Path, options: ViewerOptions, common: Common, began: float) -> None:
+    """Write a file for a viewer, and report it."""
+    from amiwarp.calib import Calibration
+    from amiwarp.plotting.viewers import FRAME_US, save_for_viewer
+
+    device = choose_device(common.device)
+    found = None if options.calibration is None else Calibration.load(options.calibration)
+    frame_us = FRAME_US if options.frame_ms is None else max(1, math.floor(1e3 * options.frame_ms + 0.5))
+    with progress("writing frames") as advance:
+        summary = save_for_viewer(
+            recording, out, calibration=found, frame_us=frame_us, device=device, progress=advance
+        )  # fmt: skip
+    seconds = time.perf_counter() - began
+    data: dict[str, Any] = {"file": str(out), **asdict(summary), "device": device, "seconds": seconds}
+    rate = summary.events / max(seconds, 1e-9) / 1e6
+    frames = f"{summary.frames:,} frames ({' and '.join(summary.streams)})"
+    report(
+        common,
+        data,
+        [
+            f"{out}: {summary.events:,} events in {frames}, {summary.angles:,} prism angles, {seconds:.2f} s, "
+            f"{rate:.3g} Mev/s"
+        ],
+    )
 
 
 def _convert_lines(d: dict[str, Any]) -> list[str]:

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from amiwarp.live.stream.sources import EmulatedCamera
     from amiwarp.optics.models import Model
     from amiwarp.optics.prism import NominalPrism
+    from amiwarp.plotting.viewers import LiveViewer
 
 # Functions that ``record`` and ``live`` share: event source, link to the controller, status line, end of session.
 
@@ -299,6 +300,20 @@ class OutputOptions:
             metavar="ADDRESS",
         ),
     ] = None
+    rerun: Annotated[
+        str | None,
+        _in_outputs(
+            help="Show images of the events in the viewer Rerun: spawn starts it, HOST:PORT is one that runs.",
+            metavar="ADDRESS",
+        ),
+    ] = None
+    foxglove: Annotated[
+        str | None,
+        _in_outputs(
+            help="Address to serve images of the events at for Foxglove, which connects to ws://HOST:PORT.",
+            metavar="HOST:PORT",
+        ),
+    ] = None
 
     @property
     def files(self) -> list[str]:
@@ -412,11 +427,13 @@ class _Receivers:
             writer = _writer(options.out, source, found, compensated=True, encoders=encoders)
             self.out = resources.enter_context(writer)
         self.sink = sink(options.to)
+        self.viewers = [resources.enter_context(one) for one in _open_viewers(options, source)]
+        self.raw += self.viewers
 
     @property
     def sinks(self) -> tuple[Callable[[Compensated], None], ...]:
         """Functions that take compensated packets and send them."""
-        return () if self.sink is None else (_send_to(self.sink),)
+        return (*(() if self.sink is None else (_send_to(self.sink),)), *self.viewers)
 
 
 def _session(
@@ -442,6 +459,10 @@ def _follow(session: Session, stop: threading.Event, line: StatusLine, receivers
 
     status = session.run(stop, update)
     line.report_lost_packets(receivers.sink, receivers.raw_sink)
+    for viewer in receivers.viewers:
+        viewer.close()
+        if viewer.lost:
+            line.say(f"{viewer.lost:,} frames were not shown: the viewer, or this computer, is too slow")
     return status
 
 
@@ -465,6 +486,18 @@ def _open_sink(
     sink = open_sink(address, hello, stop=stop, say=say)
     resources.push(sink)
     return sink
+
+
+def _open_viewers(options: OutputOptions, source: Source) -> Iterator[LiveViewer]:
+    """Yield the viewers to which the options send images."""
+    if options.rerun is not None:
+        from amiwarp.plotting.viewers import rerun_viewer
+
+        yield rerun_viewer(options.rerun, source.size, source.name)
+    if options.foxglove is not None:
+        from amiwarp.plotting.viewers import foxglove_server
+
+        yield foxglove_server(options.foxglove, source.size)
 
 
 def _prism(found: Calibration) -> NominalPrism | None:

@@ -59,7 +59,7 @@ def export(
     path, limits = Path(path), LIMITS[chosen]
     ends = (source.t_first, source.t_last) if len(source) else (0, 0)
     outline = Outline(path, *size, *ends, codec, bag)
-    _check_limits(outline, limits)
+    check_limits(outline, limits)
     pixels = Pixels(limits, size, rounding, seed)
     write: Writer = formats.io_function(formats.WRITERS[chosen])
     with NewFile(path, overwrite=overwrite) as new, errors_name(path, lambda: f"writing {limits.label}"):
@@ -67,7 +67,7 @@ def export(
     return pixels.dropped
 
 
-def _check_limits(about: Outline, limits: formats.Limits) -> None:
+def check_limits(about: Outline, limits: formats.Limits) -> None:
     """Raise :class:`AmiwarpError` if the size or the times lie beyond what a format can hold."""
     remedy = "write a native recording (.h5)"
     if max(about.width, about.height) > limits.side:

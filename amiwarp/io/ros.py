@@ -501,26 +501,58 @@ PACKET_US = 10_000
 """Longest packet [us]."""
 
 
+class PacketEncoder:
+    """Encoder of events, in order of time, to serialised messages of the type :data:`MESSAGE` in EVT 3.0."""
+
+    def __init__(self, about: Outline) -> None:
+        """Load rosbags. Raises :class:`AmiwarpError` if it is missing."""
+        try:
+            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        except ImportError as error:
+            raise AmiwarpError(
+                f"{about.path}: ROS bags need rosbags; install it by: pip install 'amiwarp[ros]'"
+            ) from error
+        self.store = get_typestore(Stores.ROS2_HUMBLE)
+        """Definitions of the message and of its parts."""
+        self.store.register(get_types_from_msg(PACKET_DEFINITION, MESSAGE))
+        self._about, self._clock, self._count = about, _Clock(about.bag), 0
+        self._encoder = Evt3Encoder(origin_of(about))
+
+    def __call__(self, block: Events) -> Iterator[tuple[int, Any]]:
+        """Yield the packets of a block: the time of the recording of each [ns], and the serialised message."""
+        types, about = self.store.types, self._about
+        for events in self._clock.packets(block):
+            recorded, stamp = self._clock.times(int(events.t[0]))
+            words = self._encoder.encode(events, self_contained=True).astype("<u2")
+            time = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+            message = types[MESSAGE](
+                header=types["std_msgs/msg/Header"](stamp=time, frame_id="event_camera"),
+                height=about.height,
+                width=about.width,
+                seq=self._count,
+                time_base=0,
+                encoding="evt3",
+                is_bigendian=False,
+                events=words.view(np.uint8),
+            )
+            self._count += 1
+            yield recorded, self.store.serialize_cdr(message, MESSAGE)
+
+
 def write_ros2(part: Path, blocks: Iterable[Events], about: Outline) -> None:
     """Write all events. The extension of the file decides between MCAP and SQLite."""
     kind = about.path.suffix.lower()
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError as error:
-        raise AmiwarpError(f"{about.path}: ROS bags need rosbags; install it by: pip install 'amiwarp[ros]'") from error
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    store.register(get_types_from_msg(PACKET_DEFINITION, MESSAGE))
+    encoder = PacketEncoder(about)
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
     storage = StoragePlugin.MCAP if kind == ".mcap" else StoragePlugin.SQLITE3
     with scratch_folder(part.parent) as folder:
         bag = folder / "bag"
         # Older programs read version 8 too, the earliest that rosbags writes.
         with Writer(bag, version=8, storage_plugin=storage) as writer, contextlib.ExitStack() as opened:
-            connection = writer.add_connection(about.bag.topic if about.bag else TOPIC, MESSAGE, typestore=store)
-            found = (
-                (recorded, connection, store.serialize_cdr(message, MESSAGE))
-                for recorded, message in _messages(store.types, blocks, about)
-            )
+            topic = about.bag.topic if about.bag else TOPIC
+            connection = writer.add_connection(topic, MESSAGE, typestore=encoder.store)
+            found = ((recorded, connection, data) for block in blocks for recorded, data in encoder(block))
             streams = [opened.enter_context(contextlib.closing(found))]
             if about.bag is not None:
                 copied = _others(writer, about.bag)
@@ -528,28 +560,6 @@ def write_ros2(part: Path, blocks: Iterable[Events], about: Outline) -> None:
             for recorded, to, data in heapq.merge(*streams, key=itemgetter(0)):
                 writer.write(to, recorded, data)
         os.replace(bag / f"bag{kind}", part)
-
-
-def _messages(types: Any, blocks: Iterable[Events], about: Outline) -> Iterator[tuple[int, Any]]:
-    """Yield packets, and the time of the recording of each [ns]."""
-    encoder, clock = Evt3Encoder(origin_of(about)), _Clock(about.bag)
-    for number, events in enumerate(packet for block in blocks for packet in clock.packets(block)):
-        recorded, stamp = clock.times(int(events.t[0]))
-        words = encoder.encode(events, self_contained=True).astype("<u2")
-        time = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
-        yield (
-            recorded,
-            types[MESSAGE](
-                header=types["std_msgs/msg/Header"](stamp=time, frame_id="event_camera"),
-                height=about.height,
-                width=about.width,
-                seq=number,
-                time_base=0,
-                encoding="evt3",
-                is_bigendian=False,
-                events=words.view(np.uint8),
-            ),
-        )
 
 
 class _Clock:
