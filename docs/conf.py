@@ -19,6 +19,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
+    "sphinx_copybutton",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "api_pages",
@@ -76,12 +77,20 @@ sphinx_gallery_conf = {
 }
 
 html_theme = "furo"
-html_title = "amiwarp"
+html_title = f"amiwarp {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+templates_path = ["_templates"]
+html_sidebars = {
+    "**": [
+        f"sidebar/{part}.html"
+        for part in ("brand", "search", "sections", "scroll-start", "navigation", "scroll-end")
+    ]
+}
 html_show_sourcelink = False
 html_copy_source = False
 html_show_copyright = False
 html_math_renderer = "mathml"
 pygments_style = "friendly"
+copybutton_selector = "div:is(.highlight-sh, .highlight-python, .highlight-Python) pre"  # not what a program prints
 html_theme_options = {"footer_icons": [], "top_of_page_buttons": []}
