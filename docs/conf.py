@@ -56,8 +56,16 @@ repository_pages = {
     "changelog": "CHANGELOG.md",
     "contributing": "CONTRIBUTING.md",
     "reference/measurements/*": "benchmarks/results/*.md",
+    "reference/files/*": "examples/*.py",
+    "reference/files/auto": "benchmarks/auto.py",
+    "reference/files/mutants": "benchmarks/mutants.toml",
+    "reference/files/packets": "amiwarp/live/stream/packets.py",
+    "reference/files/refraction": "amiwarp/kernels/refraction.py",
 }
-repository_aliases = {"README.md": "index"}
+repository_aliases = {
+    "README.md": "index",
+    **{f"docs/tutorials/{path.name}": f"gallery/{path.stem}" for path in HERE.glob("tutorials/*.py")},
+}
 
 sphinx_gallery_conf = {
     "examples_dirs": "tutorials",
@@ -83,8 +91,7 @@ html_css_files = ["site.css"]
 templates_path = ["_templates"]
 html_sidebars = {
     "**": [
-        f"sidebar/{part}.html"
-        for part in ("brand", "search", "sections", "scroll-start", "navigation", "scroll-end")
+        f"sidebar/{part}.html" for part in ("brand", "search", "sections", "scroll-start", "navigation", "scroll-end")
     ]
 }
 html_show_sourcelink = False

@@ -101,6 +101,11 @@ def test_links_lead_to_the_pages_of_the_site(extension: Any, tmp_path: Path) -> 
     assert rewrite("[a](../docs/how-to/gpu.md) [b](speed.json) [c](none.md)", "reference/speed") == (
         "[a](../how-to/gpu.md) [b](../../results/speed.json) [c](none.md)"
     )
+    (tmp_path / "run.py").write_text("x = 1\n")
+    assert "# run.py\n\n```{literalinclude} ../../run.py\n:language: python\n" in pages.page_text(
+        docs, "how-to/run", tmp_path / "run.py"
+    )
+    assert pages.page_text(docs, "reference/speed", tmp_path / "README.md") == "x"
     assert rewrite("![picture](../README.md)", "reference/speed") == "![picture](../index.md)"
 
 

@@ -1,9 +1,9 @@
 """Show files of the repository that lie outside ``docs`` as pages, and make links between all of them work.
 
-Each entry of ``repository_pages`` is a page and the file that it shows; ``*`` stands for any name. The pages are copied
-before Sphinx reads its sources and are not under version control. Links in Markdown are those of the repository, which
-lead somewhere in a plain checkout: on the site a link to a file that is shown leads to its page, and a link to a folder
-becomes plain text.
+Each entry of ``repository_pages`` is a page and the file that it shows; ``*`` stands for any name. The pages are
+copied before Sphinx reads its sources and are not under version control. A file that is not Markdown is shown as code.
+Links in Markdown are those of the repository, which lead somewhere in a plain checkout: on the site a link to a file
+that is shown leads to its page, and a link to a folder becomes plain text.
 """
 
 from __future__ import annotations
@@ -28,6 +28,15 @@ def shown_files(docs: Path, entries: dict[str, str]) -> dict[str, Path]:
     return out
 
 
+def page_text(docs: Path, page: str, path: Path) -> str:
+    """Return the text of ``page``, which shows the file ``path``."""
+    if path.suffix == ".md":
+        return path.read_text()
+    language, shown = path.suffix.removeprefix(".").replace("py", "python"), os.path.relpath(path, (docs / page).parent)
+    name = path.relative_to(docs.parent).as_posix()
+    return f"---\norphan: true\n---\n\n# {name}\n\n```{{literalinclude}} {shown}\n:language: {language}\n```\n"
+
+
 def rewrite(text: str, page: str, docs: Path, shown: dict[str, Path], aliases: dict[str, str]) -> str:
     """Return the Markdown of ``page`` with links that lead to the right pages of the site."""
     pages = {path: name for name, path in shown.items()}
@@ -41,7 +50,8 @@ def rewrite(text: str, page: str, docs: Path, shown: dict[str, Path], aliases: d
         if not path or "://" in link or not file.exists():
             return link
         if file in pages:
-            return os.path.relpath(docs / f"{pages[file]}.md", here) + hash_ + anchor
+            suffix = ".rst" if pages[file].startswith("gallery/") else ".md"
+            return os.path.relpath(docs / f"{pages[file]}{suffix}", here) + hash_ + anchor
         return os.path.relpath(file, here) + hash_ + anchor
 
     def link(match: re.Match[str]) -> str:
@@ -62,7 +72,7 @@ def write(app: Sphinx, config: object) -> None:
             if old.relative_to(docs).with_suffix("").as_posix() not in shown:
                 old.unlink()
     for page, path in shown.items():
-        write_page(docs / f"{page}.md", path.read_text())
+        write_page(docs / f"{page}.md", page_text(docs, page, path))
 
 
 def read(app: Sphinx, docname: str, source: list[str]) -> None:

@@ -88,8 +88,8 @@ print(f"{done.made} recordings, {done.events:,} events")
 # :func:`amiwarp.collate` joins the events of a batch and copies them to the device,
 # and :func:`amiwarp.voxel_grid` makes all tensors of the batch in one call. This
 # data set is small, so its tensors are made once and kept.
-# ``examples/train_from_files.py`` reads the files anew in every epoch, in worker
-# processes.
+# :doc:`examples/train_from_files.py </reference/files/train_from_files>` reads the
+# files anew in every epoch, in worker processes.
 
 device = "cuda:0" if torch.cuda.is_available() else "cpu"
 SIDE, BINS = 48, 5
