@@ -18,7 +18,7 @@ MOST_SAMPLES = 32
 """Largest number of encoder samples in one message."""
 STATES = ("stopped", "at speed", "on the way to its speed", "fault")
 """Meaning of each value of :attr:`ControllerStatus.state`."""
-FAULTS = ("stall", "over-current", "encoder lost", "index missed", "host lost")
+FAULTS = ("stall", "over-current", "encoder lost", "index missed", "host lost", "over-speed")
 """Meaning of each bit of :attr:`ControllerStatus.faults`, lowest bit first."""
 REFUSALS = ("accepted", "unknown command", "out of range", "not possible now")
 """Meaning of each value of :attr:`Answer.refused`."""

@@ -1,0 +1,76 @@
+"""The firmware as controllers that Python drives in simulated time, like ``amiwarp.live.link.emulator.Controller``.
+
+``amiwarp.live.link.emulator.PseudoTerminal`` offers them as serial ports: ``python boards.py native`` or ``rp2040``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from pathlib import Path
+
+HERE = Path(__file__).parent
+BUILD = HERE / "build"
+
+
+class NativeBoard:
+    """The firmware's core compiled for this computer, with the motor and encoder of ``native/board.c``.
+
+    ``pulses``: 0 for ten per second, 1 at the index, 2 from the camera (see :meth:`pulse`). Times are in us.
+    """
+
+    VALUES = (
+        "jammed", "driver_fault", "no_index", "dead_a", "reversed_motor", "bad_spi", "runaway", "angle", "rpm", "",
+        "now", "late_us", "pulses",
+    )  # fmt: skip
+    """What :meth:`get` returns; the names before ``angle`` are faults that :meth:`set` switches."""
+    plugged = True
+
+    def __init__(
+        self, *, counts_per_turn: int = 4096, magnetic: bool = False, pulses: int = 0, drift_ppm: float = 0.0,
+        clock_start: float = 0.0, seed: int = 1, library: Path = BUILD / "libboard.so",
+    ) -> None:  # fmt: skip
+        self.library = ctypes.CDLL(str(library))
+        self.library.board_new.restype = ctypes.c_void_p
+        self.library.board_get.restype = ctypes.c_double
+        self.library.board_advance.restype = ctypes.c_uint32
+        self._board = ctypes.c_void_p(
+            self.library.board_new(
+                counts_per_turn, int(magnetic), pulses, ctypes.c_double(drift_ppm), ctypes.c_double(clock_start), seed
+            )
+        )
+        self._out = ctypes.create_string_buffer(1 << 20)
+
+    def advance(self, now_us: int) -> bytes:
+        """Run until a simulated time and return the bytes sent; the simulated line is infinitely fast."""
+        size = self.library.board_advance(self._board, ctypes.c_uint64(max(now_us, 0)), self._out, len(self._out))
+        return self._out.raw[:size] if size else b""
+
+    def feed(self, data: bytes, now_us: int) -> None:
+        """Give the firmware bytes from the host at a simulated time."""
+        self.library.board_feed(self._board, data, len(data))
+
+    def set(self, name: str, value: float = 1.0) -> None:
+        """Switch a fault on or off."""
+        self.library.board_set(self._board, self.VALUES.index(name), ctypes.c_double(value))
+
+    def get(self, name: str) -> float:
+        """Return a value of the simulated board."""
+        return float(self.library.board_get(self._board, self.VALUES.index(name)))
+
+    @property
+    def now(self) -> int:
+        """Simulated time [us]."""
+        return int(self.get("now"))
+
+    def reset(self) -> None:
+        """Reset the controller; the motor's shaft keeps its position."""
+        self.library.board_reset(self._board)
+
+    def pulse(self) -> None:
+        """Give a pulse of the camera to the firmware, now."""
+        self.library.board_pulse(self._board)
+
+    def counters(self) -> dict[str, int]:
+        """Return the firmware's statistics of received frames."""
+        names = ("frames", "damaged", "unknown", "lost", "overruns")
+        return {name: self.library.board_counter(self._board, k) for k, name in enumerate(names)}

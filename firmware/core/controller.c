@@ -1,0 +1,282 @@
+#include "controller.h"
+
+#define HOST_LOST_US 3000000u
+#define STATUS_US 1000000u
+#define CHECK_US 10000u
+#define FAULT(name) (1u << FAULT_BIT_##name)
+#define STOPPING (FAULT(STALL) | FAULT(OVER_CURRENT) | FAULT(ENCODER_LOST) | FAULT(OVER_SPEED))
+
+const struct settings default_settings = {
+    .counts_per_turn = 4096, .encoder = QUADRATURE, .pulses = PULSES_TIMED, .has_index = true,
+    .most_rpm = 3000, .most_ramp = 5000, .stop_ramp = 2000, .stall_ms = 1000,
+    .gains = {.no_load_rpm = 4000, .friction = 600, .kp = 20 * 256, .ki = 100 * 256, .duty_slew = 1500},
+};
+
+static int32_t size_of(int32_t x) { return x == INT32_MIN ? INT32_MAX : x < 0 ? -x : x; }
+static int32_t step_of(int32_t to, int32_t from) { return (int32_t)((uint32_t)to - (uint32_t)from); } /* may wrap */
+static bool before(uint32_t a, uint32_t b) { return (int32_t)(a - b) < 0; }
+
+#define WAITING(ring) ((ring_index)((ring).head - (ring).tail))
+#define FIRST(ring, n) (&(ring).items[(ring).tail & ((n) - 1u)])
+#define DROP(ring) ((ring).tail = (ring_index)((ring).tail + 1u))
+
+/* Sending. */
+
+static void send(struct controller *c, uint8_t type, const uint8_t *payload, uint32_t size) {
+    uint8_t packet[HEADER_BYTES + BATCH * SAMPLE_BYTES + CRC_BYTES], frame[sizeof packet + 2];
+    _Static_assert(BATCH * SAMPLE_BYTES >= CONTROLLER_STATUS_BYTES && sizeof packet < 254, "fits in one COBS block");
+    packet[0] = PROTOCOL_VERSION, packet[1] = type;
+    put16(packet + 2, c->sequence++);
+    for (uint32_t k = 0; k < size; k++) packet[HEADER_BYTES + k] = payload[k];
+    uint32_t bytes = frame_encode(packet, HEADER_BYTES + size, frame);
+    if (bytes > TX_BYTES - WAITING(c->tx)) return; /* lost as a whole; the host sees it by the sequence number */
+    for (uint32_t k = 0; k < bytes; k++) c->tx.items[(ring_index)(c->tx.head + k) & (TX_BYTES - 1u)] = frame[k];
+    __asm__ volatile("" ::: "memory");
+    c->tx.head = (ring_index)(c->tx.head + bytes);
+}
+
+static void flush(struct controller *c) {
+    uint8_t payload[BATCH * SAMPLE_BYTES];
+    for (uint32_t k = 0; k < c->batched; k++) {
+        put32(payload + SAMPLE_BYTES * k, c->batch[k].t);
+        put32(payload + SAMPLE_BYTES * k + 4, (uint32_t)c->batch[k].count);
+    }
+    if (c->batched) send(c, SAMPLES_TYPE, payload, SAMPLE_BYTES * c->batched);
+    c->batched = 0;
+}
+
+static void send_two(struct controller *c, uint8_t type, uint32_t first, uint32_t second) {
+    uint8_t payload[8];
+    put32(payload, first), put32(payload + 4, second);
+    flush(c);
+    send(c, type, payload, 8);
+}
+
+static void send_status(struct controller *c, uint32_t now) {
+    uint8_t payload[CONTROLLER_STATUS_BYTES];
+    put32(payload + CONTROLLER_STATUS_T_US, now);
+    payload[CONTROLLER_STATUS_STATE] = c->sent_state = c->state;
+    put16(payload + CONTROLLER_STATUS_FAULTS, c->sent_faults = c->faults);
+    put32(payload + CONTROLLER_STATUS_RPM, f32_from_q16(c->speed));
+    put32(payload + CONTROLLER_STATUS_TARGET_RPM, c->sent_target = c->target_bits);
+    put32(payload + CONTROLLER_STATUS_COUNTS_PER_TURN, c->sent_counts = c->settings.counts_per_turn);
+    flush(c);
+    send(c, CONTROLLER_STATUS_TYPE, payload, sizeof payload);
+    c->status_at = now;
+    c->told = true;
+}
+
+/* State and faults. */
+
+static void release(struct controller *c) {
+    speed_release(&c->control);
+    c->target_bits = 0;
+    c->duty = 0;
+    c->enabled = false;
+}
+
+static void fail(struct controller *c, uint32_t fault) {
+    c->faults |= (uint16_t)fault;
+    release(c);
+}
+
+static void set_if(struct controller *c, uint32_t fault, bool on) {
+    c->faults = (uint16_t)(on ? c->faults | fault : c->faults & ~fault);
+}
+
+static uint8_t state_of(const struct controller *c) {
+    if (c->faults & STOPPING) return STATE_FAULT;
+    int32_t away = size_of(c->speed - c->control.target), target = size_of(c->control.target);
+    if (target == 0 && c->control.reference == 0 && away < (c->state == STATE_STOPPED ? RPM(10) : RPM(2))) return STATE_STOPPED;
+    int32_t slack = target / 32 + RPM(1); /* twice as much before the state changes back */
+    bool near = target && c->control.reference == c->control.target
+        && away <= (c->state == STATE_AT_SPEED ? 2 * slack : slack);
+    return near ? STATE_AT_SPEED : STATE_ON_THE_WAY_TO_ITS_SPEED;
+}
+
+static void check(struct controller *c, uint32_t now) {
+    c->state = state_of(c);
+    set_if(c, FAULT(HOST_LOST), now - c->heard > HOST_LOST_US);
+    if (!c->told || now - c->status_at >= STATUS_US || c->state != c->sent_state || c->faults != c->sent_faults
+        || c->target_bits != c->sent_target || c->settings.counts_per_turn != c->sent_counts) send_status(c, now);
+}
+
+/* True once `condition` has held for `ms` calls in a row. */
+static bool lasts(uint16_t *counter, bool condition, uint16_t ms) {
+    *counter = (uint16_t)(condition ? *counter + (*counter < UINT16_MAX) : 0);
+    return *counter >= ms;
+}
+
+/* Checks of each sample, before the speed control. */
+static void protect(struct controller *c) {
+    const struct settings *s = &c->settings;
+    int32_t speed = size_of(c->speed), reference = size_of(c->control.reference);
+    bool turning = reference > RPM(20);
+    bool away = speed > reference + reference / 2 + RPM(300)
+        || (turning && speed > RPM(30) && (c->speed < 0) != (c->control.reference < 0));
+    if (lasts(&c->over_ms, speed / 6 > RPM(s->most_rpm) / 5, 20)) fail(c, FAULT(OVER_SPEED));
+    if (lasts(&c->runaway_ms, c->enabled && away, 500)) fail(c, FAULT(OVER_SPEED));
+    if (lasts(&c->stalled_ms, turning && speed < reference / 8, s->stall_ms)) fail(c, FAULT(STALL));
+    if (lasts(&c->current_ms, c->driver_fault, 2)) fail(c, FAULT(OVER_CURRENT));
+    if (c->bad_answers >= 5) fail(c, FAULT(ENCODER_LOST));
+    /* More than 1 in 16 edges lost within 0.1 s. */
+    if (++c->lost_ms >= 100) {
+        uint32_t edges;
+        do edges = c->edges_lost; while (edges != c->edges_lost); /* an interrupt may come between its bytes */
+        uint32_t lost = edges - c->edges_seen;
+        if (lost > 8 + (uint32_t)(size_of((int32_t)(c->tracker.speed >> 16)) * 100 / 16)) fail(c, FAULT(ENCODER_LOST));
+        c->edges_seen = edges;
+        c->lost_ms = 0;
+    }
+    /* No index pulse for one and a half turns. */
+    if (s->has_index && s->encoder == QUADRATURE) {
+        uint32_t since = (uint32_t)size_of(step_of(c->last.count, c->last_index.count));
+        if (since > s->counts_per_turn + s->counts_per_turn / 2) c->faults |= FAULT(INDEX_MISSED);
+    }
+}
+
+static void take_index(struct controller *c, struct stamp at) {
+    uint32_t per_turn = c->settings.counts_per_turn;
+    if (c->indexed && c->settings.encoder == QUADRATURE) {
+        uint32_t turned = (uint32_t)size_of(step_of(at.count, c->last_index.count)), off = turned % per_turn;
+        /* Counts that do not make whole turns, or stand still from pulse to pulse: an encoder's wire is broken. */
+        bool whole = turned > 0 && turned >= per_turn / 2 && (off < per_turn / 8 || off > per_turn - per_turn / 8);
+        if (lasts(&c->bad_turns, !whole && size_of(c->control.reference) > RPM(20), 3)) fail(c, FAULT(ENCODER_LOST));
+        /* The pulses also measure the speed without the counts. */
+        uint32_t least = 50000000u / (uint32_t)c->settings.most_rpm;
+        if (whole && turned < per_turn + per_turn / 8 && at.t - c->last_index.t < least) fail(c, FAULT(OVER_SPEED));
+    }
+    c->indexed = true;
+    c->last_index = at;
+    c->faults &= (uint16_t)~FAULT(INDEX_MISSED);
+    send_two(c, INDEX_TYPE, at.t, (uint32_t)at.count);
+}
+
+/* A magnetic encoder has its index where its angle passes zero; the time is interpolated. */
+static void pass_zero(struct controller *c, struct stamp at) {
+    int32_t step = step_of(at.count, c->last.count);
+    if (!c->sampled || c->last.count >> 14 == at.count >> 14 || size_of(c->speed) < RPM(5)) return;
+    int32_t zero = (step > 0 ? at.count : c->last.count) & ~(int32_t)(AS5047_COUNTS - 1);
+    int64_t share = (int64_t)(int32_t)(at.t - c->last.t) * step_of(zero, c->last.count);
+    take_index(c, (struct stamp){c->last.t + (uint32_t)(share / step), zero});
+}
+
+static void take_sample(struct controller *c, struct stamp at) {
+    c->speed = tracker_step(&c->tracker, at.count);
+    if (c->settings.encoder == MAGNETIC) pass_zero(c, at);
+    if (!c->sampled) c->last_index = at;
+    c->last = at;
+    c->sampled = true;
+    c->batch[c->batched++] = at;
+    if (c->batched == BATCH) flush(c);
+    protect(c);
+    if (c->faults & STOPPING) return;
+    c->duty = speed_step(&c->control, c->speed);
+    c->enabled = c->duty != 0 || c->control.target != 0;
+}
+
+/* Commands. */
+
+static uint8_t set_speed(struct controller *c, const uint8_t *payload) {
+    int32_t rpm, ramp, most = c->settings.most_ramp;
+    uint32_t bits = get32(payload + SET_SPEED_RPM), slope = get32(payload + SET_SPEED_RAMP);
+    if (!q16_from_f32(bits, &rpm) || size_of(rpm) > RPM(c->settings.most_rpm)) return REFUSED_OUT_OF_RANGE;
+    if (slope == 0 || slope >= 0x7F800000u) return REFUSED_OUT_OF_RANGE; /* zero, negative, infinite or NaN */
+    if (c->faults & STOPPING) return REFUSED_NOT_POSSIBLE_NOW;           /* a stop clears the faults */
+    if (!q16_from_f32(slope, &ramp) || ramp > RPM(most)) ramp = RPM(most);
+    ramp /= TICK_HZ;
+    c->control.target = rpm;
+    c->control.ramp = ramp > 0 ? ramp : 1;
+    c->target_bits = rpm == 0 ? 0 : bits;
+    c->bad_turns = 0;
+    return REFUSED_ACCEPTED;
+}
+
+static uint8_t stop(struct controller *c) {
+    c->faults &= (uint16_t)~STOPPING;
+    c->over_ms = c->runaway_ms = c->stalled_ms = c->current_ms = c->bad_turns = 0;
+    c->control.target = 0;
+    c->control.ramp = RPM(c->settings.stop_ramp) / TICK_HZ;
+    c->target_bits = 0;
+    return REFUSED_ACCEPTED;
+}
+
+static uint8_t set_counts(struct controller *c, const uint8_t *payload) {
+    uint32_t per_turn = get32(payload + SET_COUNTS_PER_TURN);
+    if (per_turn == c->settings.counts_per_turn) return REFUSED_ACCEPTED;
+    if (per_turn == 0 || per_turn >= (uint32_t)1 << 24) return REFUSED_OUT_OF_RANGE;
+    if (c->settings.encoder == MAGNETIC || c->state != STATE_STOPPED) return REFUSED_NOT_POSSIBLE_NOW;
+    c->settings.counts_per_turn = per_turn;
+    tracker_begin(&c->tracker, c->last.count, per_turn);
+    c->indexed = false;
+    c->last_index = c->last;
+    return REFUSED_ACCEPTED;
+}
+
+static void execute(struct controller *c, uint32_t size, uint32_t now) {
+    const uint8_t *packet = c->decoder.packet, *payload = packet + HEADER_BYTES;
+    uint8_t answer[ANSWER_BYTES], refused = REFUSED_UNKNOWN_COMMAND, type = packet[1];
+    c->heard = now;
+    if (type == PING_TYPE && size == PING_BYTES) {
+        check(c, now);
+        send_two(c, PONG_TYPE, get32(payload + PING_NUMBER), now);
+        return;
+    }
+    if (type == SET_SPEED_TYPE && size == SET_SPEED_BYTES) refused = set_speed(c, payload);
+    else if (type == STOP_TYPE && size == STOP_BYTES) refused = stop(c);
+    else if (type == SET_COUNTS_TYPE && size == SET_COUNTS_BYTES) refused = set_counts(c, payload);
+    else c->decoder.unknown++;
+    put16(answer + ANSWER_SEQUENCE, get16(packet + 2));
+    answer[ANSWER_REFUSED] = refused;
+    flush(c);
+    send(c, ANSWER_TYPE, answer, sizeof answer);
+    check(c, now);
+}
+
+void controller_begin(struct controller *c, const struct settings *settings, uint32_t now) {
+    uint8_t *bytes = (uint8_t *)c;
+    for (uint32_t k = 0; k < sizeof *c; k++) bytes[k] = 0;
+    c->settings = *settings;
+    c->control.gains = settings->gains;
+    tracker_begin(&c->tracker, 0, settings->counts_per_turn);
+    c->heard = now;
+    c->checked_at = now;
+}
+
+void controller_poll(struct controller *c, uint32_t now) {
+    while (WAITING(c->rx)) {
+        uint8_t byte = *FIRST(c->rx, RX_BYTES);
+        DROP(c->rx);
+        int size = frame_decode(&c->decoder, byte);
+        if (size >= 0) execute(c, (uint32_t)size, now);
+    }
+    for (;;) { /* samples and pulses in the order of their times; a pulse after a sample of the same time */
+        bool sample = WAITING(c->samples), index = WAITING(c->index), sync = WAITING(c->sync);
+        uint32_t at = sample ? FIRST(c->samples, WAITING_SAMPLES)->t : 0;
+        const struct stamp *pulse = index ? FIRST(c->index, WAITING_PULSES) : 0;
+        const struct stamp *trigger = sync ? FIRST(c->sync, WAITING_PULSES) : 0;
+        if (index && (!sample || before(pulse->t, at)) && (!sync || !before(trigger->t, pulse->t))) {
+            take_index(c, *pulse);
+            DROP(c->index);
+        } else if (sync && (!sample || before(trigger->t, at))) {
+            send_two(c, SYNC_TYPE, trigger->t, c->pulse_number++);
+            DROP(c->sync);
+        } else if (sample) {
+            take_sample(c, *FIRST(c->samples, WAITING_SAMPLES));
+            DROP(c->samples);
+        } else {
+            break;
+        }
+    }
+    if (now - c->checked_at >= CHECK_US) {
+        c->checked_at = now;
+        check(c, now);
+    }
+}
+
+int controller_take(struct controller *c) {
+    if (!WAITING(c->tx)) return -1;
+    uint8_t byte = *FIRST(c->tx, TX_BYTES);
+    DROP(c->tx);
+    return byte;
+}

@@ -1,0 +1,144 @@
+/* The prism's controller without its hardware. A port latches counts and pulses in interrupts, calls controller_poll()
+   in its main loop, sends the bytes of controller_take(), and sets the motor to `duty` and `enabled`.
+
+   All memory is in struct controller. Nothing here is floating point. Interrupts and the main loop share only the rings,
+   each with one writer and one reader, and 32-bit words. */
+#ifndef CONTROLLER_H
+#define CONTROLLER_H
+
+#include "encoder.h"
+#include "frame.h"
+#include "speed.h"
+
+/* Sizes of the rings, powers of two. A port with little memory defines smaller ones. */
+#ifndef TX_BYTES
+#define TX_BYTES 1024u
+#endif
+#ifndef RX_BYTES
+#define RX_BYTES 256u
+#endif
+#ifndef WAITING_SAMPLES
+#define WAITING_SAMPLES 64u
+#endif
+#define WAITING_PULSES 8u
+#define BATCH 5u /* samples per packet */
+
+enum encoder { QUADRATURE, MAGNETIC };
+enum pulses {
+    PULSES_TIMED,  /* ten per second, sent to the camera's trigger input */
+    PULSES_INDEX,  /* one per turn at the index, sent to the camera's trigger input */
+    PULSES_CAMERA, /* sent by the camera or another clock, and received */
+};
+
+struct settings {
+    uint32_t counts_per_turn;
+    uint8_t encoder, pulses;
+    bool has_index;
+    int32_t most_rpm, most_ramp, stop_ramp; /* limits of commands [rpm, rpm/s], and slope of a stop */
+    uint16_t stall_ms;                      /* time at an eighth of the speed or less that is a stall */
+    struct gains gains;
+};
+extern const struct settings default_settings;
+
+#ifdef __AVR__
+typedef uint8_t ring_index; /* read and written at once; rings of 128 items at most */
+#else
+typedef uint16_t ring_index;
+#endif
+struct stamp { uint32_t t; int32_t count; };
+#define RING(type, n) struct { type items[n]; volatile ring_index head, tail; }
+
+struct controller {
+    struct settings settings;
+    /* Written by interrupts. */
+    volatile int32_t count;
+    volatile uint32_t ticks, edges_lost, overruns; /* overruns: samples, pulses or bytes that found their ring full */
+    volatile uint8_t bad_answers;                  /* of the magnetic encoder, one after the other */
+    uint8_t levels;                                /* 2 A + B at the last edge */
+    bool backwards;                                /* direction of the last step */
+    uint16_t angle;                                /* of the magnetic encoder */
+    bool angle_known;
+    RING(struct stamp, WAITING_SAMPLES) samples;
+    RING(struct stamp, WAITING_PULSES) index;
+    RING(struct stamp, WAITING_PULSES) sync;
+    RING(uint8_t, RX_BYTES) rx;
+    /* Written by the main loop. */
+    RING(uint8_t, TX_BYTES) tx;
+    int32_t duty;
+    bool enabled;
+    /* Private. */
+    struct frame_decoder decoder;
+    struct tracker tracker;
+    struct speed_control control;
+    struct stamp batch[BATCH], last, last_index;
+    uint32_t heard, status_at, checked_at, pulse_number, edges_seen, target_bits, sent_target, sent_counts;
+    uint16_t sequence, stalled_ms, runaway_ms, over_ms, current_ms, bad_turns, lost_ms;
+    uint16_t faults, sent_faults;
+    uint8_t batched, state, sent_state;
+    int32_t speed;
+    bool indexed, sampled, told, driver_fault;
+};
+
+void controller_begin(struct controller *c, const struct settings *settings, uint32_t now);
+void controller_poll(struct controller *c, uint32_t now);
+int controller_take(struct controller *c); /* next byte to send, or -1 */
+
+/* What follows is called by interrupts. */
+
+#define PUT(c, ring, n, ...) do { \
+        ring_index head_ = (ring).head; \
+        if ((ring_index)(head_ - (ring).tail) >= (n)) { (c)->overruns++; break; } \
+        (ring).items[head_ & ((n) - 1u)] = __VA_ARGS__; \
+        __asm__ volatile("" ::: "memory"); /* the item is written before the head */ \
+        (ring).head = (ring_index)(head_ + 1u); \
+    } while (0)
+
+static inline void on_byte(struct controller *c, uint8_t byte) { PUT(c, c->rx, RX_BYTES, byte); }
+
+/* Levels of A and B after an edge, 2 A + B. */
+static inline void on_edge(struct controller *c, uint8_t levels) {
+    int8_t step = quadrature_step[c->levels << 2 | levels];
+    c->levels = levels;
+    if (step == QUADRATURE_LOST) c->edges_lost++;
+    else if (step) {
+        c->count = (int32_t)((uint32_t)c->count + (uint32_t)step); /* wraps */
+        c->backwards = step < 0;
+    }
+}
+
+/* Edge of the index pulse at time t [us]. The edge at lower counts is the index, whichever way the prism turns: the
+   pulse's first edge forwards, its last edge backwards. Returns whether this is the index. */
+static inline bool on_index(struct controller *c, uint32_t t, bool rising) {
+    if (rising == c->backwards) return false;
+    PUT(c, c->index, WAITING_PULSES, (struct stamp){t, c->count});
+    return true;
+}
+
+/* Pulse that the camera receives or sends, at time t [us]. */
+static inline void on_sync(struct controller *c, uint32_t t) { PUT(c, c->sync, WAITING_PULSES, (struct stamp){t, 0}); }
+
+/* Every millisecond: the count at time t [us]. Returns whether to send a pulse to the camera now. */
+static inline bool on_tick(struct controller *c, uint32_t t, int32_t count) {
+    c->ticks++;
+    PUT(c, c->samples, WAITING_SAMPLES, (struct stamp){t, count});
+    return c->settings.pulses == PULSES_TIMED && c->ticks % (TICK_HZ / 10u) == 0;
+}
+
+/* Answer of the magnetic encoder, before on_tick(): updates the count. */
+static inline void on_answer(struct controller *c, uint16_t frame) {
+    int angle = as5047_angle(frame);
+    if (angle < 0) {
+        if (c->bad_answers < UINT8_MAX) c->bad_answers++;
+        return;
+    }
+    c->bad_answers = 0;
+    if (!c->angle_known) c->count = angle;
+    else { /* the shortest way in 14 bits */
+        int16_t step = (int16_t)((((uint16_t)angle - c->angle + 8192u) & 16383u) - 8192u);
+        c->count = (int32_t)((uint32_t)c->count + (uint32_t)step);
+    }
+    c->angle = (uint16_t)angle;
+    c->angle_known = true;
+}
+
+#endif

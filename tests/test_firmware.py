@@ -1,0 +1,441 @@
+"""The firmware's core, compiled for this computer: protocol, encoders, speed control, faults. Skipped without gcc."""
+
+import ctypes
+import importlib.util
+import itertools
+import math
+import random
+import shutil
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+from cobs import cobs
+
+from amiwarp.live.link import protocol
+from amiwarp.live.link.clocks import WRAP
+from amiwarp.live.link.link import Follower, LinkUpdate
+from amiwarp.live.link.protocol import (
+    Answer,
+    ControllerStatus,
+    FrameDecoder,
+    Index,
+    Message,
+    Ping,
+    Pong,
+    Samples,
+    SetCounts,
+    SetSpeed,
+    Stop,
+    Sync,
+    encode,
+)  # fmt: skip
+
+FIRMWARE = Path(__file__).parents[1] / "firmware"
+pytestmark = [
+    pytest.mark.skipif(not FIRMWARE.is_dir(), reason="the firmware is not in this copy of the project"),
+    pytest.mark.skipif(shutil.which("gcc") is None or shutil.which("make") is None, reason="needs gcc and make"),
+]
+S = 1_000_000
+COUNT = math.tau / 4096
+T = TypeVar("T")
+FAULT = {name: 1 << bit for bit, name in enumerate(protocol.FAULTS)}
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"firmware_{name}", FIRMWARE / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def build(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the library and the fuzzer in a folder of their own."""
+    folder = tmp_path_factory.mktemp("firmware")
+    make = ("make", "-s", "-C", str(FIRMWARE), f"BUILD={folder}", "CC=gcc", f"{folder}/libboard.so", f"{folder}/fuzz")
+    done = subprocess.run(make, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture
+def board(build: Path) -> Callable[..., Any]:
+    make: Callable[..., Any] = load("boards").NativeBoard
+    return lambda **settings: make(library=build / "libboard.so", **settings)
+
+
+class Host:
+    """A host that talks to a board in simulated time and keeps the messages."""
+
+    def __init__(self, board: Any, damage: Callable[[bytes], bytes] = bytes) -> None:
+        self.board, self.decoder, self.damage = board, FrameDecoder(), damage
+        self.messages: list[Message] = []
+        self._sequence = itertools.count()
+
+    def send(self, message: Message) -> int:
+        number = next(self._sequence) % (1 << 16)
+        self.board.feed(self.damage(encode(message, number)), self.board.now)
+        return number
+
+    def run(self, seconds: float, step_us: int = 5000) -> list[Message]:
+        """Advance, with ten pings per second, and return the new messages."""
+        end, before = self.board.now + round(seconds * S), len(self.messages)
+        while self.board.now < end:
+            now = min(self.board.now + step_us, end)
+            self.messages += [m for _, m in self.decoder.feed(self.damage(self.board.advance(now)))]
+            if now % 100_000 < step_us:
+                self.send(Ping(now))
+        return self.messages[before:]
+
+    def command(self, message: Message) -> int | None:
+        """Send a command; return the reason of its refusal, or None without an answer."""
+        number = self.send(message)
+        return next((m.refused for m in self.run(0.05) if isinstance(m, Answer) and m.sequence == number), None)
+
+    @property
+    def status(self) -> ControllerStatus:
+        return next(m for m in reversed(self.messages) if isinstance(m, ControllerStatus))
+
+
+def of(kind: type[T], messages: list[Message]) -> list[T]:
+    return [m for m in messages if isinstance(m, kind)]
+
+
+# One description of the protocol, and the same bytes.
+
+
+def test_the_header_is_that_of_the_python_protocol() -> None:
+    generate = load("generate")
+    assert generate.HEADER.read_text() == generate.described()
+
+
+def test_frames_have_the_bytes_of_the_documentation(board: Callable[..., Any]) -> None:
+    library, rng = board().library, random.Random(0)
+    packets = [bytes.fromhex("010202010102 0304FFFFFFFF".replace(" ", ""))]
+    packets += [bytes(rng.choice((0, rng.randrange(256), 7)) for _ in range(n)) for n in (0, 1, 30, 250, 264)]
+    packets += [bytes(range(1, 256)) * 2, *(bytes(n) for n in (1, 253, 254)), *(b"\1" * n for n in range(245, 260))]
+    for packet in packets:
+        held = ctypes.create_string_buffer(packet, len(packet) + 4)
+        frame, size = ctypes.create_string_buffer(700), ctypes.c_uint32()
+        library.board_frame(held, len(packet), frame, ctypes.byref(size))
+        assert frame.raw[: size.value] == cobs.encode(packet + zlib.crc32(packet).to_bytes(4, "little")) + b"\0"
+
+
+def test_numbers_on_the_line_are_rounded_to_fixed_point(board: Callable[..., Any]) -> None:
+    library, rng = board().library, np.random.default_rng(1)
+    q16 = ctypes.c_int32()
+    values = np.concatenate([rng.uniform(-32000, 32000, 300), 10.0 ** rng.uniform(-9, 4, 300), [0.0, -0.0, 720, 1 / 3]])
+    for value in values.astype(np.float32):
+        assert library.board_q16(int(value.view(np.uint32)), ctypes.byref(q16))
+        assert abs(q16.value - float(value) * 65536) <= 0.5
+        back = np.uint32(library.board_f32(q16.value) & 0xFFFFFFFF).view(np.float32)
+        assert back == pytest.approx(q16.value / 65536, rel=2**-22, abs=0)
+    for value in np.array([np.nan, np.inf, -np.inf, 32768, -1e30], np.float32):
+        assert not library.board_q16(int(value.view(np.uint32)), ctypes.byref(q16))
+
+
+def test_every_step_of_the_encoders(board: Callable[..., Any]) -> None:
+    library = board().library
+    cycle = [0b00, 0b10, 0b11, 0b01]  # 2 A + B, A leads
+    for old, new in itertools.product(range(4), repeat=2):
+        step = (cycle.index(new) - cycle.index(old)) % 4
+        assert library.board_step(old << 2 | new) == {0: 0, 1: 1, 2: 2, 3: -1}[step]
+    for frame in range(0, 1 << 16, 7):
+        valid = frame.bit_count() % 2 == 0 and not frame & 0x4000
+        assert library.board_angle(frame) == (frame & 0x3FFF if valid else -1)
+
+
+# Speed, angles and pulses.
+
+
+@pytest.mark.parametrize(("rpm", "magnetic"), [(720.0, False), (-240.0, False), (1440.0, True), (-60.0, True)])
+def test_the_motor_follows_its_ramp_and_stops(board: Callable[..., Any], rpm: float, magnetic: bool) -> None:
+    host = Host(board(magnetic=magnetic))
+    host.run(0.2)
+    assert (host.status.state, host.status.rpm) == (0, pytest.approx(0.0, abs=2.0))
+    assert host.command(SetSpeed(rpm, abs(rpm))) == 0
+    measured = []
+    for k in range(1, 9):
+        host.run(0.1)
+        measured.append(host.board.get("rpm") - rpm * (0.05 + 0.1 * k))
+    assert np.abs(measured).max() < 0.05 * abs(rpm) + 10.0
+    host.run(1.0)
+    turned = -host.board.get("angle")
+    host.run(4.0)
+    turned += host.board.get("angle")
+    assert turned / math.tau * 15.0 == pytest.approx(rpm, rel=0.005)
+    assert (host.status.state, host.status.target_rpm, host.status.faults) == (1, rpm, 0)
+    assert host.command(Stop()) == 0
+    host.run(1.5)
+    assert (host.status.state, host.status.target_rpm) == (0, 0.0)
+    assert host.board.get("rpm") == pytest.approx(0.0, abs=2.0)
+    assert host.decoder.received == protocol.FrameCounters(frames=host.decoder.received.frames)
+
+
+@pytest.mark.parametrize(("rpm", "magnetic"), [(720.0, False), (-720.0, False), (300.0, True)])
+def test_angles_on_the_host_are_those_of_the_shaft(board: Callable[..., Any], rpm: float, magnetic: bool) -> None:
+    """The clock and the counts wrap on the way."""
+    turning = board(magnetic=magnetic, clock_start=WRAP - 2.2 * S, drift_ppm=80.0)
+    host, follower = Host(turning), Follower("port")
+    if not magnetic:
+        turning.library.board_tamper(turning._board, (1 << 31) - 50_000 if rpm > 0 else 50_000 - (1 << 31))
+    host.command(SetSpeed(rpm, 2000.0))
+    host.run(0.5)
+    follower.opened(0)
+    times, angles, truth = [], [], {}
+    for _ in range(300):
+        data = turning.advance(turning.now + 5000)
+        truth[turning.now] = turning.get("angle")
+        follower.feed(data, turning.now + 400)
+        host.send(Ping(0))
+        update = follower.take()
+        assert not update.messages
+        times.extend(update.t_us)
+        angles.extend(update.angle)
+    start = WRAP - 2.2 * S
+    on_clock = [start + t * (1 + 80e-6) for t in truth]
+    error = np.interp(times, on_clock, list(truth.values())) - angles
+    error = (error + math.pi) % math.tau - math.pi
+    inside = slice(10, -10)
+    assert len(times) > 1300
+    # eccentricity of the disc, noise of the magnetic encoder, and a linear interpolation over 5 ms
+    assert np.abs(error[inside] - error[inside].mean()).max() < 0.015
+    assert abs(error[inside].mean()) < 2 * COUNT
+
+
+def test_index_pulses_are_latched_within_two_microseconds(board: Callable[..., Any]) -> None:
+    host = Host(board())
+    host.command(SetSpeed(1440.0, 5000.0))
+    host.run(1.0)
+    pulses = of(Index, host.run(2.0))
+    assert {b.count - a.count for a, b in itertools.pairwise(pulses)} == {4096}
+    assert 0 < host.board.get("late_us") <= 2.0
+    assert math.gcd(*(b.t_us - a.t_us for a, b in itertools.pairwise(pulses))) == 1
+
+
+@pytest.mark.parametrize("pulses", [0, 1, 2])
+def test_pulses_of_the_camera_are_numbered_and_timed(board: Callable[..., Any], pulses: int) -> None:
+    host = Host(board(pulses=pulses))
+    host.command(SetSpeed(600.0, 5000.0))
+    host.run(1.0)
+    sent = []
+    got: list[Message] = []
+    for _ in range(20):
+        if pulses == 2:
+            host.board.pulse()
+            sent.append(host.board.now)
+        got += host.run(0.1)
+    syncs = of(Sync, got)
+    assert [m.number - syncs[0].number for m in syncs] == list(range(len(syncs)))
+    if pulses == 0:
+        assert {b.t_us - a.t_us for a, b in itertools.pairwise(syncs)} == {100_000}
+    elif pulses == 1:
+        assert [m.t_us for m in syncs] == [m.t_us for m in of(Index, got)]
+    else:
+        assert [m.t_us for m in syncs] == sent
+    assert len(syncs) in (19, 20, 21)
+
+
+def test_messages_are_in_the_order_of_their_times(board: Callable[..., Any]) -> None:
+    host = Host(board())
+    host.command(SetSpeed(1440.0, 5000.0))
+    host.run(2.0)
+    last = 0
+    for message in host.messages:
+        for t in (
+            message.t_us
+            if isinstance(message, Samples)
+            else [message.t_us]
+            if isinstance(message, Index | Sync)
+            else []
+        ):
+            assert t >= last
+            last = t
+    assert len(of(Pong, host.messages)) == 20
+
+
+# Commands.
+
+
+@pytest.mark.parametrize(
+    ("message", "refused"),
+    [
+        (SetSpeed(3000.5, 100.0), 2), (SetSpeed(-1e9, 100.0), 2), (SetSpeed(math.nan, 100.0), 2),
+        (SetSpeed(100.0, 0.0), 2), (SetSpeed(100.0, -1.0), 2), (SetSpeed(100.0, math.nan), 2),
+        (SetSpeed(100.0, math.inf), 2), (SetSpeed(100.0, 1e6), 0), (SetSpeed(0.0, 1e-6), 0), (SetCounts(0), 2),
+        (SetCounts(1 << 24), 2), (SetCounts(4096), 0), (SetCounts(1000), 0), (Stop(), 0), (Index(0, 0), 1),
+    ],
+)  # fmt: skip
+def test_answers_to_commands(board: Callable[..., Any], message: Message, refused: int) -> None:
+    host = Host(board())
+    host.run(0.1)
+    assert host.command(message) == refused
+
+
+def test_counts_are_not_changed_while_the_prism_turns(board: Callable[..., Any]) -> None:
+    host = Host(board())
+    host.command(SetSpeed(300.0, 3000.0))
+    host.run(1.0)
+    assert host.command(SetCounts(1000)) == 3
+    assert host.status.counts_per_turn == 4096
+    host.command(Stop())
+    host.run(1.0)
+    assert host.command(SetCounts(1000)) == 0
+    assert host.status.counts_per_turn == 1000
+
+
+# Faults.
+
+
+@pytest.mark.parametrize(
+    ("switch", "fault", "magnetic"),
+    [
+        ("jammed", "stall", False), ("driver_fault", "over-current", False), ("dead_a", "encoder lost", False),
+        ("bad_spi", "encoder lost", True), ("reversed_motor", "over-speed", False), ("runaway", "over-speed", True),
+    ],
+)  # fmt: skip
+def test_a_fault_stops_the_motor_until_a_stop_command(
+    board: Callable[..., Any], switch: str, fault: str, magnetic: bool
+) -> None:
+    host = Host(board(magnetic=magnetic))
+    early = switch in ("reversed_motor", "jammed")
+    if early:
+        host.board.set(switch)
+    host.command(SetSpeed(720.0, 1000.0))
+    host.run(0.2 if early else 2.0)
+    assert (host.status.state, host.status.faults) == (2 if early else 1, 0)
+    host.board.set(switch)
+    host.run(3.0)
+    assert host.status.faults == FAULT[fault]
+    assert (host.status.state, host.status.target_rpm) == (3, 0.0)
+    assert host.command(SetSpeed(100.0, 100.0)) == 3
+    host.board.set(switch, 0)
+    host.run(16.0)
+    assert host.board.get("rpm") == pytest.approx(0.0, abs=10.0)  # released
+    assert host.command(Stop()) == 0
+    host.run(0.5)
+    assert (host.status.state, host.status.faults) == (0, 0)
+    assert host.command(SetSpeed(100.0, 1000.0)) == 0
+
+
+def test_a_lost_wire_of_the_encoder_does_not_let_the_motor_run_away(board: Callable[..., Any]) -> None:
+    host = Host(board())
+    host.command(SetSpeed(720.0, 1000.0))
+    host.run(2.0)
+    host.board.set("dead_a")
+    fastest = 0.0
+    for _ in range(150):
+        host.run(0.01)
+        fastest = max(fastest, host.board.get("rpm"))
+    assert host.status.faults == FAULT["encoder lost"]
+    assert fastest < 3000.0
+
+
+def test_a_missing_index_and_a_silent_host_do_not_stop_the_motor(board: Callable[..., Any]) -> None:
+    host = Host(board())
+    host.command(SetSpeed(300.0, 3000.0))
+    host.run(1.0)
+    host.board.set("no_index")
+    host.run(0.5)
+    assert (host.status.state, host.status.faults) == (1, FAULT["index missed"])
+    host.board.set("no_index", 0)
+    host.run(0.5)
+    assert host.status.faults == 0
+    received = host.decoder.feed(host.board.advance(host.board.now + 4 * S))
+    host.messages += [m for _, m in received]
+    assert (host.status.state, host.status.target_rpm, host.status.faults) == (1, 300.0, FAULT["host lost"])
+    host.run(0.2)
+    assert host.status.faults == 0
+
+
+def test_a_reset_stops_the_motor_and_the_host_reports_it(board: Callable[..., Any]) -> None:
+    host, follower = Host(board()), Follower("port")
+    follower.opened(0)
+    host.command(SetSpeed(600.0, 3000.0))
+    for step in range(400):
+        if step == 200:
+            host.board.reset()
+        follower.feed(host.board.advance(host.board.now + 5000), host.board.now + 400)
+    messages: list[str] = []
+    update: LinkUpdate | None = None
+    while update is None or len(update.t_us) or update.messages:
+        update = follower.take()
+        messages += update.messages
+    assert any("the controller was reset" in m for m in messages)
+    assert follower.status is not None
+    assert (follower.status.state, follower.status.target_rpm) == (0, 0.0)
+    assert host.board.get("rpm") < 300.0
+
+
+# Damaged lines.
+
+
+def test_lost_and_changed_bytes_are_counted_and_do_no_harm(board: Callable[..., Any]) -> None:
+    rng = random.Random(3)
+
+    def damage(data: bytes) -> bytes:
+        changed = [b ^ (1 << rng.randrange(8)) if rng.random() < 0.002 else b for b in data if rng.random() > 0.003]
+        return bytes(changed)
+
+    host = Host(board(), damage)
+    accepted = 0
+    for k in range(40):
+        accepted += host.command(SetSpeed(300.0 + k, 3000.0)) is not None
+        host.run(0.1)
+    assert accepted > 20  # frames of 18 bytes, and their answers
+    counters = host.board.counters()
+    assert counters["damaged"] > 5
+    assert counters["frames"] > 50
+    assert host.status.faults == 0
+    assert host.decoder.received.damaged > 20
+    host.damage = bytes
+    host.run(0.1)
+    assert host.command(Stop()) == 0
+
+
+def test_garbage_is_not_a_command(board: Callable[..., Any]) -> None:
+    rng, host = random.Random(5), Host(board())
+    host.run(0.1)
+    for _ in range(100):
+        host.board.feed(rng.randbytes(300), host.board.now)
+        host.run(0.005)
+    assert (host.status.state, host.status.target_rpm) == (0, 0.0)
+    host.board.feed(b"\0", host.board.now)
+    assert host.command(SetSpeed(200.0, 500.0)) == 0
+
+
+def test_other_versions_and_types_are_skipped(board: Callable[..., Any]) -> None:
+    host = Host(board())
+    host.run(0.1)
+    for packet in (b"\2\x82\0\0", b"\1\xf0\1\0" + bytes(300), b"\1\x81\2\0abc"):
+        host.board.feed(cobs.encode(packet + zlib.crc32(packet).to_bytes(4, "little")) + b"\0", host.board.now)
+    host.run(0.1)
+    assert host.board.counters()["unknown"] == 3
+    assert host.board.counters()["damaged"] == 0
+    assert of(Pong, host.run(0.2))
+
+
+def test_a_host_that_does_not_read_loses_whole_frames(board: Callable[..., Any]) -> None:
+    host = Host(board())
+    host.board._out = ctypes.create_string_buffer(40)  # a line too slow for the samples
+    received = b"".join(host.board.advance(t) for t in range(0, 2 * S, 5000))
+    decoder = FrameDecoder()
+    decoder.feed(received)
+    assert decoder.received.damaged == 0
+    assert decoder.received.lost > 50
+
+
+def test_fuzzed_frames_and_commands(build: Path) -> None:
+    done = subprocess.run([build / "fuzz", "100000"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("100000 frames")
