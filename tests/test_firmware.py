@@ -20,6 +20,7 @@ from cobs import cobs
 
 from amiwarp.live.link import protocol
 from amiwarp.live.link.clocks import WRAP
+from amiwarp.live.link.conformance import check_controller
 from amiwarp.live.link.link import Follower, LinkUpdate
 from amiwarp.live.link.protocol import (
     Answer,
@@ -36,6 +37,7 @@ from amiwarp.live.link.protocol import (
     Sync,
     encode,
 )  # fmt: skip
+from tests.test_conformance import VirtualWire
 
 FIRMWARE = Path(__file__).parents[1] / "firmware"
 pytestmark = [
@@ -292,6 +294,14 @@ def test_counts_are_not_changed_while_the_prism_turns(board: Callable[..., Any])
     host.run(1.0)
     assert host.command(SetCounts(1000)) == 0
     assert host.status.counts_per_turn == 1000
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"magnetic": True, "drift_ppm": -80.0}, {"pulses": 1, "counts_per_turn": 1000}]
+)
+def test_the_firmware_passes_the_conformance_suite(board: Callable[..., Any], settings: dict[str, Any]) -> None:
+    checks = check_controller(VirtualWire(board(**settings)), 240.0)
+    assert [check.name for check in checks if not check.passed] == []
 
 
 # Faults.

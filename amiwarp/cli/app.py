@@ -136,7 +136,7 @@ COMMANDS = {
     ),
     "motor": Command(
         "rig",
-        "Set the speed of the prism's motor, stop it, or print the controller's status.",
+        "Set the speed of the prism's motor, stop it, print the controller's status, or check the controller.",
         "amiwarp motor set --port /dev/ttyACM0 --rpm 720",
     ),
     "record": Command(

@@ -10,7 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -601,17 +601,27 @@ POLL_S = 0.02
 """Interval between two readings of the data that the controller has sent [s]."""
 
 
+CHECK_RPM, LEAST_CHECK_RPM = 240.0, 60.0
+"""Default and smallest speed of ``amiwarp motor check`` [turns/min]."""
+_VERDICTS = {True: "passed", False: "FAILED", None: "skipped"}
+
+
 class Action(enum.StrEnum):
-    """Action of ``amiwarp motor``: print the status, set the speed, or stop."""
+    """Action of ``amiwarp motor``: print the status, set the speed, stop, or check the controller."""
 
     STATUS = "status"
     SET = "set"
     STOP = "stop"
+    CHECK = "check"
 
 
 def run_motor(
     action: Annotated[
-        Action, typer.Argument(help="status: print the status; set: turn at --rpm; stop: stop the motor.")
+        Action,
+        typer.Argument(
+            help="status: print the status; set: turn at --rpm; stop: stop the motor; check: test the controller "
+            "against the serial protocol, with a turning motor."
+        ),
     ],
     *,
     port: Annotated[
@@ -621,7 +631,9 @@ def run_motor(
             "Default: the port that sends encoder samples."
         ),
     ] = None,
-    rpm: Annotated[float | None, typer.Option(help="Speed to set (turns/min); negative: backwards.")] = None,
+    rpm: Annotated[
+        float | None, typer.Option(help="Speed to set (turns/min); negative: backwards. For check: 240 by default.")
+    ] = None,
     ramp_rpm_s: Annotated[
         float, typer.Option(min=0.001, help="Largest change of the speed (turns/min per second).")
     ] = 500.0,
@@ -629,19 +641,27 @@ def run_motor(
         float,
         typer.Option(min=0.0, help="Largest accepted speed (turns/min): what prism, mount and bearing withstand."),
     ] = LIMIT_RPM,
+    yes: Annotated[bool, typer.Option("--yes", help="For check: let the motor turn.")] = False,
     common: Common,
 ) -> None:
-    """Set the speed of the prism's motor, stop it, or print the controller's status.
+    """Set the speed of the prism's motor, stop it, print the controller's status, or check the controller.
 
-    The motor keeps its last commanded speed after this command exits.
+    The motor keeps its last commanded speed after this command exits. A check takes about 25 s, ends with a stop, and
+    fails (status 1) if a part of the serial protocol is violated.
     """
-    if (rpm is None) == (action is Action.SET):
+    if action is Action.CHECK:
+        rpm = CHECK_RPM if rpm is None else rpm
+    elif (rpm is None) == (action is Action.SET):
         raise AmiwarpError("'amiwarp motor set' needs --rpm, the speed to set; status and stop do not accept it")
     if rpm is not None and not abs(rpm) <= limit_rpm:
         raise AmiwarpError(
             f"--rpm {rpm:g} is beyond the limit of {limit_rpm:g} rpm; raise --limit-rpm only if prism and mount "
             "withstand it"
         )
+    if action is Action.CHECK:
+        assert rpm is not None
+        _check_motor(port, rpm, yes, common)
+        return
     with Link(port) as link:
         messages: list[str] = []
         _wait(link, messages)
@@ -653,6 +673,37 @@ def run_motor(
             _wait(link, messages, 0.0)
         data = _described(link, messages)
     report(common, data, [table(_motor_rows(data)), *data["messages"], *_hint(data)])
+
+
+def _check_motor(port: str | None, rpm: float, yes: bool, common: Common) -> None:
+    """Run the conformance suite and print its table; exit with status 1 if a check failed."""
+    from amiwarp.live.link.conformance import Check, SerialWire, check_controller
+
+    if abs(rpm) < LEAST_CHECK_RPM:
+        raise AmiwarpError(f"--rpm {rpm:g} is too slow for a check; give {LEAST_CHECK_RPM:g} rpm or more")
+    if not yes:
+        raise AmiwarpError(
+            f"the check turns the motor at {rpm:g} rpm; cover the prism, keep hands away, and add --yes to start it"
+        )
+
+    def tell(check: Check) -> None:
+        say(f"{check.name}: {_VERDICTS[check.passed]}")
+
+    wire = SerialWire(port)
+    try:
+        checks = check_controller(wire, rpm, tell)
+    except OSError as error:
+        raise AmiwarpError(f"{wire.name}: the port is gone, {error}; is the motor at rest?") from error
+    finally:
+        wire.close()
+    failed = [check for check in checks if check.passed is False]
+    rows = [(check.name, _VERDICTS[check.passed], check.measured) for check in checks]
+    verdict = f"{len(failed)} of {len(checks)} checks failed" if failed else "the controller passes"
+    remedies = [f"{check.name}: {check.remedy}" for check in failed]
+    data = {"port": wire.name, "rpm": rpm, "passed": not failed, "checks": [asdict(check) for check in checks]}
+    report(common, data, [table(rows, "check", "result", "measured"), "", *remedies, verdict])
+    if failed:
+        raise typer.Exit(1)
 
 
 def _wait(link: Link, messages: list[str], target: float | None = None) -> None:

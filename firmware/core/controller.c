@@ -3,6 +3,7 @@
 #define HOST_LOST_US 3000000u
 #define STATUS_US 1000000u
 #define CHECK_US 10000u
+#define STILL_CHECKS 10u /* a prism that swings into a cogging position has not stopped */
 #define FAULT(name) (1u << FAULT_BIT_##name)
 #define STOPPING (FAULT(STALL) | FAULT(OVER_CURRENT) | FAULT(ENCODER_LOST) | FAULT(OVER_SPEED))
 
@@ -87,7 +88,9 @@ static void set_if(struct controller *c, uint32_t fault, bool on) {
 static uint8_t state_of(const struct controller *c) {
     if (c->faults & STOPPING) return STATE_FAULT;
     int32_t away = size_of(c->speed - c->control.target), target = size_of(c->control.target);
-    if (target == 0 && c->control.reference == 0 && away < (c->state == STATE_STOPPED ? RPM(10) : RPM(2))) return STATE_STOPPED;
+    if (target == 0 && c->control.reference == 0 && away < (c->state == STATE_STOPPED ? RPM(10) : RPM(2))) {
+        if (c->still >= STILL_CHECKS) return STATE_STOPPED;
+    }
     int32_t slack = target / 32 + RPM(1); /* twice as much before the state changes back */
     bool near = target && c->control.reference == c->control.target
         && away <= (c->state == STATE_AT_SPEED ? 2 * slack : slack);
@@ -95,6 +98,8 @@ static uint8_t state_of(const struct controller *c) {
 }
 
 static void check(struct controller *c, uint32_t now) {
+    bool slow = c->control.target == 0 && size_of(c->speed) < RPM(10);
+    c->still = (uint8_t)(!slow ? 0 : c->still < STILL_CHECKS ? c->still + 1 : c->still);
     c->state = state_of(c);
     set_if(c, FAULT(HOST_LOST), now - c->heard > HOST_LOST_US);
     if (!c->told || now - c->status_at >= STATUS_US || c->state != c->sent_state || c->faults != c->sent_faults

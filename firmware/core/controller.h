@@ -74,7 +74,7 @@ struct controller {
     uint32_t heard, status_at, checked_at, pulse_number, edges_seen, target_bits, sent_target, sent_counts;
     uint16_t sequence, stalled_ms, runaway_ms, over_ms, current_ms, bad_turns, lost_ms;
     uint16_t faults, sent_faults;
-    uint8_t batched, state, sent_state;
+    uint8_t batched, state, sent_state, still;
     int32_t speed;
     bool indexed, sampled, told, driver_fault;
 };

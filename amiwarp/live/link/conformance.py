@@ -1,0 +1,465 @@
+"""Conformance suite for a controller: checks firmware, or the emulator, against ``docs/reference/link-protocol.md``.
+
+The suite turns the motor. It stops the motor at its end, also after an error.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import math
+import random
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.errors import AmiwarpError
+from amiwarp.live.link import protocol
+from amiwarp.live.link.clocks import FEWEST_PAIRS, UnwrappedClock, fit_to_round_trips, monotonic_us
+from amiwarp.live.link.link import open_port
+
+LISTEN_S, ANSWER_S, PING_S = 2.5, 1.0, 0.25
+"""Time for which the first frames are awaited, longest wait for an answer, and interval of pings [s]."""
+LEAST_HZ, LONGEST_GAP_US = 990.0, 20_000
+"""Smallest rate of encoder samples [1/s], and longest time between two of them [us]."""
+CLOCK_TOLERANCE = 0.01
+"""Largest relative difference between the rates of the controller's and the host's clocks."""
+SPEED_TOLERANCE, OVERSHOOT = 0.02, 0.15
+"""Largest relative errors of the mean speed at rest of the ramp, and of the speed at the end of the ramp."""
+RAMP_S, SETTLE_S, STEADY_S, STOP_S = 1.0, 5.0, 3.0, 8.0
+"""Duration of the ramp, longest time from its end to the state "at speed", time at constant speed, and longest time to
+stop [s]."""
+LATCH_US, LATCH_COUNTS = 2, 2.0
+"""Coarsest resolution of the controller's clock [us], and largest distance of an index pulse from the samples [counts].
+"""
+SYNC_HZ = (1.5, 30.0)
+"""Smallest and largest rate of sync pulses [1/s]."""
+SILENCE_S = 10.0
+"""Longest silence of the host until the controller must report it [s]."""
+SLICE_S = 0.3
+"""Time at which the speed is measured during the ramp, and for which a stopped motor must stand still [s]."""
+
+
+class Wire(Protocol):
+    """Line to a controller, with the host's clock."""
+
+    def now_us(self) -> int:
+        """Return the time [us]."""
+
+    def read(self) -> bytes:
+        """Wait for a short time and return the bytes that have arrived."""
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+
+    def reopen(self) -> bool:
+        """Close the line and open it again; return False if this line cannot."""
+
+
+class SerialWire:
+    """Wire through a serial port, see :func:`~amiwarp.live.link.link.open_port`."""
+
+    def __init__(self, port: str | None) -> None:
+        self._port: Any = open_port(port)
+        self.name = str(self._port.port)
+        self._where = port or self.name
+
+    def now_us(self) -> int:
+        """Return the time of the host's monotonic clock [us]."""
+        return monotonic_us()
+
+    def read(self) -> bytes:
+        """Return the bytes that have arrived, after waiting for at most 50 ms."""
+        return bytes(self._port.read(max(1, self._port.in_waiting)))
+
+    def write(self, data: bytes) -> None:
+        """Send bytes."""
+        self._port.write(data)
+
+    def reopen(self) -> bool:
+        """Close the port and open it again."""
+        self.close()
+        self._port = open_port(self._where)
+        return True
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """Result of one check."""
+
+    name: str
+    """What is checked."""
+    passed: bool | None
+    """Whether the controller passed; None if the check was skipped."""
+    measured: str
+    """What was found."""
+    remedy: str
+    """What to do about a failure."""
+
+
+def check_controller(wire: Wire, rpm: float, done: Callable[[Check], None] = lambda check: None) -> list[Check]:
+    """Check a controller and return the results in order. The motor turns at up to ``rpm`` [turns/min].
+
+    ``done`` is called with each result. A controller without frames, or without a status, ends the suite early.
+    """
+    suite, results = _Suite(wire, rpm), []
+    try:
+        for check in suite.checks():
+            results.append(check)
+            done(check)
+    finally:
+        with contextlib.suppress(OSError, AmiwarpError):
+            suite.send(protocol.Stop())
+    return results
+
+
+class _Suite:
+    """State of the suite: what was received, with unwrapped times."""
+
+    def __init__(self, wire: Wire, rpm: float) -> None:
+        self._wire, self._rpm = wire, rpm
+        self._decoder, self._clock = protocol.FrameDecoder(), UnwrappedClock()
+        self._sequence, self._numbers = itertools.count(), itertools.count(1)
+        self._sent: dict[int, int] = {}
+        self._trips: list[tuple[int, int, int]] = []
+        self._answers: dict[int, int] = {}
+        self._status: protocol.ControllerStatus | None = None
+        self._samples: list[tuple[int, int]] = []
+        self._index: list[tuple[int, int]] = []
+        self._sync: list[tuple[int, int]] = []
+        self._statuses: list[protocol.ControllerStatus] = []
+        self._latest = -math.inf  # time of the latest sample or index pulse
+        self._disorder = 0
+        self._first: protocol.FrameCounters | None = None  # opening the port cuts the first frame
+
+    def checks(self) -> Iterator[Check]:
+        """Run all checks."""
+        self._run(LISTEN_S, until=lambda: self._decoder.received.frames > 1)
+        received = self._decoder.received
+        what = f"{received.frames} frames, {received.damaged} damaged, {received.lines} lines of text"
+        yield Check("frames arrive", received.frames > 1, what, "check port, baud rate (460,800) and the sender's CRC")
+        if received.frames <= 1:
+            return
+        self._first = protocol.FrameCounters(damaged=received.damaged, unknown=received.unknown, lost=received.lost)
+        self._run(LISTEN_S, until=lambda: self._status is not None)
+        yield self._check_status()
+        if self._status is None:
+            return
+        yield self._check_pings()
+        yield self._check_rest()
+        yield self._check_samples()
+        yield self._check_refusals()
+        yield from self._check_speed()
+        yield self._check_bad_frames()
+        yield self._check_silence()
+        yield self._check_stop()
+        remedy = "send samples and index pulses in the order of their times, with time and count latched together"
+        yield Check("times increase", self._disorder == 0, f"{self._disorder} out of order", remedy)
+        yield self._check_opening()
+        yield self._check_clock()
+        yield self._check_losses()
+
+    # Talking.
+
+    def send(self, message: protocol.Message, *, sequence: int | None = None) -> int:
+        """Send a message and return its sequence number."""
+        number = next(self._sequence) & 0xFFFF if sequence is None else sequence
+        self._wire.write(protocol.encode(message, number))
+        return number
+
+    def _ping(self) -> int:
+        number = next(self._numbers)
+        self._sent[number] = self._wire.now_us()
+        self.send(protocol.Ping(number))
+        return number
+
+    def _run(self, seconds: float, *, until: Callable[[], bool] = lambda: False, pings: bool = True) -> bool:
+        """Receive for a time, or until a condition holds; return whether it holds."""
+        end, due = self._wire.now_us() + round(seconds * 1e6), self._wire.now_us() + round(PING_S * 1e6)
+        while not until():
+            now = self._wire.now_us()
+            if now >= end:
+                return until()
+            if pings and now >= due:
+                self._ping()
+                due = now + round(PING_S * 1e6)
+            data = self._wire.read()
+            host_us = self._wire.now_us()
+            for _, message in self._decoder.feed(data):
+                self._take(message, host_us)
+        return True
+
+    def _take(self, message: protocol.Message, host_us: int) -> None:
+        if isinstance(message, protocol.Samples):
+            for raw, count in zip(message.t_us, message.count, strict=True):
+                t = self._clock(raw)
+                self._disorder += t <= self._latest
+                self._latest = t
+                self._samples.append((t, count))
+        elif isinstance(message, protocol.Index):
+            t = self._clock(message.t_us)
+            self._disorder += t < self._latest
+            self._index.append((t, message.count))
+        elif isinstance(message, protocol.Sync):
+            self._sync.append((self._clock(message.t_us), message.number))
+        elif isinstance(message, protocol.ControllerStatus):
+            self._status = message
+            self._statuses.append(message)
+        elif isinstance(message, protocol.Pong) and message.number in self._sent:
+            self._trips.append((self._sent.pop(message.number), self._clock(message.t_us), host_us))
+        elif isinstance(message, protocol.Answer):
+            self._answers[message.sequence] = message.refused
+
+    def _command(self, message: protocol.Message) -> int | None:
+        """Send a command and return the answer's reason for a refusal; None without an answer."""
+        number = self.send(message)
+        self._run(ANSWER_S, until=lambda: number in self._answers)
+        return self._answers.pop(number, None)
+
+    @property
+    def _now(self) -> protocol.ControllerStatus:
+        assert self._status is not None
+        return self._status
+
+    def _counts_since(self, start: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return times [us] and counts, both without wraps, of the samples from number ``start`` on."""
+        rows = np.array(self._samples[start:], np.int64).reshape(-1, 2)
+        return rows[:, 0], np.unwrap(rows[:, 1], period=1 << 32).astype(np.int64)
+
+    def _speed(self, start: int) -> float:
+        """Return the mean speed by the samples from number ``start`` on [turns/min]; NaN without samples."""
+        t, count = self._counts_since(start)
+        if len(t) < 2:
+            return math.nan
+        return float(count[-1] - count[0]) / float(t[-1] - t[0]) * 60e6 / max(self._now.counts_per_turn, 1)
+
+    # Checks.
+
+    def _check_status(self) -> Check:
+        name, remedy = "status once per second", "send a status (type 0x04) once per second and on each change"
+        status = self._status
+        if status is None:
+            return Check(name, False, f"none in {LISTEN_S:g} s", remedy)
+        known = status.state < len(protocol.STATES) and status.faults >> len(protocol.FAULTS) == 0
+        what = f"state {status.state}, faults {status.faults:#x}, {status.counts_per_turn:,} counts per turn"
+        return Check(name, known and status.counts_per_turn > 0, what, "send a known state, faults and counts per turn")
+
+    def _check_pings(self) -> Check:
+        sent = []
+        for _ in range(10):
+            sent.append(self._ping())
+            self._run(ANSWER_S, until=lambda: sent[-1] not in self._sent, pings=False)
+        trips = sorted(received - at for at, _, received in self._trips)
+        missing = sum(number in self._sent for number in sent)
+        what = f"{missing} of {len(sent)} without a pong"
+        if trips:
+            what += f", round trip {trips[len(trips) // 2] / 1000:.1f} ms"
+        return Check("answers pings", missing == 0, what, "check the line to the controller, and send a pong at once")
+
+    def _check_rest(self) -> Check:
+        refused = self._command(protocol.Stop())
+        rests = self._run(STOP_S, until=lambda: self._now.state == 0)
+        faults = [f for bit, f in enumerate(protocol.FAULTS) if self._now.faults >> bit & 1]
+        what = f"answer {_reason(refused)}, state {self._now.state}, faults: {', '.join(faults) or 'none'}"
+        remedy = "answer a stop (0x82) with 0 and report state 0; remove the cause of faults"
+        return Check("rests after a stop", refused == 0 and rests and not faults, what, remedy)
+
+    def _check_samples(self) -> Check:
+        start = len(self._samples)
+        self._run(2.0)
+        t, _ = self._counts_since(start)
+        rate = (len(t) - 1) / max(float(t[-1] - t[0]), 1.0) * 1e6 if len(t) > 1 else 0.0
+        gap = int(np.diff(t).max()) if len(t) > 1 else 0
+        what = f"{rate:.0f} per second, longest gap {gap / 1000:.1f} ms"
+        good = rate >= LEAST_HZ and gap <= LONGEST_GAP_US
+        remedy = "latch a sample each millisecond; is the line too slow?"
+        return Check("encoder samples at 1 kHz", good, what, remedy)
+
+    def _check_refusals(self) -> Check:
+        speeds = (math.nan, 100.0), (1e9, 100.0), (10.0, -1.0)
+        answers = [*(self._command(protocol.SetSpeed(*pair)) for pair in speeds), self._command(protocol.SetCounts(0))]
+        target = self._now.target_rpm
+        what = f"answers {', '.join(map(_reason, answers))}; target {target:g} rpm"
+        remedy = "answer 2 to speeds that are not finite or too high, to ramps below 0, and to 0 counts per turn"
+        return Check("refuses what is out of range", set(answers) == {2} and target == 0, what, remedy)
+
+    def _check_speed(self) -> Iterator[Check]:
+        rpm, start = self._rpm, len(self._samples)
+        refused = self._command(protocol.SetSpeed(rpm, abs(rpm) / RAMP_S))
+        self._run(ANSWER_S, until=lambda: math.isclose(self._now.target_rpm, rpm, rel_tol=1e-6))
+        same = math.isclose(self._now.target_rpm, rpm, rel_tol=1e-6)
+        what = f"answer {_reason(refused)}, target {self._now.target_rpm:g} rpm"
+        yield Check(
+            "accepts a speed", refused == 0 and same, what, "answer 0, and report the same target in the status"
+        )
+        arrived = self._run(RAMP_S + SETTLE_S, until=lambda: self._now.state == 1)
+        self._run(RAMP_S)  # the speed may still overshoot
+        yield self._check_ramp(start, arrived)
+        steady, pulses, syncs = len(self._samples), len(self._index), len(self._sync)
+        self._run(STEADY_S)
+        mean = self._speed(steady)
+        what = f"{mean:.2f} rpm by the counts, {self._now.rpm:.2f} rpm by the status"
+        good = abs(mean / rpm - 1.0) <= SPEED_TOLERANCE and abs(self._now.rpm / rpm - 1.0) <= OVERSHOOT
+        yield Check(
+            "keeps its speed", good and self._now.state == 1, what, "check counts per turn and the control loop"
+        )
+        yield self._check_index(pulses)
+        yield self._check_latch(steady, pulses)
+        yield self._check_sync(syncs)
+
+    def _check_ramp(self, start: int, arrived: bool) -> Check:
+        t, count = self._counts_since(start)
+        at = np.arange(t[0], t[-1], SLICE_S * 1e6) if len(t) else np.zeros(0)
+        factor = 60.0 / (SLICE_S * max(self._now.counts_per_turn, 1) * self._rpm)
+        speed = np.diff(np.interp(at, t, count)) * factor  # of the target
+        highest, lowest = (float(speed.max()), float(speed.min())) if len(speed) else (math.nan, math.nan)
+        begun = float(speed[0]) if len(speed) else math.nan
+        what = f"{100 * begun:.0f} % of the speed in the first {SLICE_S:g} s, at most {100 * highest:.0f} %"
+        if lowest < -OVERSHOOT:
+            return Check(
+                "follows the ramp", False, what, "the counts run backwards: exchange A and B, or the motor's wires"
+            )
+        good = arrived and highest <= 1.0 + OVERSHOOT and begun <= SLICE_S / RAMP_S
+        if not arrived:
+            what += f'; no state "at speed" {SETTLE_S:g} s after the ramp'
+        return Check("follows the ramp", good, what, "limit the change of the speed; tune the control loop")
+
+    def _check_index(self, pulses: int) -> Check:
+        name, remedy = "one index pulse per turn", "check the index sensor, its interrupt, and the counts per turn"
+        counts = np.unwrap(np.array([c for _, c in self._index[pulses:]], np.int64), period=1 << 32)
+        expected = STEADY_S * abs(self._rpm) / 60.0
+        if len(counts) < max(2, expected / 2.0):
+            return Check(name, False, f"{len(counts)} pulses in {expected:.0f} turns", remedy)
+        steps = np.abs(np.diff(counts))
+        error = float(np.abs(steps - self._now.counts_per_turn).max())
+        what = f"{len(counts)} pulses, {steps.min():,} to {steps.max():,} counts apart"
+        return Check(name, error <= 0.01 * self._now.counts_per_turn, what, remedy)
+
+    def _check_latch(self, start: int, pulses: int) -> Check:
+        name = "latches time and count together"
+        t, count = self._counts_since(start)
+        inside = [(at, c) for at, c in self._index[pulses:] if len(t) and t[0] < at < t[-1]]
+        if len(inside) < 2:
+            return Check(name, None, "too few index pulses", "")
+        at, latched = np.array(inside, np.int64).T
+        off = latched - np.interp(at, t, count)
+        off -= (1 << 32) * np.rint(off / (1 << 32))
+        resolution = math.gcd(*np.diff(at).tolist())
+        rate = abs(self._rpm) / 60e6 * self._now.counts_per_turn
+        what = f"index pulses within {np.abs(off).max():.1f} counts of the samples, clock in steps of {resolution} us"
+        good = np.abs(off).max() <= LATCH_COUNTS + LATCH_US * rate + 0.01 * 1000 * rate and resolution <= LATCH_US
+        return Check(name, bool(good), what, "read clock and counter together in the interrupt; use a clock of 1 us")
+
+    def _check_sync(self, syncs: int) -> Check:
+        name, pulses = "sync pulses", self._sync[syncs:]
+        if not pulses:
+            return Check(name, None, "none; without them clocks agree to about a millisecond", "")
+        rate = len(pulses) / STEADY_S
+        consecutive = all((b - a) % (1 << 32) == 1 for (_, a), (_, b) in itertools.pairwise(pulses))
+        what = f"{rate:.1f} per second, numbers {'in order' if consecutive else 'with gaps'}"
+        good = consecutive and SYNC_HZ[0] <= rate <= SYNC_HZ[1]
+        return Check(name, good, what, "send two to ten pulses per second and number them from 0")
+
+    def _check_bad_frames(self) -> Check:
+        rng = random.Random(0)
+        stop = protocol.encode(protocol.Stop(), next(self._sequence) & 0xFFFF)
+        changed = bytes([*stop[:4], stop[4] ^ 1 or 2, *stop[5:]])
+        other = [
+            b"\2\x82\0\0",
+            b"\1\xf0\0\0",
+            b"\1\xf0\0\0" + bytes(300),
+            b"\1\x82\0\0\7",
+        ]  # another version, types, size
+        frames = [
+            changed,
+            stop[:-3] + b"\0",
+            bytes(rng.randrange(1, 256) for _ in range(300)) + b"\0",
+            b"\x55" * 700 + b"\0",
+        ]
+        for frame in [*frames, *(_framed(packet, next(self._sequence)) for packet in other)]:
+            self._wire.write(frame)
+            self._run(0.05, pings=False)
+        number = self._ping()
+        answered = self._run(ANSWER_S, until=lambda: number not in self._sent, pings=False)
+        kept = math.isclose(self._now.target_rpm, self._rpm, rel_tol=1e-6)
+        what = (
+            f"{len(frames) + len(other)} sent; pong: {'yes' if answered else 'no'}, target {self._now.target_rpm:g} rpm"
+        )
+        remedy = "drop frames with a wrong CRC, version, type or size, and synchronise at the next zero byte"
+        return Check("ignores bad frames", answered and kept, what, remedy)
+
+    def _check_silence(self) -> Check:
+        lost = 1 << protocol.FAULTS.index("host lost")
+        start = self._wire.now_us()
+        noticed = self._run(SILENCE_S, until=lambda: bool(self._now.faults & lost), pings=False)
+        after = (self._wire.now_us() - start) * 1e-6
+        samples = len(self._samples)
+        self._run(0.5, pings=False)
+        speed = self._speed(samples)
+        self._ping()
+        cleared = self._run(LISTEN_S, until=lambda: not self._now.faults & lost)
+        turning = abs(speed / self._rpm - 1.0) <= OVERSHOOT
+        noted = f"reported after {after:.1f} s" if noticed else f"not reported in {SILENCE_S:g} s"
+        what = f'"host lost" {noted}, {speed:.0f} rpm meanwhile, {"" if cleared else "not "}cleared by a ping'
+        remedy = "set fault bit 4 after a few seconds without a frame, clear it at the next; keep the motor turning"
+        return Check("notices a silent host", noticed and turning and cleared, what, remedy)
+
+    def _check_stop(self) -> Check:
+        refused, start = self._command(protocol.Stop()), self._wire.now_us()
+        rests = self._run(STOP_S, until=lambda: self._now.state == 0)
+        after, samples = (self._wire.now_us() - start) * 1e-6, len(self._samples)
+        self._run(SLICE_S)
+        speed = self._speed(samples)
+        still = abs(speed) < max(0.05 * abs(self._rpm), 60.0 / SLICE_S / max(self._now.counts_per_turn, 1) * 2)
+        what = f"answer {_reason(refused)}, state {self._now.state} after {after:.1f} s, {speed:.1f} rpm by the counts"
+        good = refused == 0 and rests and still and self._now.target_rpm == 0
+        return Check("stops", good, what, "brake to rest and report state 0 and target 0")
+
+    def _check_opening(self) -> Check:
+        name, before, restarts = "runs on when the port is opened", self._latest, self._decoder.received.restarts
+        kept = self._decoder.received.damaged, self._decoder.received.lost
+        if not self._wire.reopen():
+            return Check(name, None, "this line cannot be opened again", "")
+        start = len(self._samples)
+        self._run(LISTEN_S, until=lambda: len(self._samples) > start + 100)
+        again = self._decoder.received
+        alive = len(self._samples) > start
+        good = alive and again.restarts == restarts and self._samples[start][0] > before
+        again.damaged, again.lost = kept  # closing the port cuts frames
+        what = "sequence numbers and clock continue" if good else "restarted" if alive else "no samples"
+        return Check(name, good, what, "disable the board's automatic reset by DTR")
+
+    def _check_clock(self) -> Check:
+        name, remedy = "its clock counts microseconds", "count microseconds; wrap at 32 bits, not before"
+        if len(self._trips) < FEWEST_PAIRS:
+            return Check(name, None, "too few pongs", remedy)
+        drift = fit_to_round_trips(*np.array(self._trips, np.int64).T).drift
+        return Check(name, abs(drift) <= CLOCK_TOLERANCE, f"{1e6 * drift:+.0f} ppm to this computer's", remedy)
+
+    def _check_losses(self) -> Check:
+        now, first = self._decoder.received, self._first
+        assert first is not None
+        damaged, lost, unknown = now.damaged - first.damaged, now.lost - first.lost, now.unknown - first.unknown
+        what = f"{now.frames:,} frames: {damaged} damaged, {lost} lost, {unknown} unknown, {now.restarts} restarts"
+        remedy = "check cable and baud rate; print nothing else on this port; did the controller reset?"
+        return Check("no frame is damaged or lost", damaged + lost + unknown + now.restarts == 0, what, remedy)
+
+
+def _reason(refused: int | None) -> str:
+    return "none" if refused is None else str(refused)
+
+
+def _framed(packet: bytes, sequence: int) -> bytes:
+    """Return a packet of four bytes or more as a frame, with a sequence number and a valid CRC."""
+    from cobs import cobs
+
+    packet = packet[:2] + (sequence & 0xFFFF).to_bytes(2, "little") + packet[4:]
+    return bytes(cobs.encode(packet + zlib.crc32(packet).to_bytes(4, "little"))) + b"\0"
