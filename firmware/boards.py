@@ -6,7 +6,10 @@
 from __future__ import annotations
 
 import ctypes
+import json
+import subprocess
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).parent
 BUILD = HERE / "build"
@@ -74,3 +77,59 @@ class NativeBoard:
         """Return the firmware's statistics of received frames."""
         names = ("frames", "damaged", "unknown", "lost", "overruns")
         return {name: self.library.board_counter(self._board, k) for k, name in enumerate(names)}
+
+
+class SimulatedBoard:
+    """The image for the RP2040 on rp2040js (needs Node.js and ``npm install`` in ``simulator``), in simulated time.
+
+    ``image``: flash image (``.bin``). Times are in us.
+    """
+
+    plugged = True
+
+    def __init__(self, image: Path, *, magnetic: bool = False) -> None:
+        kind = "MAGNETIC" if magnetic else "QUADRATURE"
+        self._process = subprocess.Popen(
+            ["node", str(HERE / "simulator" / "board.mjs"), str(image), kind],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
+        )  # fmt: skip
+        self._inbox = b""
+        self.now = 0
+
+    def _ask(self, line: str) -> str:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(line + "\n")
+        answer = self._process.stdout.readline()
+        if not answer:
+            raise RuntimeError(f"the simulator ended with status {self._process.wait()}")
+        return answer.rstrip("\n")
+
+    def advance(self, now_us: int) -> bytes:
+        """Run until a simulated time and return the bytes sent."""
+        inbox, self._inbox = self._inbox, b""
+        now, _, data = self._ask(f"run {max(now_us, self.now)} {inbox.hex()}").partition(" ")
+        self.now = int(now)
+        return bytes.fromhex(data)
+
+    def feed(self, data: bytes, now_us: int) -> None:
+        """Give bytes to the UART, at its baud rate."""
+        self._inbox += data
+
+    def set(self, name: str, value: float = 1.0) -> None:
+        """Switch a fault on or off."""
+        self._ask(f"set {name} {value}")
+
+    def get(self, name: str) -> Any:
+        """Return a value of the simulated board."""
+        return json.loads(self._ask(f"get {name}"))
+
+    def reset(self) -> None:
+        """Reset the chip."""
+        self._ask("reset")
+
+    def close(self) -> None:
+        """End the simulator."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait()

@@ -1,0 +1,22 @@
+/* Pins of a Raspberry Pi Pico. The wiring of the rig follows this table. */
+#ifndef PINS_H
+#define PINS_H
+
+#define PIN_UART_TX 0       /* link, 460,800 baud, 3.3 V */
+#define PIN_UART_RX 1
+#define PIN_A 2             /* quadrature encoder, pulled up */
+#define PIN_B 3
+#define PIN_INDEX 4         /* index Z, high once per turn, pulled down */
+#define PIN_CAMERA_SYNC 5   /* pulses of the camera (PULSES_CAMERA), pulled down */
+#define PIN_TRIGGER 6       /* pulses to the camera's trigger input, 1 ms high */
+#define PIN_PWM 8           /* motor driver: 25 kHz */
+#define PIN_DIRECTION 9     /* high: forwards */
+#define PIN_ENABLE 10       /* high: on */
+#define PIN_DRIVER_FAULT 11 /* low: over-current or over-temperature, pulled up */
+#define PIN_SPI_MISO 16     /* magnetic encoder, 7.8 MHz, mode 1 */
+#define PIN_SPI_CS 17
+#define PIN_SPI_SCK 18
+#define PIN_SPI_MOSI 19
+#define PIN_LED 25          /* on while the motor is driven */
+
+#endif

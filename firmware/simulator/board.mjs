@@ -1,0 +1,162 @@
+// Runs a flash image on rp2040js, with a simulated motor and encoder, in steps that the caller asks for.
+//
+// Lines on standard input: "run UNTIL_US HEX" gives bytes to the UART and runs; the answer is "NOW_US HEX", the time
+// and the bytes sent. "set NAME VALUE" switches a fault, "get NAME" reads a value, "reset" resets the chip.
+import { readFileSync } from 'node:fs';
+import { createInterface } from 'node:readline';
+import { RP2040 } from 'rp2040js';
+
+const [path, kind] = process.argv.slice(2);
+const image = readFileSync(path);
+const magnetic = kind === 'MAGNETIC';
+const STEP_NS = 50_000, TAU = 2 * Math.PI, BYTE_NS = 10e9 / 460_800;
+const PIN = { a: 2, b: 3, index: 4, sync: 5, trigger: 6, direction: 9, enable: 10, fault: 11, cs: 17 };
+const perTurn = magnetic ? 16384 : 4096;
+const faults = { jammed: 0, driver_fault: 0, no_index: 0, dead_a: 0, reversed_motor: 0, bad_spi: 0, runaway: 0, hang: 0 };
+
+let mcu, clock, cycleNs = 8, out = [], inbox = [], arrivesNs = 0, resets = 0, watchdogs = 0;
+let turns = 0.3, rpm = 0, position = Math.floor(turns * perTurn), inPulse = false, random = 1;
+let indexNs = [], triggerNs = [];
+const worst = {}, busy = {};  // cycles by number of the exception
+
+const uniform = () => { random = (Math.imul(random, 1664525) + 1013904223) >>> 0; return (random >>> 8) / 8388608 - 1; };
+
+function boot() {
+  const was = clock?.nanos ?? 0;
+  mcu = new RP2040();
+  clock = mcu.clock;
+  mcu.logger = { debug() {}, info() {}, warn() {}, error(_, text) { process.stderr.write(`rp2040js: ${text}\n`); } };
+  mcu.flash.set(image);
+  mcu.sram.fill(0);
+  offset = was + offset;
+  mcu.core.VTOR = 0;
+  mcu.core.SP = 0x20042000;
+  mcu.core.PC = 0x10000000;  // the ROM calls the boot stage
+  mcu.uart[0].onByte = (byte) => out.push(byte);
+  let angle = 0;
+  mcu.spi[0].onTransmit = (word) => {
+    if (mcu.gpio[PIN.cs].outputValue) return mcu.spi[0].completeTransmit(0xffff);  // not selected
+    const answer = angle;
+    if (word === 0xffff) angle = frame();
+    mcu.spi[0].completeTransmit(faults.bad_spi ? answer ^ 1 : answer);
+  };
+  const watchdog = mcu.peripherals[0x40058];
+  watchdog.onWatchdogTrigger = () => { watchdogs++; boot(); };
+  for (const name of ['a', 'b', 'index', 'sync']) mcu.gpio[PIN[name]].setInputValue(false);
+  mcu.gpio[PIN.fault].setInputValue(!faults.driver_fault);
+  mcu.gpio[PIN.trigger].addListener((value) => { if (value === 1) triggerNs.push(now()); });
+  const core = mcu.core, enter = core.exceptionEntry.bind(core), leave = core.exceptionReturn.bind(core), stack = [];
+  core.exceptionEntry = (number) => { stack.push([number, core.cycles, 0]); enter(number); };
+  core.exceptionReturn = (value) => {
+    const [number, begun, nested] = stack.pop(), total = core.cycles - begun;
+    worst[number] = Math.max(worst[number] ?? 0, total - nested);
+    busy[number] = (busy[number] ?? 0) + total - nested;
+    if (stack.length) stack[stack.length - 1][2] += total;
+    leave(value);
+  };
+  levels();
+  resets++;
+}
+let offset = 0;  // time before the last reset [ns]
+const now = () => offset + clock.nanos;
+
+function levels() {
+  const [a, b] = [[0, 0], [1, 0], [1, 1], [0, 1]][position & 3];
+  const set = (pin, value) => { if (mcu.gpio[pin].rawInputValue !== !!value) mcu.gpio[pin].setInputValue(!!value); };
+  set(PIN.a, a && !faults.dead_a);
+  set(PIN.b, b);
+  const phase = ((position % perTurn) + perTurn) % perTurn, pulse = phase < perTurn / 256 + 1 && !magnetic;
+  if (pulse !== inPulse) {
+    inPulse = pulse;
+    if (!faults.no_index) {
+      if (pulse === rpm > 0) indexNs.push(now());
+      set(PIN.index, pulse);
+    }
+  }
+}
+
+const disc = () => (turns + 2e-4 * Math.sin(TAU * turns)) * perTurn;  // an eccentric disc
+
+function frame() {
+  let word = Math.floor(disc() + 1.5 * uniform()) & 0x3fff, parity = word;
+  for (const k of [8, 4, 2, 1]) parity ^= parity >> k;
+  return word | ((parity & 1) << 15);
+}
+
+function turn() {  // the same motor as native/board.c
+  const dt = STEP_NS * 1e-9, enabled = mcu.gpio[PIN.enable].outputValue, duty = (mcu.pwm.channels[4].cc & 0xffff) / 5000;
+  let drive = enabled ? (mcu.gpio[PIN.direction].outputValue ? duty : -duty) : 0;
+  if (faults.reversed_motor) drive = -drive;
+  if (faults.runaway) drive = 1.3;
+  let pull = enabled || faults.runaway ? (4000 * drive - rpm) / 0.15 : 0;
+  pull += 200 * Math.sin(12 * TAU * turns + 1) + 40 * Math.sin(TAU * turns);
+  pull += 3000 * uniform() * Math.min(1, Math.abs(rpm) / 50);
+  const friction = (200 + 0.1 * Math.abs(rpm)) * dt;
+  rpm += pull * dt;
+  rpm = Math.abs(rpm) > friction ? rpm - Math.sign(rpm) * friction : 0;
+  if (faults.jammed) rpm = 0;
+  turns += (rpm / 60) * dt;
+}
+
+function execute(until) {  // the processor, until a time [ns]
+  const core = mcu.core, chip = mcu;
+  while (chip === mcu && now() < until) {
+    if (core.waiting) {
+      const next = clock.nextAlarm ? clock.nanosToNextAlarm : Infinity;
+      clock.tick(Math.max(Math.min(until - now(), next), 0));
+      if (core.waiting && next > until - now() && now() >= until - 1) break;
+    } else if (faults.hang) {
+      clock.tick(1000);
+    } else {
+      clock.tick(core.executeInstruction() * cycleNs);
+    }
+  }
+}
+
+function step() {
+  const from = now(), before = disc();
+  turn();
+  const after = disc(), to = Math.floor(after), forward = to > position;
+  if (!magnetic) while (position !== to) {
+    position += forward ? 1 : -1;
+    const at = forward ? position : position + 1;
+    execute(from + (STEP_NS * (at - before)) / (after - before));
+    levels();
+  }
+  while (inbox.length && arrivesNs <= from + STEP_NS) {
+    execute(arrivesNs);
+    mcu.uart[0].feedByte(inbox.shift());
+    arrivesNs += BYTE_NS;
+  }
+  execute(from + STEP_NS);
+}
+
+boot();
+resets = 0;
+for await (const line of createInterface({ input: process.stdin })) {
+  const [what, ...rest] = line.split(' ');
+  if (what === 'run') {
+    if (rest[1]) {
+      if (!inbox.length) arrivesNs = now() + BYTE_NS;
+      inbox.push(...Buffer.from(rest[1], 'hex'));
+    }
+    const until = Number(rest[0]) * 1000;
+    while (now() < until) step();
+    process.stdout.write(`${Math.floor(now() / 1000)} ${Buffer.from(out).toString('hex')}\n`);
+    out = [];
+  } else if (what === 'set') {
+    faults[rest[0]] = Number(rest[1]);
+    if (rest[0] === 'driver_fault') mcu.gpio[PIN.fault].setInputValue(!faults.driver_fault);
+    if (rest[0] === 'sync') mcu.gpio[PIN.sync].setInputValue(!!faults.sync);
+    process.stdout.write('\n');
+  } else if (what === 'get') {
+    const values = {
+      rpm, angle: TAU * turns, index_us: indexNs.map((t) => t / 1000), trigger_us: triggerNs.map((t) => t / 1000),
+      worst, busy, resets, watchdogs, cycles: mcu.core.cycles, boot_us: offset / 1000,
+    };
+    process.stdout.write(`${JSON.stringify(values[rest[0]])}\n`);
+  } else if (what === 'reset') {
+    boot();
+    process.stdout.write('\n');
+  }
+}
