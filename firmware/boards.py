@@ -1,13 +1,16 @@
 """The firmware as controllers that Python drives in simulated time, like ``amiwarp.live.link.emulator.Controller``.
 
-``amiwarp.live.link.emulator.PseudoTerminal`` offers them as serial ports: ``python boards.py native`` or ``rp2040``.
+``python boards.py native`` or ``python boards.py IMAGE`` checks it; ``--link PATH`` offers a serial port.
 """
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import json
 import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -133,3 +136,74 @@ class SimulatedBoard:
         assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait()
+
+
+class SimulatedWire:
+    """Line to a board in simulated time, for ``amiwarp.live.link.conformance.check_controller``."""
+
+    def __init__(self, board: Any) -> None:
+        self.board = board
+
+    def now_us(self) -> int:
+        """Return the simulated time [us]."""
+        return int(self.board.now)
+
+    def read(self) -> bytes:
+        """Run for 5 ms and return the bytes sent."""
+        return bytes(self.board.advance(self.board.now + 5000))
+
+    def write(self, data: bytes) -> None:
+        """Send bytes to the board."""
+        self.board.feed(data, self.board.now)
+
+    def reopen(self) -> bool:
+        """Return True: opening a port does not act on these boards."""
+        return True
+
+
+def make(name: str) -> Any:
+    """Return the board ``native``, ``native-magnetic``, or the one that runs an image."""
+    if name.startswith("native"):
+        return NativeBoard(magnetic=name.endswith("magnetic"))
+    return SimulatedBoard(Path(name), magnetic="MAGNETIC" in name)
+
+
+def serve(board: Any, link: Path, seconds: float) -> None:
+    """Offer a board as a serial port. A simulator slower than real time slows the board's clock, and loses nothing."""
+    from amiwarp.live.link.emulator import PseudoTerminal
+
+    state = [time.monotonic(), float(board.now)]
+
+    def now_us() -> int:
+        now = time.monotonic()
+        state[1] += min(now - state[0], 0.005) * 1e6
+        state[0] = now
+        return int(state[1])
+
+    with PseudoTerminal(board, link, now_us=now_us) as port:
+        print(port.name, flush=True)
+        time.sleep(seconds)
+
+
+def main() -> int:
+    """Serve a board, or check it in simulated time."""
+    from amiwarp.live.link.conformance import check_controller
+
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("board", help="native, native-magnetic, or a flash image (.bin)")
+    options.add_argument("--link", type=Path, help="symbolic link for the serial port")
+    options.add_argument("--seconds", type=float, default=3600.0)
+    options.add_argument("--rpm", type=float, default=240.0)
+    chosen = options.parse_args()
+    board = make(chosen.board)
+    if chosen.link is not None:
+        serve(board, chosen.link, chosen.seconds)
+        return 0
+    checks = check_controller(
+        SimulatedWire(board), chosen.rpm, lambda c: print(f"{c.passed!s:6} {c.name}: {c.measured}", flush=True)
+    )
+    return int(any(check.passed is False for check in checks))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

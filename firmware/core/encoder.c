@@ -9,5 +9,5 @@ int as5047_angle(uint16_t frame) {
     parity ^= parity >> 4;
     parity ^= parity >> 2;
     parity ^= parity >> 1;
-    return (parity & 1u) || (frame & 0x4000u) ? -1 : frame & 0x3FFF;
+    return (parity & 1u) || (frame & 0x4000u) ? -1 : (int)(frame & 0x3FFFu);
 }
