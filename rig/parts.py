@@ -1,0 +1,604 @@
+"""Printed and bought parts of the rig as solids, in millimetres.
+
+The z axis is the axis of rotation and points to the scene, y points up. z = 0 is the rear face of the housing, next to
+the camera. The thick edge of the wedge points to +x.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from manifold3d import CrossSection, Manifold, OpType
+
+ADD = OpType.Add
+
+SEGMENTS = 180
+"""Number of sides of a circle."""
+PETG, GLASS, STEEL, ALUMINIUM = 1.27e-3, 2.51e-3, 7.85e-3, 2.70e-3
+"""Densities [g/mm³] of the printed material (solid), N-BK7, steel and aluminium."""
+BELT_PITCH, BELT_WIDTH, PITCH_LINE, TOOTH_DEPTH, BELT_BACK = 2.0, 6.0, 0.254, 0.75, 0.63
+"""GT2 belt [mm]: pitch, width, distance of the pitch line from the tips of the pulley's teeth, depth of a tooth, and
+thickness without teeth."""
+FLANGE, BELT_ROOM = 1.2, 7.0
+"""Thickness of a pulley's flange, and distance between its flanges [mm]."""
+SPRING = 1.5
+"""Length of the compressed wave spring [mm]."""
+PLATE = 5.0
+"""Thickness of the housing's plate, which carries the motor [mm]."""
+FORK_WIDTH, FORK_DEPTH, FORK_SLOT, FORK_SLOT_DEPTH, FORK_LENGTH = 14.0, 10.0, 5.0, 7.0, 6.0
+"""Fork barrier [mm]: width along its beam, depth, width and depth of its slot, and length along the flag's path."""
+
+
+@dataclass(frozen=True)
+class Bearing:
+    """Thin-section deep-groove ball bearing [mm, g, N]."""
+
+    name: str
+    bore: float
+    outer: float
+    width: float
+    mass: float
+    """Mass [g]."""
+    play: tuple[float, float]
+    """Radial play, class normal (ISO 5753) [mm]."""
+    runout: float
+    """Largest radial runout of the inner ring, class normal (ISO 492) [mm]."""
+    dynamic: float
+    """Basic dynamic load rating [N]."""
+
+    @property
+    def inner(self) -> float:
+        """Outer radius of what may touch the inner ring's face."""
+        return self.bore / 2 + 0.14 * (self.outer - self.bore)
+
+    @property
+    def outside(self) -> float:
+        """Inner radius of what may touch the outer ring's face."""
+        return self.outer / 2 - 0.14 * (self.outer - self.bore)
+
+
+BEARINGS = (
+    Bearing("6705", 25.0, 32.0, 4.0, 8.0, (0.005, 0.020), 0.013, 1100.0),
+    Bearing("6706", 30.0, 37.0, 4.0, 9.5, (0.005, 0.020), 0.013, 1140.0),
+    Bearing("6708", 40.0, 50.0, 6.0, 25.0, (0.006, 0.020), 0.015, 2500.0),
+    Bearing("6805", 25.0, 37.0, 7.0, 22.0, (0.005, 0.020), 0.013, 4300.0),
+    Bearing("6806", 30.0, 42.0, 7.0, 26.0, (0.005, 0.020), 0.013, 4500.0),
+    Bearing("6808", 40.0, 52.0, 7.0, 34.0, (0.006, 0.020), 0.015, 4900.0),
+    Bearing("6810", 50.0, 65.0, 7.0, 52.0, (0.006, 0.023), 0.020, 6700.0),
+    Bearing("6811", 55.0, 72.0, 9.0, 83.0, (0.008, 0.028), 0.020, 9000.0),
+    Bearing("6812", 60.0, 78.0, 10.0, 106.0, (0.008, 0.028), 0.020, 11900.0),
+)
+"""Masses and load ratings are typical ones; dimensions are those of the series 67 and 68 (ISO 15: 17 and 18)."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Dimensions of a rig [mm].
+
+    Parameters
+    ----------
+    name : str
+        Name of the folder of its files.
+    wedge : float
+        Diameter of the wedge.
+    thickness : float
+        Thickness of the wedge on the axis.
+    apex_deg : float
+        Apex angle of the wedge [deg].
+    teeth : tuple of int
+        Teeth of the pulleys of rotor and motor.
+    belt : float
+        Pitch length of the belt.
+    series : str
+        Series of the bearings, 67 or 68.
+    lens : float
+        Outer diameter of the lens, which reaches into the rotor.
+    pupil : float
+        Distance of the lens's entrance pupil behind its front.
+    """
+
+    name: str
+    wedge: float
+    thickness: float
+    apex_deg: float
+    teeth: tuple[int, int]
+    belt: float
+    series: str
+    lens: float
+    pupil: float
+    motor: tuple[float, float, float]
+    """Motor: diameter of body, length of body, diameter of shaft."""
+    motor_screws: tuple[float, float]
+    """Motor: distance of its two M3 threads, and diameter of its centring boss."""
+    camera: tuple[float, float, float, float] = (40.0, 40.0, 30.0, 20.0)
+    """Camera body: width, height, length, and height of the optical axis above its tripod thread's face."""
+    screw: tuple[float, float] = (1.6, 2.0)
+    """Set screws that balance the rotor: core hole, and thread."""
+    seat: float = 0.1
+    """Radial gap between wedge and seat."""
+    wall: float = 2.0
+    """Least wall between the wedge's seat and the bearing's bore."""
+    lip: float = 1.0
+    """Width of the lips that hold the wedge."""
+    between: float = 2.0
+    """Distance between the bearings."""
+    clearance: float = 0.7
+    """Smallest gap between a part that turns and one that does not."""
+
+    @property
+    def bearing(self) -> Bearing:
+        """Smallest bearing whose bore leaves a wall around the wedge's seat."""
+        least = self.wedge + 2 * (self.seat + self.wall)
+        made = (bearing for bearing in BEARINGS if bearing.name.startswith(self.series))
+        return next(bearing for bearing in made if bearing.bore >= least - 1e-9)
+
+    @property
+    def clear(self) -> float:
+        """Radius of the clear aperture."""
+        return self.wedge / 2 - self.lip
+
+    @property
+    def edge(self) -> float:
+        """Thickness of the wedge at its thick edge."""
+        return self.thickness + self.wedge / 2 * math.tan(math.radians(self.apex_deg))
+
+    @property
+    def bearing_z(self) -> tuple[float, float]:
+        """Rear faces of both bearings."""
+        rear = 2.0 + SPRING
+        return rear, rear + self.bearing.width + self.between
+
+    @property
+    def shoulder_z(self) -> float:
+        """Front face of the front bearing, where the rotor's shoulder begins."""
+        return self.bearing_z[1] + self.bearing.width
+
+    @property
+    def face_z(self) -> float:
+        """Front face of the housing. The bearing stands out by 0.1 mm, so that the cap clamps it."""
+        return self.shoulder_z - 0.1
+
+    @property
+    def pulley_z(self) -> float:
+        """Rear face of the rotor's pulley."""
+        return self.shoulder_z + 2.6
+
+    @property
+    def front_z(self) -> float:
+        """Front face of the rotor."""
+        return self.pulley_z + 2 * FLANGE + BELT_ROOM
+
+    @property
+    def seat_z(self) -> float:
+        """Rear, flat face of the wedge. Between its thick edge and the ring remain 1.3 mm for an O-ring."""
+        return self.front_z - 1.3 - self.edge
+
+    @property
+    def lens_z(self) -> float:
+        """Front of the lens."""
+        return self.seat_z - 2.0
+
+    @property
+    def cover_z(self) -> float:
+        """Inner face of the cover's front."""
+        return self.front_z + 7.0
+
+    @property
+    def outline(self) -> float:
+        """Radius of plate and cover about the axis: room for the cap's screws, and for the fork beside the pulley."""
+        return max(self.bearing.outer / 2 + 10.0, self.pitch(self.teeth[0]) + 13.4)
+
+    @property
+    def height(self) -> float:
+        """Height of the axis above the base."""
+        return self.outline + 9.0
+
+    @property
+    def flag(self) -> float:
+        """Radius of the index flag's tip."""
+        return self.outline - 4.0
+
+    def pitch(self, teeth: int) -> float:
+        """Return the pitch radius of a pulley."""
+        return teeth * BELT_PITCH / (2 * math.pi)
+
+    @property
+    def distance(self) -> float:
+        """Distance between the axes of rotor and motor, from the belt's length (two open pulleys, exact)."""
+        large, small = (self.pitch(teeth) for teeth in self.teeth)
+        low, high = large - small + 1e-6, self.belt / 2
+        for _ in range(60):
+            middle = (low + high) / 2
+            lean = math.asin((large - small) / middle)
+            length = 2 * middle * math.cos(lean) + math.pi * (large + small) + 2 * lean * (large - small)
+            low, high = (middle, high) if length < self.belt else (low, middle)
+        return low
+
+    @property
+    def stops(self) -> tuple[tuple[str, float, float], ...]:
+        """Apertures between lens and scene: name, z and radius. Those up to the wedge come first."""
+        opening = self.opening
+        return (
+            ("seat's lip", self.seat_z, self.clear),
+            ("wedge's ring", self.front_z, self.clear),
+            ("wedge's ring", self.front_z + 2.0, self.clear),
+            ("cover", self.cover_z, opening),
+            ("cover", self.cover_z + 2.0, opening + 2.0),
+        )
+
+    @property
+    def opening(self) -> float:
+        """Radius of the cover's opening on its inner side: it lets pass what the wedge's ring lets pass."""
+        return self.clear + 1.0 * (self.cover_z - self.front_z)
+
+
+ONE_INCH = Rig("one-inch", 25.4, 3.5, 1.0, (60, 30), 180.0, "67", 17.0, 4.0, (28.0, 40.0, 4.0), (17.0, 7.0))
+TWO_INCH = Rig("two-inch", 50.8, 5.0, 1.0, (100, 50), 280.0, "68", 40.0, 10.0, (36.0, 45.0, 5.0), (25.0, 10.0), screw=(2.5, 3.0))
+RIGS = (ONE_INCH, TWO_INCH)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Solid of a part in its place in the rig."""
+
+    name: str
+    solid: Manifold
+    kind: str
+    """'printed', 'bought' or 'glass'."""
+    turns: bool
+    """True if it turns with the prism."""
+    mass: float
+    """Mass [g], printed parts solid."""
+    apart: tuple[float, float, float]
+    """Direction and order in which the exploded view moves it."""
+
+
+def ring(inner: float, outer: float, low: float, high: float) -> Manifold:
+    """Return a tube about the z axis by its radii and its ends."""
+    flat = CrossSection.circle(outer, SEGMENTS)
+    if inner > 0:
+        flat -= CrossSection.circle(inner, SEGMENTS)
+    return flat.extrude(high - low).translate((0, 0, low))
+
+
+def rod(radius: float, low: float, high: float, x: float = 0.0, y: float = 0.0, sides: int = 48) -> Manifold:
+    """Return a cylinder along z."""
+    return Manifold.cylinder(high - low, radius, radius, sides).translate((x, y, low))
+
+
+def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> Manifold:
+    """Return a box by its extents."""
+    size = tuple(high - low for low, high in (x, y, z))
+    return Manifold.cube(size).translate((x[0], y[0], z[0]))
+
+
+def around(radius: float, angles_deg: Iterable[float]) -> list[tuple[float, float]]:
+    """Return points on a circle about the axis."""
+    return [(radius * math.cos(math.radians(a)), radius * math.sin(math.radians(a))) for a in angles_deg]
+
+
+def holes(points: Iterable[tuple[float, float]], diameter: float, low: float, high: float) -> Manifold:
+    """Return round holes along z, to subtract."""
+    return Manifold.batch_boolean([rod(diameter / 2, low, high, x, y, 32) for x, y in points], ADD)
+
+
+def slots(points: Iterable[tuple[float, float]], diameter: float, reach: float, low: float, high: float) -> Manifold:
+    """Return slots along x, to subtract: ``reach`` to either side."""
+    flats = [
+        CrossSection.circle(diameter / 2, 32).translate((x - reach, y))
+        + CrossSection.circle(diameter / 2, 32).translate((x + reach, y))
+        for x, y in points
+    ]
+    return Manifold.batch_boolean([flat.hull().extrude(high - low).translate((0, 0, low)) for flat in flats], ADD)
+
+
+def pulley(teeth: int) -> CrossSection:
+    """Return the outline of a GT2 pulley."""
+    tip = teeth * BELT_PITCH / (2 * math.pi) - PITCH_LINE
+    groove = CrossSection.circle(0.56, 24).translate((tip - TOOTH_DEPTH + 0.56, 0.0))
+    groove += CrossSection([[(tip - 0.3, -0.54), (tip + 0.2, -0.72), (tip + 0.2, 0.72), (tip - 0.3, 0.54)]])
+    grooves = [groove.rotate(360 * k / teeth) for k in range(teeth)]
+    return CrossSection.circle(tip, 4 * teeth) - CrossSection.batch_boolean(grooves, ADD)
+
+
+def ring_screws(rig: Rig) -> tuple[float, list[tuple[float, float]]]:
+    """Return the radius and the points of the four M2 screws of the wedge's ring."""
+    root = rig.pitch(rig.teeth[0]) - PITCH_LINE - TOOTH_DEPTH
+    radius = (rig.wedge / 2 + rig.seat + root) / 2
+    return radius, around(radius, (45, 135, 225, 315))
+
+
+def balance_holes(rig: Rig) -> tuple[float, list[float]]:
+    """Return the radius and the angles [deg] of the twelve threads for set screws that balance the rotor."""
+    step = 15.0
+    angles = [k * step for k in range(24) if (k * step) % 90 not in (30.0, 45.0, 60.0)]
+    return ring_screws(rig)[0], angles
+
+
+def rotor(rig: Rig) -> Manifold:
+    """Return the rotor: tube, shoulder, pulley, seat of the wedge, index flag, threads of M2 screws."""
+    bearing, low, high = rig.bearing, rig.pulley_z, rig.front_z
+    flange = rig.pitch(rig.teeth[0]) + 1.4
+    out = ring(0, bearing.bore / 2 - 0.01, rig.bearing_z[0] + 0.2, high)
+    out += ring(0, bearing.inner, rig.shoulder_z, low + 0.1)
+    out += pulley(rig.teeth[0]).extrude(high - low).translate((0, 0, low))
+    out += ring(0, flange, low, low + FLANGE) + ring(0, flange, high - FLANGE, high)
+    out += box((-rig.flag, -flange + 2.0), (-2.0, 2.0), (high - FLANGE, high))
+    out -= rod(rig.clear, -1, high + 1, sides=SEGMENTS) + rod(
+        rig.wedge / 2 + rig.seat, rig.seat_z, high + 1, sides=SEGMENTS
+    )
+    radius, angles = balance_holes(rig)
+    out -= holes(ring_screws(rig)[1], 1.6, high - 8.0, high + 1)
+    out -= holes(around(radius, angles), rig.screw[0], high - 8.2, high + 1)
+    return out - holes(rear_screws(rig), 1.6, 0, rig.bearing_z[0] + 8.0)
+
+
+def rear_screws(rig: Rig) -> list[tuple[float, float]]:
+    """Return the points of the three M2 screws of the rear ring."""
+    return around((rig.clear + rig.bearing.bore / 2) / 2, (90, 210, 330))
+
+
+def motor_end(rig: Rig) -> float:
+    """Return the radius of plate and cover about the motor's axis."""
+    return max(rig.motor_screws[0] / 2 + 5.5, rig.pitch(rig.teeth[1]) + 1.2 + 4.0)
+
+
+def outline(rig: Rig) -> CrossSection:
+    """Return the outline of the plate and the cover, without feet and lugs."""
+    end = motor_end(rig)
+    ends = [CrossSection.circle(end, 96).translate((rig.distance + dx, 0)) for dx in (-3.0, 3.0)]
+    return CrossSection.batch_boolean([CrossSection.circle(rig.outline, SEGMENTS), *ends], ADD).hull()
+
+
+def lugs(rig: Rig) -> list[tuple[float, float]]:
+    """Return the points of the M3 screws that hold the cover."""
+    end = motor_end(rig) + 3.5
+    return [*around(rig.outline + 3.0, (135, 225)), (rig.distance + 3, end), (rig.distance + 3, -end)]
+
+
+def cap_screws(rig: Rig) -> list[tuple[float, float]]:
+    """Return the points of the M3 screws that hold the bearing cap."""
+    return around(rig.bearing.outer / 2 + 3.5, (30, 150, 210, 330))
+
+
+def with_lugs(rig: Rig) -> CrossSection:
+    """Return the outline with the lugs for the cover's screws."""
+    eyes = [CrossSection.circle(5.0, 48).translate(point) for point in lugs(rig)]
+    return CrossSection.batch_boolean([outline(rig), *eyes], ADD)
+
+
+def housing(rig: Rig) -> Manifold:
+    """Return the housing: barrel of the bearings, plate with the motor's slots, foot."""
+    bearing, face = rig.bearing, rig.face_z
+    barrel = bearing.outer / 2 + 4.0
+    out = with_lugs(rig).extrude(PLATE).translate((0, 0, face - PLATE)) + ring(0, barrel, 0, face)
+    out += box((-barrel, barrel), (-rig.height, 0), (face - PLATE, face))
+    out += box((-barrel, barrel), (-rig.height, -rig.height + PLATE), (0, face + 20))
+    for x in (-barrel, barrel - 4):
+        out += box((x, x + 4), (-rig.height, -barrel * 0.5), (0, face))
+    out -= rod(bearing.outer / 2 + 0.025, 2.0, face + 1, sides=SEGMENTS)
+    out -= rod(bearing.outside, -1, 3, sides=SEGMENTS)
+    out -= slots([(rig.distance, 0)], rig.motor_screws[1] + 0.4, 3.0, face - PLATE - 1, face + 1)
+    pair = [(rig.distance, side * rig.motor_screws[0] / 2) for side in (-1, 1)]
+    out -= slots(pair, 3.4, 3.0, face - PLATE - 1, face + 1)
+    out -= holes([*cap_screws(rig), *lugs(rig)], 2.5, face - PLATE - 1, face + 1)
+    out -= holes(rear_plate_screws(rig), 1.6, -1, 8)
+    return out - upright_holes(rig, foot_holes(rig), 3.3)
+
+
+def foot_holes(rig: Rig) -> list[tuple[float, float]]:
+    """Return x and z of the M4 screws between housing and base."""
+    x = rig.bearing.outer / 2 - 4.0
+    return [(side, z) for side in (-x, x) for z in (4.0, rig.face_z + 15.0)]
+
+
+def upright_holes(rig: Rig, points: Iterable[tuple[float, float]], diameter: float) -> Manifold:
+    """Return holes along y through foot and base, to subtract."""
+    made = [
+        Manifold.cylinder(30, diameter / 2, diameter / 2, 32).rotate((-90, 0, 0)).translate((x, -rig.height - 15, z))
+        for x, z in points
+    ]
+    return Manifold.batch_boolean(made, ADD)
+
+
+def cap(rig: Rig) -> Manifold:
+    """Return the cap that clamps the front bearing's outer ring."""
+    half = rig.bearing.outer / 2
+    return ring(rig.bearing.outside, half + 6.5, rig.shoulder_z, rig.shoulder_z + 1.9) - holes(
+        cap_screws(rig), 3.4, 0, rig.pulley_z
+    )
+
+
+def spacer(rig: Rig) -> Manifold:
+    """Return the spacer between the bearings' inner rings."""
+    return ring(rig.bearing.bore / 2 + 0.05, rig.bearing.inner, rig.bearing_z[0] + rig.bearing.width, rig.bearing_z[1])
+
+
+def rear_ring(rig: Rig) -> Manifold:
+    """Return the ring that clamps the bearings' inner rings on the rotor."""
+    low, high = rig.bearing_z[0] - 2.5, rig.bearing_z[0]
+    return ring(rig.clear, rig.bearing.inner, low, high) - holes(rear_screws(rig), 2.4, low - 1, high + 1)
+
+
+def wedge_ring(rig: Rig) -> Manifold:
+    """Return the ring that holds the wedge, over an O-ring. It covers the set screws, so that none can fly out."""
+    low, high = rig.front_z, rig.front_z + 2.0
+    outer = rig.pitch(rig.teeth[0]) + 1.0
+    return ring(rig.clear, outer, low, high) - holes(ring_screws(rig)[1], 2.4, low - 1, high + 1)
+
+
+def wedge(rig: Rig) -> Manifold:
+    """Return the wedge. Its flat face points to the camera."""
+    out = rod(rig.wedge / 2, rig.seat_z, rig.seat_z + 2 * rig.edge, sides=SEGMENTS)
+    normal = (-math.sin(math.radians(rig.apex_deg)), 0.0, math.cos(math.radians(rig.apex_deg)))
+    return out.trim_by_plane(tuple(-n for n in normal), -(rig.seat_z + rig.thickness) * normal[2])
+
+
+def cover(rig: Rig) -> Manifold:
+    """Return the cover: guard of the belt and the rotor, hood, and mount of fork barrier and encoder board."""
+    low, inside, high = rig.face_z, rig.cover_z, rig.cover_z + 2.0
+    shape = outline(rig)
+    out = shape.extrude(high - low).translate((0, 0, low))
+    out += with_lugs(rig).extrude(4.0).translate((0, 0, low))
+    out += box((-12, 12), (0, rig.outline + 1), (high - 18.0, high))
+    out -= shape.offset(-2.0).extrude(inside - low + 1).translate((0, 0, low - 1))
+    out -= Manifold.cylinder(2.02, rig.opening, rig.opening + 2.02, SEGMENTS).translate((0, 0, inside - 0.01))
+    out -= holes(lugs(rig), 3.4, low - 1, low + 5)
+    z = rig.front_z - FLANGE / 2
+    side, half = FORK_LENGTH / 2 + 0.4, FORK_WIDTH / 2 + 0.4
+    out -= box((-side, side), (rig.outline - 10, rig.outline + 2), (z - half, z + half))
+    out -= slots([(rig.distance, 0)], 11.0, 3.0, inside - 1, high + 1)
+    board = [(rig.distance, y) for y in (-11.5, 11.5)]
+    return out - slots(board, 2.7, 3.0, inside - 1, high + 1)
+
+
+def magnet_cup(rig: Rig) -> Manifold:
+    """Return the cup that holds the encoder's magnet on the motor's shaft."""
+    low, high = rig.front_z + 0.5, magnet_z(rig)
+    out = rod(5.0, low, high)
+    out -= rod(3.02, high - 2.0, high + 1) + rod(rig.motor[2] / 2 + 0.02, low - 1, low + 2.5)
+    return out.translate((rig.distance, 0, 0))
+
+
+def magnet_z(rig: Rig) -> float:
+    """Return z of the magnet's front: 1.1 mm of chip and 1 mm of air behind the board on the cover."""
+    return rig.cover_z + 2.0 - 2.1
+
+
+def rear_plate_screws(rig: Rig) -> list[tuple[float, float]]:
+    """Return the points of the M2 screws of the rear plate."""
+    return around(rig.bearing.outer / 2 + 2.0, (30, 150, 270))
+
+
+def rear_plate(rig: Rig) -> Manifold:
+    """Return the plate that closes the rear against light and fingers; a ring of black foam seals it to the lens."""
+    out = ring(rig.lens / 2 + 1.0, rig.bearing.outer / 2 + 4.0, -2.0, 0.0)
+    return out - holes(rear_plate_screws(rig), 2.4, -3, 1)
+
+
+def riser(rig: Rig) -> Manifold:
+    """Return the block under the camera."""
+    width, _, length, _ = rig.camera
+    top, (low, high) = -rig.camera[3], camera_z(rig)
+    out = box((-width / 2, width / 2), (-rig.height, top), (low, low + length))
+    hole = Manifold.cylinder(rig.height, 3.3, 3.3, 32).rotate((-90, 0, 0)).translate((0, -rig.height - 1, (low + high) / 2))
+    return out - hole
+
+
+def camera_z(rig: Rig) -> tuple[float, float]:
+    """Return the rear and the front face of the camera's body."""
+    high = -4.0
+    return high - rig.camera[2], high
+
+
+def base(rig: Rig) -> Manifold:
+    """Return the base plate."""
+    x, (low, high) = rig.bearing.outer / 2 + 8.0, camera_z(rig)
+    y = (-rig.height - 6.0, -rig.height)
+    out = box((-x, x), y, (low - 12, rig.face_z + 24))
+    out -= upright_holes(rig, foot_holes(rig), 4.4)
+    slot = [upright_holes(rig, [(0, (low + high) / 2 + z)], 6.6) for z in (-12.0, 12.0)]
+    out -= (slot[0] + slot[1]).hull()
+    corners = [(side, z) for side in (-x + 6, x - 6) for z in (low - 6, rig.face_z + 20)]
+    return out - upright_holes(rig, corners, 4.4)
+
+
+def belt(rig: Rig) -> Manifold:
+    """Return the belt without its teeth."""
+    inner, outer = (
+        CrossSection.batch_boolean(
+            [
+                CrossSection.circle(rig.pitch(teeth) - PITCH_LINE + more, SEGMENTS).translate((x, 0))
+                for teeth, x in zip(rig.teeth, (0.0, rig.distance), strict=True)
+            ],
+            ADD,
+        ).hull()
+        for more in (0.02, 0.02 + BELT_BACK)
+    )
+    low = rig.pulley_z + FLANGE + (BELT_ROOM - BELT_WIDTH) / 2
+    return (outer - inner).extrude(BELT_WIDTH).translate((0, 0, low))
+
+
+def motor(rig: Rig) -> Manifold:
+    """Return the motor with its shaft."""
+    body, length, shaft = rig.motor
+    rear = rig.face_z - PLATE
+    out = rod(body / 2, rear - length, rear, sides=96)
+    out += rod(rig.motor_screws[1] / 2, rear - 1, rear + 3) + rod(shaft / 2, rear, rig.front_z + 3.0)
+    return out.translate((rig.distance, 0, 0))
+
+
+def motor_pulley(rig: Rig) -> Manifold:
+    """Return the motor's pulley, with an M3 thread for the set screw that holds it on the shaft."""
+    low, high, flange = rig.pulley_z, rig.front_z, rig.pitch(rig.teeth[1]) + 1.2
+    out = pulley(rig.teeth[1]).extrude(high - low).translate((0, 0, low))
+    out += rod(flange, low, low + FLANGE, sides=96) + rod(flange, high - FLANGE, high, sides=96)
+    out -= rod(rig.motor[2] / 2 + 0.02, low - 1, high + 1)
+    thread = Manifold.cylinder(30, 1.25, 1.25, 24).rotate((0, 90, 0)).translate((0, 0, (low + high) / 2))
+    return (out - thread).translate((rig.distance, 0, 0))
+
+
+def fork(rig: Rig) -> Manifold:
+    """Return the fork barrier of the index, and its board."""
+    z, top = rig.front_z - FLANGE / 2, rig.outline + 1
+    half, side = FORK_WIDTH / 2, FORK_LENGTH / 2
+    out = box((-side, side), (top - FORK_DEPTH, top), (z - half, z + half))
+    slot = FORK_SLOT / 2
+    out -= box((-5, 5), (top - FORK_DEPTH - 1, top - FORK_DEPTH + FORK_SLOT_DEPTH), (z - slot, z + slot))
+    return out + box((-10, 10), (top, top + 1.6), (rig.cover_z - 15.0, rig.cover_z + 1.0))
+
+
+def encoder(rig: Rig) -> Manifold:
+    """Return the magnetic encoder's chip and board."""
+    low = rig.cover_z + 2.0
+    out = box((-2.5, 2.5), (-2.5, 2.5), (low - 1.1, low)) + box((-11, 11), (-14, 14), (low, low + 1.6))
+    return out.translate((rig.distance, 0, 0))
+
+
+def lens(rig: Rig) -> Manifold:
+    """Return the lens and the camera's body."""
+    width, tall, _, up = rig.camera
+    (low, high), radius = camera_z(rig), rig.lens / 2
+    return box((-width / 2, width / 2), (-up, tall - up), (low, high)) + rod(radius, high, rig.lens_z, sides=96)
+
+
+def bearing_solids(rig: Rig) -> list[Manifold]:
+    """Return both bearings as plain rings."""
+    made = rig.bearing
+    return [ring(made.bore / 2, made.outer / 2, z, z + made.width) for z in rig.bearing_z]
+
+
+
+def assembly(rig: Rig) -> list[Part]:
+    """Return all parts in their places."""
+
+    def printed(name: str, solid: Manifold, turns: bool, apart: tuple[float, float, float]) -> Part:
+        return Part(name, solid, "printed", turns, solid.volume() * PETG, apart)
+
+    glass = wedge(rig)
+    rear, front = bearing_solids(rig)
+    mass = rig.bearing.mass
+    magnet = rod(3.0, magnet_z(rig) - 2.0, magnet_z(rig), rig.distance)
+    return [
+        printed("base", base(rig), False, (0, -30, 0)),
+        printed("riser", riser(rig), False, (0, -12, -62)),
+        Part("camera with lens", lens(rig), "bought", False, 130.0, (0, 0, -62)),
+        printed("rear plate", rear_plate(rig), False, (0, 0, -24)),
+        Part("motor", motor(rig), "bought", False, 90.0 if rig.motor[0] < 30 else 160.0, (0, 0, -10)),
+        printed("housing", housing(rig), False, (0, 0, 0)),
+        printed("rear ring", rear_ring(rig), True, (0, 0, 18)),
+        Part("rear bearing", rear, "bought", False, mass, (0, 0, 32)),
+        printed("spacer", spacer(rig), True, (0, 0, 40)),
+        Part("front bearing", front, "bought", False, mass, (0, 0, 48)),
+        printed("bearing cap", cap(rig), False, (0, 0, 58)),
+        printed("rotor", rotor(rig), True, (0, 0, 72)),
+        Part("belt", belt(rig), "bought", False, 4.0, (0, 0, 72)),
+        printed("motor pulley", motor_pulley(rig), False, (0, 0, 72)),
+        printed("magnet cup", magnet_cup(rig), False, (0, 0, 82)),
+        Part("magnet", magnet, "bought", False, magnet.volume() * 7.5e-3, (0, 0, 92)),
+        Part("wedge", glass, "glass", True, glass.volume() * GLASS, (0, 0, 88)),
+        printed("wedge ring", wedge_ring(rig), True, (0, 0, 100)),
+        printed("cover", cover(rig), False, (0, 0, 120)),
+        Part("fork barrier", fork(rig), "bought", False, 2.0, (0, 30, 120)),
+        Part("encoder board", encoder(rig), "bought", False, 4.0, (0, 0, 138)),
+    ]
