@@ -1,1 +1,1 @@
-"""Mechanics of a rig that turns a wedge prism in front of an event camera: parts, drawings and what they are good for."""
+"""Mechanics of a rig that turns a wedge prism in front of an event camera: parts, drawings and numbers."""

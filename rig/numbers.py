@@ -6,8 +6,9 @@ Bearing Analysis*, and the thin rotating disc of Timoshenko and Goodier, *Theory
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -62,7 +63,7 @@ def point(mass: float, x: float, y: float, z: float) -> Body:
     return Body(mass, at, mass * (at @ at * np.eye(3) - np.outer(at, at)))
 
 
-def to_mesh(part: Part):  # noqa: ANN201
+def to_mesh(part: Part):
     """Return a part as a mesh of trimesh."""
     import trimesh
 
@@ -70,9 +71,15 @@ def to_mesh(part: Part):  # noqa: ANN201
     return trimesh.Trimesh(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts), process=False)
 
 
+@lru_cache(maxsize=4)
+def bodies(rig: Rig) -> tuple[Body, ...]:
+    """Return the mass properties of all parts."""
+    return tuple(Body.of(part) for part in parts.assembly(rig))
+
+
 def rotating(rig: Rig) -> Body:
     """Return the body that turns: printed parts, wedge, screws of the rings, and the inner half of the bearings."""
-    turning = [Body.of(part) for part in parts.assembly(rig) if part.turns]
+    turning = [body for part, body in zip(parts.assembly(rig), bodies(rig), strict=True) if part.turns]
     rings = [point(rig.bearing.mass * 0.45, 0.0, 0.0, z + rig.bearing.width / 2) for z in rig.bearing_z]
     screws = [point(0.2, x, y, rig.front_z - 1.0) for x, y in parts.ring_screws(rig)[1]]
     screws += [point(0.2, x, y, rig.bearing_z[0]) for x, y in parts.rear_screws(rig)]
@@ -93,7 +100,7 @@ def unbalance(body: Body) -> NDArray[np.float64]:
 
 
 def screw_mass(rig: Rig, length: float) -> float:
-    """Return the mass of a set screw with hexagon socket [g]: a cylinder of 0.87 diameters, less 15 % for the socket."""
+    """Return the mass of a set screw [g]: a cylinder of 0.87 diameters, less 15 % for its socket."""
     return 0.85 * STEEL * math.pi / 4 * (0.87 * rig.screw[1]) ** 2 * length
 
 
@@ -112,13 +119,10 @@ def balance(rig: Rig, body: Body) -> tuple[list[tuple[float, float]], Body]:
     u = unbalance(body)
     pull = [sum(radius * math.cos(math.radians(a)) for a in group) for group in groups]
 
-    def cost(lengths: Sequence[float]) -> float:
-        left = u[0] + sum(p * screw_mass(rig, length) for p, length in zip(pull, lengths, strict=True))
-        used = sum(len(group) for group, length in zip(groups, lengths, strict=True) if length)
-        return abs(left) + 0.05 * used
-
-    best = min(itertools.product(LENGTHS, repeat=len(groups)), key=cost)
-    screws = [(a, length) for group, length in zip(groups, best, strict=True) if length for a in group]
+    tried = np.array(list(itertools.product(LENGTHS, repeat=len(groups))))
+    left = np.abs(u[0] + screw_mass(rig, 1.0) * tried @ pull)
+    best = tried[np.argmin(left + 0.05 * (tried > 0) @ [len(group) for group in groups])]
+    screws = [(a, float(length)) for group, length in zip(groups, best, strict=True) if length for a in group]
     for angle, length in screws:
         (x, y), z = parts.around(radius, [angle])[0], rig.front_z - 0.2 - length / 2
         body = body + point(screw_mass(rig, length), x, y, z)
@@ -152,15 +156,16 @@ def vibration(rig: Rig, body: Body) -> tuple[float, float]:
     angle : float
         Radius of the cone on which the camera's axis moves [rad].
     """
-    whole = [Body.of(part) for part in parts.assembly(rig)]
-    total = whole[0]
-    for each in whole[1:]:
+    total, *others = bodies(rig)
+    for each in others:
         total = total + each
     centre = total.centre
     about = total.inertia - total.mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
     force, moment = unbalance(body), -body.inertia[:2, 2]
     arm = moment - centre[2] * force
-    lean = max(abs(arm[0]) / about[1, 1], abs(arm[1]) / about[0, 0], float(np.hypot(*arm)) / min(about[0, 0], about[1, 1]))
+    lean = max(
+        abs(arm[0]) / about[1, 1], abs(arm[1]) / about[0, 0], float(np.hypot(*arm)) / min(about[0, 0], about[1, 1])
+    )
     return float(np.hypot(*force) / total.mass), float(lean)
 
 
@@ -188,18 +193,18 @@ def stress(rig: Rig, rpm: float) -> dict[str, float]:
     w, radius = omega(rpm), rig.wedge / 2e3
     body = rotating(rig)
     outer = (rig.pitch(rig.teeth[0]) + 1.4) / 1e3
-    offset = wedge_unbalance(rig) + GLASS * math.pi * (rig.wedge / 2) ** 2 * rig.thickness * rig.seat
+    offset = wedge_unbalance(rig) + rig.seat * glass_mass(rig)
     return {
         "glass": (3 + 0.21) / 8 * GLASS * 1e6 * w**2 * radius**2 / 1e6,
         "rotor": PETG * 1e6 * w**2 * outer**2 / 1e6,
         "wedge's pull": offset * 1e-6 * w**2,
-        "ring's screws, 50 g shock": 50 * GRAVITY * 1e-3 * (body_mass_of_glass(rig)),
+        "shock": 50 * GRAVITY * 1e-3 * glass_mass(rig),
         "rim": outer * w,
         "energy": 0.5 * (body.inertia[2, 2] * 1e-9) * w**2,
     }
 
 
-def body_mass_of_glass(rig: Rig) -> float:
+def glass_mass(rig: Rig) -> float:
     """Return the mass of the wedge [g]."""
     return GLASS * math.pi * (rig.wedge / 2) ** 2 * rig.thickness
 
@@ -207,15 +212,21 @@ def body_mass_of_glass(rig: Rig) -> float:
 # Vignetting
 
 
-SENSORS = {"640×480, 9 µm": (640, 480, 9e-3), "346×260, 18.5 µm": (346, 260, 18.5e-3), "1280×720, 4.86 µm": (1280, 720, 4.86e-3)}
+SENSORS = {
+    "640×480, 9 µm": (640, 480, 9e-3),
+    "346×260, 18.5 µm": (346, 260, 18.5e-3),
+    "1280×720, 4.86 µm": (1280, 720, 4.86e-3),
+}
 """Sensors: columns, rows, pixel pitch [mm]."""
 
 
-def clear_of_stops(rig: Rig, sensor: tuple[int, int, float], focal: float, number: float = 2.0, back: float = 0.0) -> float:
+def clear_of_stops(
+    rig: Rig, sensor: tuple[int, int, float], focal: float, number: float = 2.0, back: float = 0.0
+) -> float:
     """Return the smallest distance of the image's rays from the rim of an aperture [mm]; negative if some are cut off.
 
-    Every ray of the border of the image is followed from the rim of the lens's entrance pupil to the scene, at 24 angles
-    of the prism. Behind the wedge it has the direction that ``ExactModel`` gives it.
+    Every ray of the image's border is followed from the rim of the lens's entrance pupil to the scene, at 24 angles of
+    the prism. Behind the wedge it has the direction that ``ExactModel`` gives it.
 
     Parameters
     ----------
@@ -272,11 +283,13 @@ class Tolerance:
     """Rotation of the camera once a turn [rad]: in phase with the prism, and a quarter turn later."""
 
 
-def error(tolerance: Tolerance, free: Sequence[str], *, apex_deg: float, width: int = 640, fov_deg: float = 60.0) -> float:
+def error(
+    tolerance: Tolerance, free: Sequence[str], *, apex_deg: float, width: int = 640, fov_deg: float = 60.0
+) -> float:
     """Return the rms error [px] that is left if calibration frees these parameters besides apex and phase.
 
-    The true rig is computed by ``ExactModel``, with the camera's shake as a rotation of the rays. A least-squares fit of
-    ``ExactModel`` to it, with a constant shift of the picture, stands for a calibration without noise.
+    The true rig is computed by ``ExactModel``, with the camera's shake as a rotation of the rays. A least-squares fit
+    of ``ExactModel`` to it, with a constant shift of the picture, stands for a calibration without noise.
 
     Parameters
     ----------
@@ -287,8 +300,8 @@ def error(tolerance: Tolerance, free: Sequence[str], *, apex_deg: float, width: 
 
     camera = amiwarp.Camera.from_fov(width, width * 3 // 4, math.radians(fov_deg))
     prism = amiwarp.Prism(math.radians(apex_deg), flat_side="camera")
-    x, y = np.meshgrid(np.linspace(20, width - 20, 9), np.linspace(20, width * 0.75 - 20, 7))
-    theta = np.arange(16) * math.pi / 8
+    x, y = np.meshgrid(np.linspace(20, width - 20, 7), np.linspace(20, width * 0.75 - 20, 5))
+    theta = np.arange(12) * math.pi / 6
     scene = np.repeat(np.column_stack([x.ravel(), y.ravel()]), len(theta), axis=0)
     angle = np.tile(theta, x.size)
     wobble, tilt, harmonics = (
@@ -301,8 +314,13 @@ def error(tolerance: Tolerance, free: Sequence[str], *, apex_deg: float, width: 
         rays = camera.pixels_to_rays(seen)
         along, across = tolerance.shake
         lean = along * np.array([np.cos(angle), np.sin(angle)]) + across * np.array([-np.sin(angle), np.cos(angle)])
-        turned = np.column_stack([rays[:, 0] + lean[0] * rays[:, 2], rays[:, 1] + lean[1] * rays[:, 2],
-                                  rays[:, 2] - lean[0] * rays[:, 0] - lean[1] * rays[:, 1]])  # fmt: skip
+        turned = np.column_stack(
+            [
+                rays[:, 0] + lean[0] * rays[:, 2],
+                rays[:, 1] + lean[1] * rays[:, 2],
+                rays[:, 2] - lean[0] * rays[:, 0] - lean[1] * rays[:, 1],
+            ]
+        )
         seen = camera.rays_to_pixels(turned)
 
     def waves(values: Sequence[float]) -> NDArray[np.float64]:

@@ -4,9 +4,11 @@ The z axis is the axis of rotation and points to the scene, y points up. z = 0 i
 the camera. The thick edge of the wedge points to +x.
 """
 
+import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 from manifold3d import CrossSection, Manifold, OpType
 
@@ -233,7 +235,9 @@ class Rig:
 
 
 ONE_INCH = Rig("one-inch", 25.4, 3.5, 1.0, (60, 30), 180.0, "67", 17.0, 4.0, (28.0, 40.0, 4.0), (17.0, 7.0))
-TWO_INCH = Rig("two-inch", 50.8, 5.0, 1.0, (100, 50), 280.0, "68", 40.0, 10.0, (36.0, 45.0, 5.0), (25.0, 10.0), screw=(2.5, 3.0))
+TWO_INCH = Rig(
+    "two-inch", 50.8, 5.0, 1.0, (100, 50), 280.0, "68", 40.0, 10.0, (36.0, 45.0, 5.0), (25.0, 10.0), screw=(2.5, 3.0)
+)
 RIGS = (ONE_INCH, TWO_INCH)
 
 
@@ -250,7 +254,7 @@ class Part:
     mass: float
     """Mass [g], printed parts solid."""
     apart: tuple[float, float, float]
-    """Direction and order in which the exploded view moves it."""
+    """How far the exploded view moves it [mm]."""
 
 
 def ring(inner: float, outer: float, low: float, high: float) -> Manifold:
@@ -353,7 +357,7 @@ def outline(rig: Rig) -> CrossSection:
 def lugs(rig: Rig) -> list[tuple[float, float]]:
     """Return the points of the M3 screws that hold the cover."""
     end = motor_end(rig) + 3.5
-    return [*around(rig.outline + 3.0, (135, 225)), (rig.distance + 3, end), (rig.distance + 3, -end)]
+    return [*around(rig.outline + 3.5, (135, 225)), (rig.distance + 3, end), (rig.distance + 3, -end)]
 
 
 def cap_screws(rig: Rig) -> list[tuple[float, float]]:
@@ -438,8 +442,8 @@ def cover(rig: Rig) -> Manifold:
     """Return the cover: guard of the belt and the rotor, hood, and mount of fork barrier and encoder board."""
     low, inside, high = rig.face_z, rig.cover_z, rig.cover_z + 2.0
     shape = outline(rig)
-    out = shape.extrude(high - low).translate((0, 0, low))
-    out += with_lugs(rig).extrude(4.0).translate((0, 0, low))
+    out = with_lugs(rig).extrude(4.0).translate((0, 0, low))
+    out += shape.extrude(high - low - 2.0).translate((0, 0, low + 2.0))
     out += box((-12, 12), (0, rig.outline + 1), (high - 18.0, high))
     out -= shape.offset(-2.0).extrude(inside - low + 1).translate((0, 0, low - 1))
     out -= Manifold.cylinder(2.02, rig.opening, rig.opening + 2.02, SEGMENTS).translate((0, 0, inside - 0.01))
@@ -467,7 +471,7 @@ def magnet_z(rig: Rig) -> float:
 
 def rear_plate_screws(rig: Rig) -> list[tuple[float, float]]:
     """Return the points of the M2 screws of the rear plate."""
-    return around(rig.bearing.outer / 2 + 2.0, (30, 150, 270))
+    return around(rig.bearing.outer / 2 + 2.0, (60, 180, 300))
 
 
 def rear_plate(rig: Rig) -> Manifold:
@@ -481,7 +485,11 @@ def riser(rig: Rig) -> Manifold:
     width, _, length, _ = rig.camera
     top, (low, high) = -rig.camera[3], camera_z(rig)
     out = box((-width / 2, width / 2), (-rig.height, top), (low, low + length))
-    hole = Manifold.cylinder(rig.height, 3.3, 3.3, 32).rotate((-90, 0, 0)).translate((0, -rig.height - 1, (low + high) / 2))
+    hole = (
+        Manifold.cylinder(rig.height, 3.3, 3.3, 32)
+        .rotate((-90, 0, 0))
+        .translate((0, -rig.height - 1, (low + high) / 2))
+    )
     return out - hole
 
 
@@ -495,11 +503,11 @@ def base(rig: Rig) -> Manifold:
     """Return the base plate."""
     x, (low, high) = rig.bearing.outer / 2 + 8.0, camera_z(rig)
     y = (-rig.height - 6.0, -rig.height)
-    out = box((-x, x), y, (low - 12, rig.face_z + 24))
+    out = box((-x, x), y, (low - 12, rig.face_z + 32))
     out -= upright_holes(rig, foot_holes(rig), 4.4)
     slot = [upright_holes(rig, [(0, (low + high) / 2 + z)], 6.6) for z in (-12.0, 12.0)]
     out -= (slot[0] + slot[1]).hull()
-    corners = [(side, z) for side in (-x + 6, x - 6) for z in (low - 6, rig.face_z + 20)]
+    corners = [(side, z) for side in (-x + 6, x - 6) for z in (low - 6, rig.face_z + 26)]
     return out - upright_holes(rig, corners, 4.4)
 
 
@@ -568,18 +576,19 @@ def bearing_solids(rig: Rig) -> list[Manifold]:
     return [ring(made.bore / 2, made.outer / 2, z, z + made.width) for z in rig.bearing_z]
 
 
-
-def assembly(rig: Rig) -> list[Part]:
+@lru_cache(maxsize=4)
+def assembly(rig: Rig) -> tuple[Part, ...]:
     """Return all parts in their places."""
 
     def printed(name: str, solid: Manifold, turns: bool, apart: tuple[float, float, float]) -> Part:
+        solid = solid.simplify(2e-3)  # the files have float32 numbers: no edge may be shorter than they resolve
         return Part(name, solid, "printed", turns, solid.volume() * PETG, apart)
 
     glass = wedge(rig)
     rear, front = bearing_solids(rig)
     mass = rig.bearing.mass
     magnet = rod(3.0, magnet_z(rig) - 2.0, magnet_z(rig), rig.distance)
-    return [
+    return (
         printed("base", base(rig), False, (0, -30, 0)),
         printed("riser", riser(rig), False, (0, -12, -62)),
         Part("camera with lens", lens(rig), "bought", False, 130.0, (0, 0, -62)),
@@ -601,4 +610,30 @@ def assembly(rig: Rig) -> list[Part]:
         printed("cover", cover(rig), False, (0, 0, 120)),
         Part("fork barrier", fork(rig), "bought", False, 2.0, (0, 30, 120)),
         Part("encoder board", encoder(rig), "bought", False, 4.0, (0, 0, 138)),
-    ]
+    )
+
+
+TOUCHES = 1e-3
+"""Largest volume by which two parts may overlap, as circles have corners [mm³]."""
+
+
+def problems(rig: Rig, made: Iterable[Part]) -> list[str]:
+    """Return what is wrong with the solids: pieces, overlaps, and gaps between what turns and what does not."""
+    out = []
+    for part in made:
+        if len(part.solid.decompose()) != 1 and part.kind == "printed":
+            out.append(f"{part.name} is in several pieces")
+    for one, other in itertools.combinations(made, 2):
+        overlap = (one.solid ^ other.solid).volume()
+        if overlap > TOUCHES:
+            out.append(f"{one.name} and {other.name} overlap by {overlap:.3f} mm³")
+        if one.turns == other.turns or FITS.intersection((one.name, other.name)):
+            continue
+        gap = one.solid.min_gap(other.solid, rig.clearance)
+        if gap < rig.clearance - 1e-4:
+            out.append(f"{one.name} and {other.name} are {gap:.2f} mm apart, less than {rig.clearance} mm")
+    return out
+
+
+FITS = {"rear bearing", "front bearing", "belt"}
+"""Parts that touch what turns and what does not."""

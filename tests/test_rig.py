@@ -1,0 +1,136 @@
+"""The rig's printable parts, and the numbers that its pages state."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("manifold3d", reason="the rig's parts need manifold3d: pip install 'amiwarp[rig]'")
+trimesh = pytest.importorskip("trimesh", reason="the rig's parts need trimesh: pip install 'amiwarp[rig]'")
+
+from rig import __main__ as command  # noqa: E402
+from rig import numbers, parts  # noqa: E402
+from rig.parts import ONE_INCH, RIGS, TWO_INCH, Part, Rig  # noqa: E402
+
+PAGE = (Path(__file__).parent.parent / "rig" / "numbers.md").read_text()
+
+
+@pytest.fixture(scope="module", params=RIGS, ids=lambda rig: rig.name)
+def rig(request: pytest.FixtureRequest) -> Rig:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def made(rig: Rig) -> Sequence[Part]:
+    return parts.assembly(rig)
+
+
+def test_parts_neither_overlap_nor_come_too_close(rig: Rig, made: Sequence[Part]) -> None:
+    assert parts.problems(rig, made) == []
+
+
+def test_a_steeper_wedge_fits(rig: Rig) -> None:
+    own = replace(rig, apex_deg=2.0)
+    assert parts.problems(own, parts.assembly(own)) == []
+
+
+def test_an_overlap_a_narrow_gap_and_a_loose_piece_are_seen(made: Sequence[Part], rig: Rig) -> None:
+    by_name = {part.name: part for part in made}
+    turning, still = by_name["rear ring"], by_name["rear plate"]  # 1 mm apart
+    assert parts.problems(rig, [turning, still]) == []
+    low = replace(turning, solid=turning.solid.translate((0, 0, -0.5)))
+    assert parts.problems(rig, [low, still]) == ["rear ring and rear plate are 0.50 mm apart, less than 0.7 mm"]
+    lower = replace(turning, solid=turning.solid.translate((0, 0, -2.0)))
+    assert any("overlap" in text for text in parts.problems(rig, [lower, still]))
+    pieces = replace(still, solid=still.solid + still.solid.translate((0, 0, 50)))
+    assert any("pieces" in text for text in parts.problems(rig, [pieces]))
+
+
+def test_volumes(rig: Rig, made: Sequence[Part]) -> None:
+    """Regular polygons of 180 sides are smaller than their circles by 2e-4."""
+    volume = {part.name: numbers.to_mesh(part).volume for part in made}
+    assert all(value > 0 for value in volume.values())
+    assert volume["wedge"] == pytest.approx(math.pi * (rig.wedge / 2) ** 2 * rig.thickness, rel=3e-4)
+    bearing = rig.bearing
+    each = math.pi / 4 * (bearing.outer**2 - bearing.bore**2) * bearing.width
+    assert volume["rear bearing"] == pytest.approx(each, rel=3e-4)
+
+
+def test_bearings_and_belt_fit(rig: Rig) -> None:
+    assert rig.bearing.name == {"one-inch": "6706", "two-inch": "6811"}[rig.name]
+    r, s = (teeth / math.pi for teeth in rig.teeth)  # pitch of 2 mm
+    c = rig.distance
+    wrapped = math.pi + 2 * math.asin((r - s) / c), math.pi - 2 * math.asin((r - s) / c)
+    assert 2 * math.sqrt(c**2 - (r - s) ** 2) + r * wrapped[0] + s * wrapped[1] == pytest.approx(rig.belt, abs=1e-6)
+    assert rig.teeth[1] * wrapped[1] / (2 * math.pi) > 6  # teeth in mesh on the small pulley
+    assert rig.teeth[0] == 2 * rig.teeth[1]  # errors of the motor's side repeat twice a turn
+
+
+def test_written_files_are_watertight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command.main([str(tmp_path), "--rig", "one-inch"])
+    files = sorted((tmp_path / "one-inch").glob("*.stl"))
+    assert len(files) == 12
+    assert "12 parts to print" in capsys.readouterr().out
+    for file in files:
+        mesh = trimesh.load(file)
+        assert mesh.is_watertight, file.name
+        assert mesh.is_winding_consistent, file.name
+        assert mesh.volume > 0, file.name
+
+
+def test_wedge_unbalance_is_that_of_its_mesh(rig: Rig) -> None:
+    mesh = numbers.to_mesh(next(part for part in parts.assembly(rig) if part.name == "wedge"))
+    by_mesh = mesh.volume * mesh.center_mass[0] * 2.51e-3
+    assert numbers.wedge_unbalance(rig) == pytest.approx(by_mesh, rel=1e-3)
+
+
+def test_set_screws_balance_the_rotor(rig: Rig) -> None:
+    body = numbers.rotating(rig)
+    screws, balanced = numbers.balance(rig, body)
+    left = np.hypot(*numbers.unbalance(balanced))
+    assert left < 0.15  # g mm
+    radius = parts.balance_holes(rig)[0]
+    pull = sum(numbers.screw_mass(rig, length) * radius * math.cos(math.radians(angle)) for angle, length in screws)
+    assert numbers.unbalance(body)[0] + pull == pytest.approx(numbers.unbalance(balanced)[0], abs=1e-9)
+
+
+def test_forces_of_a_single_mass() -> None:
+    """A mass in the plane of the front bearing loads that bearing alone."""
+    front = ONE_INCH.bearing_z[1] + ONE_INCH.bearing.width / 2
+    rear, loaded = numbers.bearing_forces(ONE_INCH, numbers.point(0.1, 20.0, 0.0, front), 1440.0)
+    assert rear == pytest.approx(0.0, abs=1e-12)
+    assert loaded == pytest.approx(0.1e-3 * 20e-3 * (2 * math.pi * 24) ** 2, rel=1e-9)  # m r ω²
+
+
+def test_friction_by_hand() -> None:
+    """Mean diameter 33.5 mm, 100 mm²/s, 1,000 rpm: (1e5)^(2/3) = 2154.4; 2 · 1e-7 · 1.8 · 2154.4 · 33.5³."""
+    assert numbers.friction(ONE_INCH, 1000.0, 100.0, 1.8) == pytest.approx(29.16, abs=0.01)
+
+
+def test_lens_is_clear_of_the_stops(rig: Rig) -> None:
+    """A prism that does nothing, against the rays' geometry; then the focal lengths of the page."""
+    sensor = numbers.SENSORS["640×480, 9 µm"]
+    flat, focal, number = replace(rig, apex_deg=1e-6), 8.0, 2.0
+    corner = math.hypot(320 * 9e-3, 240 * 9e-3) / focal
+    at = flat.lens_z - flat.pupil
+    left = min(radius - focal / (2 * number) - (z - at) * corner for _, z, radius in flat.stops)
+    assert numbers.clear_of_stops(flat, sensor, focal, number) == pytest.approx(left, abs=1e-3)
+    shortest = numbers.shortest_focal(rig, sensor)
+    assert shortest == {"one-inch": 4.5, "two-inch": 3.2}[rig.name]
+    assert numbers.clear_of_stops(rig, sensor, shortest - 0.1) < 0 <= numbers.clear_of_stops(rig, sensor, shortest)
+
+
+def test_wobble_costs_little_and_nothing_once_it_is_freed() -> None:
+    off = numbers.Tolerance("wobble", "", wobble_deg=(0.35, 0.35))
+    size = {"apex_deg": 1.0, "width": 320}
+    assert 0.01 < numbers.error(off, (), **size) < 0.02  # px
+    assert numbers.error(off, ("wobble",), **size) < 1e-3
+
+
+def test_page_states_what_is_computed() -> None:
+    for row in [*command.balance_rows([ONE_INCH], [1.0]), *command.speed_rows()]:
+        assert "| " + " | ".join(row) + " |" in PAGE
+    assert TWO_INCH.bearing.name in PAGE
