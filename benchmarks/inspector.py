@@ -71,7 +71,7 @@ from amiwarp.viewer.inspector import Selection
 opened = Inspector(open_recording(sys.argv[1]), device=sys.argv[2])
 start, length = opened.first_window()
 opened.open(start, int(sys.argv[3]) or length)
-opened.open(*opened.window, Selection(region=opened.suggest_region().region))
+opened.open(*opened.window, Selection(region=opened.suggest_region()))
 shown = opened.show()
 took, cpu = time.perf_counter() - began, time.process_time() - cpu
 most = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
@@ -217,11 +217,11 @@ def rates(path: Path, n: int) -> dict[str, Any]:
     while not counted.fill(0.2):
         pass
     out: dict[str, Any] = {"fill_s": time.perf_counter() - began, "fill_cpu_s": time.process_time() - cpu}
-    whole = counted.curve(source.t_first, source.t_last + 1, 1000)
+    edges, whole = counted.curve(source.t_first, source.t_last + 1, 1000)
     for length_us in (source.t_last - source.t_first, 1_000_000, 100_000, 10_000):
         start = source.t_first + (source.t_last - source.t_first - length_us) // 2
         out[f"curve_{length_us}_us"] = timed(lambda _, a=start, b=start + length_us: counted.curve(a, b, 1000))
-    total = float(((whole.on + whole.off) * np.diff(whole.edges_us)).sum() * 1e-6)
+    total = float((whole * np.diff(edges)).sum() * 1e-6)
     slowest = max(each["ms"] for name, each in out.items() if name.startswith("curve"))
     return {**out, "ok": math.isclose(total, n, rel_tol=1e-6) and slowest <= MOST_RATE_MS}
 

@@ -51,6 +51,16 @@ def recording(texture: np.ndarray) -> Recording:
     return simulate(texture, CAMERA, PRISM, duration_s=0.4, seed=1, sensor=SensorModel.ideal())
 
 
+def said(live: LiveSource) -> dict[str, str]:
+    """Return what the inspector says of a stream: its rows by name, and as "note" what is wrong."""
+    state = live.state()
+    return {**{name: text for name, text, _ in state["live_rows"]}, "note": state["stream_note"]}
+
+
+def rpm(rows: dict[str, str]) -> float:
+    return float(rows["speed of the prism"].split()[0])
+
+
 def known(recording: Recording, away_deg: float) -> Calibration:
     assert recording.truth is not None
     values = {"apex": PRISM.apex, "phase": recording.truth.parameters["phase"] - math.radians(away_deg)}
@@ -301,9 +311,9 @@ def test_the_speed_is_that_of_the_first_turn() -> None:
         assert (ring.recording() is not None) is complete
         assert ring.turn_share == pytest.approx(min((start + 29_000 - 1_000_000) * 720 / 60e6, 1.0), abs=1e-3)
     assert ring.age_s < 60.0
-    figures = LiveSource(ring, ["moved"]).figures()
-    assert figures.rpm == pytest.approx(720.0, rel=1e-3)
-    assert figures.message == "moved"
+    figures = said(LiveSource(ring, ["moved"]))
+    assert rpm(figures) == pytest.approx(720.0, rel=1e-3)
+    assert figures["last message"] == "moved"
     shown = Inspector(LiveSource(ring, [])())
     assert shown.turn_us == pytest.approx(60e6 / 720.0, rel=1e-3)
 
@@ -326,20 +336,21 @@ def test_lost_angles_are_said_and_no_extrapolated_speed_is_shown() -> None:
     ring.link.connected = False
     arrive(200_000, 500_000, None)
     assert live().events.t_last <= 200_000
-    lost = live.figures()
-    assert lost.connected
-    assert lost.no_angles == "the port COM3 of the controller is gone"
-    assert lost.rpm == pytest.approx(720.0, rel=1e-3)
+    lost = said(live)
+    assert lost["events"] == "receiving"
+    assert "No prism angles arrive: the port COM3 of the controller is gone." in lost["note"]
+    assert rpm(lost) == pytest.approx(720.0, rel=1e-3)
     ring.link.connected = True
     stream.restart()
     arrive(500_000, 540_000, 500_000)
-    back = live.figures()
+    back = said(live)
     assert live().events.t_last <= before.events.t_last + 1000
-    assert (back.no_angles, live.figures().turn_share) == ("", pytest.approx(0.48, abs=0.02))
-    assert back.rpm == pytest.approx(720.0, rel=1e-3)
+    assert back["note"] == ""
+    assert float(said(live)["turn covered"].removesuffix(" %")) == pytest.approx(48.0, abs=2.0)
+    assert rpm(back) == pytest.approx(720.0, rel=1e-3)
     arrive(540_000, 600_000, 500_000)
     assert live().events.t_first >= 499_000
-    assert live.figures().rpm == pytest.approx(720.0, rel=1e-3)
+    assert rpm(said(live)) == pytest.approx(720.0, rel=1e-3)
     assert Inspector(live()).turn_us == pytest.approx(60e6 / 720.0, rel=1e-3)
 
 
@@ -347,7 +358,7 @@ def test_a_stream_is_followed_while_one_looks(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_recording(tmp_path / "r.h5", replace(recording, truth=None))
-    said: list[str] = []
+    messages: list[str] = []
     monkeypatch.setattr(ring_module, "FIRST_S", 120.0)
     looked_at = threading.Event()
 
@@ -362,27 +373,27 @@ def test_a_stream_is_followed_while_one_looks(
 
     source = Held(tmp_path / "r.h5")
     ring = RecentEvents(source)
-    with followed(source, None, ring, said.append):
+    with followed(source, None, ring, messages.append):
         first = ring.recording()
         assert first is not None
-        live = LiveSource(ring, said)
+        live = LiveSource(ring, messages)
         assert live().events.t_last >= first.events.t_last
-        running = live.figures()
-        assert (running.problem, running.message, running.turn_share) == ("", "", 1.0)
-        assert running.rpm == pytest.approx(720.0, rel=1e-3)
+        running = said(live)
+        assert (running["note"], running["turn covered"], "last message" in running) == ("", "100 %", False)
+        assert rpm(running) == pytest.approx(720.0, rel=1e-3)
         looked_at.set()
         end = time.monotonic() + 120.0
-        while not said:
+        while not messages:
             assert time.monotonic() < end
             time.sleep(0.01)
         last = ring.recording()
     assert last is not None
     assert last.events.t_last > first.events.t_last
-    assert "the stream has ended" in said[0]
-    over = live.figures()
-    assert not over.connected
-    assert over.problem == over.message == said[0]
-    assert over.dropped == 0
+    assert "the stream has ended" in messages[0]
+    over = said(live)
+    assert over["events"] == "interrupted, last ones shown"
+    assert over["note"] == f"The stream is interrupted: {messages[0]}."
+    assert over["lost events"] == "0"
     assert live().events.t_last == last.events.t_last
     assert not [t for t in threading.enumerate() if t.name == "amiwarp-follow"]
 

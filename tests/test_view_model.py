@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import math
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -325,38 +326,31 @@ def test_the_region_with_the_largest_gain_is_suggested() -> None:
     before[40, 50] = before[41, 300] = 5000.0  # hot pixels
     after = before.copy()
     after[150:240, 230:340] = np.where(np.arange(110) % 10 < 2, 20.0, 0.0)
-    found = suggest_region(before, after)
-    assert found.gains
-    left, top, right, bottom = found.region
+    left, top, right, bottom = found = suggest_region(before, after)
     assert right - left == 120
     assert bottom - top == 90
     assert left == pytest.approx(225, abs=12)
     assert top == pytest.approx(150, abs=12)
-    fallback = suggest_region(after, after)
-    assert not fallback.gains
-    assert fallback.region == pytest.approx(found.region, abs=12)
+    assert suggest_region(after, after) == pytest.approx(found, abs=12)  # without a gain, where most structure is
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (60, 80), (10, 1000), (1000, 10), (720, 1280)])
 def test_a_suggested_region_lies_in_the_image(shape: tuple[int, int]) -> None:
     for image in (np.zeros(shape, np.float32), np.eye(*shape, dtype=np.float32)):
-        left, top, right, bottom = suggest_region(image, image).region
+        left, top, right, bottom = suggest_region(image, image)
         assert 0 <= left < right <= shape[1]
         assert 0 <= top < bottom <= shape[0]
         assert right - left <= 120
 
 
-def test_compensation_sharpens_the_suggested_region(inspector: Inspector, recording: Recording) -> None:
+def test_compensation_sharpens_the_suggested_region(inspector: Inspector) -> None:
     whole, found = inspector.show(), inspector.suggest_region()
-    assert found.gains
     span = inspector.loaded.span
-    inspector.open(span.start_us, span.length_us, Selection(region=found.region))
+    inspector.open(span.start_us, span.length_us, Selection(region=found))
     shown = inspector.show()
     assert shown.sharpness_after > 1.3 * shown.sharpness_before
     assert shown.sharpness_after - shown.sharpness_before > whole.sharpness_after - whole.sharpness_before
     assert inspector.suggest_region() == found  # a region that is shown does not matter
-    plain = Inspector(replace(recording, encoder=None, prism=None, camera=None, truth=None))
-    assert not plain.suggest_region().gains
 
 
 def test_edges_that_come_from_outside_suggest_no_region() -> None:
@@ -366,7 +360,7 @@ def test_edges_that_come_from_outside_suggest_no_region() -> None:
     after[150:240, 230:340] = np.where(np.arange(110) % 10 < 2, 20.0, 0.0)
     before[:90, :120] = 0.05
     after[:90, :120] = np.where(np.arange(120) < 4, 40.0, 0.05)
-    left, top, _, _ = suggest_region(before, after).region
+    left, top, _, _ = suggest_region(before, after)
     assert left > 120
     assert top > 90
 
@@ -380,11 +374,11 @@ def test_neither_the_border_nor_an_empty_part_counts_as_a_gain() -> None:
         image[150:250, 230:360] = np.where(columns % 10 < full, 60.0 / full, 0.0)
         image[150:250, 60:190] = np.where(abs(columns - 65) < empty / 2, 300.0 / empty, 0.0)
     after[:8], after[:, :8] = 0.0, 0.0
-    left, top, right, bottom = suggest_region(before, after, margin=10).region
+    left, top, right, bottom = suggest_region(before, after, margin=10)
     assert left >= 220
     assert right <= 370
     before[20:], after[20:] = 4.0, 4.0
-    left, top, right, bottom = suggest_region(before, after, margin=10).region
+    left, top, right, bottom = suggest_region(before, after, margin=10)
     assert min(left, top, 400 - right, 300 - bottom) >= 10
 
 
@@ -501,7 +495,7 @@ def test_of_a_large_image_the_square_with_most_events_is_searched(monkeypatch: p
     after[450:540, 600:700] = np.where(np.arange(100) % 10 < 2, 20.0, 0.0)
     monkeypatch.setattr(viewer, "MOST_SEARCHED", 330**2)
     assert viewer.busiest(before) == (512, 320, 832, 640)
-    left, top, right, bottom = suggest_region(before, after).region
+    left, top, right, bottom = suggest_region(before, after)
     assert 590 < left < right < 720
     assert 440 < top < bottom < 560
 
@@ -668,9 +662,9 @@ def test_a_scale_gives_colours_and_marks() -> None:
 # event rates
 
 
-def expected_rates(events: Events, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    on, off = (np.diff(np.searchsorted(events.t[events.p == p], edges)) for p in (1, 0))
-    return on / np.diff(edges) * 1e6, off / np.diff(edges) * 1e6
+def expected_rates(events: Events, edges: np.ndarray) -> np.ndarray:
+    counts = np.array([np.diff(np.searchsorted(events.t[events.p == p], edges)) for p in (0, 1)])
+    return np.asarray(counts / np.diff(edges) * 1e6)
 
 
 def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -683,24 +677,21 @@ def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
     first, stop = int(events.t[0]), int(events.t[-1]) + 1
     for start, end, bins in ((first, stop, 100), (first, stop, 7), (first - 5000, stop + 5000, 50),
                              (40_000, 41_000, 200), (40_000, 40_010, 200), (0, 60_000, 4000)):  # fmt: skip
-        found = rates.curve(start, end, bins)
-        assert found.edges_us[0] == start
-        assert found.edges_us[-1] == end
-        assert len(found.on) <= bins
-        on, off = expected_rates(events, found.edges_us)
-        lengths = np.diff(found.edges_us)
+        edges, found = rates.curve(start, end, bins)
+        assert (edges[0], edges[-1]) == (start, end)
+        assert found.shape[1] <= bins
+        expected, lengths = expected_rates(events, edges), np.diff(edges)
         # an edge between two edges of the recording's bins counts part of a bin in the next one
         most = 3.0 * 25.0 / lengths.min() * 1e6 * 0.5
-        assert np.abs(found.on - on).max() <= most
-        assert (found.on * lengths).sum() == pytest.approx((on * lengths).sum(), rel=2e-3)
-        assert (found.off * lengths).sum() == pytest.approx((off * lengths).sum(), rel=2e-3)
-    exact = rates.curve(40_000, 41_000, 200)
-    assert len(exact.on) == 200
-    np.testing.assert_array_equal(exact.on, expected_rates(events, exact.edges_us)[0])
+        assert np.abs(found[1] - expected[1]).max() <= most
+        np.testing.assert_allclose((found * lengths).sum(axis=1), (expected * lengths).sum(axis=1), rtol=2e-3)
+    edges, exact = rates.curve(40_000, 41_000, 200)
+    assert exact.shape == (2, 200)
+    np.testing.assert_array_equal(exact, expected_rates(events, edges))
     monkeypatch.setattr(timeline, "MOST_EXACT", 10)
-    coarse = rates.curve(40_000, 41_000, 200)
-    assert 30 < len(coarse.on) < 60
-    np.testing.assert_allclose(coarse.off[1:-1], expected_rates(events, coarse.edges_us)[1][1:-1])
+    edges, coarse = rates.curve(40_000, 41_000, 200)
+    assert 30 < coarse.shape[1] < 60
+    np.testing.assert_allclose(coarse[0, 1:-1], expected_rates(events, edges)[0, 1:-1])
 
 
 def test_rates_are_known_as_far_as_the_recording_is_read(tmp_path: Path) -> None:
@@ -708,22 +699,22 @@ def test_rates_are_known_as_far_as_the_recording_is_read(tmp_path: Path) -> None
     stretched = Events(events.x, events.y, events.t * 1000, events.p)
     rates = EventRates(MemoryEvents(stretched, 16, 16))
     first, stop = int(stretched.t[0]), int(stretched.t[-1]) + 1
-    assert np.isnan(rates.curve(first, stop, 100).on).all()
+    assert np.isnan(rates.curve(first, stop, 100)[1]).all()
     assert not rates.fill(0.0)
     assert rates.share == pytest.approx(1 / 3, abs=0.01)
-    some = rates.curve(first, stop, 90)
-    assert np.isfinite(some.on[:29]).all()
-    assert np.isnan(some.on[31:]).all()
+    _, some = rates.curve(first, stop, 90)
+    assert np.isfinite(some[:, :29]).all()
+    assert np.isnan(some[:, 31:]).all()
     while not rates.fill(0.0):
         pass
-    full = rates.curve(first, stop, 90)
-    np.testing.assert_array_equal(full.on[:29], some.on[:29])
-    assert (full.on * np.diff(full.edges_us)).sum() * 1e-6 == pytest.approx(stretched.p.sum())
+    edges, full = rates.curve(first, stop, 90)
+    np.testing.assert_array_equal(full[:, :29], some[:, :29])
+    assert (full[1] * np.diff(edges)).sum() * 1e-6 == pytest.approx(stretched.p.sum())
     text = tmp_path / "events.txt"
     text.write_text("".join(f"{k * 1e-3:.6f} 1 2 {k % 2}\n" for k in range(1000)))
     of_file = EventRates(open_recording(text).events)
     assert of_file.fill(60.0)
-    np.testing.assert_allclose(of_file.curve(0, 999_000, 9).on, 500.0, rtol=0.02)
+    np.testing.assert_allclose(of_file.curve(0, 999_000, 9)[1], 500.0, rtol=0.02)
 
 
 # state
@@ -860,20 +851,24 @@ def test_a_calibration_uses_what_is_selected(
     inspector.set(replace(truth, apex=0.5 * truth.apex))
     said: list[str] = []
     settings = Settings(model="exact", stages=("sharpness",))
-    found = find_calibration(inspector, settings, progress=lambda what, share: said.append(what))
+    found, text = find_calibration(inspector, settings, progress=lambda what, share: said.append(what))
     assert said
-    assert found.calibration.camera == recording.camera
-    assert found.calibration.parameters["apex"] == pytest.approx(truth.apex, abs=math.radians(0.12))
-    assert found.before < found.current < found.after
-    assert found.after == pytest.approx(inspector.show(truth).sharpness_after, rel=0.1)
-    assert found.scope.startswith(f"{inspector.loaded.selected:,} events from 0.020 s to 0.200 s")
-    assert ("x 20 to 139, y 10 to 109 px" in found.scope) is (region is not None)
-    assert calibrated_events(inspector)[1] == found.scope
+    assert found.camera == recording.camera
+    assert found.parameters["apex"] == pytest.approx(truth.apex, abs=math.radians(0.12))
+    words = re.search(r"region ([\d.]+) as recorded, ([\d.]+) now, ([\d.]+) with the result", text)
+    assert words is not None
+    before, now, after = map(float, words.groups())
+    assert before < now < after
+    assert after == pytest.approx(inspector.show(truth).sharpness_after, rel=0.1)
+    scope = calibrated_events(inspector)[1]
+    assert scope.startswith(f"{inspector.loaded.selected:,} events from 0.020 s to 0.200 s")
+    assert ("x 20 to 139, y 10 to 109 px" in scope) is (region is not None)
+    assert text.startswith(f"found on {scope}: exact model, apex {math.degrees(found.parameters['apex']):.4g}°")
     assert inspector.knobs.apex == 0.5 * truth.apex  # nothing is accepted yet
-    inspector.accept(found.calibration)
+    inspector.accept(found)
     assert inspector.sources["apex"] is Source.CALIBRATED
     shown = inspector.show()
-    assert (shown.sharpness_before, shown.sharpness_after) == pytest.approx((found.before, found.after), rel=0.03)
+    assert (shown.sharpness_before, shown.sharpness_after) == pytest.approx((before, after), rel=0.03)
 
 
 def test_a_selection_that_determines_nothing_is_refused(inspector: Inspector) -> None:
@@ -887,20 +882,31 @@ def test_a_selection_that_determines_nothing_is_refused(inspector: Inspector) ->
         find_calibration(inspector)
 
 
+def surface_values(surface: dict[str, Any]) -> np.ndarray:
+    """Return the sharpness of a map as the page gets it, by row and column of its parameters."""
+    picture = surface["picture"]
+    return np.frombuffer(picture["values"], np.float32).reshape(picture["height"], picture["width"])[::-1]
+
+
 def test_the_cost_surface_has_its_top_at_the_truth(inspector: Inspector) -> None:
     truth = inspector.knobs
     inspector.set(replace(truth, apex=0.8 * truth.apex, phase=truth.phase + 0.6))
     shares: list[float] = []
     surface = cost_surface(inspector, points=(9, 13), progress=lambda what, share: shares.append(share))
-    assert surface.names == ("apex", "phase")
-    assert surface.sharpness.shape == (13, 9)
+    assert (surface["x_title"], surface["y_title"]) == ("apex angle (°)", "phase (°)")
+    sharpness = surface_values(surface)
+    assert sharpness.shape == (13, 9)
     assert shares == pytest.approx(np.arange(13) / 13)
-    row, column = np.unravel_index(np.argmax(surface.sharpness), surface.sharpness.shape)
-    apex, phase = surface.values[0][column], surface.values[1][row]
+    row, column = np.unravel_index(np.argmax(sharpness), sharpness.shape)
+    apex, phase = math.radians(surface["x"][column]), math.radians(surface["y"][row])
     assert apex == pytest.approx(truth.apex, abs=0.21 * truth.apex)
     assert abs(math.remainder(phase - truth.phase, math.tau)) < math.radians(31.0)
-    still = np.ptp(surface.sharpness[:, 0])
-    assert still < 0.01 * np.ptp(surface.sharpness)  # without an apex, the phase does not matter
+    still = np.ptp(sharpness[:, 0])
+    assert still < 0.01 * np.ptp(sharpness)  # without an apex, the phase does not matter
+    (now, at_truth), places = surface["marks"], [(0.8 * truth.apex, truth.phase + 0.6), (truth.apex, truth.phase)]
+    for mark, (x, y) in zip((now, at_truth), places, strict=True):
+        assert mark["x"] == pytest.approx(math.degrees(x))
+        assert mark["y"] == pytest.approx(math.degrees(y))
 
 
 def test_the_cost_surface_without_encoder_is_over_the_speed(recording: Recording, inspector: Inspector) -> None:
@@ -910,10 +916,11 @@ def test_the_cost_surface_without_encoder_is_over_the_speed(recording: Recording
     zero = float(encoder.angle_at([without.zero_us])[0])
     without.set(replace(inspector.knobs, rpm=718.0, phase=inspector.knobs.phase + zero))
     surface = cost_surface(without, points=(5, 7))
-    assert surface.names == ("apex", "rpm")
-    at_truth = surface.sharpness[4, 2]  # within one turn, sharpness hardly depends on the speed
-    assert surface.values[1][4] == pytest.approx(720.0, abs=0.1)
-    assert surface.sharpness.max() - at_truth < 0.05 * np.ptp(surface.sharpness[:, 3])
+    assert surface["y_title"] == "speed of the prism (rpm)"
+    sharpness = surface_values(surface)
+    at_truth = sharpness[4, 2]  # within one turn, sharpness hardly depends on the speed
+    assert surface["y"][4] == pytest.approx(720.0, abs=0.1)
+    assert sharpness.max() - at_truth < 0.05 * np.ptp(sharpness[:, 3])
 
 
 def test_the_page_says_how_many_events_were_read_of_a_full_window(
@@ -1064,13 +1071,13 @@ def test_statistics_of_a_region(polarity: int | None) -> None:
             last[x, y] = t
             ons, n = ons + p, n + 1
     found = made.statistics()
-    assert (found.on, found.off, found.duration_us) == (ons, n - ons, 50_000)
-    assert (found.pixels, found.area) == (len(last), 260)
-    assert found.on_share == ons / n
-    assert found.rate == pytest.approx(n / 0.05)
-    assert found.median_us == np.median(intervals)
-    edges = viewer.INTERVALS_US
-    assert found.intervals.tolist() == [sum(low <= each < high for each in intervals) for low, high in pairwise(edges)]
+    assert [text for _, text in found["rows"]] == [
+        f"{n / 0.05:,.0f} events/s", f"{n / 260:.3g}", f"{100.0 * ons / n:.1f} %", f"{100.0 * len(last) / 260:.1f} %",
+        f"{np.median(intervals):,.0f} µs",
+    ]  # fmt: skip
+    assert found["median"] == pytest.approx(math.log10(np.median(intervals)))
+    counts = [sum(low <= each < high for each in intervals) for low, high in pairwise(viewer.INTERVALS_US)]
+    np.testing.assert_allclose(found["y"], 100.0 * np.array(counts) / len(intervals))
 
 
 def test_intervals_between_two_runs_are_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1079,9 +1086,9 @@ def test_intervals_between_two_runs_are_not_counted(monkeypatch: pytest.MonkeyPa
     made = Inspector(Recording(MemoryEvents(events, 2, 1)))
     made.open(0, 100_000)
     found = made.statistics()
-    assert found.on + found.off == 3200
-    assert found.duration_us == 50_000
-    assert found.intervals.sum() == 3200 - 2 * viewer.RUNS
+    assert found["rows"][0] == ["rate", "64,000 events/s"]  # 3,200 in 50 ms
+    counts = np.array(found["y"]) / 100.0 * (3200 - 2 * viewer.RUNS)
+    np.testing.assert_allclose(counts, np.rint(counts), rtol=0, atol=1e-6)
 
 
 def test_another_recording_is_shown_beside(recording: Recording, inspector: Inspector, tmp_path: Path) -> None:

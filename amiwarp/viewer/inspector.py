@@ -45,18 +45,6 @@ MOST_EXACT = 1_000_000
 """Largest number of events that are read to count them in bins finer than those of the whole recording."""
 
 
-@dataclass(frozen=True, eq=False)
-class RateCurve:
-    """Rates of ON and OFF events in time bins of equal length, or nearly so."""
-
-    edges_us: NDArray[np.int64]
-    """Edges of the bins on the events' clock [us], shape ``(n + 1,)``."""
-    on: NDArray[np.float64]
-    """Rate of ON events [1/s], shape ``(n,)``; NaN where the recording is not read yet."""
-    off: NDArray[np.float64]
-    """Rate of OFF events [1/s], shape ``(n,)``; NaN where the recording is not read yet."""
-
-
 class EventRates:
     """Counts of a recording's events over time. Call :meth:`fill` until it returns True, in one thread.
 
@@ -94,9 +82,11 @@ class EventRates:
         self._read = sums, read_us
         return read_us == self._stop
 
-    def curve(self, start_us: int, end_us: int, bins: int) -> RateCurve:
-        """Return the rates between two times in about ``bins`` bins.
+    def curve(self, start_us: int, end_us: int, bins: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the rates of OFF and ON events between two times in about ``bins`` bins of equal length, or nearly so.
 
+        Returns edges of the bins on the events' clock [us], shape ``(n + 1,)``, and rates [1/s], shape ``(2, n)``, NaN
+        where the recording is not read yet.
         Bins finer than those of the whole recording are counted if the time between holds few events. Otherwise, the
         curve has fewer bins. Times outside the recording have rate 0.
         """
@@ -115,8 +105,7 @@ class EventRates:
             counts = np.diff(sums[:, np.minimum(before, sums.shape[1] - 1)], axis=1).astype(np.float64)
             if read_us < self._stop:
                 counts[:, edges[1:] > read_us] = np.nan
-        off, on = counts / np.diff(edges) * 1e6
-        return RateCurve(edges, on, off)
+        return edges, counts / np.diff(edges) * 1e6
 
     def _count(self, block: Events) -> None:
         low, high = np.searchsorted(self._edges, (block.t[0], block.t[-1]), side="right") - 1
@@ -435,18 +424,6 @@ class Selection:
 
 
 @dataclass(frozen=True, eq=False)
-class WindowAngles:
-    """Prism angles of a window's events, without the clock offset that is set on the page."""
-
-    on_device: UploadedEvents
-    """Events of the images, on the device."""
-    theta: NDArray[np.float64]
-    """Prism angles of the drawn events [rad], shape ``(n,)``."""
-    speed: NDArray[np.float64]
-    """Speed of the prism at the drawn events [rad/us], shape ``(n,)``."""
-
-
-@dataclass(frozen=True, eq=False)
 class LoadedWindow:
     """Selected events of a window, in memory and on the device, and their image without compensation."""
 
@@ -466,8 +443,9 @@ class LoadedWindow:
     """Events of the images: the selected events, and those near the region that compensation may move into it."""
     curve_events: Events
     """Part of these events from which the sharpness curve is computed."""
-    angles: dict[float, WindowAngles] = field(default_factory=dict)
-    """Prism angles by the speed of a prism without encoder [1/min]; with an encoder, the only key is 0."""
+    angles: dict[float, tuple[UploadedEvents, NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
+    """Events on the device, prism angles [rad] and speeds [rad/us] of the drawn events, without the clock offset set on
+    the page, by the speed of a prism without encoder [1/min]; with an encoder, the only key is 0."""
     wrapped: dict[tuple[float, float], NDArray[np.float64]] = field(default_factory=dict)
     """Prism angles of the drawn events from 0 to 2π [rad], by speed and drift of the clock offset; the last ones only.
     """
@@ -532,52 +510,6 @@ INTERVALS_US = np.logspace(0, 6, 49)
 """Edges of the bins of the histogram of intervals [us]: eight bins per decade, from 1 us to 1 s."""
 
 
-@dataclass(frozen=True, eq=False)
-class Statistics:
-    """Statistics of the selected events of a time window."""
-
-    on: int
-    """Number of ON events."""
-    off: int
-    """Number of OFF events."""
-    duration_us: int
-    """Length of the time window, or of the runs that were read from it [us]."""
-    pixels: int
-    """Number of pixels with events."""
-    area: int
-    """Number of pixels of the region."""
-    intervals: NDArray[np.int64]
-    """Numbers of intervals between successive events of a pixel in the bins of :data:`INTERVALS_US`. Intervals under
-    1 us are in the first bin, intervals over 1 s in the last one."""
-    median_us: float
-    """Median of these intervals [us]; NaN if there are none."""
-
-    @property
-    def on_share(self) -> float:
-        """Share of ON events."""
-        return self.on / (self.on + self.off)
-
-    @property
-    def rate(self) -> float:
-        """Number of events per time [1/s]."""
-        return (self.on + self.off) / self.duration_us * 1e6
-
-    def state(self) -> dict[str, Any]:
-        """Return what page and window show: rows of name and value, and the histogram of the intervals."""
-        n, known, decades = self.on + self.off, bool(self.intervals.any()), np.log10(INTERVALS_US)
-        rows = [
-            ("rate", f"{self.rate:,.0f} events/s"), ("events per pixel", f"{n / self.area:.3g}"),
-            ("ON", f"{100.0 * self.on_share:.1f} %"),
-            ("pixels with events", f"{100.0 * self.pixels / self.area:.1f} %"),
-            ("median interval of a pixel", f"{self.median_us:,.0f} µs" if known else "–"),
-        ]  # fmt: skip
-        return {
-            "rows": [list(row) for row in rows], "x": (0.5 * (decades[1:] + decades[:-1])).tolist() if known else [],
-            "y": (100.0 * self.intervals / max(1, self.intervals.sum())).tolist(),
-            "median": math.log10(max(self.median_us, 1.0)) if known else None,
-        }  # fmt: skip
-
-
 # Selected events of a time window, on the host and with their prism angles on the device.
 
 MOST_POINTS, WINDOW_POINTS = 100_000, 1_000_000
@@ -614,18 +546,7 @@ LEAST_SHARE = 0.8
 from outside."""
 
 
-@dataclass(frozen=True)
-class Suggestion:
-    """Suggested region of the image."""
-
-    region: Region
-    """Left, top, right and bottom [px]; right and bottom are exclusive."""
-    gains: bool
-    """Whether compensation with the current parameters sharpens the region. Otherwise, the region has most structure.
-    """
-
-
-def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32], *, margin: int = 0) -> Suggestion:
+def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32], *, margin: int = 0) -> Region:
     """Return the region in which compensation gains most sharpness.
 
     If it gains nothing anywhere, return the region of the recorded image that has most structure. ``before`` and
@@ -637,16 +558,15 @@ def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32], *, m
     if before.size > MOST_SEARCHED:
         left, top, right, bottom = busiest(before)
         part = np.s_[top:bottom, left:right]
-        found = suggest_region(before[part], after[part], margin=margin)
-        x0, y0, x1, y1 = found.region
-        return replace(found, region=(left + x0, top + y0, left + x1, top + y1))
+        x0, y0, x1, y1 = suggest_region(before[part], after[part], margin=margin)
+        return left + x0, top + y0, left + x1, top + y1
     width = min(columns, WIDEST, max(columns // 3, NARROWEST))
     while True:
         height = min(rows, max(1, round(width * min(rows / columns, 1.0))))
-        left, top, gains = _best_box(before, after, width, height, margin)
+        left, top = _best_box(before, after, width, height, margin)
         events = float(before[top : top + height, left : left + width].sum())
         if events <= CLEAR_EVENTS or width <= NARROWEST:
-            return Suggestion((left, top, left + width, top + height), gains)
+            return left, top, left + width, top + height
         width = max(NARROWEST, min(width - 1, int(width * (CLEAR_EVENTS / events) ** 0.5)))
 
 
@@ -665,8 +585,8 @@ def busiest(image: NDArray[np.float32]) -> Region:
 
 def _best_box(
     before: NDArray[np.float32], after: NDArray[np.float32], width: int, height: int, margin: int
-) -> tuple[int, int, bool]:
-    """Return left and top of the best box of a size, and whether compensation sharpens it."""
+) -> tuple[int, int]:
+    """Return left and top of the best box of a size: without a gain, of that with most structure."""
     mean, over_mean = _of_boxes(before, width, height)
     mean_after, over_mean_after = _of_boxes(after, width, height)
     noise = random_variance(SMOOTHING_PX)
@@ -676,13 +596,12 @@ def _best_box(
     variance = np.where(mean >= LEAST_SHARE * mean_after, variance, 0.0)
     margins = (min(margin, (n - 1) // 2) for n in variance.shape)  # at least the middle is searched
     inner = tuple(slice(m, n - m) for m, n in zip(margins, variance.shape, strict=True))
-    gains = bool((over_mean_after - over_mean)[inner].max() > LEAST_SIGMA * noise * (2.0 / (width * height)) ** 0.5)
-    if not gains:
+    if (over_mean_after - over_mean)[inner].max() <= LEAST_SIGMA * noise * (2.0 / (width * height)) ** 0.5:
         variance = factor = mean * over_mean
     candidates = np.full(variance.shape, -np.inf)
     candidates[inner] = np.where(variance[inner] >= NEARLY_BEST * variance[inner].max(), factor[inner], -np.inf)
     top, left = np.unravel_index(int(np.argmax(candidates)), candidates.shape)
-    return int(left), int(top), gains
+    return int(left), int(top)
 
 
 def _of_boxes(image: NDArray[np.float32], width: int, height: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -1065,7 +984,7 @@ class Inspector:
         self._window = self._load(start_us, max(1, length_us), chosen)
         self.selection, self.window = chosen, (start_us, length_us)
 
-    def suggest_region(self) -> Suggestion:
+    def suggest_region(self) -> Region:
         """Return the region in which compensation gains most sharpness in the current time window."""
         loaded = self.loaded
         if self.selection.region is not None:
@@ -1162,8 +1081,13 @@ class Inspector:
 
         return sharpness
 
-    def statistics(self) -> Statistics:
-        """Return the statistics of the selected events of the time window. Intervals between runs are not counted."""
+    def statistics(self) -> dict[str, Any]:
+        """Return the statistics of the selected events of the time window for page and window.
+
+        They are rows of name and value, and the shares [%] and the median of the intervals between successive events of
+        a pixel, over the logarithm of the interval [us]. Intervals between runs are not counted. Those under 1 us are
+        in the first bin, those over 1 s in the last one.
+        """
         events, span, (left, top, right, bottom) = self.loaded.events, self.loaded.span, self.loaded.region
         events = events[inside(events, self.loaded.region)]
         starts = span.events.t[np.cumsum([0, *(run.stop - run.start for run in span.runs)])[:-1]]
@@ -1172,12 +1096,19 @@ class Inspector:
         order = np.argsort(pixel, kind="stable")
         steps = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
         counts, _ = np.histogram(np.clip(steps, 1, 999_999), INTERVALS_US)
-        on, read = int(events.p.sum()), len(span.events)
-        return Statistics(
-            on=on, off=len(events) - on, duration_us=max(1, round(span.length_us * read / span.count)),
-            pixels=len(np.unique(pixel % ((bottom - top) * (right - left)))), area=(bottom - top) * (right - left),
-            intervals=counts, median_us=float(np.median(steps)) if len(steps) else math.nan,
-        )  # fmt: skip
+        n, area, known, decades = len(events), (right - left) * (bottom - top), bool(len(steps)), np.log10(INTERVALS_US)
+        pixels, read_us = len(np.unique(pixel % area)), max(1, round(span.length_us * len(span.events) / span.count))
+        median_us = float(np.median(steps)) if known else math.nan
+        rows = [
+            ("rate", f"{n / read_us * 1e6:,.0f} events/s"), ("events per pixel", f"{n / area:.3g}"),
+            ("ON", f"{100.0 * events.p.mean():.1f} %"), ("pixels with events", f"{100.0 * pixels / area:.1f} %"),
+            ("median interval of a pixel", f"{median_us:,.0f} µs" if known else "–"),
+        ]  # fmt: skip
+        return {
+            "rows": [list(row) for row in rows], "x": (0.5 * (decades[1:] + decades[:-1])).tolist() if known else [],
+            "y": (100.0 * counts / max(1, counts.sum())).tolist(),
+            "median": math.log10(max(median_us, 1.0)) if known else None,
+        }  # fmt: skip
 
     def orbit(self, x: float, y: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """Return the orbit of the scene point that would appear at (x, y) [px] without the prism.
@@ -1245,7 +1176,7 @@ class Inspector:
         ``knobs``: the parameters; None for the events as recorded.
         """
         given = self._unprismed if knobs is None else knobs
-        return self.model_of(given), self._angles(w, given).on_device, self._drift_us(given)
+        return self.model_of(given), self._angles(w, given)[0], self._drift_us(given)
 
     def positions(self, events: Events, knobs: Knobs) -> NDArray[np.float32]:
         """Return the compensated positions of events [px], shape ``(n, 2)``."""
@@ -1309,15 +1240,14 @@ class Inspector:
         """Return how far the clock offset is from that of the recording's own encoder [us]."""
         return knobs.clock_offset - self._recorded_offset_us
 
-    def _angles(self, w: LoadedWindow, knobs: Knobs) -> WindowAngles:
+    def _angles(self, w: LoadedWindow, knobs: Knobs) -> tuple[UploadedEvents, NDArray[np.float64], NDArray[np.float64]]:
         """Return the prism angles of a window; those of the two last speeds are kept."""
         rpm = 0.0 if self.has_encoder else knobs.rpm
         if rpm not in w.angles:
             encoder, t = self._encoder(rpm), w.drawn.t
             for old in list(w.angles)[:-1]:
                 del w.angles[old]
-            angle, speed = encoder.angle_at(t), encoder.speed_at(t) * 1e-6
-            w.angles[rpm] = WindowAngles(self._upload(w.events, rpm), angle, speed)
+            w.angles[rpm] = self._upload(w.events, rpm), encoder.angle_at(t), encoder.speed_at(t) * 1e-6
         return w.angles[rpm]
 
     def _upload(self, events: Events, rpm: float) -> UploadedEvents:
@@ -1328,8 +1258,8 @@ class Inspector:
 
     def _theta(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
         """Return the prism angles of the drawn events [rad], shape ``(n,)``."""
-        angles = self._angles(w, knobs)
-        return angles.theta + angles.speed * self._drift_us(knobs)
+        _, theta, speed = self._angles(w, knobs)
+        return theta + speed * self._drift_us(knobs)
 
     def _wrapped(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
         """Return the prism angles of the drawn events, from 0 to 2π [rad], shape ``(n,)``."""

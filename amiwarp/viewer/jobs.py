@@ -1,15 +1,12 @@
-"""Work of the inspector's page in threads: phase, calibration, live stream as a recording, and downloads."""
+"""What page and window do in threads: phase, calibration, live stream as a recording, and files."""
 
 import asyncio
 import contextlib
-import logging
 import math
 import re
 import weakref
-from collections.abc import Callable, Coroutine, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,25 +29,17 @@ from amiwarp.live.stream.session import RecentEvents
 from amiwarp.optics.models import ExactModel, alternatives
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.tasks import Progress, silent
-from amiwarp.viewer.drawing import Look, Scene, ShownImages, caption, select_part, shown_lines
+from amiwarp.viewer.drawing import Look, Scale, Scene, ShownImages, caption, picture_state, select_part, shown_lines
 from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, MOST_SEARCHED, Inspector, Knobs, Source, busiest, size_name
+from amiwarp.viewer.layout import EXPORTS, SLIDERS, UNITS, orbit_text
 
-# Work of one page: its threads, jobs and updates, and the messages about their errors.
+# Progress of long work in threads.
 
-MOST_IN_FLIGHT = 8
-"""Largest number of messages to the page that are unsent; while more are waiting, nothing is computed."""
-WAIT_S = 0.02
-"""Interval between two checks of the number of unsent messages [s]."""
 PROGRESS_S = 0.1
 """Shortest interval between two progress messages of a job [s].
 
 The calibration of a small recording causes eighty per second, and the page would draw each of them.
 """
-_CUDA_LOCK = asyncio.Lock()
-"""Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""
-QUICK = {**dict.fromkeys(("window", "suggestion", "state", "knobs"), ("clouds", "images")), "look": ("clouds",)}
-SLOW = ("curve", "picture", "statistics")
-"""Updates that are made at once, with the parts of the page that wait for them, and updates that take longer."""
 
 
 class JobCancelled(Exception):
@@ -80,131 +69,6 @@ class JobProgress:
     def _pass_on(self, what: str, share: float) -> None:
         if (show := self._show()) is not None and not self.cancelled:
             show(what, share)
-
-
-class PageWork:
-    """What is computed for one page, in threads, and the messages about it.
-
-    Updates run one after the other. If a slider moves several times meanwhile, only its last position is used. What
-    waits for an update is marked on the page. Nothing is computed while the page does not keep up with the messages.
-    """
-
-    def __init__(self, server: Any, device: Any) -> None:
-        self.server, self.state = server, server.state
-        self.buffers_lock = asyncio.Lock()
-        """Lock of the inspector's buffers on the device, which only one thread may use at a time."""
-        self.device_lock: Any = _CUDA_LOCK if "cuda" in str(device) else contextlib.nullcontext()
-        self._quick_requests: set[str] = set()
-        self._slow_requests: set[str] = set()
-        self._doing: set[str] = set()
-        self._quick: asyncio.Task[None] | None = None
-        self._slow: asyncio.Task[None] | None = None
-        self._jobs: set[asyncio.Task[None]] = set()
-        self._error_source = ""
-        # A tab's own pool, which ends with the tab: calibration or film; curve or picture; quick updates.
-        self._threads = ThreadPoolExecutor(3, "amiwarp-tab")
-
-    async def make(self, todo: set[str]) -> None:
-        """Make a set of quick updates."""
-        raise NotImplementedError
-
-    async def make_slow(self, name: str) -> None:
-        """Make one slow update."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        """Stop all work. A thread ends when its current work is done."""
-        for task in self._jobs:
-            task.cancel()
-        self._threads.shutdown(wait=False, cancel_futures=True)
-
-    def request(self, *what: str) -> None:
-        """Request quick updates: "window", "knobs", "look", "suggestion" or "state"."""
-        self._quick_requests.update(what)
-        self._show_pending()
-        if self._quick is None or self._quick.done():
-            self._quick = self.start_job(self._update())
-
-    def request_slow(self, *what: str) -> None:
-        """Request updates that run in a thread after all quick updates: "curve", "picture" or "preparation"."""
-        self._slow_requests.update(what)
-        self._show_pending()
-        if self._slow is None or self._slow.done():
-            self._slow = self.start_job(self._update_slowly())
-
-    async def until_drawn(self) -> None:
-        """Wait until no quick update is pending."""
-        while self._quick is not None and not self._quick.done():
-            await asyncio.sleep(0.005)
-
-    def start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Run a job until it ends or the browser tab is closed."""
-        self._jobs.add(task := asyncio.get_running_loop().create_task(work))
-        task.add_done_callback(self._ended)
-        return task
-
-    async def in_thread(self, work: Callable[..., Any], *args: Any, **options: Any) -> Any:
-        """Call ``work`` in one of the browser tab's threads, and return its result."""
-        return await asyncio.get_running_loop().run_in_executor(self._threads, partial(work, *args, **options))
-
-    def say(self, text: str, severity: str = "info") -> None:
-        """Show a message."""
-        with self.state:
-            self.state.update({"message": text, "severity": severity})
-
-    @contextlib.contextmanager
-    def errors_shown(self, what: str) -> Iterator[None]:
-        """Show errors of the enclosed code as a message, until the same kind of action (``what``) succeeds."""
-        try:
-            yield
-        except (AmiwarpError, OSError) as error:
-            self._error_source = what
-            self.state.update({"message": str(error), "severity": "error"})
-        else:
-            if self.state.severity == "error" and self._error_source == what:
-                self.state.update({"message": "", "severity": "info"})
-
-    def _show_pending(self) -> None:
-        """Show which parts of the page wait for an update."""
-        quick = self._quick_requests | self._doing
-        parts = {part for what in quick for part in QUICK.get(what, ())} | (self._slow_requests | self._doing) & {*SLOW}
-        self.state.updating = sorted(parts)
-
-    def _ended(self, task: asyncio.Task[None]) -> None:
-        self._jobs.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            logging.getLogger(__name__).error("the page's work failed", exc_info=error)
-            text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
-            self.say(text, "error")
-
-    async def _update(self) -> None:
-        while self._quick_requests:
-            while (page := self.server.protocol) is not None and page.network_monitor.pending > MOST_IN_FLIGHT:
-                await asyncio.sleep(WAIT_S)
-            todo, self._quick_requests = self._quick_requests, set()
-            async with self._done(todo), self.device_lock, self.buffers_lock:
-                await self.make(todo)
-            await asyncio.sleep(0)
-
-    async def _update_slowly(self) -> None:
-        while self._slow_requests:
-            await self.until_drawn()
-            name = min(self._slow_requests)  # in alphabetical order: the curve first, the preparation last
-            self._slow_requests.discard(name)
-            async with self._done({name}), self.device_lock:
-                with self.errors_shown(name):
-                    await self.make_slow(name)
-
-    @contextlib.asynccontextmanager
-    async def _done(self, todo: set[str]) -> Any:
-        """Mark updates as being made, and send the state to the browser when they are made."""
-        self._doing |= todo
-        try:
-            yield
-        finally:
-            self._doing -= todo
-            with self.state:
-                self._show_pending()
 
 
 # Estimate of the prism's phase at first sight, so that the page opens with compensated events.
@@ -266,22 +130,6 @@ SURFACE_POINTS = (21, 37)
 """Number of values of the first and the second parameter of a cost surface."""
 
 
-@dataclass(frozen=True, eq=False)
-class FoundCalibration:
-    """Result of a calibration on the shown events, which nobody has accepted yet."""
-
-    calibration: Calibration
-    """The calibration, of the whole camera."""
-    scope: str
-    """The events that it used, for the page."""
-    before: float
-    """Sharpness of the shown region as recorded."""
-    current: float
-    """Sharpness of the shown region with the inspector's parameters at the end of the calibration."""
-    after: float
-    """Sharpness of the shown region with the calibrated parameters."""
-
-
 def calibrated_events(inspector: Inspector, *, whole: bool = False) -> tuple[Recording, str]:
     """Return the events that :func:`find_calibration` uses, and a description of them for the page."""
     if whole:
@@ -300,11 +148,12 @@ def calibrated_events(inspector: Inspector, *, whole: bool = False) -> tuple[Rec
 
 def find_calibration(
     inspector: Inspector, settings: Settings | None = None, *, whole: bool = False, progress: Progress | None = None
-) -> FoundCalibration:
+) -> tuple[Calibration, str]:
     """Calibrate on the events of the window and the selection, or on the whole recording as ``amiwarp calibrate`` does.
 
-    Without an encoder, the search starts at the speed set on the page. Raises :class:`AmiwarpError` if these events
-    cannot determine the parameters.
+    Returns the calibration of the whole camera, which nobody has accepted yet, and a description of it. Without an
+    encoder, the search starts at the speed set on the page. Raises :class:`AmiwarpError` if these events cannot
+    determine the parameters.
     """
     (recording, scope), rpm = calibrated_events(inspector, whole=whole), inspector.knobs.rpm
     wedge = ExactModel.NAME in alternatives(inspector.knobs.model)
@@ -315,81 +164,54 @@ def find_calibration(
     if not whole:
         found = replace(found, camera=inspector.camera)
     sharpness = inspector.sharpness_meter()
-    values = (sharpness(each) for each in (None, inspector.knobs, inspector.knobs_of(found)))
-    return FoundCalibration(found, scope, *values)
-
-
-@dataclass(frozen=True, eq=False)
-class CostSurface:
-    """Sharpness of the shown region over two parameters, with all others fixed."""
-
-    names: tuple[str, str]
-    """Names of the parameters along the columns and along the rows."""
-    values: tuple[NDArray[np.float64], NDArray[np.float64]]
-    """Values of these parameters, in their units, shapes ``(columns,)`` and ``(rows,)``."""
-    sharpness: NDArray[np.float64]
-    """Sharpness, shape ``(rows, columns)``."""
+    before, now, after = (sharpness(each) for each in (None, inspector.knobs, inspector.knobs_of(found)))
+    exact, warnings = found.exact, "".join(f"; {text}" for text in found.warnings)
+    size, phase = exact.parameters.get(size_name(exact.model_name)), found.parameters["phase"]
+    return found, (
+        f"found on {scope}: {found.model_name} model, {orbit_text(exact.model_name, size, phase)}; sharpness of the "
+        f"region {before:.3g} as recorded, {now:.3g} now, {after:.3g} with the result; {found.seconds:.1f} s{warnings}"
+    )
 
 
 def cost_surface(
-    inspector: Inspector, *, points: tuple[int, int] = SURFACE_POINTS, progress: Progress | None = None
-) -> CostSurface:
-    """Return the sharpness over the two parameters that matter most.
+    inspector: Inspector, found: Calibration | None = None, *, points: tuple[int, int] = SURFACE_POINTS,
+    progress: Progress = silent,
+) -> dict[str, Any]:  # fmt: skip
+    """Return a map of the sharpness of the region over the two parameters that matter most, with all others fixed.
 
     These are the size, from 0 to twice its value, and phase, over one turn about its value. Without an encoder, they
-    are speed and size; with a depth map, clock offset and phase. ``points``: numbers of their values. The call may run
-    in a thread; ``progress`` may raise an error to stop it.
+    are speed and size; with a depth map, clock offset and phase. ``points``: numbers of their values. The map has marks
+    of the current, the ``found`` and the true parameters. The call may run in a thread; ``progress`` may raise an error
+    to stop it.
     """
-    progress, current = progress or silent, inspector.knobs
-    sharpness = inspector.sharpness_meter()
+    current, sharpness = inspector.knobs, inspector.sharpness_meter()
     size = size_name(current.model)
     sizes = np.linspace(0.0, 2.0 * (current.value(size) or inspector.nominal_apex or CURVE_HALF_WIDTH[size]), points[0])
     if inspector.depth is not None:  # there is no one size
         width, size = CURVE_HALF_WIDTH["clock_offset"], "clock_offset"
         sizes = current.clock_offset + np.linspace(-width, width, points[0])
-    if inspector.has_encoder:
-        names, values = (size, "phase"), (sizes, current.phase + np.linspace(-math.pi, math.pi, points[1]))
-    else:
-        width = CURVE_HALF_WIDTH["rpm"]
-        names, values = (size, "rpm"), (sizes, current.rpm + np.linspace(-width, width, points[1]))
-    out = np.empty((len(values[1]), len(values[0])))
-    for row, second in enumerate(values[1]):
-        progress(f"sharpness over {names[0]} and {names[1]}", row / len(out))
-        for column, first in enumerate(values[0]):
-            changes: dict[str, Any] = {names[0]: float(first), names[1]: float(second)}
-            out[row, column] = sharpness(current.with_values(changes))
-    return CostSurface(names, values, out)
+    second, width = ("phase", math.pi) if inspector.has_encoder else ("rpm", CURVE_HALF_WIDTH["rpm"])
+    names, scales = (size, second), (UNITS[size], UNITS[second])
+    others = (current.value(second) or 0.0) + np.linspace(-width, width, points[1])
+    out = np.empty(points[::-1])
+    for row, other in enumerate(others.tolist()):
+        progress(f"sharpness over {size} and {second}", row / len(out))
+        out[row] = [sharpness(current.with_values({size: each, second: other})) for each in sizes.tolist()]
+    marks, (x_title, y_title) = [], (f"{SLIDERS[name][0]} ({SLIDERS[name][1]})" for name in names)
+    known = (("○", "now", inspector.knobs), ("◇", "truth", inspector.truth),
+             ("✕", "result", None if found is None else inspector.knobs_of(found)))  # fmt: skip
+    for sign, title, knobs in known:
+        if knobs is not None:
+            x, y = ((knobs.value(name) or 0.0) / scale for name, scale in zip(names, scales, strict=True))
+            if second == "phase":
+                y += 360.0 * round((inspector.knobs.phase / scales[1] - y) / 360.0)
+            marks.append({"x": x, "y": y, "sign": sign, "title": title})
+    scale = Scale("sharpness", "1", float(out.min()), max(float(out.max()), float(out.min()) + 1e-9), "cividis")
+    return {"x": (sizes / scales[0]).tolist(), "y": (others / scales[1]).tolist(), "marks": marks, "x_title": x_title,
+            "y_title": y_title, "picture": picture_state(out[::-1], scale)}  # fmt: skip
 
 
 # Live stream as the inspector sees it: its last seconds as a recording, and figures about it.
-
-
-@dataclass(frozen=True)
-class LiveFigures:
-    """Figures about a live stream, for the page."""
-
-    connected: bool
-    """Whether events arrive."""
-    problem: str
-    """Why no events arrive; empty if they do."""
-    no_angles: str
-    """Why no angles of the prism arrive; empty if they do, or if no events arrive either."""
-    rate_mev_s: float
-    """Rate of the received events [million events/s]."""
-    latency_ms: float
-    """Time since the latest events arrived [ms]: the age of what is shown, if it is shown now."""
-    turn_share: float
-    """Share of a turn of the prism that the kept events cover, 0 to 1."""
-    dropped: int
-    """Number of events that were dropped because this computer was too slow."""
-    late: int
-    """Number of events that arrived out of order and got a later time."""
-    rpm: float | None
-    """Measured speed of the prism in the last turn of the shown events [turns/min]; None if it is unknown."""
-    message: str
-    """Latest message of the source or of the controller; empty if there was none."""
-    segment: int = 1
-    """Number of the shown segment: a new one begins when the source comes back, with a clock of its own."""
 
 
 class LiveSource:
@@ -410,17 +232,37 @@ class LiveSource:
         self._last = self._recent.recording() or self._last
         return self._last
 
-    def figures(self) -> LiveFigures:
-        """Return the figures of this moment."""
-        recent, status, problem = self._recent, self._recent.status, self._recent.silence
+    def state(self) -> dict[str, Any]:
+        """Return figures of this moment for page and window: rows of name, value and "bad", and what is wrong.
+
+        The speed is that of the last turn of the shown events; the latency is their age if they are shown now.
+        """
+        recent, problem, status = self._recent, self._recent.silence, self._recent.status
         last, encoder = self._last.events.t_last, self._last.encoder
+        no_angles = "" if problem else recent.encoder_silence
         turn_us = 2e6 if encoder is None else min(2e6, 60e6 / max(abs(encoder.rpm), 1.0))
         rpm = None if encoder is None else rpm_between(encoder, round(last - turn_us), last)
-        return LiveFigures(
-            not problem, problem, "" if problem else recent.encoder_silence, 0.0 if problem else status.rate_mev_s,
-            1e3 * recent.age_s, recent.turn_share, status.dropped, status.late, rpm,
-            self._messages[-1] if self._messages else "", recent.segment,
-        )  # fmt: skip
+        said, speed = self._messages[-1] if self._messages else "", "unknown" if rpm is None else f"{rpm:.1f} rpm"
+        angles, rate = not (problem or no_angles), 0.0 if problem else status.rate_mev_s
+        fresh, latency_ms = angles and recent.turn_share >= 1.0, 1e3 * recent.age_s
+        rows = [
+            ("events", "interrupted, last ones shown" if problem else "receiving", problem),
+            ("prism angles", "receiving" if angles else "interrupted, last turn shown", not angles),
+            ("rate", f"{rate:.2f} million events/s", False),
+            ("latency", "–" if problem else f"{latency_ms:.0f} ms", not problem and latency_ms > 1e3),
+            ("turn covered", f"{100.0 * recent.turn_share:.0f} %", recent.turn_share < 1.0),
+            ("speed of the prism", speed if fresh else f"{speed}, last measured", rpm is None or not fresh),
+            ("lost events", f"{status.dropped:,}", status.dropped), ("out of order", f"{status.late:,}", status.late),
+        ]  # fmt: skip
+        if recent.segment > 1:
+            rows.append(("segment", f"{recent.segment}, since the source came back", False))
+        if said and not problem:
+            rows.append(("last message", said, False))
+        message = "" if said == problem else said
+        note = f"The stream is interrupted: {problem}. {message}".strip() if problem else ""
+        if no_angles:
+            note = f"No prism angles arrive: {no_angles}. The last turn before it is shown, until they return."
+        return {"live_rows": [[name, text, "bad" if bad else ""] for name, text, bad in rows], "stream_note": note}
 
 
 # Files that the page offers as downloads: images, events and films.
@@ -544,15 +386,6 @@ FRAMES, FPS = 90, 25.0
 """Number of pictures of a turning film, and pictures per second."""
 FILM_SIZE = (1280, 560)
 """Width and height of a film [px]."""
-EXPORTS = {
-    "picture": ("picture", ".png"), "image": ("images", ".png"), "values": ("image values", ".tif"),
-    "events": ("events", ".h5"), "compensated": ("compensated events", ".h5"), "csv": ("events, CSV", ".csv"),
-    "npz": ("events, NPZ", ".npz"), "calibration": ("calibration", ".json"), "turntable": ("film, turning", ".mp4"),
-    "film": ("film from here", ".mp4"),
-}  # fmt: skip
-"""Downloads by name: text of the button, and suffix."""
-FILMS = ("turntable", "film")
-"""Downloads that take long."""
 
 
 def download_name(recording: str, what: str) -> str:

@@ -11,7 +11,7 @@ from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS, alternatives, size_names
-from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look, Scale, picture_state
+from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look
 from amiwarp.viewer.inspector import (
     OTHERS,
     SLIDING,
@@ -25,7 +25,6 @@ from amiwarp.viewer.inspector import (
     size_name,
     truth_text,
 )
-from amiwarp.viewer.jobs import EXPORTS, FILMS, CostSurface, FoundCalibration, LiveFigures
 from amiwarp.viewer.serve import FOLDER, Check, flag, number, one_of
 
 # State of the inspector's page: what it shows, with which parameters; its history, and its text in the address.
@@ -354,6 +353,15 @@ KEYS = (
     ("?", ("toggle", "help_shown"), "show or hide this help"),
 )
 """Keys of the page: name of the key, method of the panel with its arguments, and help text."""
+EXPORTS = {
+    "picture": ("picture", ".png"), "image": ("images", ".png"), "values": ("image values", ".tif"),
+    "events": ("events", ".h5"), "compensated": ("compensated events", ".h5"), "csv": ("events, CSV", ".csv"),
+    "npz": ("events, NPZ", ".npz"), "calibration": ("calibration", ".json"), "turntable": ("film, turning", ".mp4"),
+    "film": ("film from here", ".mp4"),
+}  # fmt: skip
+"""Downloads by name: text of the button, and suffix."""
+FILMS = ("turntable", "film")
+"""Downloads that take long."""
 CALLS = (
     "key", "released", "choose", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
     "resize_window", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline", "undo", "redo",
@@ -678,31 +686,7 @@ def notes(inspector: Inspector) -> list[str]:
     return [*inspector.notes, *filter(None, [phase])]
 
 
-# Texts and figures about a live stream and a calibration.
-
-
-def live_state(f: LiveFigures) -> dict[str, Any]:
-    """Return the figures of a stream for the page: rows of name, value and whether it is bad, and what is wrong."""
-    angles, speed = f.connected and not f.no_angles, "unknown" if f.rpm is None else f"{f.rpm:.1f} rpm"
-    fresh = angles and f.turn_share >= 1.0
-    rows: list[tuple[str, str, bool]] = [
-        ("events", "receiving" if f.connected else "interrupted, last ones shown", not f.connected),
-        ("prism angles", "receiving" if angles else "interrupted, last turn shown", not angles),
-        ("rate", f"{f.rate_mev_s:.2f} million events/s", False),
-        ("latency", f"{f.latency_ms:.0f} ms" if f.connected else "–", f.connected and f.latency_ms > 1e3),
-        ("turn covered", f"{100.0 * f.turn_share:.0f} %", f.turn_share < 1.0),
-        ("speed of the prism", speed if fresh else f"{speed}, last measured", f.rpm is None or not fresh),
-        ("lost events", f"{f.dropped:,}", f.dropped > 0), ("out of order", f"{f.late:,}", f.late > 0),
-    ]  # fmt: skip
-    if f.segment > 1:
-        rows.append(("segment", f"{f.segment}, since the source came back", False))
-    if f.connected and f.message:
-        rows.append(("last message", f.message, False))
-    message = "" if f.message == f.problem else f.message
-    note = "" if f.connected else f"The stream is interrupted: {f.problem}. {message}".strip()
-    if f.no_angles:
-        note = f"No prism angles arrive: {f.no_angles}. The last turn before it is shown, until they return."
-    return {"live_rows": [[name, text, "bad" if bad else ""] for name, text, bad in rows], "stream_note": note}
+# Texts about the prism's parameters.
 
 
 def with_unit(name: str, value: float, digits: int = 4) -> str:
@@ -715,34 +699,3 @@ def orbit_text(model: str, size: float | None, phase: float) -> str:
     """Return the size of a model, as its slider sets it, and its phase [rad], with their units."""
     name = size_name(model)
     return f"{name.replace('_', ' ')} {with_unit(name, (size or 0.0) / UNITS[name])}, phase {math.degrees(phase):.4g}°"
-
-
-def found_text(found: FoundCalibration) -> str:
-    """Return a description of the result of a calibration."""
-    c, exact = found.calibration, found.calibration.exact
-    warnings = "".join(f"; {text}" for text in c.warnings)
-    orbit = orbit_text(exact.model_name, exact.parameters.get(size_name(exact.model_name)), c.parameters["phase"])
-    return (
-        f"found on {found.scope}: {c.model_name} model, {orbit}; sharpness of the region {found.before:.3g} as "
-        f"recorded, {found.current:.3g} now, {found.after:.3g} with the result; {c.seconds:.1f} s{warnings}"
-    )
-
-
-def surface_state(surface: CostSurface, inspector: Inspector, found: Calibration | None) -> dict[str, Any]:
-    """Return the map of sharpness for the page, with marks of the current, the found and the true parameters."""
-    low, high = float(surface.sharpness.min()), float(surface.sharpness.max())
-    picture = picture_state(surface.sharpness[::-1], Scale("sharpness", "1", low, max(high, low + 1e-9), "cividis"))
-    names, scales = surface.names, [UNITS[name] for name in surface.names]
-    x, y = ((values / scale).tolist() for values, scale in zip(surface.values, scales, strict=True))
-    known = {"now": ("○", inspector.knobs), "truth": ("◇", inspector.truth),
-             "result": ("✕", None if found is None else inspector.knobs_of(found))}  # fmt: skip
-    marks = []
-    for title, (sign, knobs) in known.items():
-        if knobs is not None:
-            place = [(knobs.value(name) or 0.0) / scale for name, scale in zip(names, scales, strict=True)]
-            if names[1] == "phase":
-                place[1] += 360.0 * round((inspector.knobs.phase / scales[1] - place[1]) / 360.0)
-            marks.append({"x": place[0], "y": place[1], "sign": sign, "title": title})
-    titles = [f"{SLIDERS[name][0]} ({SLIDERS[name][1]})" for name in names]
-    return {"x": x, "y": y, "picture": picture, "marks": marks, "x_title": titles[0],
-            "y_title": titles[1]}  # fmt: skip

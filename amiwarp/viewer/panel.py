@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import math
 import secrets
 import tempfile
 import traceback
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +29,7 @@ from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
 from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection, size_name
-from amiwarp.viewer.jobs import SLOW, JobCancelled, JobProgress, PageWork
+from amiwarp.viewer.jobs import JobCancelled, JobProgress
 from amiwarp.viewer.serve import finite, serve, use_page
 
 CARD_POINTS = 1_000_000
@@ -36,22 +38,44 @@ BINS = 400
 """Number of points of the drawn event rates."""
 STEP_S = 0.2
 """Duration of counting events after which the timeline shows what is counted [s]."""
+MOST_IN_FLIGHT = 8
+"""Largest number of messages to the page that are unsent; while more are waiting, nothing is computed."""
+WAIT_S = 0.02
+"""Interval between two checks of the number of unsent messages [s]."""
+_CUDA_LOCK = asyncio.Lock()
+"""Lock for all tabs: Warp's CUDA calls may run in only one thread at a time."""
+QUICK = {**dict.fromkeys(("window", "suggestion", "state", "knobs"), ("clouds", "images")), "look": ("clouds",)}
+SLOW = ("curve", "picture", "statistics")
+"""Updates that are made at once, with the parts of the page that wait for them, and updates that take longer."""
 PLAY_S, FOLLOW_S, RATES_S = 0.05, 0.1, 1.0
 """Shortest interval between two pictures while a recording is played, and while a live stream is followed, and between
 two counts of a live stream's events for the timeline [s]."""
 
 
-class Panel(PageWork, layout.Actions):
+class Panel(layout.Actions):
     """Panel that connects the page of one browser tab with its inspector. Call :meth:`close` when the tab is closed.
 
     The page may call the methods in :data:`amiwarp.viewer.layout.CALLS`. The server checks their arguments by their
-    annotations.
+    annotations. Updates are computed in threads, one after the other. If a slider moves several times meanwhile, only
+    its last position is used. What waits for an update is marked on the page. Nothing is computed while the page does
+    not keep up with the messages.
     """
 
     def __init__(self, server: Any, inspector: Inspector, library: Library | None = None) -> None:
         """Build the page on a new trame server. ``library``: other recordings that the page may open."""
-        super().__init__(server, inspector.device)
-        self.inspector, self._library = inspector, library
+        self.server, self.state, self.inspector, self._library = server, server.state, inspector, library
+        self.buffers_lock = asyncio.Lock()
+        """Lock of the inspector's buffers on the device, which only one thread may use at a time."""
+        self.device_lock: Any = _CUDA_LOCK if "cuda" in str(inspector.device) else contextlib.nullcontext()
+        self._quick_requests: set[str] = set()
+        self._slow_requests: set[str] = set()
+        self._doing: set[str] = set()
+        self._quick: asyncio.Task[None] | None = None
+        self._slow: asyncio.Task[None] | None = None
+        self._jobs: set[asyncio.Task[None]] = set()
+        self._error_source = ""
+        # A tab's own pool, which ends with the tab: calibration or film; curve or picture; quick updates.
+        self._threads = ThreadPoolExecutor(3, "amiwarp-tab")
         self.shown: DisplayedWindow | None = None
         """Window as the page shows it; None before the first update."""
         self.plays = False
@@ -90,11 +114,13 @@ class Panel(PageWork, layout.Actions):
             self.start_job(self._watch(inspector.latest))
 
     def close(self) -> None:
-        """Stop all work of the browser tab, and remove its downloads."""
+        """Stop all work of the browser tab, and remove its downloads. A thread ends when its current work is done."""
         self._folder.cleanup()
         self.cancel()
         self.inspector.closed = True
-        super().close()
+        for task in self._jobs:
+            task.cancel()
+        self._threads.shutdown(wait=False, cancel_futures=True)
 
     def cancel(self) -> None:
         """Stop the calibration or the film that is being made."""
@@ -141,12 +167,96 @@ class Panel(PageWork, layout.Actions):
         self.state.update({"start_ms": round(start_us * 1e-3, 3), "length_ms": round(length_us * 1e-3, 3)})
 
     def request(self, *what: str, change: str = "") -> None:
-        """Request quick updates of the page.
+        """Request quick updates: "window", "knobs", "look", "suggestion" or "state".
 
         ``change``: name of a change that lasts, such as a drag; it is undone in one step.
         """
         self._change = f"{change} {self._drags}" if change else ""
-        super().request(*what)
+        self._quick_requests.update(what)
+        self._show_pending()
+        if self._quick is None or self._quick.done():
+            self._quick = self.start_job(self._update())
+
+    def request_slow(self, *what: str) -> None:
+        """Request updates that run in a thread after all quick updates: "curve", "picture" or "preparation"."""
+        self._slow_requests.update(what)
+        self._show_pending()
+        if self._slow is None or self._slow.done():
+            self._slow = self.start_job(self._update_slowly())
+
+    async def until_drawn(self) -> None:
+        """Wait until no quick update is pending."""
+        while self._quick is not None and not self._quick.done():
+            await asyncio.sleep(0.005)
+
+    def start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Run a job until it ends or the browser tab is closed."""
+        self._jobs.add(task := asyncio.get_running_loop().create_task(work))
+        task.add_done_callback(self._ended)
+        return task
+
+    async def in_thread(self, work: Callable[..., Any], *args: Any, **options: Any) -> Any:
+        """Call ``work`` in one of the browser tab's threads, and return its result."""
+        return await asyncio.get_running_loop().run_in_executor(self._threads, partial(work, *args, **options))
+
+    def say(self, text: str, severity: str = "info") -> None:
+        """Show a message."""
+        with self.state:
+            self.state.update({"message": text, "severity": severity})
+
+    @contextlib.contextmanager
+    def errors_shown(self, what: str) -> Iterator[None]:
+        """Show errors of the enclosed code as a message, until the same kind of action (``what``) succeeds."""
+        try:
+            yield
+        except (AmiwarpError, OSError) as error:
+            self._error_source = what
+            self.state.update({"message": str(error), "severity": "error"})
+        else:
+            if self.state.severity == "error" and self._error_source == what:
+                self.state.update({"message": "", "severity": "info"})
+
+    def _show_pending(self) -> None:
+        """Show which parts of the page wait for an update."""
+        quick = self._quick_requests | self._doing
+        parts = {part for what in quick for part in QUICK.get(what, ())} | (self._slow_requests | self._doing) & {*SLOW}
+        self.state.updating = sorted(parts)
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._jobs.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            logging.getLogger(__name__).error("the page's work failed", exc_info=error)
+            text = f"internal error: {error or type(error).__name__}; the log of the server shows the details"
+            self.say(text, "error")
+
+    async def _update(self) -> None:
+        while self._quick_requests:
+            while (page := self.server.protocol) is not None and page.network_monitor.pending > MOST_IN_FLIGHT:
+                await asyncio.sleep(WAIT_S)
+            todo, self._quick_requests = self._quick_requests, set()
+            async with self._done(todo), self.device_lock, self.buffers_lock:
+                await self.make(todo)
+            await asyncio.sleep(0)
+
+    async def _update_slowly(self) -> None:
+        while self._slow_requests:
+            await self.until_drawn()
+            name = min(self._slow_requests)  # in alphabetical order: the curve first, the preparation last
+            self._slow_requests.discard(name)
+            async with self._done({name}), self.device_lock:
+                with self.errors_shown(name):
+                    await self.make_slow(name)
+
+    @contextlib.asynccontextmanager
+    async def _done(self, todo: set[str]) -> Any:
+        """Mark updates as being made, and send the state to the browser when they are made."""
+        self._doing |= todo
+        try:
+            yield
+        finally:
+            self._doing -= todo
+            with self.state:
+                self._show_pending()
 
     def _listen(self) -> None:
         """Follow the state variables that the page sets, and offer the methods that it calls."""
@@ -329,7 +439,7 @@ class Panel(PageWork, layout.Actions):
         """Show the figures of a live stream, also while it is not followed, until the page is closed."""
         while True:
             with self.state as state:
-                state.update(layout.live_state(source.figures()))
+                state.update(source.state())
             await asyncio.sleep(FOLLOW_S)
 
     def _clock_us(self, time_ms: float) -> int:
@@ -346,9 +456,9 @@ class Panel(PageWork, layout.Actions):
 
     def _show_rates(self) -> None:
         start_ms, end_ms = self.state.rate_span
-        curve, share = self._rates.curve(self._clock_us(start_ms), self._clock_us(end_ms), BINS), self._rates.share
+        _, rates = self._rates.curve(self._clock_us(start_ms), self._clock_us(end_ms), BINS)
+        off, on, share = *map(drawing.float_bytes, rates), self._rates.share
         note = "" if share >= 1.0 else f"counting events: {100.0 * share:.0f} %"
-        on, off = map(drawing.float_bytes, (curve.on, curve.off))
         self.state.update({"rate_on": on, "rate_off": off, "rate_note": note})
 
     # Parameters of the prism, and those to compare with
@@ -441,14 +551,15 @@ class Panel(PageWork, layout.Actions):
                 text, severity = ("calibration cancelled", "info") if progress.cancelled else (found, "error")
                 self.say(text, severity)
                 return
-            self.found = found.calibration
+            self.found, text = found
             with state:
-                state.update({"found": layout.found_text(found), "against_choices": self._against_choices()})
+                state.update({"found": text, "against_choices": self._against_choices()})
             async with self.device_lock:
-                surface = await self.in_thread(_guarded, jobs.cost_surface, weakref.ref(inspector), progress)
+                draw = partial(jobs.cost_surface, found=self.found)
+                surface = await self.in_thread(_guarded, draw, weakref.ref(inspector), progress)
             if not isinstance(surface, str) and self.inspector is inspector:
                 with state:
-                    state.surface = layout.surface_state(surface, inspector, self.found)
+                    state.surface = surface
         finally:
             with state:
                 state.update({"busy": "", "calibrating": False})
@@ -468,13 +579,13 @@ class Panel(PageWork, layout.Actions):
     # Downloads
 
     def export(self, what: str) -> None:
-        """Give the browser a file; ``what`` is a name in :data:`amiwarp.viewer.jobs.EXPORTS`."""
+        """Give the browser a file; ``what`` is a name in :data:`amiwarp.viewer.layout.EXPORTS`."""
         s = self.state
         if what in ("picture", "image") and self.shown is not None:
             words = drawing.caption(self.inspector, self.shown).split("; ")
             self.server.js_call("page", what, jobs.download_name(self.inspector.recording.name, what), words)
-        elif what in jobs.EXPORTS and what not in ("picture", "image") and not (what in jobs.FILMS and s.busy):
-            self.start_job(self._film(what) if what in jobs.FILMS else self._write(what))
+        elif what in layout.EXPORTS and what not in ("picture", "image") and not (what in layout.FILMS and s.busy):
+            self.start_job(self._film(what) if what in layout.FILMS else self._write(what))
 
     async def _write(self, what: str) -> None:
         inspector = self.inspector
@@ -498,7 +609,7 @@ class Panel(PageWork, layout.Actions):
             ended=lambda: progress.ended,
         )  # fmt: skip
         with s:
-            s.update({"busy": f"making the {jobs.EXPORTS[what][0]}", "progress": 0})
+            s.update({"busy": f"making the {layout.EXPORTS[what][0]}", "progress": 0})
         try:
             with contextlib.suppress(JobCancelled):
                 async with self.device_lock:
@@ -608,7 +719,7 @@ class Panel(PageWork, layout.Actions):
         if name == "preparation":
             await self.in_thread(drawing.prepare, self.inspector)
         elif name == "statistics":
-            self.state.statistics = (await self.in_thread(self.inspector.statistics)).state()
+            self.state.statistics = await self.in_thread(self.inspector.statistics)
         elif name == "curve":
             await self._curve()
         elif self.image is ImageKind.LOG_INTENSITY and self.shown is not None:
@@ -625,7 +736,7 @@ class Panel(PageWork, layout.Actions):
         if suggest:
             if await in_thread(jobs.estimate_phase, inspector):
                 self.show_knobs()
-            region = (await in_thread(inspector.suggest_region)).region
+            region = await in_thread(inspector.suggest_region)
             s.update({"region_wanted": list(region), "region_kind": "suggested"})
             await in_thread(inspector.open, start_us, length_us, self._selection())
         self._picked = -1

@@ -187,8 +187,7 @@ class Window(layout.Actions):
                     self.scene.look_from(self.view, self._look)
             if "suggestion" in wanted:
                 jobs.estimate_phase(inspector)
-                region = inspector.suggest_region().region
-                inspector.open(*self.time_window, replace(inspector.selection, region=region))
+                inspector.open(*self.time_window, replace(inspector.selection, region=inspector.suggest_region()))
             before = getattr(self, "shown", None)
             self.shown, self._shown_knobs = inspector.show(against=self.b), inspector.knobs
             self._picked = self._picked if before is not None and before.events is self.shown.events else -1
@@ -307,8 +306,8 @@ class Window(layout.Actions):
             self._progress = False
             return
         with self._job("calibration"):
-            found = jobs.find_calibration(self.inspector, progress=self._show_progress)
-            self.found, self.message = found.calibration, f"{layout.found_text(found)}. Press a to accept"
+            self.found, text = jobs.find_calibration(self.inspector, progress=self._show_progress)
+            self.message = f"{text}. Press a to accept"
 
     def film(self) -> None:
         """Save a film from here on under a new name in the current folder, or end it. The window goes on meanwhile."""
@@ -381,7 +380,7 @@ class Window(layout.Actions):
             return
         self._played_s = now
         if isinstance(latest, jobs.LiveSource):
-            state = layout.live_state(latest.figures())
+            state = latest.state()
             self._stream = [*(f"{name}: {text}" for name, text, _ in state["live_rows"]), state["stream_note"]]
         if self.plays:
             with self.errors_shown("window"):
@@ -615,7 +614,7 @@ class Window(layout.Actions):
 
     def _show_statistics(self) -> None:
         """Show the statistics of the selected events, as the page does."""
-        found, (chart, (line, mark)) = self.inspector.statistics().state(), self._plots["intervals"]
+        found, (chart, (line, mark)) = self.inspector.statistics(), self._plots["intervals"]
         rows = [f"{name}:  {text}" for name, text in found["rows"]]
         self._texts[3].input = "\n".join(["Statistics of the selected events", *rows])
         x, y = found["x"] or [0.0, 6.0], found["y"] if found["x"] else [0.0, 0.0]
