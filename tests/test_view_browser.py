@@ -695,7 +695,7 @@ def test_pictures_have_legend_colour_bar_and_caption_and_images_the_difference(
     page.locator("#difference").check()
     page.locator("#after-title").filter(has_text="difference").wait_for()
     ready(page)
-    pair = drawing.with_difference(make_images(inspector, ImageKind.COUNT))
+    pair = make_images(inspector, ImageKind.COUNT, difference=True)
     assert pair.before is not None
     assert pair.after_scale is not None
     found, size = picture("image"), -(-320 // (right - left))

@@ -148,7 +148,7 @@ def test_the_slider_of_the_size_has_name_and_unit_of_the_optic_s_own(
     assert inspector.sources[name] is Source.HAND
     again = Inspector(recording, inspector.as_calibration())
     assert knob_values(again)[name] == pytest.approx(given, abs=1e-4)
-    assert orbit_text(model, again.knobs.value(name), 0.0).startswith(f"{name.replace('_', ' ')} {given:g}")
+    assert orbit_text(model, again.knobs.value, 0.0).startswith(f"{name.replace('_', ' ')} {given:g}")
 
 
 @pytest.mark.parametrize(

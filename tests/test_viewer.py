@@ -129,7 +129,7 @@ def test_what_is_shown_is_what_compensation_gives(inspector: Inspector, recordin
     inspector.set(replace(true_knobs(recording), model=model, clock_offset=300.0))
     inspector.open(*inspector.first_window())
     shown = inspector.show()
-    encoder = inspector.adjusted_encoder
+    encoder = inspector.encoder_of(inspector.knobs)
     events = recording.events.between(shown.span.start_us, shown.span.start_us + shown.span.length_us)
     assert shown.span.count == shown.selected == len(events)
     expected = compensate_events(shown.events, inspector.model, encoder)
@@ -239,9 +239,10 @@ def test_an_encoder_s_own_clock_offset_counts_once(recording: Recording) -> None
     for each in (inspector, punctual):
         each.open(*punctual.first_window())
     np.testing.assert_allclose(inspector.show().after, punctual.show().after, atol=0.01)
-    assert inspector.adjusted_encoder.clock_offset_us == 0.0
+    assert inspector.encoder_of(inspector.knobs).clock_offset_us == 0.0
     found = calibration_of(recording, clock_offset=700.0)
-    assert Inspector(late, found).adjusted_encoder.clock_offset_us == 700.0
+    inspector = Inspector(late, found)
+    assert inspector.encoder_of(inspector.knobs).clock_offset_us == 700.0
 
 
 def test_an_encoder_s_error_that_a_calibration_found_is_corrected(recording: Recording) -> None:

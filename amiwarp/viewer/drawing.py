@@ -43,7 +43,6 @@ from amiwarp.viewer.inspector import (
     colours_on_offer,
     inside,
     read_span,
-    recorded_counts,
 )
 
 if TYPE_CHECKING:
@@ -55,24 +54,13 @@ MOST_EVENTS = 4_000_000
 """Largest number of events that are read. Of a fuller window, the middle is used."""
 
 
-@dataclass(frozen=True, eq=False)
-class SelectedPart:
-    """Events of a part of the image without gaps in time, with the camera that sees only this part."""
-
-    recording: Recording
-    """The events, with coordinates in the part, and its camera; the encoder is that of the whole recording."""
-    start_us: int
-    """Start of the time window [us]."""
-    length_us: int
-    """Length of the time window [us]."""
-    step: int
-    """Distance between the used columns, and between the used rows [px]."""
-
-
 def select_part(
     inspector: Inspector, window: LoadedWindow, part: Region, *, most: float = math.inf, longest_us: float = math.inf
-) -> SelectedPart:
-    """Return the selected events of a part of the image in a window of the inspector.
+) -> tuple[Recording, int, int, int]:
+    """Return the selected events of a part of the image, without gaps in time, as a recording of a smaller camera.
+
+    Returns the recording, with coordinates in the part, its camera, and the encoder of the whole recording; start and
+    length of its time window [us]; and the distance between the used columns, and between the used rows [px].
 
     ``most``: largest number of events and pixels together; of a larger part, every second (third, ...) column and row
     is used. ``longest_us``: longest duration [us]; of a longer window, and of one with too many events, the middle is
@@ -83,7 +71,8 @@ def select_part(
     length_us = max(1, math.ceil(share * span.length_us))
     start_us = span.start_us + (span.length_us - length_us) // 2
     if span.count > len(span.events):  # the window was read in runs with gaps
-        events = inspector.select(read_span(inspector.recording.events, start_us, length_us, most_events=span.count))
+        span = read_span(inspector.recording.events, start_us, length_us, most_events=span.count)
+        events = inspector.select(span, inspector.selection).events
     first, stop = np.searchsorted(events.t, (start_us, start_us + length_us))
     events = events[first:stop]
     left, top, right, bottom = part
@@ -100,8 +89,7 @@ def select_part(
     )
     source = MemoryEvents(Events(x, y, events.t[kept], events.p[kept]), width, height)
     whole = inspector.recording
-    recording = Recording(source, camera, whole.encoder, whole.prism, name=whole.name)
-    return SelectedPart(recording, start_us, length_us, step)
+    return Recording(source, camera, whole.encoder, whole.prism, name=whole.name), start_us, length_us, step
 
 
 # Log intensity of the shown region, reconstructed within about a second.
@@ -146,36 +134,34 @@ def log_intensity(
     (left, top, right, bottom), m = window.region, inspector.margin_px  # from where the prism may move events into it
     width, height = inspector.recording.events.size
     left, top, right, bottom = wide = max(left - m, 0), max(top - m, 0), min(right + m, width), min(bottom + m, height)
-    part = select_part(inspector, window, wide, most=share * MOST_WORK, longest_us=turn_us)
-    step = part.step
+    part, start_us, length_us, step = select_part(inspector, window, wide, most=share * MOST_WORK, longest_us=turn_us)
     if knobs.focal_length is not None:
         knobs = replace(knobs, focal_length=knobs.focal_length / step)
-    model = inspector.model_of(knobs, part.recording.camera, np.s_[top:bottom:step, left:right:step])
-    encoder = inspector.encoder_of(knobs)
-    work = Reconstruction(part.recording, model=model, encoder=encoder, device=inspector.device)
-    picture = _picture(work, part, window.chosen)
+    model = inspector.model_of(knobs, part.camera, np.s_[top:bottom:step, left:right:step])
+    work = Reconstruction(part, model=model, encoder=inspector.encoder_of(knobs), device=inspector.device)
+    picture = _picture(work, (start_us, length_us), window.chosen)
     rows, columns = (np.arange(window.region[k], window.region[k + 2]) for k in (1, 0))
     cut = np.ix_((rows - top) // step, (columns - left) // step)
     limits = [f"{100 / step**2:.2g} % of the pixels"] if step > 1 else []
-    if part.length_us < window.span.length_us:
-        limits.append(f"{part.length_us * 1e-3:.3g} ms in the middle")
+    if length_us < window.span.length_us:
+        limits.append(f"{length_us * 1e-3:.3g} ms in the middle")
     note = "; ".join([f"{picture.pairs:,} pairs, residual {picture.residual:.2f}", *limits])
     return picture.log[cut], picture.known[cut], note
 
 
-def _picture(work: Reconstruction, part: SelectedPart, chosen: list[Picture]) -> Picture:
-    """Return the picture of a part.
+def _picture(work: Reconstruction, window: tuple[int, int], chosen: list[Picture]) -> Picture:
+    """Return the picture of a time window.
 
     The choice of the smoothness takes most of the time. That of the picture in ``chosen`` is taken if the residual is
     about the same; otherwise, the new picture replaces it.
     """
     if chosen:
         work.smoothness = chosen[0].smoothness
-        picture = work.window(part.start_us, part.length_us)
+        picture = work.window(*window)
         if abs(picture.residual - chosen[0].residual) <= SAME_RESIDUAL * chosen[0].residual:
             return picture
         work.smoothness = None
-    chosen[:] = [work.window(part.start_us, part.length_us)]
+    chosen[:] = [work.window(*window)]
     return chosen[0]
 
 
@@ -296,12 +282,14 @@ class ShownImages:
 
 
 def make_images(
-    inspector: Inspector, kind: ImageKind, *, against: Knobs | None = None, shown: DisplayedWindow | None = None
-) -> ShownImages:
+    inspector: Inspector, kind: ImageKind, *, against: Knobs | None = None, shown: DisplayedWindow | None = None,
+    difference: bool = False,
+) -> ShownImages:  # fmt: skip
     """Return the images of the inspector's window.
 
     ``against``: parameters of the first image instead of none. ``shown``: the window with these parameters, if it is
-    known: its counts are not made again. Raises :class:`AmiwarpError` if a log intensity cannot be reconstructed, or
+    known: its counts are not made again. ``difference``: of counts, the second image shows after minus before, with a
+    scale of its own. Raises :class:`AmiwarpError` if a log intensity cannot be reconstructed, or
     there is no depth map.
     """
     window, knobs = inspector.loaded, inspector.knobs
@@ -326,21 +314,15 @@ def make_images(
     if kind is ImageKind.TIME_SURFACE:
         scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, "viridis")
     else:
-        scale = _count_scale((before, after), "polarity" if kind is ImageKind.POLARITY else "gray")
-    return ShownImages(kind, before, after, scale)
+        scale = count_scale((before, after), "polarity" if kind is ImageKind.POLARITY else "gray")
+    if not (difference and kind is ImageKind.COUNT):
+        return ShownImages(kind, before, after, scale)
+    most = max(float(np.abs(after - before).max()), 1.0)
+    own = Scale("difference of events", "per pixel", -most, most, "difference")
+    return ShownImages(kind, before, after - before, scale, after_scale=own)
 
 
-def with_difference(images: ShownImages) -> ShownImages:
-    """Return images of which the second shows the difference: after minus before, with a scale of its own."""
-    if images.before is None or images.kind is not ImageKind.COUNT:
-        return images
-    difference = images.after - images.before
-    most = max(float(np.abs(difference).max()), 1.0)
-    scale = Scale("difference of events", "per pixel", -most, most, "difference")
-    return replace(images, after=difference, after_scale=scale)
-
-
-def _count_scale(images: Sequence[NDArray[np.float32]], colours: str = "gray") -> Scale:
+def count_scale(images: Sequence[NDArray[np.float32]], colours: str = "gray") -> Scale:
     """Return one scale of counts for images."""
     positive = [image[image > 0.0] for image in images]
     top = max([1.0, *(float(np.percentile(each, PERCENTILE)) for each in positive if each.size)])
@@ -398,40 +380,27 @@ def legend_of(truth: DrawnTruth, colour: Colour, most: int) -> Legend:
     """Return the legend of a colour choice; the legend is empty if a scale explains the colours.
 
     A legend of depth has ``most`` rows. Other legends list at most ``most`` causes or instances, the most frequent
-    first, with their fractions of the drawn events.
+    first, with their fractions of the drawn events, and sum up the rest.
     """
+    from matplotlib.colors import to_hex
+
     if colour is Colour.POLARITY:
         return ("", "polarity"), (ON_COLOUR, "ON: brighter"), (OFF_COLOUR, "OFF: darker")
     if colour not in STORES:
         return ()
+    values, title, more = truth.values(colour), colour.value, []
     if colour is Colour.DEPTH:
-        return (("", "depth [m]"), *_depth_rows(truth.values(colour), most))
-    return (("", colour.value), *_name_rows(truth, colour, most))
-
-
-def _depth_rows(depth: NDArray[Any], most: int) -> Legend:
-    """Return ``most`` legend rows of depths [m] in equal ratios, and a row for the sky if an event saw the sky."""
-    scale = _scale(depth)
-    steps = np.geomspace(*scale, most)
-    rows = _rows(_depths(steps, scale), [f"{step:#.3g}".rstrip(".") for step in steps])
-    return (*rows, (GREY, "sky")) if np.isinf(depth).any() else rows
-
-
-def _name_rows(truth: DrawnTruth, colour: Colour, most: int) -> Legend:
-    """Return the legend rows of the most frequent causes or instances, and a row that sums up the rest."""
-    counts = np.bincount(truth.values(colour))
-    found = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
-    shares = 100.0 * counts / counts.sum()
-    texts = [f"{truth.name(colour, k)} {shares[k]:.3g} %" for k in found[:most].tolist()]
-    rows, others = _rows(_names(colour, found[:most]), texts), found[most:]
-    return (*rows, ("", f"{len(others)} more {shares[others].sum():.3g} %")) if len(others) else rows
-
-
-def _rows(rgb: NDArray[np.float64], texts: list[str]) -> Legend:
-    """Return legend rows of colours (0 to 1), shape (k, 3), and texts."""
-    from matplotlib.colors import to_hex
-
-    return tuple((to_hex(each), text) for each, text in zip(rgb, texts, strict=True))
+        steps, title = np.geomspace(*_scale(values), most), "depth [m]"  # in equal ratios
+        rgb, texts = _depths(steps, _scale(values)), [f"{step:#.3g}".rstrip(".") for step in steps]
+        more = [(GREY, "sky")] if np.isinf(values).any() else []
+    else:
+        counts = np.bincount(values)
+        found = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
+        shares, others = 100.0 * counts / counts.sum(), found[most:]
+        texts = [f"{truth.name(colour, k)} {shares[k]:.3g} %" for k in found[:most].tolist()]
+        rgb = _names(colour, found[:most])
+        more = [("", f"{len(others)} more {shares[others].sum():.3g} %")] if len(others) else []
+    return (("", title), *zip(map(to_hex, rgb), texts, strict=True), *more)
 
 
 def _names(colour: Colour, values: NDArray[Any]) -> NDArray[np.float64]:
@@ -493,13 +462,12 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
     """Return red, green and blue of each point (0 to 255), shape ``(n, 3)``."""
     from matplotlib.colors import to_rgb
 
-    if look.overlaid and not after:
+    unknown = shown.is_beside and look.colour not in colours_on_offer(shown.truth.truth)
+    if (look.overlaid and not after) or unknown:
         return np.full((len(shown.events), 3), 128, np.uint8)
     if look.colour is Colour.POLARITY:
         two = np.array([to_rgb(OFF_COLOUR), to_rgb(ON_COLOUR)])
         return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
-    if shown.is_beside and look.colour not in colours_on_offer(shown.truth.truth):
-        return np.full((len(shown.events), 3), 128, np.uint8)
     if look.colour in STORES:
         values = shown.truth.values(look.colour)
         rgb = _depths(values, _scale(values)) if look.colour is Colour.DEPTH else _names(look.colour, values)
@@ -1315,12 +1283,6 @@ def shown_lines(
 
 NO_ORBIT = {"orbit": b"", "column": b"", "has_orbit": False}
 """State variables without an orbit."""
-
-
-def whole_image(events: Events, size: tuple[int, int]) -> dict[str, Any]:
-    """Return the image of events as recorded, for the browser."""
-    counts = recorded_counts(events, size)
-    return picture_state(counts, _count_scale([counts]))
 
 
 def event_text(shown: DisplayedWindow, k: int) -> str:

@@ -71,7 +71,8 @@ class EventRates:
         until, read_us = time.perf_counter() + seconds, self._read[1]
         for block in self._blocks:
             if len(block):
-                self._count(block)
+                low, high = np.searchsorted(self._edges, (block.t[0], block.t[-1]), side="right") - 1
+                self._counts[:, low : high + 1] += counted(block, self._edges[low : high + 2])
                 read_us = int(block.t[-1])
             if time.perf_counter() >= until:
                 break
@@ -107,24 +108,17 @@ class EventRates:
                 counts[:, edges[1:] > read_us] = np.nan
         return edges, counts / np.diff(edges) * 1e6
 
-    def _count(self, block: Events) -> None:
-        low, high = np.searchsorted(self._edges, (block.t[0], block.t[-1]), side="right") - 1
-        edges = np.searchsorted(block.t, self._edges[low + 1 : high + 1])
-        on = np.concatenate([[0], np.cumsum(block.p, dtype=np.int64)])
-        at = np.concatenate([[0], edges, [len(block)]])
-        ons = np.diff(on[at])
-        self._counts[1, low : high + 1] += ons
-        self._counts[0, low : high + 1] += np.diff(at) - ons
-
-    def _exact(self, edges: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    def _exact(self, edges: NDArray[np.int64]) -> NDArray[np.int64] | None:
         """Return the numbers of OFF and ON events in bins, read from the source; None if there are too many."""
         if isinstance(self._source, FileEvents):  # would be read from its start
             return None
         first, stop = (self._source.find(int(t)) for t in (edges[0], edges[-1]))
-        if stop - first > MOST_EXACT:
-            return None
-        events = self._source.slice(first, stop)
-        return np.array([np.diff(np.searchsorted(events.t[events.p == p], edges)) for p in (0, 1)], np.float64)
+        return None if stop - first > MOST_EXACT else counted(self._source.slice(first, stop), edges)
+
+
+def counted(events: Events, edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the numbers of OFF and ON events in time bins, shape ``(2, n)``."""
+    return np.array([np.diff(np.searchsorted(events.t[events.p == p], edges)) for p in (0, 1)])
 
 
 # Events of a time window, read without loading the other events.
@@ -441,8 +435,6 @@ class LoadedWindow:
     """Pixels of the drawn events [px], shape ``(n, 2)``."""
     events: Events
     """Events of the images: the selected events, and those near the region that compensation may move into it."""
-    curve_events: Events
-    """Part of these events from which the sharpness curve is computed."""
     angles: dict[float, tuple[UploadedEvents, NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
     """Events on the device, prism angles [rad] and speeds [rad/us] of the drawn events, without the clock offset set on
     the page, by the speed of a prism without encoder [1/min]; with an encoder, the only key is 0."""
@@ -821,11 +813,6 @@ class Inspector:
         if not all(map(self.knobs.value, size)):
             self.knobs = self.knobs.with_values(size)
 
-    @property
-    def adjusted_encoder(self) -> Encoder:
-        """Encoder with the clock offset set on the page."""
-        return self.encoder_of(self.knobs)
-
     def use_depths(self, depth: DepthMap) -> None:
         """Compensate each event at the depth of what its pixel sees, as :func:`amiwarp.compensate` does.
 
@@ -1075,7 +1062,7 @@ class Inspector:
             rpm = 0.0 if self.has_encoder else given.rpm
             if rpm not in on_device:
                 on_device.clear()
-                on_device[rpm] = self._upload(w.curve_events, rpm)
+                on_device[rpm] = self._upload(w.events[:: max(1, -(-len(w.events) // CURVE_EVENTS))], rpm)
             model, drift_us = self.model_of(given), self._drift_us(given)
             return imager.measure(model, on_device[rpm], drift_us, w.region)[1]
 
@@ -1190,13 +1177,9 @@ class Inspector:
             most = self._most_events or MOST_EVENTS
             span = read_span(self.recording.events, start_us, length_us, most_events=most)
             self._span = _in_pixels(span, self.recording.events.size) if self._is_beside else span
-        return self._select(self._span, selection)
+        return self.select(self._span, selection)
 
-    def select(self, span: Span) -> Events:
-        """Return the events of a time window that meet the selection."""
-        return self._select(span, self.selection).events
-
-    def _select(self, span: Span, selection: Selection) -> LoadedWindow:
+    def select(self, span: Span, selection: Selection) -> LoadedWindow:
         """Select the events of a time window. Raises :class:`AmiwarpError` if no event meets the selection."""
         recording, m = self.recording, self.margin_px
         left, top, right, bottom = region = selection.region or (0, 0, *recording.events.size)
@@ -1217,8 +1200,7 @@ class Inspector:
         drawn, truth = events[thin], DrawnTruth(recording.truth, span, thin if near is None else near[thin])
         xy = np.stack([drawn.x, drawn.y], axis=1).astype(np.float32)
         xy = xy if span.places is None else span.places[truth.positions]
-        curve_events = events[:: max(1, -(-len(events) // CURVE_EVENTS))]
-        return LoadedWindow(span, region, n, drawn, truth, xy, events, curve_events)
+        return LoadedWindow(span, region, n, drawn, truth, xy, events)
 
     def kept(self, events: Events, selection: Selection, region: Region) -> NDArray[np.bool_]:
         """Return whether each event meets the selection, with another region, shape ``(n,)``."""

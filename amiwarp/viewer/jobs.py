@@ -7,6 +7,7 @@ import re
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -91,20 +92,17 @@ def estimate_phase(inspector: Inspector) -> bool:
     if inspector.sources["phase"] is not Source.ASSUMED or not math.isfinite(inspector.turn_us):
         return False
     measure = _searched(inspector).sharpness_meter()
-    sharpness: dict[float, float] = {}
 
-    def best(phases: list[float]) -> float:
-        for phase in phases:
-            if phase not in sharpness:
-                sharpness[phase] = measure(replace(inspector.knobs, phase=phase))
-        return max(sharpness, key=lambda phase: sharpness[phase])
+    @cache
+    def sharpness(phase: float) -> float:
+        return measure(replace(inspector.knobs, phase=phase))
 
     step = math.tau / COARSE
-    found = best((step * np.arange(COARSE) - math.pi).tolist())
-    usual = float(np.median([*sharpness.values()]))
+    phases = (step * np.arange(COARSE) - math.pi).tolist()
+    found, usual = max(phases, key=sharpness), float(np.median([*map(sharpness, phases)]))
     for share in FINER:
-        found = best([found + k * step / share for k in (-2, -1, 1, 2)])
-    if sharpness[found] < max(measure(None), LEAST_GAIN * usual):
+        found = max((found + k * step / share for k in range(-2, 3)), key=sharpness)
+    if sharpness(found) < max(measure(None), LEAST_GAIN * usual):
         return False
     inspector.set(replace(inspector.knobs, phase=found))
     inspector.sources["phase"] = Source.ESTIMATED
@@ -117,10 +115,10 @@ def _searched(inspector: Inspector) -> Inspector:
     if width * height <= MOST_SEARCHED:
         return inspector
     window = inspector.loaded
-    part = select_part(inspector, window, busiest(inspector.counts(window, None)))
-    small = Inspector(part.recording, device=inspector.device)
+    part, *times, _ = select_part(inspector, window, busiest(inspector.counts(window, None)))
+    small = Inspector(part, device=inspector.device)
     small.set(inspector.knobs)
-    small.window = part.start_us, part.length_us
+    small.window = times[0], times[1]
     return small
 
 
@@ -134,16 +132,16 @@ def calibrated_events(inspector: Inspector, *, whole: bool = False) -> tuple[Rec
     """Return the events that :func:`find_calibration` uses, and a description of them for the page."""
     if whole:
         return inspector.recording, f"the whole recording, {len(inspector.recording.events):,} events"
-    part = select_part(inspector, inspector.loaded, inspector.loaded.region)
-    s, start_s = inspector.selection, (part.start_us - inspector.recording.events.t_first) * 1e-6
-    kind, end_s = "" if s.polarity is None else ("OFF ", "ON ")[s.polarity], start_s + part.length_us * 1e-6
-    texts = [f"{len(part.recording.events):,} {kind}events from {start_s:.3f} s to {end_s:.3f} s"]
+    part, start_us, length_us, _ = select_part(inspector, inspector.loaded, inspector.loaded.region)
+    s, start_s = inspector.selection, (start_us - inspector.recording.events.t_first) * 1e-6
+    kind, end_s = "" if s.polarity is None else ("OFF ", "ON ")[s.polarity], start_s + length_us * 1e-6
+    texts = [f"{len(part.events):,} {kind}events from {start_s:.3f} s to {end_s:.3f} s"]
     if s.region is not None:
         left, top, right, bottom = s.region
         texts.append(f"x {left} to {right - 1}, y {top} to {bottom - 1} px")
     texts += ["without hot pixels"] if s.hide_hot else []
     texts += [f"without background activity ({s.noise_us * 1e-3:g} ms)"] if s.noise_us is not None else []
-    return part.recording, ", ".join(texts)
+    return part, ", ".join(texts)
 
 
 def find_calibration(
@@ -166,10 +164,10 @@ def find_calibration(
     sharpness = inspector.sharpness_meter()
     before, now, after = (sharpness(each) for each in (None, inspector.knobs, inspector.knobs_of(found)))
     exact, warnings = found.exact, "".join(f"; {text}" for text in found.warnings)
-    size, phase = exact.parameters.get(size_name(exact.model_name)), found.parameters["phase"]
+    orbit = orbit_text(exact.model_name, exact.parameters.get, found.parameters["phase"])
     return found, (
-        f"found on {scope}: {found.model_name} model, {orbit_text(exact.model_name, size, phase)}; sharpness of the "
-        f"region {before:.3g} as recorded, {now:.3g} now, {after:.3g} with the result; {found.seconds:.1f} s{warnings}"
+        f"found on {scope}: {found.model_name} model, {orbit}; sharpness of the region {before:.3g} as recorded, "
+        f"{now:.3g} now, {after:.3g} with the result; {found.seconds:.1f} s{warnings}"
     )
 
 
@@ -280,7 +278,7 @@ def write_events(inspector: Inspector, path: Path, *, compensated: bool) -> int:
     the recording lacks are those set on the page. A window with more events than the page reads is written completely.
     Raises :class:`AmiwarpError` if the file exists.
     """
-    recording, span, encoder = inspector.recording, inspector.loaded.span, inspector.adjusted_encoder
+    recording, span, encoder = inspector.recording, inspector.loaded.span, inspector.encoder_of(inspector.knobs)
     width, height = recording.events.size
     first_us = max(span.start_us, encoder.coverage[0])
     last_us = min(span.start_us + span.length_us, encoder.coverage[1])
@@ -305,7 +303,7 @@ def write_table(inspector: Inspector, path: Path) -> None:
     Raises :class:`AmiwarpError` for another suffix, or if the file exists.
     """
     ending = check_ending(path, "tables are written", (".csv", ".npz"))
-    encoder, knobs = inspector.adjusted_encoder, inspector.knobs
+    encoder, knobs = inspector.encoder_of(inspector.knobs), inspector.knobs
 
     def table(e: Events) -> tuple[NDArray[Any], ...]:
         theta, moved = np.mod(encoder.angle_at(e.t), math.tau), inspector.positions(e, knobs)

@@ -382,6 +382,15 @@ SETTABLE: dict[str, Check] = {
 :data:`CALLS`."""
 CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice")
 """State variables that the browser keeps to itself."""
+EMPTY: tuple[tuple[Any, str], ...] = (
+    ("", "trame_error_report_msg stream_note hover measured address events sharpness message rate_note picked_text "
+         "image_note against_title b_text busy found"),
+    (b"", "cloud_before cloud_after cloud_third third_before colours_before colours_after rate_on rate_off"),
+    (False, "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "
+            "difference has_b calibrating"),
+    (None, "overview before after surface"), ((), "live_rows updating titles against_choices"),
+)  # fmt: skip
+"""Values of state variables before the first update, and their names."""
 NO_SCALE: dict[str, Any] = {"bar": "", "ticks": [], "title": "", "square": None}
 """Scale of an image before the first update."""
 
@@ -400,19 +409,15 @@ class Actions:
     found: Calibration | None = None
     """Result of a calibration that is not accepted yet."""
     history: History | None = None
+    request: Callable[..., None]
+    """Request updates, by their names. Successive ones with an equal ``change`` are undone in one step."""
+    say: Callable[..., None]
+    """Show a text as a message."""
     steps: tuple[Callable[[History], ViewState], ...] = ()
     """Steps through the history that are to be made after the changes which were requested before them."""
 
-    def request(self, *what: str, change: str = "") -> None:
-        """Request updates. Successive changes of one name are undone in one step."""
-        raise NotImplementedError
-
     def released(self) -> None:
         """End a change that lasts, such as a drag."""
-
-    def say(self, text: str) -> None:
-        """Show a message."""
-        raise NotImplementedError
 
     @contextlib.contextmanager
     def errors_shown(self, what: str) -> Iterator[None]:
@@ -597,34 +602,25 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
     return {
         **source_state(inspector), **knob_state(inspector), **prism_state(inspector),
         **NO_ORBIT,
-        "trame__title": f"amiwarp: {recording.name}", "trame_error_report_msg": "", "name": recording.name,
-        "size": list(size), "live": inspector.latest is not None, "live_rows": [], "stream_note": "",
-        "has_encoder": inspector.has_encoder, "models": list(alternatives(inspector.knobs.model)),
-        "apex_most": apex_most(inspector), "truths": truths(inspector),
-        "has_truth": inspector.truth is not None, "truth": truth_text(recording.truth),
+        "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "truth": truth_text(recording.truth),
+        "size": list(size), "live": inspector.latest is not None, "has_encoder": inspector.has_encoder,
+        "models": list(alternatives(inspector.knobs.model)), "apex_most": apex_most(inspector),
+        "truths": truths(inspector), "has_truth": inspector.truth is not None, "beside": inspector.beside is not None,
         "exports": [[name, text, name in FILMS] for name, (text, _) in EXPORTS.items()],
-        "help_shown": False, "open_shown": False, "playing": False, "speed": 0.1, "loop": False, "polarity": "both",
-        "hide_hot": False, "noise_filter": False, "noise_ms": 2.0, "region_kind": "whole",
-        "region_wanted": [0, 0, *size], "region": [0, 0, *size], "knob": inspector.orbit_names[0],
+        "keys": [[key, words] for key, _, words in KEYS], "scope": SCOPES[0], "scopes": list(SCOPES),
         "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
-        "point_size": 2, "opacity": 1.0, "dark": False, "overlaid": False, "view": [View.FREE.value, 0],
-        "tool": "region", "hover": "", "measured": "", "late": 0, "slice": [0.0, 1.0], "orbit_shown": True,
-        "keys": [[key, words] for key, _, words in KEYS], "address": "", "can_undo": False, "can_redo": False,
-        "events": "", "sharpness": "", "updating": [], "severity": "info", "message": "", "picked": -1,
-        "rate_on": b"", "rate_off": b"", "rate_note": "", "picked_text": "",
-        **dict.fromkeys(("cloud_before", "cloud_after", "cloud_third", "third_before"), b""),
-        **dict.fromkeys(("colours_before", "colours_after"), b""), "beside": inspector.beside is not None,
-        "titles": [], "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
-        "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
-        "overview": None, "before": None, "after": None, "kind": ImageKind.COUNT.value,
+        "kind": ImageKind.COUNT.value, "has_depth": inspector.depth is not None,
         "kinds": [each.value for each in ImageKind if each is not ImageKind.DEPTH or inspector.depth is not None],
-        "has_depth": inspector.depth is not None, "image_note": "", "image_slow": False, "image_scale": NO_SCALE,
-        "after_scale": NO_SCALE, "difference": False, "against_title": "",
-        "against_choices": [], "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
-        "curve_mark": 0.0, "against": "recorded", "has_b": False, "b_text": "", "busy": "", "calibrating": False,
-        "progress": 0, "found": "", "surface": None, "scope": SCOPES[0], "scopes": list(SCOPES),
-        "calibrate_on": ["", ""], "statistics": {"rows": [], "x": [], "y": [], "median": None},
+        "speed": 0.1, "polarity": "both", "noise_ms": 2.0, "region_kind": "whole", "region_wanted": [0, 0, *size],
+        "region": [0, 0, *size], "knob": inspector.orbit_names[0], "point_size": 2, "opacity": 1.0, "orbit_shown": True,
+        "view": [View.FREE.value, 0], "tool": "region", "late": 0, "slice": [0.0, 1.0], "severity": "info",
+        "picked": -1, "against": "recorded", "progress": 0, "calibrate_on": ["", ""], "curve_mark": 0.0,
+        "image_scale": NO_SCALE, "after_scale": NO_SCALE, "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
+        "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
+        "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
+        "statistics": {"rows": [], "x": [], "y": [], "median": None},
+        **{name: value for value, names in EMPTY for name in names.split()},
     }  # fmt: skip
 
 
@@ -695,7 +691,11 @@ def with_unit(name: str, value: float, digits: int = 4) -> str:
     return f"{value:.{digits}g}{unit if unit in ('°', '') else f' {unit}'}"
 
 
-def orbit_text(model: str, size: float | None, phase: float) -> str:
-    """Return the size of a model, as its slider sets it, and its phase [rad], with their units."""
+def orbit_text(model: str, value: Callable[[str], float | None], phase: float) -> str:
+    """Return the size of a model, as its slider sets it, and its phase [rad], with their units.
+
+    ``value``: function that returns the value of a parameter by its name.
+    """
     name = size_name(model)
-    return f"{name.replace('_', ' ')} {with_unit(name, (size or 0.0) / UNITS[name])}, phase {math.degrees(phase):.4g}°"
+    size = with_unit(name, (value(name) or 0.0) / UNITS[name])
+    return f"{name.replace('_', ' ')} {size}, phase {math.degrees(phase):.4g}°"

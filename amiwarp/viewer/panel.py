@@ -28,7 +28,7 @@ from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
-from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection, size_name
+from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection, recorded_counts
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
 from amiwarp.viewer.serve import finite, serve, use_page
 
@@ -479,10 +479,8 @@ class Panel(layout.Actions):
     def show_b(self, knobs: Knobs | None) -> None:
         """Show parameters on the left as B; None for the recorded events."""
         self.b = knobs
-        text = ""
-        if knobs is not None:
-            text = f"{knobs.model}, {layout.orbit_text(knobs.model, knobs.value(size_name(knobs.model)), knobs.phase)}"
-        against = "recorded" if knobs is None else "B"
+        orbit = "" if knobs is None else layout.orbit_text(knobs.model, knobs.value, knobs.phase)
+        text, against = ("", "recorded") if knobs is None else (f"{knobs.model}, {orbit}", "B")
         self.state.update({"has_b": knobs is not None, "b_text": text, "against": against})
         self.request("knobs")
 
@@ -635,14 +633,15 @@ class Panel(layout.Actions):
 
     def restore(self, address: str) -> None:
         """Show the state that an address describes."""
-        self.travel(partial(self._described, address))
 
-    def _described(self, address: str, history: layout.History) -> layout.ViewState:
-        size = self.inspector.recording.events.size
-        state, wrong = layout.decode_state(address, history.first, size=size, duration_us=self.whole_us)
-        if wrong:
-            self.say("; ".join(wrong), "error")
-        return state
+        def described(history: layout.History) -> layout.ViewState:
+            size = self.inspector.recording.events.size
+            state, wrong = layout.decode_state(address, history.first, size=size, duration_us=self.whole_us)
+            if wrong:
+                self.say("; ".join(wrong), "error")
+            return state
+
+        self.travel(described)
 
     def remember(self, change: str) -> layout.History:
         """Add what the page shows now to the history, and to its address."""
@@ -761,7 +760,8 @@ class Panel(layout.Actions):
             orbit, column = map(drawing.float_bytes, lines)
             values |= {"orbit": orbit, "column": column, "has_orbit": True} if s.orbit_shown else {}
         if before is None or shown.span is not before.span:
-            values["overview"] = drawing.whole_image(shown.span.events, self.inspector.recording.events.size)
+            counts = recorded_counts(shown.span.events, self.inspector.recording.events.size)
+            values["overview"] = drawing.picture_state(counts, drawing.count_scale([counts]))
         left = "recorded" if against is None else s.against
         titles = drawing.cloud_titles(self.inspector, left)
         return shown, {
@@ -786,8 +786,8 @@ class Panel(layout.Actions):
         return {"before": before, "after": after, "image_scale": first, "after_scale": second, "image_note": pair.note}
 
     def _pair(self, shown: DisplayedWindow | None = None) -> drawing.ShownImages:
-        pair = drawing.make_images(self.inspector, self.image, against=self.against, shown=shown)
-        return drawing.with_difference(pair) if self.state.difference else pair
+        difference = bool(self.state.difference)
+        return drawing.make_images(self.inspector, self.image, against=self.against, shown=shown, difference=difference)
 
     async def _curve(self) -> None:
         s, name = self.state, self.state.knob
