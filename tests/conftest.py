@@ -4,6 +4,7 @@ import gc
 import math
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,9 @@ from amiwarp.tasks import limited_cpu_threads
 from tests import SHARE
 
 wp.init()
-# The many processes that tests start would otherwise compile the package each time.
+# The many processes that tests start would otherwise compile the package each time, and each of xdist's all the tests.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 LONGEST_FIRST = (
     "test_photometric", "test_lens", "test_consistency", "test_sensor_timing", "test_moving", "test_world_truth",
