@@ -200,7 +200,7 @@ OPENING_NAMES = {
 """Last parts of the names of others, whatever their module is called."""
 OPEN_NO_FILE = {
     "read_text",  # of input_files
-    "dv.io.camera.open", "archive.open", "playback.open", "stream.open", "inspector.open",
+    "drivers.open", "dv.io.camera.open", "archive.open", "playback.open", "stream.open", "inspector.open",
     "self.open", "tabs.open",
 }  # fmt: skip
 """Functions with such names that read no file."""

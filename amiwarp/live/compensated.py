@@ -50,8 +50,8 @@ def compensate_live(
     Parameters
     ----------
     source : str
-        Source: ``camera:``, ``dv``, ``prophesee``, ``tcp:HOST:PORT``, ``unix:PATH``, ``-`` for standard input, or a file
-        to replay.
+        Source: ``camera:``, ``dv``, ``prophesee``, ``tcp:HOST:PORT``, ``unix:PATH``, ``-`` for standard input, or a
+        file to replay.
     calibration : Calibration
         Calibration of the camera.
     port : str, optional
