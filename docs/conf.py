@@ -55,6 +55,7 @@ api_rooms = [
 repository_pages = {
     "changelog": "CHANGELOG.md",
     "contributing": "CONTRIBUTING.md",
+    "how-to/rig-numbers": "rig/numbers.md",
     "reference/measurements/*": "benchmarks/results/*.md",
     "reference/files/*": "examples/*.py",
     "reference/files/auto": "benchmarks/auto.py",
