@@ -1,6 +1,7 @@
 """The extensions of the site: references, tables of measurements, links, remote files, and the commands on pages."""
 
 import json
+import re
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -249,3 +250,15 @@ def test_few_commands_on_pages_are_not_run(extension: Any) -> None:
     left_out = [block for block in found if block.text.startswith(pages.NOT_RUN)]
     assert len(left_out) < 0.4 * len(found)
     assert all(block.text.splitlines()[0].removeprefix(pages.NOT_RUN).strip() for block in left_out)
+
+
+def test_the_side_bar_names_the_parts_of_the_site() -> None:
+    """The side bar hides the pages of other parts, so each part needs a link to one of its pages."""
+    template = (ROOT / "docs" / "_templates" / "sidebar" / "sections.html").read_text()
+    parts = re.findall(r'\("([^"]+)", "([^"]+)", \[([^]]+)\]\)', template)
+    index = (ROOT / "docs" / "index.md").read_text()
+    assert [name for name, _, _ in parts] == re.findall(r"^:caption: (.*)$", index, re.M)
+    for (_, page, starts), tree in zip(parts, re.findall(r"```\{toctree\}\n(.*?)```", index, re.S), strict=True):
+        pages = [re.sub(r".*<(.*)>$", r"\1", line) for line in tree.split("\n\n")[1].split("\n") if line]
+        assert page in pages
+        assert {name.split("/")[0] for name in pages} == set(re.findall(r'"([^"]+)"', starts))

@@ -128,7 +128,9 @@ def main(demo: str, *names: str) -> None:
     """Draw the pictures that are named, or all."""
     matplotlib.rcParams.update({"font.size": 9})
     for name in names or PICTURES:
-        PICTURES[name](Path(demo)).savefig(Path(__file__).with_name(f"{name}.png"), dpi=110)
+        PICTURES[name](Path(demo)).savefig(
+            Path(__file__).with_name(f"{name}.png"), dpi=110, bbox_inches="tight", pad_inches=0.05
+        )
 
 
 if __name__ == "__main__":
