@@ -19,14 +19,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from amiwarp import AmiwarpError, Events, open_recording
+from amiwarp import AmiwarpError, Camera, Events, Prism, open_recording
 from amiwarp.cli.app import app
 from amiwarp.live.stream import sources
 from amiwarp.live.stream.packets import Packet
 from amiwarp.live.stream.sources import open_source, reopen_source
+from reference.calibration_sample import exact_calibration
 from reference.camera_stub import DAVIS_TRIGGER, POLARITY, TRIGGER, Part, StubCamera, StubDevice, connected
 
 drivers = pytest.importorskip("neuromorphic_drivers")
+PRISM = Prism(math.radians(2.0))
 UNPLUGGED = RuntimeError("Usb(Device(NoDevice))")
 
 
@@ -145,6 +147,23 @@ def test_a_recording_with_the_encoder_at_the_trigger_input(tmp_path: Path, count
     np.testing.assert_array_equal(recording.encoder.t, at.astype(np.int64))
     expected = 2.0 * math.pi / counts * np.arange(len(at))
     np.testing.assert_allclose(recording.encoder.angle, expected, rtol=0, atol=1e-12)
+
+
+def test_a_camera_is_compensated_live(tmp_path: Path) -> None:
+    made, at = rows(50_000, 40, size=(346, 260)), np.arange(60, 50_000, 2000, np.uint64)
+    camera, values = Camera.from_fov(346, 260, math.radians(60)), {"apex": PRISM.apex, "phase": 0.4}
+    exact_calibration(camera, PRISM, values).save(tmp_path / "c.json")
+    pulses = np.zeros(len(at), DAVIS_TRIGGER)
+    pulses["t"], pulses["polarity"] = at, 2
+    with connected(StubCamera("DA1", "iniVation DAVIS 346", [stream(made, pulses, 5000)])):
+        args = ["live", "camera:DA1,counts_per_turn=40", "--calibration", str(tmp_path / "c.json"), "--device", "cpu"]
+        done = CliRunner().invoke(app, [*args, "--out", str(tmp_path / "o.h5"), "--json"])
+    said = json.loads(done.stdout)
+    assert (done.exit_code, said["events"], said["compensated"], said["late"]) == (1, 50_000, 50_000, 0)
+    assert "the 50,000 events received until then are kept" in done.stderr
+    recording = open_recording(tmp_path / "o.h5")
+    np.testing.assert_array_equal(recording.events.slice(0, 50_000).t, made["t"].astype(np.int64))
+    assert recording.metadata["camera_name"] == "iniVation DAVIS 346"
 
 
 def test_lost_usb_packets_are_counted_and_reported(tmp_path: Path) -> None:
