@@ -41,7 +41,7 @@ SMALL = Condition(width=160, height=120, turns=3.0)
 def error_px(condition: Condition, seed: int) -> tuple[float, str]:
     """Return the model error of the exact model's answer, and the warnings."""
     sample = make(condition, seed)
-    found = calibrate(sample.recording, events=100_000, photometric=COARSE)
+    found = calibrate(sample.recording, photometric=COARSE)
     assert sample.recording.truth is not None
     truth = ExactModel(condition.camera, condition.prism, sample.recording.truth.parameters["phase"])
     return model_error(found.exact.model, truth).rms, "; ".join(found.warnings)
@@ -259,7 +259,7 @@ def test_what_sharpness_alone_gets_wrong(changes: dict[str, float], says: str) -
 )
 def test_what_cannot_be_determined_is_refused(changes: dict[str, float], reason: str) -> None:
     with pytest.raises(AmiwarpError, match=reason):
-        calibrate(make(replace(SMALL, **changes), 1).recording, events=100_000, photometric=COARSE)  # type: ignore[arg-type]
+        calibrate(make(replace(SMALL, **changes), 1).recording, photometric=COARSE)  # type: ignore[arg-type]
 
 
 def test_the_papers_method_on_sparse_edges() -> None:
