@@ -23,10 +23,11 @@ def recordings() -> dict[str, amiwarp.Recording]:
     for x, y in ((60, 60), (150, 110), (240, 60), (90, 160), (220, 170)):
         picture[y : y + 26, x : x + 30] = 0.1
 
-    def made(**options: object) -> amiwarp.Recording:
-        motion = amiwarp.PrismMotion(720.0, PHASE, **options.pop("motion", {}))  # type: ignore[arg-type]
-        ideal = amiwarp.EncoderModel(harmonics=options.pop("harmonics", (0.0,) * 4))
-        return amiwarp.simulate(picture, camera, prism, duration_s=0.26, motion=motion, encoder=ideal, seed=2, **options)
+    def made(camera_motion: amiwarp.CameraMotion | None = None) -> amiwarp.Recording:
+        motion = amiwarp.PrismMotion(720.0, PHASE)
+        return amiwarp.simulate(
+            picture, camera, prism, duration_s=0.26, motion=motion, camera_motion=camera_motion, seed=2
+        )
 
     good = made()
     encoder = good.encoder
@@ -42,7 +43,7 @@ def recordings() -> dict[str, amiwarp.Recording]:
         "encoder reversed (A and B exchanged)": replace(good, encoder=replace(encoder, angle=-encoder.angle)),
         "counts lost in the middle, index missed": replace(good, encoder=replace(encoder, angle=slipped)),
         "wedge of 1.5° taken for one of 0.75°": good,
-        "camera shaken twice a turn by 0.2°": made(camera_motion=shaken),
+        "camera shaken twice a turn by 0.2°": made(shaken),
         "no sync: clocks 8 ms apart": replace(good, encoder=replace(encoder, t=encoder.t + 8000)),
     }
 
@@ -58,8 +59,20 @@ def main(out: Path) -> None:
             amiwarp.save_recording(file, recording)
             values = {**true.parameters, **({"apex": APEX / 2} if "taken for" in caption else {})}
             replace(true, parameters=values).save(parameters)
-            command = ["view", str(file), "--screenshot", str(picture), "--calibration", str(parameters), "--view", "x-y",
-                       "--window", "0.0:0.25", "--size", "1000x440"]  # fmt: skip
+            command = [
+                "view",
+                str(file),
+                "--screenshot",
+                str(picture),
+                "--calibration",
+                str(parameters),
+                "--view",
+                "x-y",
+                "--window",
+                "0.0:0.25",
+                "--size",
+                "1000x440",
+            ]
             subprocess.run([sys.executable, "-m", "amiwarp", *command], check=True, capture_output=True)
             tile = Image.open(picture).convert("RGB")
             framed = Image.new("RGB", (tile.width, tile.height + 34), "white")

@@ -132,7 +132,7 @@ def rerun_module() -> Any:
     """Import Rerun. Raises :class:`AmiwarpError` if it is missing."""
     try:
         import rerun
-        import rerun.chunk
+        import rerun.chunk  # noqa: F401
     except ImportError as error:
         raise AmiwarpError("Rerun needs its library; install it by: pip install 'amiwarp[rerun]'") from error
     return rerun
@@ -206,7 +206,7 @@ def foxglove_module() -> Any:
     """Import Foxglove's library. Raises :class:`AmiwarpError` if it is missing."""
     try:
         import foxglove
-        import foxglove.messages
+        import foxglove.messages  # noqa: F401
     except ImportError as error:
         raise AmiwarpError("Foxglove needs its library; install it by: pip install 'amiwarp[foxglove]'") from error
     return foxglove
