@@ -295,7 +295,11 @@ def make_images(
     window, knobs = inspector.loaded, inspector.knobs
     left, top, right, bottom = window.region
     if kind is ImageKind.LOG_INTENSITY:
-        return _log_images(inspector, window, knobs, against)
+        found = [log_intensity(inspector, window, each) for each in (against, knobs) if each is not None]
+        known = np.concatenate([log[where] for log, where, _ in found])
+        low, high = (float(np.percentile(known, share)) for share in (0.5, 99.5)) if known.size else (0.0, 1.0)
+        scale = Scale("log intensity", "ON thresholds", low, max(high, low + 1e-3), "gray")
+        return ShownImages(kind, None if against is None else found[0][0], found[-1][0], scale, found[-1][2])
     if kind is ImageKind.DEPTH:
         if inspector.depth is None:
             raise AmiwarpError("there is no depth map; start 'amiwarp view' with --depth")
@@ -340,16 +344,6 @@ def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | Non
     # events are in order of time; of several values for one pixel, NumPy keeps the last
     surface[pixel] = (events.t - window.span.start_us) * 1e-3
     return surface[:-1].reshape(height, width)
-
-
-def _log_images(inspector: Inspector, window: LoadedWindow, knobs: Knobs, against: Knobs | None) -> ShownImages:
-    """Return log intensities of the region with one scale."""
-    found = [log_intensity(inspector, window, each) for each in (against, knobs) if each is not None]
-    known = np.concatenate([log[where] for log, where, _ in found])
-    low, high = (float(np.percentile(known, share)) for share in (0.5, 99.5)) if known.size else (0.0, 1.0)
-    scale = Scale("log intensity", "ON thresholds", low, max(high, low + 1e-3), "gray")
-    before = None if against is None else found[0][0]
-    return ShownImages(ImageKind.LOG_INTENSITY, before, found[-1][0], scale, found[-1][2])
 
 
 def depth_image(depth: DepthMap) -> tuple[NDArray[np.float32], Scale]:
@@ -582,17 +576,6 @@ ROW_PX, LEAST_ROWS, MOST_ROWS = 40, 3, 12
 def strip_share(texts: Sequence[str], width: int) -> float:
     """Return the fraction of a picture's ``width`` [px] that the texts of a legend need."""
     return min((MARGIN_PX + LETTER_PX * max(map(len, texts))) / width, LARGEST_STRIP)
-
-
-def legend_actors(legend: Legend, ink: str, place: tuple[float, float]) -> list[Any]:
-    """Return the actors of a legend whose upper left corner is at a place; ``ink`` is the colour of the text."""
-    actors = []
-    for k, (colour, text) in enumerate(legend):
-        # all rows start at one corner, after line breaks: their distance does not depend on the picture's size
-        if colour:
-            actors.append(text_actor("\n" * k + MARK, colour, place))
-        actors.append(text_actor("\n" * k + ("     " if colour else "") + text, ink, place))
-    return actors
 
 
 def bar_actors(bar: Scale, ink: str, height: int) -> list[Any]:
@@ -1059,7 +1042,11 @@ class Scene:
         if self._explained == explained:
             return
         self._explained = explained
-        actors = legend_actors(rows, ink, CORNER if bar is None else (CORNER[0], BAR_BOTTOM - 0.05))
+        place, actors = CORNER if bar is None else (CORNER[0], BAR_BOTTOM - 0.05), []
+        for k, (colour, text) in enumerate(rows):
+            # all rows start at one corner, after line breaks: their distance does not depend on the picture's size
+            actors += [text_actor("\n" * k + MARK, colour, place)] if colour else []
+            actors.append(text_actor("\n" * k + ("     " if colour else "") + text, ink, place))
         actors += [] if bar is None else bar_actors(bar, ink, height)
         home.clear_actors()
         for actor in actors:

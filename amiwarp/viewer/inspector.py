@@ -118,7 +118,9 @@ class EventRates:
 
 def counted(events: Events, edges: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the numbers of OFF and ON events in time bins, shape ``(2, n)``."""
-    return np.array([np.diff(np.searchsorted(events.t[events.p == p], edges)) for p in (0, 1)])
+    at = np.searchsorted(events.t, edges)
+    on = np.diff(np.concatenate([[0], np.cumsum(events.p, dtype=np.int64)])[at])
+    return np.array([np.diff(at) - on, on])
 
 
 # Events of a time window, read without loading the other events.

@@ -187,14 +187,13 @@ export const EventClouds = {
       return [xs[0] - 2, ys[0] - 2, xs[1] + 3, ys[1] + 3];
     }
 
-    function paneAt(x, y) {
-      const all = panes();
-      return all.find((each) => x < each.left + each.width && y < each.top + each.height) || all[0];
-    }
-
-    function placeOf(event) {
+    // Return the pane below the pointer, and the place in it [px].
+    function under(event) {
       const box = canvas.value.getBoundingClientRect();
-      return [event.clientX - box.left, event.clientY - box.top];
+      const [x, y] = [event.clientX - box.left, event.clientY - box.top];
+      const all = panes();
+      const pane = all.find((each) => x < each.left + each.width && y < each.top + each.height) || all[0];
+      return [pane, x - pane.left, y - pane.top];
     }
 
     function pressed(event) {
@@ -210,18 +209,16 @@ export const EventClouds = {
         else camera.turn(...by);
         ask();
       }, (end) => {
-        const [x, y] = placeOf(end);
-        const pane = paneAt(x, y);
+        const [pane, x, y] = under(end);
         const cloud = pane.clouds.at(-1);
         if (moved || end.type !== 'pointerup' || (!cloud && props.beside)) return; // events of another recording
-        emit('pick', nearest(scene.places[cloud], projected(pane), x - pane.left, y - pane.top, REACH_PX));
+        emit('pick', nearest(scene.places[cloud], projected(pane), x, y, REACH_PX));
       });
     }
 
     function wheeled(event) {
-      const [x, y] = placeOf(event);
-      const pane = paneAt(x, y);
-      camera.scale(Math.exp(-0.0015 * event.deltaY), x - pane.left - pane.width / 2, y - pane.top - pane.height / 2);
+      const [pane, x, y] = under(event);
+      camera.scale(Math.exp(-0.0015 * event.deltaY), x - pane.width / 2, y - pane.height / 2);
       ask();
     }
 
