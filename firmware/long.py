@@ -34,11 +34,11 @@ def main(image: Path, seconds: float, rpm: float) -> bool:
             elif isinstance(message, ControllerStatus):
                 faults |= message.faults
                 speeds += [message.rpm] if board.now > 0.2e6 * seconds else []
-        if board.now % 1_000_000 == 0:
+        if board.now >= number * 1_000_000:
             board.feed(encode(Ping(number), number % 65536), board.now)
             number += 1
-        if board.now % 60_000_000 == 0:
-            print(f"{board.now / 1e6:.0f} s: {decoder.received}", flush=True)
+            if number % 60 == 0:
+                print(f"{board.now / 1e6:.0f} s: {decoder.received}", flush=True)
     received, true = decoder.received, np.array(board.get("index_us"))
     late = np.array(pulses) - true[: len(pulses)] if pulses and "MAGNETIC" not in image.name else np.zeros(1)
     cycles, busy, worst = (board.get(name) for name in ("cycles", "busy", "worst"))

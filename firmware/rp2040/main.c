@@ -204,7 +204,7 @@ int main(void) {
             ticks = c.ticks;
             REG(WATCHDOG + 0x04u) = WATCHDOG_TICKS;
         }
-        if (byte < 0) __asm__ volatile("wfi");
+        while (byte < 0 && c.ticks == ticks && c.rx.head == c.rx.tail) __asm__ volatile("wfi"); /* edges wake it, too */
     }
 }
 

@@ -33,6 +33,7 @@ function boot() {
   mcu.core.SP = 0x20042000;
   mcu.core.PC = 0x10000000;  // the ROM calls the boot stage
   mcu.uart[0].onByte = (byte) => out.push(byte);
+  mcu.pwm.channels[4].updateEnable = () => {};  // the duty is read from its register; its edges would take half the time
   let angle = 0;
   mcu.spi[0].onTransmit = (word) => {
     if (mcu.gpio[PIN.cs].outputValue) return mcu.spi[0].completeTransmit(0xffff);  // not selected
