@@ -133,9 +133,7 @@ class SimulatedBoard:
 
     def close(self) -> None:
         """End the simulator."""
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
+        self._process.communicate()
 
 
 class SimulatedWire:

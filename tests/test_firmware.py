@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
@@ -449,3 +449,93 @@ def test_fuzzed_frames_and_commands(build: Path) -> None:
     done = subprocess.run([build / "fuzz", "100000"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("100000 frames")
+
+
+# The image for the RP2040 in a simulator of the chip.
+
+
+@pytest.fixture
+def chip(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Any]]:
+    """Start the simulator on an image that is built for an encoder."""
+    if shutil.which("arm-none-eabi-gcc") is None:
+        pytest.skip("needs arm-none-eabi-gcc (Debian: gcc-arm-none-eabi)")
+    if shutil.which("node") is None or not (FIRMWARE / "simulator" / "node_modules" / "rp2040js").is_dir():
+        pytest.skip("needs Node.js, and rp2040js: npm install --prefix firmware/simulator")
+    folder, started = tmp_path_factory.mktemp("rp2040"), []
+
+    def start(encoder: str = "QUADRATURE", pulses: str = "PULSES_TIMED") -> Any:
+        options = (f"BUILD={folder}", f"ENCODER={encoder}", f"PULSES={pulses}", f"PYTHON={sys.executable}")
+        make = ("make", "-s", "-C", str(FIRMWARE), *options, "rp2040")
+        done = subprocess.run(make, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        image = folder / f"prism-{encoder}-{pulses}.bin"
+        started.append(load("boards").SimulatedBoard(image, magnetic=encoder == "MAGNETIC"))
+        return started[-1]
+
+    yield start
+    for board in started:
+        board.close()
+
+
+def test_the_image_turns_stops_and_survives_damage_and_resets(chip: Callable[..., Any]) -> None:
+    rng, host = random.Random(1), Host(chip())
+    host.run(0.15)
+    assert host.command(SetSpeed(400.0, 4000.0)) == 0
+    host.run(0.6)
+    assert (host.status.state, host.status.target_rpm, host.status.faults) == (1, 400.0, 0)
+    host.damage = lambda data: bytes(b ^ (rng.random() < 0.01) for b in data if rng.random() > 0.01)
+    host.run(0.2)
+    host.damage = bytes
+    host.run(0.05)
+    damaged = host.decoder.received.damaged
+    assert damaged > 0
+    host.run(0.3)
+    assert (host.decoder.received.damaged, host.status.target_rpm) == (damaged, 400.0)
+    true = np.array(host.board.get("index_us"))
+    pulses = of(Index, host.messages)
+    assert len(pulses) > 4
+    late = np.array([m.t_us - true[np.abs(true - m.t_us).argmin()] for m in pulses])
+    assert -1.0 <= late.min() <= late.max() <= 2.0
+    sent, syncs = np.array(host.board.get("trigger_us")), of(Sync, host.messages)
+    assert max(abs(m.t_us - sent[m.number]) for m in syncs) <= 2.0
+    assert max(host.board.get("worst").values()) < 600  # cycles of an interrupt
+    host.board.set("driver_fault")
+    host.run(0.1)
+    assert (host.status.state, host.status.faults, host.status.target_rpm) == (3, FAULT["over-current"], 0.0)
+    host.board.set("driver_fault", 0)
+    assert host.command(Stop()) == 0
+    host.board.reset()
+    host.run(0.1)
+    assert host.decoder.received.restarts == 1
+    assert (host.status.target_rpm, host.status.faults) == (0.0, 0)
+
+
+@pytest.mark.parametrize("pulses", ["PULSES_TIMED", "PULSES_INDEX", "PULSES_CAMERA"])
+def test_the_image_with_each_source_of_pulses_and_each_encoder(chip: Callable[..., Any], pulses: str) -> None:
+    magnetic = pulses == "PULSES_TIMED"
+    host = Host(chip("MAGNETIC" if magnetic else "QUADRATURE", pulses))
+    host.command(SetSpeed(600.0, 5000.0))
+    host.run(0.4)
+    edges = []
+    for _ in range(2):
+        if pulses == "PULSES_CAMERA":
+            edges.append(host.board.now)
+            host.board.set("sync")
+            host.run(0.05)
+            host.board.set("sync", 0)
+        host.run(0.1)
+    syncs = of(Sync, host.messages)
+    if pulses == "PULSES_INDEX":
+        assert [m.t_us for m in syncs] == [m.t_us for m in of(Index, host.messages)]
+        edges = host.board.get("trigger_us")
+    elif pulses == "PULSES_TIMED":
+        edges = host.board.get("trigger_us")
+    assert len(syncs) >= 2
+    assert max(abs(m.t_us - edge) for m, edge in zip(syncs, edges, strict=True)) <= 2.0
+    assert host.status.counts_per_turn == (16384 if magnetic else 4096)
+    assert host.status.rpm == pytest.approx(600.0, abs=60.0)
+    assert host.decoder.received.damaged == host.decoder.received.lost == 0
+    if magnetic:
+        host.board.set("bad_spi")
+        host.run(0.05)
+        assert host.status.faults == FAULT["encoder lost"]

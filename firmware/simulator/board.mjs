@@ -12,7 +12,7 @@ const magnetic = kind === 'MAGNETIC';
 const STEP_NS = 50_000, TAU = 2 * Math.PI, BYTE_NS = 10e9 / 460_800;
 const PIN = { a: 2, b: 3, index: 4, sync: 5, trigger: 6, direction: 9, enable: 10, fault: 11, cs: 17 };
 const perTurn = magnetic ? 16384 : 4096;
-const faults = { jammed: 0, driver_fault: 0, no_index: 0, dead_a: 0, reversed_motor: 0, bad_spi: 0, runaway: 0, hang: 0 };
+const faults = { jammed: 0, driver_fault: 0, no_index: 0, dead_a: 0, reversed_motor: 0, bad_spi: 0, runaway: 0 };
 
 let mcu, clock, cycleNs = 8, out = [], inbox = [], arrivesNs = 0, resets = 0, watchdogs = 0;
 let turns = 0.3, rpm = 0, position = Math.floor(turns * perTurn), inPulse = false, random = 1;
@@ -106,8 +106,6 @@ function execute(until) {  // the processor, until a time [ns]
       const next = clock.nextAlarm ? clock.nanosToNextAlarm : Infinity;
       clock.tick(Math.max(Math.min(until - now(), next), 0));
       if (core.waiting && next > until - now() && now() >= until - 1) break;
-    } else if (faults.hang) {
-      clock.tick(1000);
     } else {
       clock.tick(core.executeInstruction() * cycleNs);
     }
