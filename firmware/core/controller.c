@@ -167,6 +167,7 @@ static void pass_zero(struct controller *c, struct stamp at) {
 }
 
 static void take_sample(struct controller *c, struct stamp at) {
+    if (!c->sampled) tracker_begin(&c->tracker, at.count, c->settings.counts_per_turn);
     c->speed = tracker_step(&c->tracker, at.count);
     if (c->settings.encoder == MAGNETIC) pass_zero(c, at);
     if (!c->sampled) c->last_index = at;
