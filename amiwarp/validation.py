@@ -371,6 +371,8 @@ class _PublicNames(dict[str, Any]):
 def _unmet(kind: Any, value: Any) -> str:
     """Return what a type expects, in words, if a value does not fit; else an empty text."""
     origin, parts = typing.get_origin(kind) or kind, typing.get_args(kind)
+    if hasattr(origin, "__value__"):  # an alias, as NDArray and ArrayLike are from NumPy 2.5 on
+        return _unmet(origin.__value__, value)
     if origin in (typing.Union, types.UnionType):
         paths = {os.PathLike, Path} & {typing.get_origin(part) or part for part in parts}
         words = list(dict.fromkeys(_unmet(part, value) for part in parts if not (paths and part is str)))
