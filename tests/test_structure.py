@@ -15,6 +15,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 
 import pytest
+import warp as wp
 
 import amiwarp
 
@@ -106,6 +107,18 @@ def test_kernel_modules_keep_their_annotations() -> None:
     files = {where.rpartition(".")[0] for where, _, _ in device_code()}
     postponed = [name_of(path) for path in MODULES if name_of(path) in files and "__future__" in set(imports_of(path))]
     assert postponed == []
+
+
+def test_no_local_structure_has_the_name_of_a_constant_of_warp() -> None:
+    """Warp takes ``e.angle`` for its constant ``e`` until it has generated code, then compiles the module once more."""
+    constants = {name for name in dir(wp) if isinstance(getattr(wp, name), int | float)}
+    found = [
+        f"{where}: {part.value.id}"
+        for where, _, node in device_code()
+        for part in ast.walk(node)
+        if isinstance(part, ast.Attribute) and isinstance(part.value, ast.Name) and part.value.id in constants
+    ]
+    assert found == []
 
 
 def test_import_loads_nothing_heavy() -> None:

@@ -65,14 +65,14 @@ def theta_u32_at(encoder: EncoderParams, t: wp.int64) -> wp.uint32:
 @wp.func
 def of_second(encoder: EncoderParams) -> EncoderParams:
     """Return the path of the second prism of a pair. Times are relative to the same origin."""
-    e = EncoderParams()
-    e.origin = encoder.origin
-    e.shift = encoder.shift
-    e.first = encoder.second_first
-    e.start = encoder.second_start
-    e.angle = encoder.second_angle
-    e.slope = encoder.second_slope
-    return e
+    second = EncoderParams()
+    second.origin = encoder.origin
+    second.shift = encoder.shift
+    second.first = encoder.second_first
+    second.start = encoder.second_start
+    second.angle = encoder.second_angle
+    second.slope = encoder.second_slope
+    return second
 
 
 @wp.func

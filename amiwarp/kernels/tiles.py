@@ -272,19 +272,19 @@ def cast_event(
 @wp.func
 def unpack(packed: int, chunk: Chunk, canvas: Canvas, layout: Layout, i: int) -> UnpackedEvent:
     """Unpack event ``i`` of the packed events of a tile."""
-    e = UnpackedEvent()
-    e.x = float(chunk.x + (packed & 31))
-    e.y = float(chunk.y + ((packed >> 5) & 31))
-    e.weight = ((packed >> 10) & 63) + 1
-    e.turn = packed >> 16  # signed: from -1/2 to 1/2 turn
-    e.scale = canvas.scale
-    e.corner_x = layout.shift - float(chunk.column)
-    e.corner_y = layout.shift - float(chunk.row)
+    event = UnpackedEvent()
+    event.x = float(chunk.x + (packed & 31))
+    event.y = float(chunk.y + ((packed >> 5) & 31))
+    event.weight = ((packed >> 10) & 63) + 1
+    event.turn = packed >> 16  # signed: from -1/2 to 1/2 turn
+    event.scale = canvas.scale
+    event.corner_x = layout.shift - float(chunk.column)
+    event.corner_y = layout.shift - float(chunk.row)
     if canvas.dither != 0.0:
         dx, dy = dither_offset(i)
-        e.corner_x += dx * canvas.scale
-        e.corner_y += dy * canvas.scale
-    return e
+        event.corner_x += dx * canvas.scale
+        event.corner_y += dy * canvas.scale
+    return event
 
 
 @wp.func
