@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import warp as wp
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
@@ -14,7 +15,9 @@ from typer.testing import CliRunner
 
 from amiwarp import Calibration, open_recording
 from amiwarp.cli.app import app
+from amiwarp.kernels import checksum, launch
 from amiwarp.plotting import clouds
+from amiwarp.studies import demo
 
 FILES = {"recording.h5", "calibration.json", "compensated.h5", "picture.png", "demo.png"}
 
@@ -81,3 +84,21 @@ def test_plain_clouds_are_seen() -> None:
     rng = np.random.default_rng(0)
     cloud = clouds.Cloud(rng.uniform(-0.4, 0.4, (2000, 3)).astype(np.float32), rng.random(2000) < 0.5)
     assert (plain_picture(cloud).reshape(-1, 3) < 200).any(axis=1).mean() > 0.02
+
+
+def test_a_second_warm_up_compiles_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, device: str) -> None:
+    """One module stands for all of them, which take a minute to compile."""
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(demo, "run_demo", lambda settings, progress: progress("simulating", 1.0))
+    modules = {"amiwarp.kernels.checksum": checksum, "json": json}
+    monkeypatch.setattr(launch, "sys", SimpleNamespace(modules=modules, stderr=sys.stderr))
+    module = checksum.compute_checksums.module
+    compiled = []
+    for _ in range(2):
+        module.unload()
+        result = CliRunner().invoke(app, ["warm-up", "--json", "--device", device])
+        assert result.exit_code == 0, result.stderr
+        data = json.loads(result.stdout)
+        assert (data["cached"], data["cache"], data["devices"]) == (1, str(tmp_path), [device])
+        compiled.append(data["compiled"])
+    assert compiled == [1, 0]

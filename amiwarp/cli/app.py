@@ -25,7 +25,7 @@ class Command(NamedTuple):
     """Entry of the list of commands. Its texts are here so that ``amiwarp --help`` need not load the command."""
 
     file: str
-    """Module of ``amiwarp.cli`` whose function ``run_NAME`` is the command."""
+    """Module of ``amiwarp.cli`` whose function ``run_NAME`` is the command, with ``_`` for a hyphen."""
     summary: str
     """First sentence of the help."""
     example: str
@@ -37,6 +37,11 @@ COMMANDS = {
         "studies",
         "Simulate a recording, calibrate it without an initial guess, compensate it and reconstruct the picture.",
         "amiwarp demo --out amiwarp-demo",
+    ),
+    "warm-up": Command(
+        "studies",
+        "Compile the kernels of the ordinary commands in advance, for containers and continuous integration.",
+        "amiwarp warm-up",
     ),
     "info": Command(
         "recordings",
@@ -161,7 +166,7 @@ COMMANDS = {
 def function_of(name: str) -> Callable[..., None]:
     """Load the module of a command and return the command's function."""
     module = importlib.import_module(f"amiwarp.cli.{COMMANDS[name].file}")
-    function: Callable[..., None] = getattr(module, f"run_{name}")
+    function: Callable[..., None] = getattr(module, f"run_{name.replace('-', '_')}")
     return function
 
 

@@ -1,4 +1,4 @@
-"""Studies: ``amiwarp demo``, ``dataset``, ``export``, ``chart``, ``design``, ``stability`` and ``evaluate``."""
+"""Commands ``demo``, ``warm-up``, ``dataset``, ``export``, ``chart``, ``design``, ``stability`` and ``evaluate``."""
 
 from __future__ import annotations
 
@@ -103,6 +103,25 @@ def demo_lines(d: dict[str, Any]) -> list[Any]:
     ]  # fmt: skip
     notes = [f"note: {note}" for note in d["notes"]]
     return [table(rows), *notes, f"{d['events']:,} events, {d['seconds']:.1f} s in all on {d['device']}"]
+
+
+# ``amiwarp warm-up``: kernels compiled in advance.
+
+
+def run_warm_up(*, common: Common) -> None:
+    """Compile the kernels of the ordinary commands in advance, for containers and continuous integration.
+
+    Later commands find them in Warp's cache, which WARP_CACHE_PATH moves. A second call compiles nothing. Without
+    --device, the kernels for the CPU are compiled, and if there is a GPU, those for cuda:0.
+    """
+    chosen = choose_device(common.device)
+    devices = [chosen] if common.device else sorted({"cpu", chosen})
+    with progress("starting", average_s=60.0) as advance:
+        from amiwarp.studies.demo import warm_up
+
+        done = warm_up(devices, advance)
+    what = f"compiled {done.compiled} modules of kernels in {done.seconds:.1f} s for {' and '.join(devices)}"
+    report(common, asdict(done) | {"devices": devices}, [what, f"cache: {done.cache}, {done.cached} modules"])
 
 
 # ``amiwarp dataset``: thousands of simulated recordings from a specification, with a manifest.

@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.tasks import cores, cpu_threads, works_on_one_core
+from amiwarp.tasks import Progress, cores, cpu_threads, in_order, silent, works_on_one_core
 
 # Kernel launches: a single launch on CUDA, slices on a thread pool on the CPU.
 #
@@ -167,12 +167,17 @@ def load_ahead(kernels: Iterable[tuple[Any, ...]], device: Any) -> None:
     Thread(target=load_kernels, args=(wanted, device), name="amiwarp-compiler").start()
 
 
-def load_all(device: Any) -> None:
+def load_all(device: Any, progress: Progress = silent) -> None:
     """Compile and load the kernels of all imported modules, several at a time, except those for one optical model.
 
     Processes that start later find them in Warp's cache. Processes that start together would all compile them.
     """
-    wp.force_load(device, max_workers=cpu_threads())
+    names = [name for name in list(sys.modules) if name.startswith(f"{__package__}.")]
+    found = [one for name in names for one in vars(sys.modules[name]).values() if isinstance(one, wp.Kernel)]
+    kernels = {kernel.module.name: kernel for kernel in found if not _generic_arguments(kernel)}
+    jobs = [partial(load, kernel, wp.get_device(device)) for kernel in kernels.values()]
+    for k, _ in enumerate(in_order(jobs)):
+        progress("compiling kernels", (k + 1) / len(jobs))
 
 
 def slices(n: int, parts: int, smallest: int = SMALLEST_SLICE) -> list[tuple[int, int]]:

@@ -1,16 +1,22 @@
 """Demo: a recording is simulated from a picture, calibrated, compensated and reconstructed."""
 
+import importlib
 import importlib.util
 import math
+import pkgutil
+import tempfile
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
+from amiwarp import kernels
 from amiwarp.brightness.solver import SensorTiming
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.calibration_events import thin
@@ -31,7 +37,7 @@ from amiwarp.kernels.equations import find_squares, sum_costs
 from amiwarp.kernels.equations_cpu import apply_normal, make_chains
 from amiwarp.kernels.iwe import CPU_WIDTH, find_largest, read_sums, smooth, smooth_and_sum
 from amiwarp.kernels.known_nodes import find_large_regions, mark_known
-from amiwarp.kernels.launch import load_ahead
+from amiwarp.kernels.launch import load_ahead, load_all
 from amiwarp.kernels.map_positions import find_places, place_blocks
 from amiwarp.kernels.multilevel import prolong
 from amiwarp.kernels.pairs import mark_spans
@@ -47,7 +53,7 @@ from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
 from amiwarp.reconstruction.picture import Picture, Reconstruction, save_picture
 from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.simulator import Simulation
-from amiwarp.tasks import Progress, silent
+from amiwarp.tasks import Progress, part, silent
 
 # Kernels that the steps after a simulation need on a CPU, to be compiled before they are needed.
 #
@@ -317,3 +323,44 @@ def headline(values: dict[str, Any]) -> str:
         f"true {values['apex_true_deg']:.3f}°, nominal {math.degrees(NOMINAL_APEX):.3f}°; "
         f"blur {values['blur_before_px']:.2f} px before, {values['blur_after_px']:.2f} px after"
     )
+
+
+# Kernels compiled in advance, for containers and continuous integration.
+
+
+@dataclass(frozen=True, slots=True)
+class WarmUp:
+    """Result of :func:`warm_up`."""
+
+    compiled: int
+    """Number of modules of kernels that were compiled. The others were in the cache."""
+    cached: int
+    """Number of compiled modules in the cache, those of other programs and versions included."""
+    cache: str
+    """Folder of the cache."""
+    seconds: float
+    """Time that it took [s]."""
+
+
+def warm_up(devices: Sequence[str], progress: Progress = silent) -> WarmUp:
+    """Compile the kernels of the ordinary commands into Warp's cache, unless they are there.
+
+    A demo of 120 × 90 px runs on each device, because its optical model and its filters decide which of the kernels
+    with variants it needs. Then all kernels without variants are compiled.
+    """
+    began, cache = time.perf_counter(), Path(wp.config.kernel_cache_dir)
+    before = _binaries(cache)
+    for module in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}."):
+        importlib.import_module(module.name)
+    for k, device in enumerate(devices):
+        share = part(progress, k / len(devices), (k + 1) / len(devices))
+        with tempfile.TemporaryDirectory(prefix="amiwarp-") as folder:
+            run_demo(Demo(Path(folder), width=120, height=90, duration_s=0.17, device=device), part(share, 0.0, 0.6))
+        load_all(device, part(share, 0.6, 1.0))
+    after = _binaries(cache)
+    return WarmUp(len(after - before), len(after), str(cache), time.perf_counter() - began)
+
+
+def _binaries(cache: Path) -> set[Path]:
+    """Return the files of machine code in Warp's cache: object files for CPUs, PTX or CUBIN for GPUs."""
+    return {path for path in cache.glob("*/*") if path.suffix in (".o", ".ptx", ".cubin")}
