@@ -77,17 +77,15 @@ EXACT_KERNELS = (
     (find_squares,),
     (compensate_blocks, ExactParams, PinholeParams),
     (compute_checksums,),
+    (vote_point_blocks,),
     (link,),
     (prolong,),
     (mark_known,),
     (find_large_regions,),
 )
 """Kernels of calibration, compensation and reconstruction by the exact model, in the order of their use."""
-FIGURE_KERNELS = (
-    *((compensate_points, MODELS[name].STRUCT) for name in CIRCLES),
-    (vote_point_blocks,),
-)
-"""Kernels of the demo's figure and of its comparison of simpler models."""
+FIGURE_KERNELS = tuple((compensate_points, MODELS[name].STRUCT) for name in CIRCLES)
+"""Kernels of the demo's comparison of simpler models."""
 
 
 # Demo: a recording is simulated from a picture, calibrated, compensated and reconstructed.
