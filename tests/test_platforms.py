@@ -37,6 +37,8 @@ def no_faery(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path / "hidden")
     monkeypatch.setitem(sys.modules, "faery", None)
     monkeypatch.setattr(reading_process, "_idle", [])
+    # A reader of an earlier test that is collected meanwhile would give back a process that has faery.
+    monkeypatch.setattr(reading_process, "borrow", reading_process.ReadingProcess)
 
 
 @pytest.mark.usefixtures("no_faery")
