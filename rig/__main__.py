@@ -25,7 +25,9 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def list_of_parts(made: Sequence[Part]) -> str:
     """Return the masses of the parts."""
-    rows = [(k, part.name, part.kind, f"{part.mass:.1f}") for k, part in enumerate(made, 1)]
+    rows = [
+        ("" if part.kind == "screws" else k, part.name, part.kind, f"{part.mass:.1f}") for k, part in enumerate(made, 1)
+    ]
     return table(("number", "part", "kind", "mass [g]"), [*rows, ("", "all", "", f"{sum(p.mass for p in made):.0f}")])
 
 

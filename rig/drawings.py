@@ -33,8 +33,12 @@ COLOURS = {
     "cover": "#7fae6e",
     "fork barrier": "#40464f",
     "encoder board": "#2f6b3f",
+    "motor plate": "#8fb0cc",
+    "O-ring": "#1a1a1a",
 }
 """Colour of each part in all pictures."""
+SCREWS = "#3f3f3f"
+"""Colour of all screws."""
 
 
 def section(solid: Manifold) -> CrossSection:
@@ -101,7 +105,7 @@ def drawing(rig: Rig, made: Sequence[Part], out: Path) -> None:
     figure, ((whole, front), (rotor, cover)) = plt.subplots(2, 2, figsize=(16.5, 11.7), layout="constrained")
     bearing = rig.bearing
     for part in made:
-        fill(whole, section(part.solid), COLOURS[part.name], 0.75)
+        fill(whole, section(part.solid), COLOURS.get(part.name, SCREWS), 0.75)
     whole.set_title(f"{rig.name}: cut at the height of the axis, seen from above; camera left, scene right", fontsize=9)
     low, edge = parts.camera_z(rig)[0], rig.distance + rig.motor[0] / 2
     dimension(whole, (0, 0), (0, rig.distance), number(rig.distance), low - 8)
@@ -124,8 +128,8 @@ def drawing(rig: Rig, made: Sequence[Part], out: Path) -> None:
         bores,
         0,
     )
-    gap = rig.motor_screws[0] / 2
-    dimension(front, (rig.distance, -gap), (rig.distance, gap), f"{number(2 * gap)}, slot 3.4", 24)
+    low, high = parts.plate_screws(rig)
+    dimension(front, low, high, f"{number(high[1] - low[1])}, 2 × M3 for the motor plate", 32)
     dimension(
         front,
         (-rig.outline, 0),
@@ -200,17 +204,18 @@ def exploded(made: Sequence[Part], out: Path, *, apart: float = 1.5, size: tuple
     points = []
     for k, (part, mesh) in enumerate(zip(made, meshes, strict=True)):
         clear = 0.45 if part.kind == "glass" else 1.0
-        plotter.add_mesh(mesh, color=COLOURS[part.name], opacity=clear, smooth_shading=False, specular=0.2)
+        plotter.add_mesh(mesh, color=COLOURS.get(part.name, SCREWS), opacity=clear, smooth_shading=False, specular=0.2)
         plotter.add_mesh(mesh.extract_feature_edges(35), color="#303030", line_width=0.6)
         tip = np.array([mesh.center[0], mesh.bounds[3], mesh.center[2]])
         end = np.array([tip[0], top + 6.0 + 9.0 * (k % 3), tip[2]])
-        points.append(end)
-        if apart:
+        if part.kind != "screws":
+            points.append(end)
+        if apart and part.kind != "screws":
             plotter.add_mesh(pyvista.Line(tip, end), color="#808080", line_width=1)
     if apart:
         plotter.add_point_labels(
             np.array(points),
-            [str(k) for k in range(1, len(made) + 1)],
+            [str(k) for k in range(1, len(points) + 1)],
             font_size=18,
             shape_color="white",
             shape_opacity=0.9,

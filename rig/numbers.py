@@ -79,12 +79,10 @@ def bodies(rig: Rig) -> tuple[Body, ...]:
 
 def rotating(rig: Rig) -> Body:
     """Return the body that turns: printed parts, wedge, screws of the rings, and the inner half of the bearings."""
-    turning = [body for part, body in zip(parts.assembly(rig), bodies(rig), strict=True) if part.turns]
+    turning = [body for part, body in zip(parts.assembly(rig), bodies(rig), strict=True) if part.moves == "prism"]
     rings = [point(rig.bearing.mass * 0.45, 0.0, 0.0, z + rig.bearing.width / 2) for z in rig.bearing_z]
-    screws = [point(0.2, x, y, rig.front_z - 1.0) for x, y in parts.ring_screws(rig)[1]]
-    screws += [point(0.2, x, y, rig.bearing_z[0]) for x, y in parts.rear_screws(rig)]
     total = turning[0]
-    for body in (*turning[1:], *rings, *screws):
+    for body in (*turning[1:], *rings):
         total = total + body
     return total
 
@@ -192,7 +190,7 @@ def stress(rig: Rig, rpm: float) -> dict[str, float]:
     """Return stresses [MPa], forces [N], rim speed [m/s] and energy [J] of the rotor at a speed."""
     w, radius = omega(rpm), rig.wedge / 2e3
     body = rotating(rig)
-    outer = (rig.pitch(rig.teeth[0]) + 1.4) / 1e3
+    outer = rig.flange / 1e3
     offset = wedge_unbalance(rig) + rig.seat * glass_mass(rig)
     return {
         "glass": (3 + 0.21) / 8 * GLASS * 1e6 * w**2 * radius**2 / 1e6,

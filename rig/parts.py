@@ -6,7 +6,7 @@ the camera. The thick edge of the wedge points to +x.
 
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -16,8 +16,8 @@ ADD = OpType.Add
 
 SEGMENTS = 180
 """Number of sides of a circle."""
-PETG, GLASS, STEEL, ALUMINIUM = 1.27e-3, 2.51e-3, 7.85e-3, 2.70e-3
-"""Densities [g/mm³] of the printed material (solid), N-BK7, steel and aluminium."""
+PETG, GLASS, STEEL, RUBBER = 1.27e-3, 2.51e-3, 7.85e-3, 1.2e-3
+"""Densities [g/mm³] of the printed material (solid), N-BK7, steel and rubber."""
 BELT_PITCH, BELT_WIDTH, PITCH_LINE, TOOTH_DEPTH, BELT_BACK = 2.0, 6.0, 0.254, 0.75, 0.63
 """GT2 belt [mm]: pitch, width, distance of the pitch line from the tips of the pulley's teeth, depth of a tooth, and
 thickness without teeth."""
@@ -25,8 +25,13 @@ FLANGE, BELT_ROOM = 1.2, 7.0
 """Thickness of a pulley's flange, and distance between its flanges [mm]."""
 SPRING = 1.5
 """Length of the compressed wave spring [mm]."""
-PLATE = 5.0
-"""Thickness of the housing's plate, which carries the motor [mm]."""
+PLATE, MOTOR_PLATE, SLIDE = 5.0, 4.0, 3.0
+"""Thickness of the housing's plate and of the motor's plate behind it, and travel of the latter to either side [mm]."""
+CORD, SQUEEZED = 1.0, 0.75
+"""Thickness of the O-ring, free and between wedge and ring [mm]."""
+HEADS = {2.0: (3.8, 2.0, 1.6), 2.5: (4.5, 2.5, 2.05), 3.0: (5.5, 3.0, 2.5), 4.0: (7.0, 4.0, 3.3)}
+"""Screws by thread [mm]: diameter and height of a cylinder head (ISO 4762), and core hole. Countersunk heads (ISO 7046)
+have the same diameter to within 0.3 mm."""
 FORK_WIDTH, FORK_DEPTH, FORK_SLOT, FORK_SLOT_DEPTH, FORK_LENGTH = 14.0, 10.0, 5.0, 7.0, 6.0
 """Fork barrier [mm]: width along its beam, depth, width and depth of its slot, and length along the flag's path."""
 
@@ -172,7 +177,7 @@ class Rig:
 
     @property
     def seat_z(self) -> float:
-        """Rear, flat face of the wedge. Between its thick edge and the ring remain 1.3 mm for an O-ring."""
+        """Rear, flat face of the wedge. Between its thick edge and the rotor's front remain 1.3 mm."""
         return self.front_z - 1.3 - self.edge
 
     @property
@@ -200,6 +205,11 @@ class Rig:
         """Radius of the index flag's tip."""
         return self.outline - 4.0
 
+    @property
+    def flange(self) -> float:
+        """Radius of the flanges of the rotor's pulley."""
+        return self.pitch(self.teeth[0]) + 1.4
+
     def pitch(self, teeth: int) -> float:
         """Return the pitch radius of a pulley."""
         return teeth * BELT_PITCH / (2 * math.pi)
@@ -217,11 +227,17 @@ class Rig:
         return low
 
     @property
+    def o_ring(self) -> float:
+        """Inner radius of the squeezed O-ring, whose cut keeps its area. Outside, it touches the wedge's seat."""
+        return self.wedge / 2 + self.seat - math.pi / 4 * CORD**2 / SQUEEZED
+
+    @property
     def stops(self) -> tuple[tuple[str, float, float], ...]:
         """Apertures between lens and scene: name, z and radius. Those up to the wedge come first."""
         opening = self.opening
         return (
             ("seat's lip", self.seat_z, self.clear),
+            ("O-ring", self.front_z, self.o_ring),
             ("wedge's ring", self.front_z, self.clear),
             ("wedge's ring", self.front_z + 2.0, self.clear),
             ("cover", self.cover_z, opening),
@@ -248,9 +264,9 @@ class Part:
     name: str
     solid: Manifold
     kind: str
-    """'printed', 'bought' or 'glass'."""
-    turns: bool
-    """True if it turns with the prism."""
+    """'printed', 'bought', 'glass' or 'screws'."""
+    moves: str
+    """What it moves with: 'prism', 'motor', 'belt', or nothing if empty."""
     mass: float
     """Mass [g], printed parts solid."""
     apart: tuple[float, float, float]
@@ -296,6 +312,58 @@ def slots(points: Iterable[tuple[float, float]], diameter: float, reach: float, 
     return Manifold.batch_boolean([flat.hull().extrude(high - low).translate((0, 0, low)) for flat in flats], ADD)
 
 
+def screws(
+    size: float,
+    length: float,
+    grip: float,
+    points: Iterable[tuple[float, float, float]],
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    sunk: bool = False,
+) -> Manifold:
+    """Return screws that point to -z before they are turned.
+
+    The shank has the diameter of the thread as far as the screw passes holes, and that of the core hole beyond.
+
+    Parameters
+    ----------
+    size, length : float
+        Diameter of the thread and length.
+    grip : float
+        Thickness of what the screws pass without a thread.
+    points : iterable of tuple of float
+        Where the axes meet the surface that the heads lie on, or in if they are countersunk.
+    turn : tuple of float
+        Rotation about x, y and z [deg].
+    sunk : bool, default False
+        Countersunk heads of 90°, which lie 0.1 mm deep.
+    """
+    wide, tall, core = HEADS[size]
+    if sunk:
+        cone = (wide - size) / 2
+        one = Manifold.cylinder(cone, size / 2, wide / 2, 32).translate((0, 0, -0.1 - cone))
+    else:
+        one = rod(wide / 2, 0.0, tall, sides=32)
+    shank = rod(size / 2, -grip, -0.2, sides=32) + rod(core / 2 - 0.02, -length, -0.2, sides=32)
+    one += shank if sunk else shank + rod(size / 2, -0.3, 0.1, sides=32)
+    one = one.rotate(turn)
+    return Manifold.batch_boolean([one.translate(point) for point in points], ADD)
+
+
+def sinks(points: Iterable[tuple[float, float]], size: float, z: float, *, rear: bool = False) -> Manifold:
+    """Return countersinks of 90° in a face at z that looks to the front or to the rear, to subtract."""
+    top = HEADS[size][0] / 2 + 0.15
+    one = Manifold.cylinder(top, 0.0, top, 32).translate((0, 0, -top)) + rod(top, -0.001, 0.5, sides=32)
+    if rear:
+        one = one.rotate((180, 0, 0))
+    return Manifold.batch_boolean([one.translate((x, y, z)) for x, y in points], ADD)
+
+
+def at_z(points: Iterable[tuple[float, float]], z: float) -> list[tuple[float, float, float]]:
+    """Return points in a plane z."""
+    return [(x, y, z) for x, y in points]
+
+
 def pulley(teeth: int) -> CrossSection:
     """Return the outline of a GT2 pulley."""
     tip = teeth * BELT_PITCH / (2 * math.pi) - PITCH_LINE
@@ -321,8 +389,7 @@ def balance_holes(rig: Rig) -> tuple[float, list[float]]:
 
 def rotor(rig: Rig) -> Manifold:
     """Return the rotor: tube, shoulder, pulley, seat of the wedge, index flag, threads of M2 screws."""
-    bearing, low, high = rig.bearing, rig.pulley_z, rig.front_z
-    flange = rig.pitch(rig.teeth[0]) + 1.4
+    bearing, low, high, flange = rig.bearing, rig.pulley_z, rig.front_z, rig.flange
     out = ring(0, bearing.bore / 2 - 0.01, rig.bearing_z[0] + 0.2, high)
     out += ring(0, bearing.inner, rig.shoulder_z, low + 0.1)
     out += pulley(rig.teeth[0]).extrude(high - low).translate((0, 0, low))
@@ -343,26 +410,50 @@ def rear_screws(rig: Rig) -> list[tuple[float, float]]:
 
 
 def motor_end(rig: Rig) -> float:
-    """Return the radius of plate and cover about the motor's axis."""
-    return max(rig.motor_screws[0] / 2 + 5.5, rig.pitch(rig.teeth[1]) + 1.2 + 4.0)
+    """Return the radius of plate and cover about the motor's axis: room for the pulley, and for the board's nuts."""
+    return max(rig.motor_screws[0] / 2 + 5.5, rig.pitch(rig.teeth[1]) + 1.2 + 4.0, 16.5)
 
 
 def outline(rig: Rig) -> CrossSection:
     """Return the outline of the plate and the cover, without feet and lugs."""
     end = motor_end(rig)
-    ends = [CrossSection.circle(end, 96).translate((rig.distance + dx, 0)) for dx in (-3.0, 3.0)]
+    ends = [CrossSection.circle(end, 96).translate((rig.distance + dx, 0)) for dx in (-SLIDE, SLIDE)]
     return CrossSection.batch_boolean([CrossSection.circle(rig.outline, SEGMENTS), *ends], ADD).hull()
 
 
 def lugs(rig: Rig) -> list[tuple[float, float]]:
     """Return the points of the M3 screws that hold the cover."""
-    end = motor_end(rig) + 3.5
-    return [*around(rig.outline + 3.5, (135, 225)), (rig.distance + 3, end), (rig.distance + 3, -end)]
+    end, middle = motor_end(rig), rig.distance + SLIDE
+    straight = math.degrees(math.acos((rig.outline - end) / middle))  # where the outline becomes round at the motor
+    at_motor = [(middle + x, y) for x, y in around(end + 3.5, (straight, -straight))]
+    return [*around(rig.outline + 3.5, (135, 225)), *at_motor]
 
 
 def cap_screws(rig: Rig) -> list[tuple[float, float]]:
-    """Return the points of the M3 screws that hold the bearing cap."""
-    return around(rig.bearing.outer / 2 + 3.5, (30, 150, 210, 330))
+    """Return the points of the M3 screws that hold the bearing cap. Their heads lie beside the rotor's flange."""
+    beside = rig.flange + rig.clearance + HEADS[3.0][0] / 2 + 0.1
+    return around(max(rig.bearing.outer / 2 + 3.5, beside), (70, 180, 290))
+
+
+def motor_points(rig: Rig) -> list[tuple[float, float]]:
+    """Return the points of the M3 screws that hold the motor on its plate. The pulley covers them."""
+    return [(rig.distance, side * rig.motor_screws[0] / 2) for side in (-1, 1)]
+
+
+def plate_screws(rig: Rig) -> list[tuple[float, float]]:
+    """Return the points of the M3 screws between the motor's plate and the housing, beside the motor's body."""
+    return [(rig.distance - 8.0, side * (rig.motor[0] / 2 + 3.0)) for side in (-1, 1)]
+
+
+def motor_plate(rig: Rig) -> Manifold:
+    """Return the plate of the motor, behind the housing. Its slots allow to tighten the belt from behind."""
+    low, high = rig.face_z - PLATE - MOTOR_PLATE, rig.face_z - PLATE
+    eyes = [CrossSection.circle(4.5, 48).translate((x + dx, y)) for x, y in plate_screws(rig) for dx in (-SLIDE, SLIDE)]
+    middle = CrossSection.circle(rig.motor_screws[0] / 2 + 4.5, 96).translate((rig.distance, 0))
+    out = CrossSection.batch_boolean([middle, *eyes], ADD).hull().extrude(high - low).translate((0, 0, low))
+    out -= holes([(rig.distance, 0)], rig.motor_screws[1] + 0.2, low - 1, high + 1)
+    out -= holes(motor_points(rig), 3.4, low - 1, high + 1) + sinks(motor_points(rig), 3.0, high)
+    return out - slots(plate_screws(rig), 3.4, SLIDE, low - 1, high + 1)
 
 
 def with_lugs(rig: Rig) -> CrossSection:
@@ -372,7 +463,7 @@ def with_lugs(rig: Rig) -> CrossSection:
 
 
 def housing(rig: Rig) -> Manifold:
-    """Return the housing: barrel of the bearings, plate with the motor's slots, foot."""
+    """Return the housing: barrel of the bearings, plate with a slot for the motor's shaft, foot."""
     bearing, face = rig.bearing, rig.face_z
     barrel = bearing.outer / 2 + 4.0
     out = with_lugs(rig).extrude(PLATE).translate((0, 0, face - PLATE)) + ring(0, barrel, 0, face)
@@ -382,10 +473,8 @@ def housing(rig: Rig) -> Manifold:
         out += box((x, x + 4), (-rig.height, -barrel * 0.5), (0, face))
     out -= rod(bearing.outer / 2 + 0.025, 2.0, face + 1, sides=SEGMENTS)
     out -= rod(bearing.outside, -1, 3, sides=SEGMENTS)
-    out -= slots([(rig.distance, 0)], rig.motor_screws[1] + 0.4, 3.0, face - PLATE - 1, face + 1)
-    pair = [(rig.distance, side * rig.motor_screws[0] / 2) for side in (-1, 1)]
-    out -= slots(pair, 3.4, 3.0, face - PLATE - 1, face + 1)
-    out -= holes([*cap_screws(rig), *lugs(rig)], 2.5, face - PLATE - 1, face + 1)
+    out -= slots([(rig.distance, 0)], rig.motor[2] + 2.0, SLIDE, face - PLATE - 1, face + 1)
+    out -= holes([*cap_screws(rig), *lugs(rig), *plate_screws(rig)], 2.5, face - PLATE - 1, face + 1)
     out -= holes(rear_plate_screws(rig), 1.6, -1, 8)
     return out - upright_holes(rig, foot_holes(rig), 3.3)
 
@@ -407,10 +496,13 @@ def upright_holes(rig: Rig, points: Iterable[tuple[float, float]], diameter: flo
 
 def cap(rig: Rig) -> Manifold:
     """Return the cap that clamps the front bearing's outer ring."""
-    half = rig.bearing.outer / 2
-    return ring(rig.bearing.outside, half + 6.5, rig.shoulder_z, rig.shoulder_z + 1.9) - holes(
-        cap_screws(rig), 3.4, 0, rig.pulley_z
-    )
+    outer = math.hypot(*cap_screws(rig)[0]) + 3.0
+    return ring(rig.bearing.outside, outer, rig.shoulder_z, cap_z(rig)) - holes(cap_screws(rig), 3.4, 0, rig.pulley_z)
+
+
+def cap_z(rig: Rig) -> float:
+    """Return the front face of the bearing cap."""
+    return rig.shoulder_z + 1.9
 
 
 def spacer(rig: Rig) -> Manifold:
@@ -421,21 +513,38 @@ def spacer(rig: Rig) -> Manifold:
 def rear_ring(rig: Rig) -> Manifold:
     """Return the ring that clamps the bearings' inner rings on the rotor."""
     low, high = rig.bearing_z[0] - 2.5, rig.bearing_z[0]
-    return ring(rig.clear, rig.bearing.inner, low, high) - holes(rear_screws(rig), 2.4, low - 1, high + 1)
+    out = ring(rig.clear, rig.bearing.inner, low, high) - holes(rear_screws(rig), 2.4, low - 1, high + 1)
+    return out - sinks(rear_screws(rig), 2.0, low, rear=True)
 
 
 def wedge_ring(rig: Rig) -> Manifold:
-    """Return the ring that holds the wedge, over an O-ring. It covers the set screws, so that none can fly out."""
+    """Return the ring that holds the wedge, over an O-ring: its lip is parallel to the tilted face of the wedge.
+
+    It covers the set screws, so that none can fly out. A notch shows where the thick edge belongs.
+    """
     low, high = rig.front_z, rig.front_z + 2.0
     outer = rig.pitch(rig.teeth[0]) + 1.0
-    return ring(rig.clear, outer, low, high) - holes(ring_screws(rig)[1], 2.4, low - 1, high + 1)
+    lip = beyond(rig, ring(rig.clear, rig.wedge / 2 + rig.seat - 0.15, rig.seat_z, low + 0.1), SQUEEZED)
+    out = ring(rig.clear, outer, low, high) + lip - holes(ring_screws(rig)[1], 2.4, low - 3, high + 1)
+    return out - rod(0.8, low - 1, high + 1, outer)
+
+
+def beyond(rig: Rig, solid: Manifold, distance: float) -> Manifold:
+    """Return what of a solid lies further than a distance in front of the wedge's tilted face."""
+    normal = (-math.sin(math.radians(rig.apex_deg)), 0.0, math.cos(math.radians(rig.apex_deg)))
+    return solid.trim_by_plane(normal, (rig.seat_z + rig.thickness) * normal[2] + distance)
+
+
+def o_ring(rig: Rig) -> Manifold:
+    """Return the squeezed O-ring."""
+    out = beyond(rig, ring(rig.o_ring, rig.wedge / 2 + rig.seat, rig.seat_z, rig.front_z + 1.0), 0.0)
+    return out - beyond(rig, out, SQUEEZED)
 
 
 def wedge(rig: Rig) -> Manifold:
     """Return the wedge. Its flat face points to the camera."""
     out = rod(rig.wedge / 2, rig.seat_z, rig.seat_z + 2 * rig.edge, sides=SEGMENTS)
-    normal = (-math.sin(math.radians(rig.apex_deg)), 0.0, math.cos(math.radians(rig.apex_deg)))
-    return out.trim_by_plane(tuple(-n for n in normal), -(rig.seat_z + rig.thickness) * normal[2])
+    return out - beyond(rig, out, 0.0)
 
 
 def cover(rig: Rig) -> Manifold:
@@ -451,9 +560,25 @@ def cover(rig: Rig) -> Manifold:
     z = rig.front_z - FLANGE / 2
     side, half = FORK_LENGTH / 2 + 0.4, FORK_WIDTH / 2 + 0.4
     out -= box((-side, side), (rig.outline - 10, rig.outline + 2), (z - half, z + half))
-    out -= slots([(rig.distance, 0)], 11.0, 3.0, inside - 1, high + 1)
-    board = [(rig.distance, y) for y in (-11.5, 11.5)]
-    return out - slots(board, 2.7, 3.0, inside - 1, high + 1)
+    out -= screw_holes(fork_screws(rig), 1.6, 5.0)
+    out -= slots([(rig.distance, 0)], 11.6, SLIDE, inside - 1, high + 1)
+    return out - slots(board_screws(rig), 2.7, SLIDE, inside - 1, high + 1)
+
+
+def fork_screws(rig: Rig) -> list[tuple[float, float, float]]:
+    """Return the points of the M2 screws that hold the fork barrier's board on the cover."""
+    return [(x, rig.outline + 1, rig.front_z - FLANGE / 2) for x in (-7.0, 7.0)]
+
+
+def screw_holes(points: Iterable[tuple[float, float, float]], diameter: float, depth: float) -> Manifold:
+    """Return round holes downwards from points, which begin 3 mm above them, to subtract."""
+    one = rod(diameter / 2, -depth, 3.0, sides=32).rotate((-90, 0, 0))
+    return Manifold.batch_boolean([one.translate(point) for point in points], ADD)
+
+
+def board_screws(rig: Rig) -> list[tuple[float, float]]:
+    """Return the points of the M2.5 screws that hold the encoder's board on the cover."""
+    return [(rig.distance, y) for y in (-11.5, 11.5)]
 
 
 def magnet_cup(rig: Rig) -> Manifold:
@@ -477,7 +602,8 @@ def rear_plate_screws(rig: Rig) -> list[tuple[float, float]]:
 def rear_plate(rig: Rig) -> Manifold:
     """Return the plate that closes the rear against light and fingers; a ring of black foam seals it to the lens."""
     out = ring(rig.lens / 2 + 1.0, rig.bearing.outer / 2 + 4.0, -2.0, 0.0)
-    return out - holes(rear_plate_screws(rig), 2.4, -3, 1)
+    out -= holes(rear_plate_screws(rig), 2.4, -3, 1)
+    return out - sinks(rear_plate_screws(rig), 2.0, -2.0, rear=True)
 
 
 def riser(rig: Rig) -> Manifold:
@@ -530,10 +656,10 @@ def belt(rig: Rig) -> Manifold:
 def motor(rig: Rig) -> Manifold:
     """Return the motor with its shaft."""
     body, length, shaft = rig.motor
-    rear = rig.face_z - PLATE
+    rear = rig.face_z - PLATE - MOTOR_PLATE
     out = rod(body / 2, rear - length, rear, sides=96)
     out += rod(rig.motor_screws[1] / 2, rear - 1, rear + 3) + rod(shaft / 2, rear, rig.front_z + 3.0)
-    return out.translate((rig.distance, 0, 0))
+    return out.translate((rig.distance, 0, 0)) - holes(motor_points(rig), 2.5, rear - 5.0, rear + 1)
 
 
 def motor_pulley(rig: Rig) -> Manifold:
@@ -553,14 +679,15 @@ def fork(rig: Rig) -> Manifold:
     out = box((-side, side), (top - FORK_DEPTH, top), (z - half, z + half))
     slot = FORK_SLOT / 2
     out -= box((-5, 5), (top - FORK_DEPTH - 1, top - FORK_DEPTH + FORK_SLOT_DEPTH), (z - slot, z + slot))
-    return out + box((-10, 10), (top, top + 1.6), (rig.cover_z - 15.0, rig.cover_z + 1.0))
+    board = box((-10, 10), (top, top + 1.6), (rig.cover_z - 15.0, rig.cover_z + 1.0))
+    return out + board - screw_holes(fork_screws(rig), 2.2, 1.0)
 
 
 def encoder(rig: Rig) -> Manifold:
     """Return the magnetic encoder's chip and board."""
     low = rig.cover_z + 2.0
     out = box((-2.5, 2.5), (-2.5, 2.5), (low - 1.1, low)) + box((-11, 11), (-14, 14), (low, low + 1.6))
-    return out.translate((rig.distance, 0, 0))
+    return out.translate((rig.distance, 0, 0)) - holes(board_screws(rig), 2.7, low - 1, low + 3)
 
 
 def lens(rig: Rig) -> Manifold:
@@ -576,40 +703,73 @@ def bearing_solids(rig: Rig) -> list[Manifold]:
     return [ring(made.bore / 2, made.outer / 2, z, z + made.width) for z in rig.bearing_z]
 
 
+def screw_solids(rig: Rig) -> list[tuple[str, str, Manifold, tuple[float, float, float]]]:
+    """Return the screws: name, what they move with, solids, and how far the exploded view moves them.
+
+    Left out are the set screws, and the screw of the camera.
+    """
+    behind, aside, up = (180.0, 0.0, 0.0), (-90.0, 0.0, 0.0), (90.0, 0.0, 0.0)
+    low, board = rig.face_z - PLATE, rig.cover_z + 3.6
+    nuts = holes(board_screws(rig), 5.5, rig.cover_z - 2.0, rig.cover_z)
+    nuts -= holes(board_screws(rig), 2.5, rig.cover_z - 3.0, rig.cover_z + 1.0)
+    fork = [(x, y + 1.6, z) for x, y, z in fork_screws(rig)]
+    foot = [(x, -rig.height - 6.0, z) for x, z in foot_holes(rig)]
+    cap_at, cover_at = at_z(cap_screws(rig), cap_z(rig)), at_z(lugs(rig), rig.face_z + 4.0)
+    ring_at, rear_at = at_z(ring_screws(rig)[1], rig.front_z + 2.0), at_z(rear_screws(rig), rig.bearing_z[0] - 2.5)
+    light_at, motor_at = at_z(rear_plate_screws(rig), -2.0), at_z(motor_points(rig), low)
+    plate_at, board_at = at_z(plate_screws(rig), low - MOTOR_PLATE), at_z(board_screws(rig), board)
+    return [
+        ("screws of the cap", "", screws(3.0, 6.0, 1.9, cap_at), (0, 0, 64)),
+        ("screws of the cover", "", screws(3.0, 8.0, 4.0, cover_at), (0, 0, 132)),
+        ("screws of the wedge ring", "prism", screws(2.0, 8.0, 2.0, ring_at), (0, 0, 106)),
+        ("screws of the rear ring", "prism", screws(2.0, 8.0, 2.5, rear_at, behind, sunk=True), (0, 0, 12)),
+        ("screws of the rear plate", "", screws(2.0, 6.0, 2.0, light_at, behind, sunk=True), (0, 0, -30)),
+        ("screws of the motor", "", screws(3.0, 8.0, MOTOR_PLATE, motor_at, sunk=True), (0, 0, -8)),
+        ("screws of the motor plate", "", screws(3.0, 8.0, MOTOR_PLATE, plate_at, behind), (0, 0, -20)),
+        ("screws of the base", "", screws(4.0, 12.0, 6.0, foot, up), (0, -42, 0)),
+        ("screws of the fork barrier", "", screws(2.0, 5.0, 1.6, fork, aside), (0, 38, 120)),
+        ("screws of the encoder board", "", screws(2.5, 8.0, 8.0, board_at) + nuts, (0, 0, 146)),
+    ]
+
+
 @lru_cache(maxsize=4)
 def assembly(rig: Rig) -> tuple[Part, ...]:
     """Return all parts in their places."""
 
-    def printed(name: str, solid: Manifold, turns: bool, apart: tuple[float, float, float]) -> Part:
+    def printed(name: str, solid: Manifold, moves: str, apart: tuple[float, float, float]) -> Part:
         solid = solid.simplify(2e-3)  # the files have float32 numbers: no edge may be shorter than they resolve
-        return Part(name, solid, "printed", turns, solid.volume() * PETG, apart)
+        return Part(name, solid, "printed", moves, solid.volume() * PETG, apart)
 
     glass = wedge(rig)
     rear, front = bearing_solids(rig)
     mass = rig.bearing.mass
+    rubber = o_ring(rig)
     magnet = rod(3.0, magnet_z(rig) - 2.0, magnet_z(rig), rig.distance)
     return (
-        printed("base", base(rig), False, (0, -30, 0)),
-        printed("riser", riser(rig), False, (0, -12, -62)),
-        Part("camera with lens", lens(rig), "bought", False, 130.0, (0, 0, -62)),
-        printed("rear plate", rear_plate(rig), False, (0, 0, -24)),
-        Part("motor", motor(rig), "bought", False, 90.0 if rig.motor[0] < 30 else 160.0, (0, 0, -10)),
-        printed("housing", housing(rig), False, (0, 0, 0)),
-        printed("rear ring", rear_ring(rig), True, (0, 0, 18)),
-        Part("rear bearing", rear, "bought", False, mass, (0, 0, 32)),
-        printed("spacer", spacer(rig), True, (0, 0, 40)),
-        Part("front bearing", front, "bought", False, mass, (0, 0, 48)),
-        printed("bearing cap", cap(rig), False, (0, 0, 58)),
-        printed("rotor", rotor(rig), True, (0, 0, 72)),
-        Part("belt", belt(rig), "bought", False, 4.0, (0, 0, 72)),
-        printed("motor pulley", motor_pulley(rig), False, (0, 0, 72)),
-        printed("magnet cup", magnet_cup(rig), False, (0, 0, 82)),
-        Part("magnet", magnet, "bought", False, magnet.volume() * 7.5e-3, (0, 0, 92)),
-        Part("wedge", glass, "glass", True, glass.volume() * GLASS, (0, 0, 88)),
-        printed("wedge ring", wedge_ring(rig), True, (0, 0, 100)),
-        printed("cover", cover(rig), False, (0, 0, 120)),
-        Part("fork barrier", fork(rig), "bought", False, 2.0, (0, 30, 120)),
-        Part("encoder board", encoder(rig), "bought", False, 4.0, (0, 0, 138)),
+        printed("base", base(rig), "", (0, -30, 0)),
+        printed("riser", riser(rig), "", (0, -12, -62)),
+        Part("camera with lens", lens(rig), "bought", "", 130.0, (0, 0, -62)),
+        printed("rear plate", rear_plate(rig), "", (0, 0, -24)),
+        Part("motor", motor(rig), "bought", "", 90.0 if rig.motor[0] < 30 else 160.0, (0, 0, -24)),
+        printed("housing", housing(rig), "", (0, 0, 0)),
+        printed("rear ring", rear_ring(rig), "prism", (0, 0, 18)),
+        Part("rear bearing", rear, "bought", "", mass, (0, 0, 32)),
+        printed("spacer", spacer(rig), "prism", (0, 0, 40)),
+        Part("front bearing", front, "bought", "", mass, (0, 0, 48)),
+        printed("bearing cap", cap(rig), "", (0, 0, 58)),
+        printed("rotor", rotor(rig), "prism", (0, 0, 72)),
+        Part("belt", belt(rig), "bought", "belt", 4.0, (0, 0, 72)),
+        printed("motor pulley", motor_pulley(rig), "motor", (0, 0, 72)),
+        printed("magnet cup", magnet_cup(rig), "motor", (0, 0, 82)),
+        Part("magnet", magnet, "bought", "motor", magnet.volume() * 7.5e-3, (0, 0, 92)),
+        Part("wedge", glass, "glass", "prism", glass.volume() * GLASS, (0, 0, 88)),
+        printed("wedge ring", wedge_ring(rig), "prism", (0, 0, 100)),
+        printed("cover", cover(rig), "", (0, 0, 120)),
+        Part("fork barrier", fork(rig), "bought", "", 2.0, (0, 30, 120)),
+        Part("encoder board", encoder(rig), "bought", "", 4.0, (0, 0, 138)),
+        printed("motor plate", motor_plate(rig), "", (0, 0, -14)),
+        Part("O-ring", rubber, "bought", "prism", rubber.volume() * RUBBER, (0, 0, 94)),
+        *(Part(n, each, "screws", moves, each.volume() * STEEL, apart) for n, moves, each, apart in screw_solids(rig)),
     )
 
 
@@ -617,23 +777,38 @@ TOUCHES = 1e-3
 """Largest volume by which two parts may overlap, as circles have corners [mm³]."""
 
 
-def problems(rig: Rig, made: Iterable[Part]) -> list[str]:
-    """Return what is wrong with the solids: pieces, overlaps, and gaps between what turns and what does not."""
+def swept(solid: Manifold, x: float = 0.0) -> Manifold:
+    """Return the space that a solid passes when it turns about the axis along z at x: its half cuts, turned."""
+    half = CrossSection.square((1e3, 2e3)).translate((0.0, -1e3))
+    upright = solid.translate((-x, 0, 0))
+    cuts = [upright.rotate((0, 0, 7.5 * k)).rotate((-90, 0, 0)).slice(0.0) ^ half for k in range(48)]
+    profile = CrossSection.batch_boolean(cuts, ADD)
+    return profile.revolve(SEGMENTS).translate((x, 0, 0))
+
+
+def problems(rig: Rig, made: Sequence[Part]) -> list[str]:
+    """Return what is wrong with the solids: pieces, overlaps, and gaps between what moves and what does not."""
     out = []
     for part in made:
         if len(part.solid.decompose()) != 1 and part.kind == "printed":
             out.append(f"{part.name} is in several pieces")
-    for one, other in itertools.combinations(made, 2):
-        overlap = (one.solid ^ other.solid).volume()
+    axes = {"prism": 0.0, "motor": rig.distance}
+    passed = [swept(part.solid, axes[part.moves]) if part.moves in axes else part.solid for part in made]
+    for (one, first), (other, second) in itertools.combinations(zip(made, passed, strict=True), 2):
+        names = {one.name, other.name}
+        fits = one.moves == other.moves or bool(FITS & names) or names in RUNS
+        overlap = (one.solid ^ other.solid if fits else first ^ second).volume()
         if overlap > TOUCHES:
             out.append(f"{one.name} and {other.name} overlap by {overlap:.3f} mm³")
-        if one.turns == other.turns or FITS.intersection((one.name, other.name)):
+        if fits:
             continue
-        gap = one.solid.min_gap(other.solid, rig.clearance)
+        gap = first.min_gap(second, rig.clearance)
         if gap < rig.clearance - 1e-4:
             out.append(f"{one.name} and {other.name} are {gap:.2f} mm apart, less than {rig.clearance} mm")
     return out
 
 
-FITS = {"rear bearing", "front bearing", "belt"}
+FITS = {"rear bearing", "front bearing"}
 """Parts that touch what turns and what does not."""
+RUNS = ({"belt", "rotor"}, {"belt", "motor pulley"}, {"motor", "motor pulley"}, {"motor", "magnet cup"})
+"""Pairs that touch, though they do not move in the same way."""

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip("manifold3d", reason="the rig's parts need manifold3d: pip install 'amiwarp[rig]'")
+from manifold3d import Manifold
+
 trimesh = pytest.importorskip("trimesh", reason="the rig's parts need trimesh: pip install 'amiwarp[rig]'")
 
 from rig import __main__ as command  # noqa: E402
@@ -49,6 +51,90 @@ def test_an_overlap_a_narrow_gap_and_a_loose_piece_are_seen(made: Sequence[Part]
     assert any("pieces" in text for text in parts.problems(rig, [pieces]))
 
 
+def replaced(made: Sequence[Part], name: str, solid: Manifold) -> list[Part]:
+    """Return the parts with another solid for one of them."""
+    assert name in {part.name for part in made}
+    return [replace(part, solid=solid) if part.name == name else part for part in made]
+
+
+def test_a_screw_head_under_the_flange_is_seen() -> None:
+    """The cap's screws 3.5 mm outside the bearing, as in a first design: the flange of the one-inch rotor hits them."""
+    made, z = parts.assembly(ONE_INCH), parts.cap_z(ONE_INCH)
+    inner = parts.at_z(parts.around(ONE_INCH.bearing.outer / 2 + 3.5, (30, 150, 210, 330)), z)
+    wrong = parts.problems(ONE_INCH, replaced(made, "screws of the cap", parts.screws(3.0, 6.0, 1.9, inner)))
+    assert any(text.startswith("rotor and screws of the cap overlap") for text in wrong)
+
+
+def test_heads_that_stand_out_are_seen(rig: Rig, made: Sequence[Part]) -> None:
+    """Cylinder heads on the rear ring touch the rear plate, and under the motor's pulley they touch that."""
+    behind, low = (180.0, 0.0, 0.0), rig.bearing_z[0] - 2.5
+    ring = parts.screws(2.0, 8.0, 2.5, parts.at_z(parts.rear_screws(rig), low), behind)
+    wrong = parts.problems(rig, replaced(made, "screws of the rear ring", ring))
+    assert any(text.startswith("rear plate and screws of the rear ring overlap") for text in wrong)
+    on_face = parts.screws(3.0, 8.0, 5.0, parts.at_z(parts.motor_points(rig), rig.face_z))
+    wrong = parts.problems(rig, replaced(made, "screws of the motor", on_face))
+    assert any(text.startswith("motor pulley and screws of the motor overlap") for text in wrong)
+
+
+def test_a_screw_that_is_too_long_is_seen(rig: Rig, made: Sequence[Part]) -> None:
+    """The rear plate's threads end 8 mm deep; a longer screw of the fork barrier reaches the flag's path."""
+    at = parts.at_z(parts.rear_plate_screws(rig), -2.0)
+    long = parts.screws(2.0, 12.0, 2.0, at, (180.0, 0.0, 0.0), sunk=True)
+    wrong = parts.problems(rig, replaced(made, "screws of the rear plate", long))
+    assert any(text.startswith("housing and screws of the rear plate overlap") for text in wrong)
+    board = [(x, y + 1.6, z) for x, y, z in parts.fork_screws(rig)]
+    long = parts.screws(2.0, 8.0, 1.6, board, (-90.0, 0.0, 0.0))
+    wrong = parts.problems(rig, replaced(made, "screws of the fork barrier", long))
+    assert any(text.startswith("rotor and screws of the fork barrier") for text in wrong)
+
+
+def test_a_key_reaches_the_screws_that_tighten_the_belt(rig: Rig, made: Sequence[Part]) -> None:
+    """From behind, wherever the motor stands. From the front, the pulley covers the motor's own screws."""
+    face = rig.face_z - parts.PLATE - parts.MOTOR_PLATE - parts.HEADS[3.0][1]
+    key = parts.holes(parts.plate_screws(rig), 2.9, face - 100.0, face)
+    sliding = {"motor", "motor plate", "screws of the motor"}
+    for travel in (-parts.SLIDE, 0.0, parts.SLIDE):
+        for part in made:
+            solid = part.solid.translate((travel, 0, 0)) if part.name in sliding else part.solid
+            assert (solid ^ key).volume() < 1e-9, part.name
+    front = parts.holes(parts.motor_points(rig), 2.9, rig.face_z, rig.front_z)
+    pulley = next(part for part in made if part.name == "motor pulley")
+    assert (pulley.solid ^ front).volume() > 1.0
+
+
+@pytest.mark.parametrize("travel", [-parts.SLIDE, parts.SLIDE])
+def test_the_motor_slides_and_touches_nothing(rig: Rig, made: Sequence[Part], travel: float) -> None:
+    sliding = {"motor", "motor plate", "screws of the motor", "encoder board", "screws of the encoder board"}
+    moved = []
+    for part in made:
+        if part.moves == "motor":
+            swept = parts.swept(part.solid, rig.distance).translate((travel, 0, 0))
+            moved.append(replace(part, solid=swept, moves="motor, slid"))
+        elif part.name in sliding:
+            moved.append(replace(part, solid=part.solid.translate((travel, 0, 0))))
+        elif part.moves != "belt":
+            moved.append(part)
+    assert parts.problems(rig, moved) == []
+
+
+def test_swept_space_of_a_box() -> None:
+    """A box off the axis passes a ring: up to its far corners, and down to its near face."""
+    solid = parts.box((10.0, 12.0), (-1.0, 1.0), (0.0, 3.0)).translate((5.0, 0, 0))
+    low, high = np.array(parts.swept(solid, 5.0).bounding_box()).reshape(2, 3)
+    assert (low[2], high[2]) == pytest.approx((0.0, 3.0))
+    assert high[0] - 5.0 == pytest.approx(math.hypot(12.0, 1.0), rel=5e-3)
+    assert parts.swept(solid, 5.0).volume() == pytest.approx(3 * math.pi * (145.0 - 100.0), rel=0.03)
+
+
+@pytest.mark.parametrize("apex", [0.5, 1.0, 2.0])
+def test_the_o_ring_leaves_the_aperture_clear(rig: Rig, apex: float) -> None:
+    """Squeezed to 0.75 mm, and as thick all around, whatever the apex."""
+    own = replace(rig, apex_deg=apex)
+    assert own.o_ring >= own.clear
+    rubber = parts.o_ring(own)
+    assert rubber.volume() == pytest.approx(math.pi * (own.wedge / 2 + own.seat - 0.52) * 2 * math.pi * 0.25, rel=0.01)
+
+
 def test_volumes(rig: Rig, made: Sequence[Part]) -> None:
     """Regular polygons of 180 sides are smaller than their circles by 2e-4."""
     volume = {part.name: numbers.to_mesh(part).volume for part in made}
@@ -72,8 +158,8 @@ def test_bearings_and_belt_fit(rig: Rig) -> None:
 def test_written_files_are_watertight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command.main([str(tmp_path), "--rig", "one-inch"])
     files = sorted((tmp_path / "one-inch").glob("*.stl"))
-    assert len(files) == 12
-    assert "12 parts to print" in capsys.readouterr().out
+    assert len(files) == 13
+    assert "13 parts to print" in capsys.readouterr().out
     for file in files:
         mesh = trimesh.load(file)
         assert mesh.is_watertight, file.name
