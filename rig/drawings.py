@@ -162,7 +162,8 @@ def drawing(rig: Rig, made: Sequence[Part], out: Path) -> None:
     dimension(rotor, (rig.pulley_z, y), (rig.front_z, y), number(rig.front_z - rig.pulley_z), -5)
     dimension(rotor, (rig.seat_z, -y), (rig.front_z, -y), number(rig.front_z - rig.seat_z), 5)
 
-    fill(cover, solids["cover"].project(), COLOURS["cover"])
+    shadow = solids["cover"].project().offset(0.05).offset(-0.05)  # closes slivers of the projection
+    fill(cover, shadow, COLOURS["cover"])
     size = f"⌀ {number(2 * rig.outline)}, depth {number(rig.cover_z + 2 - rig.face_z)}"
     inner = CrossSection.circle(rig.opening, 180)
     fill(cover, inner, "white", 0.9)
