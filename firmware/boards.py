@@ -131,6 +131,10 @@ class SimulatedBoard:
         """Reset the chip."""
         self._ask("reset")
 
+    def hang(self, where: str) -> None:
+        """Let the program hang in its main ``loop`` or its ``tick``'s interrupt, or stop the ticks (``no-tick``)."""
+        self._ask(f"hang {where}")
+
     def close(self) -> None:
         """End the simulator."""
         self._process.communicate()

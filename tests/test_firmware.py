@@ -1,16 +1,21 @@
 """The firmware's core, compiled for this computer: protocol, encoders, speed control, faults. Skipped without gcc."""
 
+import contextlib
 import ctypes
 import importlib.util
 import itertools
+import json
 import math
 import random
 import shutil
 import subprocess
 import sys
+import threading
+import time
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from queue import SimpleQueue
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -18,10 +23,14 @@ import numpy as np
 import pytest
 from cobs import cobs
 
+from amiwarp import AmiwarpError
+from amiwarp.cli import rig
+from amiwarp.live.link import link as link_module
 from amiwarp.live.link import protocol
 from amiwarp.live.link.clocks import WRAP
 from amiwarp.live.link.conformance import check_controller
-from amiwarp.live.link.link import Follower, LinkUpdate
+from amiwarp.live.link.emulator import PseudoTerminal
+from amiwarp.live.link.link import Follower, Link, LinkUpdate
 from amiwarp.live.link.protocol import (
     Answer,
     ControllerStatus,
@@ -37,7 +46,8 @@ from amiwarp.live.link.protocol import (
     Sync,
     encode,
 )  # fmt: skip
-from tests.test_conformance import VirtualWire
+from tests.rig_world import LONG_S, Wire, World
+from tests.test_conformance import VirtualWire, motor
 
 FIRMWARE = Path(__file__).parents[1] / "firmware"
 pytestmark = [
@@ -103,6 +113,13 @@ class Host:
         """Send a command; return the reason of its refusal, or None without an answer."""
         number = self.send(message)
         return next((m.refused for m in self.run(0.05) if isinstance(m, Answer) and m.sequence == number), None)
+
+    def run_until(self, true: Callable[[], bool], seconds: float) -> None:
+        """Advance until the condition is true, for at most ``seconds``."""
+        end = self.board.now + seconds * S
+        while not true():
+            assert self.board.now < end
+            self.run(0.02)
 
     @property
     def status(self) -> ControllerStatus:
@@ -372,10 +389,12 @@ def test_a_reset_stops_the_motor_and_the_host_reports_it(board: Callable[..., An
     host, follower = Host(board()), Follower("port")
     follower.opened(0)
     host.command(SetSpeed(600.0, 3000.0))
-    for step in range(400):
+    for step in range(1000):
         if step == 200:
             host.board.reset()
         follower.feed(host.board.advance(host.board.now + 5000), host.board.now + 400)
+        if step == 300:  # it is not driven, not even to brake
+            assert 400.0 < host.board.get("rpm") < 550.0
     messages: list[str] = []
     update: LinkUpdate | None = None
     while update is None or len(update.t_us) or update.messages:
@@ -384,7 +403,7 @@ def test_a_reset_stops_the_motor_and_the_host_reports_it(board: Callable[..., An
     assert any("the controller was reset" in m for m in messages)
     assert follower.status is not None
     assert (follower.status.state, follower.status.target_rpm) == (0, 0.0)
-    assert host.board.get("rpm") < 300.0
+    assert host.board.get("rpm") == 0.0
 
 
 # Damaged lines.
@@ -451,25 +470,154 @@ def test_fuzzed_frames_and_commands(build: Path) -> None:
     assert done.stdout.startswith("100000 frames")
 
 
+# Over a pseudo-terminal, with the host's own programs.
+
+
+class Desk:
+    """A board behind a pseudo-terminal, on a simulated clock that waits for the open link and stands still without one.
+
+    Only the terminal's thread uses the board, see :meth:`do`. ``damage`` changes the bytes of both directions.
+    """
+
+    plugged = True
+
+    def __init__(self, board: Any, path: Path) -> None:
+        self.board, self.damage = board, bytes
+        self.shaft: list[tuple[int, float]] = []
+        self._actions: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._running = threading.Event()
+        self.world = World(self._running.is_set)
+        self.terminal = PseudoTerminal(self, path, now_us=self.world.step)  # type: ignore[arg-type]
+
+    def advance(self, now_us: int) -> bytes:
+        while not self._actions.empty():
+            self._actions.get()()
+        if now_us <= self.board.now:
+            return b""
+        data = self.damage(self.board.advance(now_us))
+        self.shaft.append((self.board.now, self.board.get("angle")))
+        return data
+
+    def feed(self, data: bytes, now_us: int) -> None:
+        if data:
+            self.board.feed(self.damage(data), now_us)
+
+    def do(self, action: Callable[[], None]) -> None:
+        """Run ``action`` in the terminal's thread."""
+        self._actions.put(action)
+
+    @contextlib.contextmanager
+    def link(self, port: object = None) -> Iterator[Link]:
+        with Link(self.terminal.name, host_us=self.world.now) as link:
+            self.world.conditions[1:] = [Wire(link, self.terminal)]
+            self._running.set()
+            try:
+                yield link
+            finally:
+                self._running.clear()
+
+
+def noise(seed: int) -> Callable[[bytes], bytes]:
+    rng = random.Random(seed)
+    return lambda data: bytes(b ^ (rng.random() < 0.004) for b in data if rng.random() > 0.004)
+
+
+def wait(true: Callable[[], object]) -> None:
+    end = time.monotonic() + LONG_S
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+@pytest.fixture(params=["board", "chip"])
+def desk(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Desk]:  # the core, and the image if there is a simulator
+    monkeypatch.setattr(link_module, "ANSWER_S", LONG_S)
+    monkeypatch.setattr(rig, "WAIT_S", LONG_S)
+    desk = Desk(request.getfixturevalue(request.param)(), tmp_path / "prism")
+    monkeypatch.setattr(rig, "Link", desk.link)
+    with desk.terminal:
+        yield desk
+
+
+def is_at(link: Link, state: int, target_rpm: float) -> bool:
+    status = link.status
+    return status is not None and (status.state, status.target_rpm, status.faults) == (state, target_rpm, 0)
+
+
+def test_the_link_through_damage_and_a_reset(desk: Desk) -> None:
+    news: list[LinkUpdate] = []
+
+    def said() -> str:
+        news.append(link.poll())
+        return "\n".join(m for n in news for m in n.messages)
+
+    with desk.link() as link:
+        link.set_speed(600.0, 2000.0)
+        wait(lambda: is_at(link, 1, 600.0))
+        with pytest.raises(AmiwarpError, match="out of range"):
+            link.set_speed(3500.0, 100.0)
+        desk.damage = noise(4)
+        wait(lambda: link._follower._connection.decoder.received.damaged > 20)
+        desk.damage = bytes
+        sent = link._number
+        wait(lambda: link._number > sent + 2)
+        assert is_at(link, 1, 600.0)
+        said()
+        assert not any(n.restarted for n in news)
+        t, angle = (np.concatenate([getattr(n, name) for n in news]) for name in ("t_us", "angle"))
+        assert len(t) > 300
+        error = np.interp(t, *np.array(desk.shaft).T) - angle
+        error = (error + math.pi) % math.tau - math.pi
+        assert np.abs(error).max() < 0.02  # eccentricity of the disc, and interpolation over 4 ms
+        desk.do(desk.board.reset)
+        wait(lambda: "the controller was reset" in said())
+        wait(lambda: link.status is not None and link.status.target_rpm == 0.0)
+        link.set_speed(-300.0, 4000.0)
+        wait(lambda: is_at(link, 1, -300.0))
+        link.stop()
+        wait(lambda: is_at(link, 0, 0.0))
+
+
+def test_the_command_sets_shows_and_stops(desk: Desk) -> None:
+    done = motor("set", "--rpm", -300, "--ramp-rpm-s", 5000, "--port", "prism", "--json")
+    assert json.loads(done.stdout)["target_rpm"] == -300.0
+    wait(lambda: "at speed" in motor("status", "--port", "prism").stdout)
+    data = json.loads(motor("stop", "--port", "prism", "--json").stdout)
+    assert (data["target_rpm"], data["answers"]) == (0.0, True)
+    wait(lambda: "stopped" in motor("status", "--port", "prism").stdout)
+
+
 # The image for the RP2040 in a simulator of the chip.
 
 
-@pytest.fixture
-def chip(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Any]]:
-    """Start the simulator on an image that is built for an encoder."""
+@pytest.fixture(scope="module")
+def images(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Path]:
+    """Build the image for an encoder and a source of pulses."""
     if shutil.which("arm-none-eabi-gcc") is None:
         pytest.skip("needs arm-none-eabi-gcc (Debian: gcc-arm-none-eabi)")
     if shutil.which("node") is None or not (FIRMWARE / "simulator" / "node_modules" / "rp2040js").is_dir():
         pytest.skip("needs Node.js, and rp2040js: npm install --prefix firmware/simulator")
-    folder, started = tmp_path_factory.mktemp("rp2040"), []
+    folder = tmp_path_factory.mktemp("rp2040")
 
-    def start(encoder: str = "QUADRATURE", pulses: str = "PULSES_TIMED") -> Any:
+    def build(encoder: str, pulses: str) -> Path:
         options = (f"BUILD={folder}", f"ENCODER={encoder}", f"PULSES={pulses}", f"PYTHON={sys.executable}")
         make = ("make", "-s", "-C", str(FIRMWARE), *options, "rp2040")
         done = subprocess.run(make, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
-        image = folder / f"prism-{encoder}-{pulses}.bin"
-        started.append(load("boards").SimulatedBoard(image, magnetic=encoder == "MAGNETIC"))
+        return folder / f"prism-{encoder}-{pulses}.bin"
+
+    return build
+
+
+@pytest.fixture
+def chip(images: Callable[[str, str], Path]) -> Iterator[Callable[..., Any]]:
+    """Start the simulator on an image."""
+    started = []
+
+    def start(encoder: str = "QUADRATURE", pulses: str = "PULSES_TIMED") -> Any:
+        started.append(load("boards").SimulatedBoard(images(encoder, pulses), magnetic=encoder == "MAGNETIC"))
         return started[-1]
 
     yield start
@@ -539,3 +687,68 @@ def test_the_image_with_each_source_of_pulses_and_each_encoder(chip: Callable[..
         host.board.set("bad_spi")
         host.run(0.05)
         assert host.status.faults == FAULT["encoder lost"]
+
+
+@pytest.mark.parametrize(
+    ("switch", "fault", "encoder"),
+    [
+        ("jammed", "stall", "QUADRATURE"), ("driver_fault", "over-current", "QUADRATURE"),
+        ("dead_a", "encoder lost", "QUADRATURE"), ("bad_spi", "encoder lost", "MAGNETIC"),
+        ("reversed_motor", "over-speed", "QUADRATURE"), ("runaway", "over-speed", "MAGNETIC"),
+    ],
+)  # fmt: skip
+def test_the_image_stops_the_motor_for_a_fault(chip: Callable[..., Any], switch: str, fault: str, encoder: str) -> None:
+    host = Host(chip(encoder))
+    assert host.command(SetSpeed(400.0, 4000.0)) == 0
+    host.run(0.3)
+    assert (host.status.faults, host.board.get("enable")) == (0, True)
+    host.board.set(switch)
+    host.run_until(lambda: host.status.state == 3, 1.5)
+    assert (host.status.faults, host.status.target_rpm, host.board.get("enable")) == (FAULT[fault], 0.0, False)
+    assert host.command(SetSpeed(100.0, 100.0)) == 3
+    host.board.set(switch, 0)
+    host.run_until(lambda: abs(host.board.get("rpm")) < 2500.0, 8.0)  # it runs down
+    assert host.command(Stop()) == 0
+    host.run_until(lambda: host.status.state == 0, 2.0)
+    assert (host.status.faults, host.command(SetSpeed(100.0, 1000.0))) == (0, 0)
+
+
+def test_the_image_reports_a_missing_index_and_a_silent_host(chip: Callable[..., Any]) -> None:
+    host = Host(chip())
+    host.command(SetSpeed(400.0, 4000.0))
+    host.run_until(lambda: host.status.state == 1, 2.0)
+    host.board.set("no_index")
+    host.run_until(lambda: host.status.faults != 0, 0.5)
+    assert (host.status.faults, host.status.target_rpm, host.board.get("enable")) == (
+        FAULT["index missed"],
+        400.0,
+        True,
+    )
+    host.board.set("no_index", 0)
+    host.run_until(lambda: host.status.faults == 0, 0.5)
+    host.messages += [m for _, m in host.decoder.feed(host.board.advance(host.board.now + 3_200_000))]
+    assert (host.status.faults, host.status.target_rpm, host.board.get("enable")) == (FAULT["host lost"], 400.0, True)
+    host.run_until(lambda: host.status.faults == 0, 0.5)
+
+
+@pytest.mark.parametrize("where", ["loop", "tick", "no-tick"])
+def test_the_watchdog_ends_a_hang_of_the_image(chip: Callable[..., Any], where: str) -> None:
+    host = Host(chip())
+    host.command(SetSpeed(400.0, 4000.0))
+    host.run(0.2)
+    before = host.board.get("fed")["times"]
+    host.run(0.2)
+    assert abs(host.board.get("fed")["times"] - before - 200) <= 1  # once per tick
+    assert host.board.get("watchdog_resets") == 0x1FFFC  # all but the oscillators
+    host.board.hang(where)
+    host.run(0.09)
+    assert (host.board.get("watchdogs"), host.board.get("enable")) == (0, True)
+    last = host.board.get("fed")["last_us"]
+    assert host.board.now - last > 88_000
+    host.run(0.05)
+    assert host.board.get("watchdogs") == 1
+    assert host.board.get("boot_us") - last == pytest.approx(100_000, abs=10)
+    host.run(0.3)
+    assert (host.board.get("enable"), len(host.board.get("enabled_us"))) == (False, 1)  # no pulse in the start
+    assert (host.decoder.received.restarts, host.status.target_rpm, host.status.faults) == (1, 0.0, 0)
+    assert host.command(SetSpeed(100.0, 1000.0)) == 0

@@ -176,7 +176,7 @@ static void take_sample(struct controller *c, struct stamp at) {
     c->batch[c->batched++] = at;
     if (c->batched == BATCH) flush(c);
     protect(c);
-    if (c->faults & STOPPING) return;
+    if ((c->faults & STOPPING) || !c->commanded) return; /* after a reset, the motor is off until a command */
     c->duty = speed_step(&c->control, c->speed);
     c->enabled = c->duty != 0 || c->control.target != 0;
 }
@@ -195,12 +195,14 @@ static uint8_t set_speed(struct controller *c, const uint8_t *payload) {
     c->control.ramp = ramp > 0 ? ramp : 1;
     c->target_bits = rpm == 0 ? 0 : bits;
     c->bad_turns = 0;
+    c->commanded = true;
     return REFUSED_ACCEPTED;
 }
 
 static uint8_t stop(struct controller *c) {
     c->faults &= (uint16_t)~STOPPING;
     c->over_ms = c->runaway_ms = c->stalled_ms = c->current_ms = c->bad_turns = 0;
+    c->commanded = true;
     c->control.target = 0;
     c->control.ramp = RPM(c->settings.stop_ramp) / TICK_HZ;
     c->target_bits = 0;

@@ -76,7 +76,7 @@ struct controller {
     uint16_t faults, sent_faults;
     uint8_t batched, state, sent_state, still;
     int32_t speed;
-    bool indexed, sampled, told, driver_fault;
+    bool indexed, sampled, told, driver_fault, commanded;
 };
 
 void controller_begin(struct controller *c, const struct settings *settings, uint32_t now);

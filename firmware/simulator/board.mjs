@@ -1,7 +1,8 @@
 // Runs a flash image on rp2040js, with a simulated motor and encoder, in steps that the caller asks for.
 //
 // Lines on standard input: "run UNTIL_US HEX" gives bytes to the UART and runs; the answer is "NOW_US HEX", the time
-// and the bytes sent. "set NAME VALUE" switches a fault, "get NAME" reads a value, "reset" resets the chip.
+// and the bytes sent. "set NAME VALUE" switches a fault, "get NAME" reads a value, "reset" resets the chip, "hang WHERE"
+// lets the program hang until a reset.
 import { readFileSync } from 'node:fs';
 import { createInterface } from 'node:readline';
 import { RP2040 } from 'rp2040js';
@@ -16,7 +17,7 @@ const faults = { jammed: 0, driver_fault: 0, no_index: 0, dead_a: 0, reversed_mo
 
 let mcu, clock, cycleNs = 8, out = [], inbox = [], arrivesNs = 0, resets = 0, watchdogs = 0;
 let turns = 0.3, rpm = 0, position = Math.floor(turns * perTurn), inPulse = false, random = 1;
-let indexNs = [], triggerNs = [];
+let indexNs = [], triggerNs = [], enabledNs = [], fed = { times: 0, last_us: 0 };
 const worst = {}, busy = {};  // cycles by number of the exception
 
 const uniform = () => { random = (Math.imul(random, 1664525) + 1013904223) >>> 0; return (random >>> 8) / 8388608 - 1; };
@@ -41,11 +42,20 @@ function boot() {
     if (word === 0xffff) angle = frame();
     mcu.spi[0].completeTransmit(faults.bad_spi ? answer ^ 1 : answer);
   };
-  const watchdog = mcu.peripherals[0x40058];
-  watchdog.onWatchdogTrigger = () => { watchdogs++; boot(); };
+  const watchdog = mcu.peripherals[0x40058], write = watchdog.writeUint32.bind(watchdog);
+  watchdog.onWatchdogTrigger = () => {
+    watchdog.alarm.enable = false;  // otherwise it would expire again and again at this time
+    watchdogs++;
+    boot();
+  };
+  watchdog.writeUint32 = (register, value) => {
+    if (register === 4) fed = { times: fed.times + 1, last_us: now() / 1000 };
+    write(register, value);
+  };
   for (const name of ['a', 'b', 'index', 'sync']) mcu.gpio[PIN[name]].setInputValue(false);
   mcu.gpio[PIN.fault].setInputValue(!faults.driver_fault);
   mcu.gpio[PIN.trigger].addListener((value) => { if (value === 1) triggerNs.push(now()); });
+  mcu.gpio[PIN.enable].addListener((value) => { if (value === 1) enabledNs.push(now()); });
   const core = mcu.core, enter = core.exceptionEntry.bind(core), leave = core.exceptionReturn.bind(core), stack = [];
   core.exceptionEntry = (number) => { stack.push([number, core.cycles, 0]); enter(number); };
   core.exceptionReturn = (value) => {
@@ -73,6 +83,22 @@ function levels() {
       if (pulse === rpm > 0) indexNs.push(now());
       set(PIN.index, pulse);
     }
+  }
+}
+
+const ENDLESS = 0x20041000;  // RAM that the program does not use
+
+function hang(where) {  // the main loop or the tick's interrupt never ends, or the tick's interrupt never comes
+  const core = mcu.core;
+  mcu.writeUint16(ENDLESS, 0xe7fe);  // branch to itself
+  if (where === 'loop') {
+    while (core.IPSR) clock.tick(core.executeInstruction() * cycleNs);
+    core.waiting = false;
+    core.PC = ENDLESS;
+  } else if (where === 'tick') {
+    mcu.writeUint32(core.VTOR + 4 * 16, ENDLESS | 1);
+  } else {
+    core.enabledInterrupts &= ~1;
   }
 }
 
@@ -151,11 +177,14 @@ for await (const line of createInterface({ input: process.stdin })) {
   } else if (what === 'get') {
     const values = {
       rpm, angle: TAU * turns, index_us: indexNs.map((t) => t / 1000), trigger_us: triggerNs.map((t) => t / 1000),
-      worst, busy, resets, watchdogs, cycles: mcu.core.cycles, boot_us: offset / 1000,
+      worst, busy, resets, watchdogs, fed, cycles: mcu.core.cycles, boot_us: offset / 1000,
+      enable: mcu.gpio[PIN.enable].value === 1, enabled_us: enabledNs.map((t) => t / 1000),
+      watchdog_resets: mcu.peripherals[0x40010].wdsel,
     };
     process.stdout.write(`${JSON.stringify(values[rest[0]])}\n`);
-  } else if (what === 'reset') {
-    boot();
+  } else if (what === 'reset' || what === 'hang') {
+    if (what === 'reset') boot();
+    else hang(rest[0]);
     process.stdout.write('\n');
   }
 }
