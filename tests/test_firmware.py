@@ -482,7 +482,8 @@ class Desk:
     plugged = True
 
     def __init__(self, board: Any, path: Path) -> None:
-        self.board, self.damage = board, bytes
+        self.board = board
+        self.damage: Callable[[bytes], bytes] = bytes
         self.shaft: list[tuple[int, float]] = []
         self._actions: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._running = threading.Event()
