@@ -132,7 +132,7 @@ def test_files_and_names_that_do_not_exist_are_seen() -> None:
 SHELL = re.compile(r"```sh\n(.*?)```|<!-- given: (.*?) -->", re.S)
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w-]*")
 DOTTED = re.compile(r"(?<![\w./-])amiwarp(?:\.[A-Za-z_]\w*)+")
-COMMAND = re.compile(r"(?<![\w.-])amiwarp ([a-z]+)([^;|&#`]*)")
+COMMAND = re.compile(r"(?<![\w.-])amiwarp ([a-z]+(?:-[a-z]+)*)([^;|&#`]*)")
 BENCHMARK = re.compile(r"python -m (benchmarks[\w.]*)([^;|&#`]*)")
 
 
