@@ -92,6 +92,7 @@ class TruthRenderer:
         if isinstance(simulation.prism, Moved):
             self._sight_at_rest = WorldSight(simulation.at_rest, self._scene, self._world)
         self._rays = scenery.pixel_rays(simulation.camera)
+        self._pixels = simulation.camera.rays_to_pixels(self._rays)
 
     def at(self, t_us: int, next_us: int | None = None) -> FrameTruth:
         """Return the ground truth of all pixels at a time.
@@ -113,8 +114,7 @@ class TruthRenderer:
         scene, camera, model = self._scene, self._simulation.camera, self._simulation.moving_model
         (rotation,), (position,) = self._poses([t])
         self._world.set_instants(np.array([t if at is None else at * 1e-6 for at in (t_us, next_us)]))
-        pixels = camera.rays_to_pixels(self._rays)
-        theta = self._angles(t_us)
+        pixels, theta = self._pixels, self._angles(t_us)
         bare = scenery.surfaces_at(self._world, self._rays, rotation, position)
         if self._simulation.plate is None:
             places = model.compensate_points(pixels, theta)
@@ -197,25 +197,25 @@ class TruthRenderer:
         ``seen``: surfaces that appear at ``places`` [px] in the image without the prism; ``prism``: whether the pixels
         see them through the prism.
         """
-        simulation, camera, n = self._simulation, self._simulation.camera, len(self._rays)
+        camera, n = self._simulation.camera, len(self._rays)
+        plate = self._simulation.plate if prism else None
         if next_us is None:
             return np.full((n, 2), np.nan), np.full(n, OUTSIDE, np.uint8)
         later, centres = next_us * 1e-6, None
         rays, depth = self._ray_at(seen, places, t_us * 1e-6, later)
         ends = camera.rays_to_pixels(rays)
-        if prism and simulation.plate is None:
-            ends = simulation.moving_model.deflect_points(ends, self._angles(next_us))
-        elif prism and simulation.plate is not None:
-            ends = self._plate_pixels(simulation.plate, rays, depth, later)
+        if plate is not None:
+            ends = self._plate_pixels(plate, rays, depth, later)
             known = np.isfinite(ends).all(axis=1, keepdims=True)
             rays = np.where(known, camera.pixels_to_rays(ends), self._rays)
             centres = self._plate_centres(rays, later)
+        elif prism:
+            ends = self._simulation.moving_model.deflect_points(ends, self._angles(next_us))
         (rotation,), (position,) = self._poses([later])
         hit = scenery.surfaces_at(self._world, rays, rotation, position, instant=1, centres=centres)
         hidden = hit.depth < depth * (1.0 - NEARER)
         inside = ((ends > -0.5) & (ends < np.array([camera.width, camera.height]) - 0.5)).all(axis=1)
-        pixels = camera.rays_to_pixels(self._rays)
-        return ends - pixels, np.where(inside, hidden, OUTSIDE).astype(np.uint8)
+        return ends - self._pixels, np.where(inside, hidden, OUTSIDE).astype(np.uint8)
 
     def _prism_flow(
         self,
@@ -266,7 +266,7 @@ class TruthRenderer:
         ``rays``, ``depth``: directions and depths [m] of the points from the camera at this time.
         """
         theta = np.full(len(rays), float(self._simulation.motion.angle([later * 1e6])[0]))
-        at, observed = self._simulation.camera.rays_to_pixels(rays), self._simulation.camera.rays_to_pixels(self._rays)
+        at, observed = self._simulation.camera.rays_to_pixels(rays), self._pixels
         for _ in range(DEFLECTING_STEPS):
             observed = observed - (model.compensate_at(observed, theta, 1.0 / depth) - at)
         return observed

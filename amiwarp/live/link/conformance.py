@@ -9,7 +9,6 @@ import contextlib
 import itertools
 import math
 import random
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -459,7 +458,4 @@ def _reason(refused: int | None) -> str:
 
 def _framed(packet: bytes, sequence: int) -> bytes:
     """Return a packet of four bytes or more as a frame, with a sequence number and a valid CRC."""
-    from cobs import cobs
-
-    packet = packet[:2] + (sequence & 0xFFFF).to_bytes(2, "little") + packet[4:]
-    return bytes(cobs.encode(packet + zlib.crc32(packet).to_bytes(4, "little"))) + b"\0"
+    return protocol.framed(packet[:2] + (sequence & 0xFFFF).to_bytes(2, "little") + packet[4:])

@@ -159,8 +159,6 @@ def encode(message: Message, sequence: int) -> bytes:
 
     Raises ValueError for numbers outside a field's range, or for other than 1 to :data:`MOST_SAMPLES` samples.
     """
-    from cobs import cobs
-
     if isinstance(message, Samples):
         if not 0 < len(message.t_us) == len(message.count) <= MOST_SAMPLES:
             raise ValueError(
@@ -175,6 +173,13 @@ def encode(message: Message, sequence: int) -> bytes:
         packet = _HEADER.pack(VERSION, message.KIND, sequence & 0xFFFF) + payload
     except struct.error as error:
         raise ValueError(f"{message}: {error}") from error
+    return framed(packet)
+
+
+def framed(packet: bytes) -> bytes:
+    """Return the bytes of a frame: the packet with its CRC, encoded without zeros, and a zero."""
+    from cobs import cobs
+
     return bytes(cobs.encode(packet + _CRC.pack(zlib.crc32(packet)))) + b"\0"
 
 
