@@ -30,12 +30,12 @@ EVENTS = make_events()
 
 
 @pytest.fixture
-def no_faery(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide faery from this process, and from the reading process by a module that cannot be imported."""
-    (tmp_path / "hidden").mkdir()
-    (tmp_path / "hidden" / "faery.py").write_text("raise ImportError", encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path / "hidden")
+def no_faery(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hide faery from this process and from the reading process, wherever it is installed."""
     monkeypatch.setitem(sys.modules, "faery", None)
+    hidden = reading_process.START.replace("import sys;", "import sys; sys.modules['faery'] = None;", 1)
+    assert hidden != reading_process.START
+    monkeypatch.setattr(reading_process, "START", hidden)
     monkeypatch.setattr(reading_process, "_idle", [])
     # A reader of an earlier test that is collected meanwhile would give back a process that has faery.
     monkeypatch.setattr(reading_process, "borrow", reading_process.ReadingProcess)
