@@ -1,6 +1,8 @@
 """The demo keeps its error limits, from the picture to the figure."""
 
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -96,9 +98,30 @@ def test_a_second_warm_up_compiles_nothing(tmp_path: Path, monkeypatch: pytest.M
     compiled = []
     for _ in range(2):
         module.unload()
+        launch._loaded.clear()
         result = CliRunner().invoke(app, ["warm-up", "--json", "--device", device])
         assert result.exit_code == 0, result.stderr
         data = json.loads(result.stdout)
         assert (data["cached"], data["cache"], data["devices"]) == (1, str(tmp_path), [device])
         compiled.append(data["compiled"])
     assert compiled == [1, 0]
+
+
+def test_threads_share_the_compiled_header(tmp_path: Path) -> None:
+    """Warp compiles its header for three seconds, once per thread."""
+    program = (
+        "import threading\n"
+        "from amiwarp.kernels import checksum, launch\n"
+        "from amiwarp.kernels.known_nodes import mark_known\n"
+        "from amiwarp.kernels.votes import turn_events\n"
+        "launch.load_ahead([(checksum.compute_checksums,), (mark_known,), (turn_events,)], 'cpu')\n"
+        "[one.join() for one in threading.enumerate() if one.name.startswith('amiwarp-compiler')]\n"
+        f"import pathlib; print(len(list(pathlib.Path({str(tmp_path)!r}).rglob('*.pch'))))\n"
+    )
+    environment = {**os.environ, "WARP_CACHE_PATH": str(tmp_path / "cache"), "TMPDIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment, capture_output=True, text=True, check=True, timeout=300,
+    )  # fmt: skip
+    assert len(list((tmp_path / "cache").rglob("*.o"))) == 3
+    assert done.stdout.split()[-1] == "1", done.stdout

@@ -13,7 +13,8 @@ from amiwarp.kernels.pixels import LAG_ZERO, LARGEST_LAG, LOW_BITS, LOW_MASK, TI
 from amiwarp.kernels.prism_view import Steps, View, ray_without_prisms
 from amiwarp.kernels.refraction import compensate
 
-wp.set_module_options({"enable_backward": False})
+OPTIONS = {"enable_backward": False}
+wp.set_module_options(OPTIONS)
 
 
 @wp.struct
@@ -83,7 +84,7 @@ def unpack(view: View, steps: Steps, keys: wp.array(dtype=wp.int64), origin: wp.
     block.points[i] = ray_to_pixel(view.camera, ray_without_prisms(view.prism, view.second, ray, w, w2))
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def find_points_at_rest(
     model: Any, camera: CameraParams, steps: Steps, block: Block, start: int, points: wp.array(dtype=wp.vec2)
 ):
@@ -92,7 +93,7 @@ def find_points_at_rest(
     points[i] = compensate(model, camera, block.points[i], true_state(model, steps, block.ticks[i]))
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def pack(sink: Sink, offset: wp.array(dtype=int), out: wp.array(dtype=wp.int64)):
     """Join the segments of keys without gaps: segment ``i`` begins at ``offset[i]``."""
     segment, place = wp.tid()
@@ -121,7 +122,7 @@ def count_below(keys: wp.array(dtype=wp.int64), n: int, limit: wp.int64) -> int:
     return low
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def find(keys: wp.array(dtype=wp.int64), n: int, limit: wp.int64, found: wp.array(dtype=int)):
     """Find the number of sorted keys below ``limit``, in one thread."""
     found[0] = count_below(keys, n, limit)
@@ -155,7 +156,7 @@ def time_of_row(scan: RowScan, row: int, t: wp.int64) -> wp.int64:
     return (read + PS_PER_US - wp.int64(1)) / PS_PER_US - scan.origin
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def stamp_rows(scan: RowScan, keys: wp.array(dtype=wp.int64), start: int):
     """Replace the time stamp of each key by the time at which its row is read; the time of its crossing stays."""
     i = start + wp.tid()
@@ -187,7 +188,7 @@ def transmission(bus: Bus, now: wp.int64, until: wp.int64) -> wp.int64:
     return wp.max(until, now)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def queue_events(
     bus: Bus,
     t: wp.array(dtype=wp.int64),
@@ -216,7 +217,7 @@ def queue_events(
     free[sensor] = until
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def queue_keys(
     bus: Bus,
     shift: int,
@@ -284,7 +285,7 @@ class CameraKeys:
     length: wp.int64  # length of the chunk [us]
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def sort_by_camera(layout: CameraKeys, starts: wp.array(dtype=wp.uint8), keys: wp.array(dtype=wp.int64), start: int):
     """Convert keys that count through the pixels of all cameras to keys that are sorted by camera."""
     i = start + wp.tid()
@@ -320,7 +321,7 @@ def pixel_of(layout: CameraKeys, key: wp.int64) -> int:
     return int((key >> CAMERA_LOW_BITS) & ((wp.int64(1) << bits) - wp.int64(1)))
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def carry_over(layout: CameraKeys, keys: wp.array(dtype=wp.int64), start: int):
     """Convert keys that are sorted by camera to keys of the next chunk that count through the pixels of all cameras.
 
@@ -335,7 +336,7 @@ def carry_over(layout: CameraKeys, keys: wp.array(dtype=wp.int64), start: int):
     keys[i] = t << wp.int64(layout.shift) | wp.int64(index) << wp.int64(LOW_BITS) | kept
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def find_cameras(
     layout: CameraKeys, keys: wp.array(dtype=wp.int64), n: int, cameras: int, start: int, found: wp.array(dtype=int)
 ):
@@ -347,7 +348,7 @@ def find_cameras(
     found[k] = count_below(keys, n, limit)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def unpack_cameras(
     layout: CameraKeys, keys: wp.array(dtype=wp.int64), origin: wp.int64, start: int,
     x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
@@ -366,7 +367,7 @@ def unpack_cameras(
 # Selection of events on the device.
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def mark_first_of_pixel(keys: wp.array(dtype=wp.int64), start: int, kept: wp.array(dtype=int)):
     """Mark the first of the successive keys with the same camera, time and pixel with 1, the others with 0."""
     i = start + wp.tid()
@@ -374,14 +375,14 @@ def mark_first_of_pixel(keys: wp.array(dtype=wp.int64), start: int, kept: wp.arr
     kept[i] = wp.where(i == 0 or before != keys[i] >> CAMERA_LOW_BITS, 1, 0)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def mark_transmitted(stamp: wp.array(dtype=wp.int64), start: int, kept: wp.array(dtype=int)):
     """Mark the events that the bus transmits with 1, the lost ones with 0."""
     i = start + wp.tid()
     kept[i] = wp.where(stamp[i] >= wp.int64(0), 1, 0)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def keep_marked(values: wp.array(dtype=Any), ends: wp.array(dtype=int), start: int, out: wp.array(dtype=Any)):
     """Copy the values that are marked. ``ends``: number of marked values up to and including each one."""
     i = start + wp.tid()
@@ -392,7 +393,7 @@ def keep_marked(values: wp.array(dtype=Any), ends: wp.array(dtype=int), start: i
         out[before] = values[i]
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def count_before(ends: wp.array(dtype=int), start: int, index: wp.array(dtype=int)):
     """Replace indices of values by the number of marked values before them; see :func:`keep_marked`."""
     k = start + wp.tid()

@@ -90,7 +90,7 @@ def cell_of(canvas: Canvas, frame: Frame, block: int, width: int) -> int:
     return row * canvas.columns + block_column(frame, block, width) + 1
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def empty_words(
     canvas: Canvas, cells: Cells, slot: int, counts: wp.array2d(dtype=wp.int64), fullest: wp.array(dtype=int)
 ):
@@ -108,7 +108,7 @@ def empty_words(
         cells.totals[i] = cells.totals[i] + wp.int64(votes_of_pixel(cells.words, i, canvas.columns))
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def add_totals(more: wp.array(dtype=wp.int64), counts: wp.array(dtype=wp.int64), totals: wp.array(dtype=wp.int64)):
     """Add ``more`` to the totals; clear ``more`` and the counts of the batches."""
     i = wp.tid()
@@ -119,7 +119,7 @@ def add_totals(more: wp.array(dtype=wp.int64), counts: wp.array(dtype=wp.int64),
         counts[i] = wp.int64(0)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def read_votes(cells: Cells, canvas: Canvas, frame: Frame, start: int, image: wp.array(dtype=float)):
     """Compute one pixel [events] per thread from words and totals, which are kept. For CUDA."""
     block = start + wp.tid()
@@ -154,7 +154,7 @@ def read_sums(
             image[at + k] = events_of(total)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def add_sums(sums: wp.array2d(dtype=int), start: int, totals: wp.array(dtype=wp.int64)):
     """Add the sums of all slices to the totals, one pixel per thread."""
     i = start + wp.tid()

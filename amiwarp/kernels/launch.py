@@ -10,9 +10,9 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
-from itertools import pairwise, takewhile
+from itertools import pairwise
 from queue import SimpleQueue
-from threading import Lock, Thread, main_thread
+from threading import Lock, Thread, get_ident, main_thread
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,11 @@ _Job = tuple[Callable[[], object], "SimpleQueue[BaseException | None]"]
 """Function to run, and the queue that gets its error, or None."""
 _specialising = Lock()
 _loading: defaultdict[str, Lock] = defaultdict(Lock)
+_loaded: set[tuple[str, str]] = set()
+"""Names of the modules that are loaded, each with its device."""
+_header: list[Any] = []
+"""Folder of the header that Warp precompiled for CPUs, or empty before the first compilation."""
+_heading = Lock()
 BLOCK_DIM = 256  # CUDA threads per block; block sums require full blocks
 SMALLEST_SLICE = 1 << 15  # fewest threads per slice: launching a smaller slice takes longer than running it
 
@@ -144,27 +149,68 @@ def _specialised(kernel: Any, structs: tuple[Any, ...]) -> Any:
 
 
 def load(kernel: Any, device: Any) -> None:
-    """Compile and load a kernel's module with the block size that launches here use.
+    """Compile and load a kernel's module with the block size that launches here use, at the first call.
 
     Call it before several threads launch the kernel, or each of them would try to compile it. A call waits for a
     running one for the same module.
     """
+    name = (kernel.module.name, device.alias)
+    if name in _loaded:
+        return
     with _loading[kernel.module.name]:
-        kernel.module.load(device, block_dim=1 if device.is_cpu else None)
+        if not device.is_cpu or _has_header():
+            kernel.module.load(device, block_dim=1 if device.is_cpu else None)
+        else:
+            with _heading:
+                _has_header()
+                kernel.module.load(device, block_dim=1)
+                if get_ident() in _headers():
+                    _header.append(_headers()[get_ident()])
+        _loaded.add(name)
+
+
+def _headers() -> dict[int, Any]:
+    """Return Warp's folders of its precompiled header for CPUs, by thread."""
+    return getattr(wp._src.context.runtime, "_pch_dirs", {})
+
+
+def _has_header() -> bool:
+    """Give this thread the header that the first one to compile made, which takes three seconds, if there is one.
+
+    Warp makes it once per thread. If a later version keeps it elsewhere, it does so again.
+    """
+    if _header:
+        _headers().setdefault(get_ident(), _header[0])
+    return bool(_header)
 
 
 def load_kernels(kernels: Iterable[tuple[Any, ...]], device: Any) -> None:
-    """Compile and load kernels. Each is followed by the structs of its generic arguments."""
+    """Compile and load kernels. Each is followed by the structs of its generic arguments.
+
+    A module that another thread is loading is left to that thread.
+    """
     for kernel, *structs in kernels:
         with _specialising:
             one = _specialised(kernel, tuple(structs)) if structs else kernel
-        load(one, wp.get_device(device))
+        if not _loading[one.module.name].locked():
+            load(one, wp.get_device(device))
 
 
 def load_ahead(kernels: Iterable[tuple[Any, ...]], device: Any) -> None:
     """Compile and load kernels as :func:`load_kernels` does, in the background, until the program ends."""
-    wanted = takewhile(lambda _: main_thread().is_alive(), kernels)
-    Thread(target=load_kernels, args=(wanted, device), name="amiwarp-compiler").start()
+    device = wp.get_device(device)  # before the threads start, or each of them would initialise Warp
+    left, taking = iter(kernels), Lock()
+
+    def wanted() -> Iterator[tuple[Any, ...]]:
+        while main_thread().is_alive():
+            with taking:
+                one = next(left, None)
+            if one is None:
+                return
+            yield one
+
+    for k in range(2):
+        Thread(target=load_kernels, args=(wanted(), device), name=f"amiwarp-compiler-{k}").start()
 
 
 def load_all(device: Any, progress: Progress = silent) -> None:

@@ -10,7 +10,8 @@ from amiwarp.kernels.conjugate_gradients import Prior, add_fixed
 from amiwarp.kernels.equations import Atlas, Geometry, bilinear, fraction, fractions_of
 from amiwarp.kernels.native_code import wait_for_block
 
-wp.set_module_options({"enable_backward": False})
+OPTIONS = {"enable_backward": False}
+wp.set_module_options(OPTIONS)
 
 HAT = wp.constant(8.0 / 3.0)  # energy of a bilinear hat function of any width under links of weight 1
 
@@ -67,7 +68,7 @@ def add_coarse_diagonal(
             add_fixed(sums, na + step, scale * wa[k] * wa[k])
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def divide(diagonal: wp.array(dtype=float), residual: wp.array(dtype=float), start: int, out: wp.array(dtype=float)):
     """Compute the correction on the finest grid: the residual divided by the diagonal."""
     i = start + wp.tid()
@@ -96,7 +97,7 @@ def prior_part(prior: Prior, four: float) -> float:
     return prior.smooth[0] * HAT + prior.damping[0] * four
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def restrict(
     fine: wp.array(dtype=float),
     fine_rows: int,
@@ -178,7 +179,7 @@ def prolonged(coarse: wp.array(dtype=float), first: int, fine_columns: int, i: i
     return 0.25 * (coarse[at] + coarse[at + right] + coarse[at + down] + coarse[at + right + down])
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def prolong(
     coarse: wp.array(dtype=float), fine_rows: int, fine_columns: int, start: int, fine: wp.array(dtype=float)
 ):  # fmt: skip
@@ -188,7 +189,7 @@ def prolong(
         fine[i] = fine[i] + prolonged(coarse, 0, fine_columns, i)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def prolong_to_finest(
     coarse: wp.array(dtype=float),
     fine_rows: int,
@@ -220,7 +221,7 @@ def grid_below(rows: int, columns: int, at: int, levels: int):
     return r, c, first
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def correct_small(
     rows: int,
     columns: int,

@@ -284,7 +284,7 @@ def start_pixels(view: View, steps: Steps, sensor: SensorParams, seed: int, star
     pixels[i] = new_pixel(sensor, seed, i, see_level(view, steps.at[steps.margin], ray_in_prism_frame(view, i)))
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def set_pixels(
     on: wp.array(dtype=float),
     off: wp.array(dtype=float),
@@ -555,7 +555,7 @@ def table_level(light: wp.array2d(dtype=float), sensor: SensorParams, k: int, i:
     return wp.log(light[k, i] + sensor.dark)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def start_world_pixels(
     light: wp.array2d(dtype=float), steps: Steps, sensor: SensorParams, seed: int, start: int,
     pixels: wp.array(dtype=Pixel),
@@ -565,7 +565,7 @@ def start_world_pixels(
     pixels[i] = new_pixel(sensor, seed, i, table_level(light, sensor, 0, i))
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def run_world_pixels(
     light: wp.array2d(dtype=float),
     steps: Steps,
@@ -590,7 +590,7 @@ def run_world_pixels(
     pixels[i] = shift_times(p, t0)
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def run_filtered_world_pixels(
     light: wp.array2d(dtype=float),
     steps: Steps,
@@ -689,7 +689,7 @@ def run_filtered_camera_pixels(
     seen[i] = before.level
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def find_bad_level(levels: wp.array(dtype=float), most: float, step: int, bad: wp.array(dtype=int)):
     """Find the first log intensity that is not within ``most`` of 0. Thread k looks at every ``step``-th value."""
     for i in range(wp.tid(), levels.shape[0], step):

@@ -14,7 +14,8 @@ from amiwarp.kernels.native_code import load_float, load_pairs, load_uint16, sto
 from amiwarp.kernels.prism_angle import THETA_U16_RAD, EncoderParams, of_second, theta_u32_at
 from amiwarp.kernels.refraction import PairParams
 
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+OPTIONS = {"enable_backward": False, "fuse_fp": False}
+wp.set_module_options(OPTIONS)
 
 MIX_1 = wp.constant(wp.uint32(0x85EBCA6B))  # multipliers of MurmurHash3's finaliser
 MIX_2 = wp.constant(wp.uint32(0xC2B2AE35))
@@ -135,14 +136,14 @@ def turn_events(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int,
     turn[i] = theta_u16_at(encoder, t[i])
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def turn_second(encoder: EncoderParams, t: wp.array(dtype=wp.int64), start: int, turn: wp.array(dtype=wp.uint16)):
     """Compute theta_u16 of the second prism at each event."""
     i = start + wp.tid()
     turn[i] = theta_u16_at(of_second(encoder), t[i])
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def time_events(t: wp.array(dtype=wp.int64), middle: wp.int64, start: int, time: wp.array(dtype=float)):
     """Compute the time of each event from the middle of the window [s]."""
     i = start + wp.tid()
@@ -158,7 +159,7 @@ def layer_events(
     layer[i] = wp.uint8((i % parts) * (1 + per_polarity) + per_polarity * wp.where(p[i] != wp.uint8(0), 1, 0))
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def fold_keys(
     x: wp.array(dtype=wp.uint16),
     y: wp.array(dtype=wp.uint16),
@@ -175,7 +176,7 @@ def fold_keys(
     keys[i] = (bin_of << wp.int64(33)) | (pixel << wp.int64(1)) | wp.int64(wp.where(layer[i] != wp.uint8(0), 1, 0))
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def unfold_keys(keys: wp.array(dtype=wp.int64), bins: int, start: int, events: EventArrays):
     """Recover the events from their sort keys; the prism angle becomes the middle of its bin."""
     i = start + wp.tid()
@@ -187,7 +188,7 @@ def unfold_keys(keys: wp.array(dtype=wp.int64), bins: int, start: int, events: E
     events.turn[i] = wp.uint16((wp.int64(65536) * bin_of + wp.int64(32768)) / wp.int64(bins))
 
 
-@wp.kernel
+@wp.kernel(module="unique", module_options=OPTIONS)
 def drift_turns(
     base: wp.array(dtype=wp.uint16),
     slope: wp.array(dtype=float),

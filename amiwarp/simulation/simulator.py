@@ -829,6 +829,7 @@ class Engine:
         """Set the initial state of every pixel."""
         inputs = [self._seen(steps, 0, 1), steps, self._sensor, self._simulation.seed, 0, *self._state]
         kernel = pixels.start_pixels if self._maps is not None else pixels.start_world_pixels
+        launch.load(kernel, self._device)
         wp.launch(kernel, dim=self._pixels, inputs=inputs, device=self._device)
         if self._simulation.pixels is not None:
             self._set_pixels(self._simulation.pixels)

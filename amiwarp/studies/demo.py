@@ -29,19 +29,22 @@ from amiwarp.imaging.metrics import gaussian
 from amiwarp.io import open_recording
 from amiwarp.io.files import check_output
 from amiwarp.io.formats import make_folder
-from amiwarp.kernels.camera import PinholeParams
+from amiwarp.kernels.camera import PinholeParams, fill_rays
 from amiwarp.kernels.checksum import compute_checksums
 from amiwarp.kernels.compensation import compensate_blocks
 from amiwarp.kernels.conjugate_gradients import descend, link
 from amiwarp.kernels.equations import find_squares, sum_costs
 from amiwarp.kernels.equations_cpu import apply_normal, make_chains
+from amiwarp.kernels.event_keys import unpack
 from amiwarp.kernels.iwe import CPU_WIDTH, find_largest, read_sums, smooth, smooth_and_sum
 from amiwarp.kernels.known_nodes import find_large_regions, mark_known
 from amiwarp.kernels.launch import load_ahead, load_all
 from amiwarp.kernels.map_positions import find_places, place_blocks
-from amiwarp.kernels.multilevel import prolong
+from amiwarp.kernels.multilevel import prolong_rows
 from amiwarp.kernels.pairs import mark_spans
 from amiwarp.kernels.pixel_votes import vote_event_blocks, vote_point_blocks
+from amiwarp.kernels.pixels import run_pixels_ahead, start_pixels
+from amiwarp.kernels.prism_view import see_without_prism
 from amiwarp.kernels.refraction import ExactParams, compensate_points
 from amiwarp.kernels.slow_pixels import find_time_constants
 from amiwarp.kernels.votes import turn_events
@@ -55,7 +58,7 @@ from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.tasks import Progress, part, silent
 
-# Kernels that the steps after a simulation need on a CPU, to be compiled before they are needed.
+# Kernels that the demo needs on a CPU, to be compiled before they are needed.
 #
 # Each is followed by the structs of its generic arguments. The other kernels of its module are compiled with it.
 
@@ -79,11 +82,20 @@ EXACT_KERNELS = (
     (compute_checksums,),
     (vote_point_blocks,),
     (link,),
-    (prolong,),
+    (prolong_rows,),
     (mark_known,),
     (find_large_regions,),
 )
 """Kernels of calibration, compensation and reconstruction by the exact model, in the order of their use."""
+SIMULATION_KERNELS = (
+    (compensate_points, ExactParams),
+    (fill_rays,),
+    (see_without_prism,),
+    (run_pixels_ahead,),
+    (start_pixels,),
+    (unpack,),
+)
+"""Kernels of a simulation of the exact model, in the order of their use."""
 FIGURE_KERNELS = tuple((compensate_points, MODELS[name].STRUCT) for name in CIRCLES)
 """Kernels of the demo's comparison of simpler models."""
 
@@ -174,7 +186,7 @@ def run_demo(demo: Demo, progress: Progress | None = None) -> DemoResult:
     for path in files.values():
         check_output(path)
     if demo.device == "cpu":
-        load_ahead((*EXACT_KERNELS, *FIGURE_KERNELS), demo.device)
+        load_ahead((*SIMULATION_KERNELS, *EXACT_KERNELS, *FIGURE_KERNELS), demo.device)
     # of the two threads, one often waits for the process that draws with VTK
     with ThreadPoolExecutor(2, thread_name_prefix="amiwarp-demo") as aside:
         return _run(demo, files, aside, progress or silent)
