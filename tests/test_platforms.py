@@ -22,6 +22,8 @@ from amiwarp import (
 from amiwarp.io import files, reading_process
 from amiwarp.io.native_writer import LiveWriter
 from amiwarp.live.stream.sockets import PipeSink
+from amiwarp.reconstruction.picture import save_film
+from amiwarp.simulation.pictures import open_pictures
 from reference.io_samples import make_events, write_native, write_sample
 from tests import test_io_formats
 from tests.test_io_readers import assert_equal
@@ -75,6 +77,16 @@ def test_writing_aedat4_names_faery(tmp_path):
     with pytest.raises(AmiwarpError, match=r"out\.aedat4: .* need faery, "):
         convert(tmp_path / "in.h5", tmp_path / "out.aedat4")
     assert not list(tmp_path.glob("*.aedat4"))
+
+
+def test_videos_name_the_package_that_they_need(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    (tmp_path / "in.mp4").write_bytes(bytes(100))
+    with pytest.raises(AmiwarpError, match=r"in\.mp4: videos need PyAV; .*'amiwarp\[video\]'"):
+        open_pictures(tmp_path / "in.mp4")
+    with pytest.raises(AmiwarpError, match=r"out\.mp4: videos need PyAV; "):
+        save_film([np.zeros((4, 4), np.uint8)], tmp_path / "out.mp4", fps=1.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["in.mp4"]
 
 
 @pytest.fixture

@@ -447,6 +447,15 @@ def check_ending(path: Path, what: str, endings: Collection[str], remedy: str | 
     return ending
 
 
+def video_library(path: Path) -> Any:
+    """Return PyAV, to read or write a video file. Raises :class:`AmiwarpError` where it is not installed."""
+    try:
+        import av
+    except ImportError as error:
+        raise AmiwarpError(f"{path}: videos need PyAV; install it by: pip install 'amiwarp[video]'") from error
+    return av
+
+
 def make_folder(path: Path) -> None:
     """Create a folder and its parents. Raises :class:`AmiwarpError` if that fails, or for the name of a file."""
     for new in (path, *path.parents):

@@ -30,7 +30,7 @@ from amiwarp.events.encoder import TWO_PI, Encoder, check_prisms, turn_between
 from amiwarp.events.recording import EventSource, Recording
 from amiwarp.imaging.export import encode_image
 from amiwarp.io.files import NewFile, check_output
-from amiwarp.io.formats import check_ending
+from amiwarp.io.formats import check_ending, video_library
 from amiwarp.kernels import known_nodes as kernels
 from amiwarp.kernels.launch import launch, load, start_read
 from amiwarp.optics.camera import CameraRotation, border
@@ -855,11 +855,10 @@ def save_film(frames: Iterable[NDArray[np.uint8]], path: Path, *, fps: float) ->
     """Write frames as MP4 (H.264), or as GIF if ``path`` ends in .gif, and return the number of frames.
 
     Each frame has shape (height, width) or (height, width, 3). Raises :class:`AmiwarpError` for no frames, an unknown
-    suffix, or a folder that does not exist.
+    suffix, a folder that does not exist, or without PyAV.
     """
-    import av
-
     check_path(path, (VIDEO, ".gif"))
+    av = video_library(path)
     count, kind = 0, path.suffix.lower().removeprefix(".")
     with NewFile(path) as new, av.open(str(new.part), "w", format=kind) as container:
         stream: Any = None

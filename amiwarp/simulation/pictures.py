@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name, input_path, open_input, register_reader
+from amiwarp.io.formats import video_library
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import TIME_LIMIT, check_ascending, guarded, real, shown, vector, whole
 
@@ -378,8 +379,7 @@ class VideoFile:
         AmiwarpError
             If the file cannot be decoded, or a frame is too large.
         """
-        import av
-
+        av = video_library(self.path)
         first: Fraction | None = None
         last = -1
         try:
@@ -495,8 +495,7 @@ def _open_stack(path: Path, fps: float | None) -> PictureStack:
 
 
 def _open_video(path: Path, fps: float | None) -> VideoFile:
-    import av
-
+    av = video_library(path)
     try:
         with av.open(str(input_path(path))) as container:
             if not container.streams.video:
