@@ -82,15 +82,22 @@ def speed_rows() -> list[tuple[str, ...]]:
     return rows
 
 
-def lens_rows() -> list[tuple[str, ...]]:
-    """Return the shortest focal lengths."""
+def lens_rows(rigs: Sequence[Rig] = parts.RIGS) -> list[tuple[str, ...]]:
+    """Return the shortest focal lengths for each lens."""
     rows = []
-    for rig in parts.RIGS:
-        for name, sensor in numbers.SENSORS.items():
-            focal = [numbers.shortest_focal(rig, sensor, back=back) for back in (0.0, 5.0, 10.0, 20.0)]
-            wide = math.degrees(2 * math.atan(sensor[0] * sensor[2] / 2 / focal[0]))
-            rows.append((rig.name, name, *(f"{f:.1f}" for f in focal), f"{wide:.0f}°"))
+    for rig in rigs:
+        for lens, own in numbers.lenses(rig).items():
+            for name, sensor in numbers.SENSORS.items():
+                found = [numbers.shortest_focal(own, sensor, *at) for at in ((2.0,), (4.0,), (4.0, OFF))]
+                wide = [math.degrees(2 * math.atan(sensor[0] * sensor[2] / 2 / focal)) for focal in found[:2]]
+                cells = [f"{f:.1f} ({w:.0f}°)" if w else "none" for f, w in zip(found[:2], wide, strict=True)]
+                off = f"{found[2]:.1f}" if math.isfinite(found[2]) else "none"
+                rows.append((rig.name, lens, f"{own.seat_z - own.lens_z:.1f}", name, *cells, off))
     return rows
+
+
+OFF = 0.3
+"""Distance of the lens's axis from that of the rotor: gaps of spigot, clamp and mount, and print [mm]."""
 
 
 def tolerances(rig: Rig) -> list[Tolerance]:
@@ -106,7 +113,11 @@ def tolerances(rig: Rig) -> list[Tolerance]:
         half = total / math.sqrt(2)
         size = f"seat {math.degrees(seat):.2f}°, races {math.degrees(race):.2f}°"
         out.append(Tolerance(f"wobble of the wedge, {name} seat", size, wobble_deg=(half, half)))
-    out.append(Tolerance("camera not along the axis, by eye", "1°", tilt_deg=(0.7, 0.7)))
+    wide, long = rig.grip
+    seated = math.degrees(math.hypot(0.1 / wide, 0.1 / (rig.bearing.outer + 8.0)))
+    askew = math.degrees(0.2 / long)
+    for name, tilt in (("holder: printed faces off by 0.1 mm", seated), ("holder: ring askew in its clamp", askew)):
+        out.append(Tolerance(name, f"camera tilted by {tilt:.2f}°", tilt_deg=(tilt / math.sqrt(2),) * 2))
     off = math.degrees(0.05 / pulley)
     out.append(Tolerance("printed pulley off by 0.05 mm", f"{off:.2f}° once a turn", harmonics_deg=(off, 0, 0, 0)))
     small = math.degrees(0.05 / pulley)
@@ -159,7 +170,7 @@ def checked(rig: Rig) -> Sequence[Part]:
     """Return the rig's parts, or end with what is wrong with them."""
     made = parts.assembly(rig)
     wrong = parts.problems(rig, made)
-    wrong += [f"{part.name} is not watertight" for part in made if not numbers.to_mesh(part).is_watertight]
+    wrong += [f"{part.name} is not watertight" for part in made if not numbers.in_file(part).is_watertight]
     if wrong:
         sys.exit(f"{rig.name}: " + "; ".join(wrong))
     return made
@@ -205,12 +216,17 @@ def report() -> str:
             ),
             speed_rows(),
         ),
-        "## Shortest focal length without vignetting, f/2 [mm]\n\nThe lens stands as drawn, or further back.\n",
+        "## Shortest focal length without vignetting\n\nWith the widest field of view, for lenses in the holder. "
+        f"Last column: the lens is {OFF} mm off the axis.\n",
         table(
-            ("rig", "sensor", "as drawn", "5 mm back", "10 mm back", "20 mm back", "widest field of view"), lens_rows()
+            ("rig", "lens", "lens to wedge [mm]", "sensor", "f/2 [mm]", "f/4 [mm]", f"f/4, off by {OFF} mm [mm]"),
+            lens_rows(),
         ),
         "## Error that tolerances cost, apex 1°, 640×480, 60°\n\n"
-        "Rms over image and turn [px]. Freed besides apex and phase:\n",
+        "Rms over image and turn [px]. A lens that is off the axis costs nothing that can be seen: "
+        f"{OFF} mm move a point at the border by "
+        f"{numbers.offset_error(parts.ONE_INCH, OFF, 1000.0):.4f} px if it is 1 m away. "
+        "Freed besides apex and phase:\n",
         table(("rig", "what is off", "by", *(", ".join(free) or "nothing" for free in FREED)), error_rows()),
         "## The same by simulation and calibration, apex 1°, 320×240, 60°\n\n"
         "Rms error of what `amiwarp calibrate` finds with its defaults [px].\n",
@@ -226,13 +242,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rig", choices=[rig.name for rig in parts.RIGS], help="only this rig")
     parser.add_argument("--apex-deg", type=float, default=1.0, help="apex angle of the wedge [deg]")
     parser.add_argument("--thickness-mm", type=float, help="thickness of the wedge on the axis [mm]")
+    parser.add_argument(
+        "--lens-mm",
+        type=float,
+        nargs=2,
+        metavar=("WIDTH", "REACH"),
+        help="lens: diameter, and length before its ring [mm]",
+    )
+    parser.add_argument(
+        "--grip-mm", type=float, nargs=2, metavar=("DIAMETER", "WIDTH"), help="ring that the holder grips [mm]"
+    )
     parser.add_argument("--pictures", action="store_true", help="write drawing and pictures, too")
     parser.add_argument("--numbers", type=Path, help="page of numbers to write; takes some minutes")
     given = parser.parse_args(arguments)
     for rig in parts.RIGS:
         if given.rig not in (None, rig.name):
             continue
-        own = replace(rig, apex_deg=given.apex_deg, thickness=given.thickness_mm or rig.thickness)
+        lens, reach = given.lens_mm or (rig.lens, rig.reach)
+        thickness, grip = given.thickness_mm or rig.thickness, tuple(given.grip_mm or rig.grip)
+        own = replace(rig, apex_deg=given.apex_deg, thickness=thickness, lens=lens, reach=reach, grip=grip)
         made = checked(own)
         folder = given.out / own.name
         folder.mkdir(parents=True, exist_ok=True)
@@ -241,6 +269,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 numbers.to_mesh(part).export(folder / f"{part.name.replace(' ', '_')}.stl")
         print(f"{folder}: {sum(part.kind == 'printed' for part in made)} parts to print, all watertight, none overlaps")
         screws, _ = numbers.balance(own, numbers.rotating(own))
+        print(f"lens: its front is {own.seat_z - own.lens_z:.1f} mm from the wedge")
         print(f"set screws M{own.screw[1]:g}, angles from the thick edge: {words(screws)}")
         if given.pictures:
             from rig import drawings

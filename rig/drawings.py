@@ -1,5 +1,6 @@
 """Drawings and pictures of the rig."""
 
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,9 @@ from rig.parts import Part, Rig
 
 COLOURS = {
     "base": "#8a8f98",
-    "riser": "#8a8f98",
-    "camera with lens": "#3c4858",
-    "rear plate": "#6b7280",
+    "mount ring": "#b0b4bc",
+    "camera": "#3c4858",
+    "holder": "#9a7fb8",
     "motor": "#7a5c3e",
     "housing": "#5b8db8",
     "rear ring": "#d08c3c",
@@ -35,6 +36,7 @@ COLOURS = {
     "encoder board": "#2f6b3f",
     "motor plate": "#8fb0cc",
     "O-ring": "#1a1a1a",
+    "lens": "#56657a",
 }
 """Colour of each part in all pictures."""
 SCREWS = "#3f3f3f"
@@ -51,7 +53,7 @@ def fill(axes: Any, shape: CrossSection, colour: str, alpha: float = 0.55) -> No
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Line
 
-    polygons = [np.vstack([p, p[:1]]) for p in shape.to_polygons() if len(p) > 2]
+    polygons = [np.vstack([p, p[:1]]) for p in shape.simplify(0.01).to_polygons() if len(p) > 2]
     if not polygons:
         return
     codes = [[Line.MOVETO, *[Line.LINETO] * (len(p) - 2), Line.CLOSEPOLY] for p in polygons]
@@ -98,91 +100,175 @@ def number(value: float) -> str:
 
 
 def drawing(rig: Rig, made: Sequence[Part], out: Path) -> None:
-    """Write a sheet with a cut through the rig, and the main parts with their dimensions [mm]."""
+    """Write a sheet with a cut through the rig, and all printed parts with their dimensions [mm]."""
     import matplotlib.pyplot as plt
 
     solids = {part.name: part.solid for part in made}
-    figure, ((whole, front), (rotor, cover)) = plt.subplots(2, 2, figsize=(16.5, 11.7), layout="constrained")
-    bearing = rig.bearing
-    for part in made:
-        fill(whole, section(part.solid), COLOURS.get(part.name, SCREWS), 0.75)
-    whole.set_title(f"{rig.name}: cut at the height of the axis, seen from above; camera left, scene right", fontsize=9)
-    low, edge = parts.camera_z(rig)[0], rig.distance + rig.motor[0] / 2
-    dimension(whole, (0, 0), (0, rig.distance), number(rig.distance), low - 8)
-    dimension(whole, (0, -rig.outline), (rig.front_z, -rig.outline), number(rig.front_z), -6)
-    dimension(whole, (rig.lens_z, edge), (rig.seat_z, edge), number(rig.seat_z - rig.lens_z), 8)
-    dimension(whole, (low, edge), (rig.cover_z + 2, edge), number(rig.cover_z + 2 - low), 16)
-    whole.axhline(0, color="#aa3333", linewidth=0.5, linestyle="-.")
-
-    fill(front, solids["housing"].project(), COLOURS["housing"])
-    front.set_title("housing, from the scene", fontsize=9)
-    bores = f"⌀ {number(bearing.outer)} + 0.05, lip ⌀ {number(2 * bearing.outside)}"
-    bore = CrossSection.circle(bearing.outer / 2 + 0.025, 180)
-    fill(front, bore - CrossSection.circle(bearing.outside, 180), "white", 0.9)
-    dimension(front, (0, 0), (rig.distance, 0), number(rig.distance) + " (slot ± 3)", rig.outline + 6)
-    dimension(front, (0, -rig.height), (0, 0), number(rig.height), -rig.outline - 8)
-    dimension(
-        front,
-        (-bearing.outer / 2, 0),
-        (bearing.outer / 2, 0),
-        bores,
-        0,
-    )
-    low, high = parts.plate_screws(rig)
-    dimension(front, low, high, f"{number(high[1] - low[1])}, 2 × M3 for the motor plate", 32)
-    dimension(
-        front,
-        (-rig.outline, 0),
-        (rig.distance + 3 + parts.motor_end(rig), 0),
-        number(rig.outline + rig.distance + 3 + parts.motor_end(rig)),
-        -rig.height - 8,
-    )
-
-    for name in ("rotor", "wedge", "wedge ring", "spacer", "rear ring"):
-        fill(rotor, section(solids[name]), COLOURS[name])
-    rotor.set_title(f"rotor with wedge ({number(rig.apex_deg)}°), rings, spacer; {rig.teeth[0]} teeth GT2", fontsize=9)
-    tip = rig.pitch(rig.teeth[0]) - parts.PITCH_LINE
-    diameters(
-        rotor,
-        [
-            (rig.clear, rig.front_z + 2, number(2 * rig.clear)),
-            (rig.wedge / 2 + rig.seat, rig.seat_z + 2, number(rig.wedge + 2 * rig.seat)),
-            (tip, rig.front_z - 3, f"{number(2 * tip)} teeth"),
-        ],
-        rig.front_z + 8,
-    )
-    half = bearing.bore / 2
-    for y in (-half, half):
-        rotor.plot([rig.bearing_z[0] - 9, rig.bearing_z[0]], [y, y], color="#666666", linewidth=0.4)
-    dimension(rotor, (rig.bearing_z[0], -half), (rig.bearing_z[0], half), f"⌀ {number(bearing.bore)} − 0.02", -9)
-    y = -rig.pitch(rig.teeth[0]) - 2
-    dimension(
-        rotor, (rig.bearing_z[0] + 0.2, y), (rig.shoulder_z, y), number(rig.shoulder_z - rig.bearing_z[0] - 0.2), -5
-    )
-    dimension(rotor, (rig.pulley_z, y), (rig.front_z, y), number(rig.front_z - rig.pulley_z), -5)
-    dimension(rotor, (rig.seat_z, -y), (rig.front_z, -y), number(rig.front_z - rig.seat_z), 5)
-
-    shadow = solids["cover"].project().offset(0.05).offset(-0.05)  # closes slivers of the projection
-    fill(cover, shadow, COLOURS["cover"])
-    size = f"⌀ {number(2 * rig.outline)}, depth {number(rig.cover_z + 2 - rig.face_z)}"
-    inner = CrossSection.circle(rig.opening, 180)
-    fill(cover, inner, "white", 0.9)
-    cover.set_title("cover, from the scene", fontsize=9)
-    dimension(cover, (-rig.opening, 0), (rig.opening, 0), f"⌀ {number(2 * rig.opening)}")
-    dimension(
-        cover,
-        (-rig.outline, 0),
-        (rig.outline, 0),
-        size,
-        -rig.outline - 7,
-    )
-    for axes in (whole, front, rotor, cover):
+    figure, rows = plt.subplots(3, 3, figsize=(24, 19), layout="constrained")
+    sheets = (whole, housing, holder, rotor, cover, base, rings, plate, bearing_cap)
+    for axes, draw in zip(rows.flat, sheets, strict=True):
+        draw(axes, rig, solids)
         axes.set_aspect("equal")
         axes.autoscale_view()
         axes.margins(0.06)
         axes.axis("off")
     figure.savefig(out, metadata={"Date": None} if out.suffix == ".svg" else None)
     plt.close(figure)
+
+
+def whole(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
+    """Draw the cut through the rig at the height of the axis."""
+    for name, solid in solids.items():
+        fill(axes, section(solid), COLOURS.get(name, SCREWS), 0.75)
+    axes.set_title(f"{rig.name}: cut at the height of the axis, seen from above; camera left, scene right")
+    low, edge = parts.camera_z(rig)[0], rig.distance + rig.motor[0] / 2
+    dimension(axes, (0, 0), (0, rig.distance), number(rig.distance), min(low, rig.face_z - 9 - rig.motor[1]) - 8)
+    dimension(axes, (0, -rig.outline), (rig.front_z, -rig.outline), number(rig.front_z), -6)
+    gap = f"lens to wedge {number(rig.seat_z - rig.lens_z)}"
+    dimension(axes, (rig.lens_z, edge), (rig.seat_z, edge), gap, 8)
+    dimension(axes, (low, edge), (rig.cover_z + 2, edge), number(rig.cover_z + 2 - low), 16)
+    axes.axhline(0, color="#aa3333", linewidth=0.5, linestyle="-.")
+
+
+def housing(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
+    """Draw the housing from the scene."""
+    solid, bearing, end = solids["housing"], rig.bearing, parts.motor_end(rig)
+    fill(axes, solid.slice(rig.face_z - 0.5), COLOURS["housing"])
+    lip = CrossSection.circle(bearing.outer / 2 + 0.025, 180) - CrossSection.circle(bearing.outside, 180)
+    fill(axes, lip, "white", 0.9)
+    depth = number(rig.face_z)
+    axes.set_title(f"6 housing, from the scene; depth of the barrel {depth}, plate {number(parts.PLATE)}")
+    dimension(axes, (0, 0), (rig.distance, 0), number(rig.distance) + " (slot ± 3)", rig.outline + 6)
+    dimension(axes, (0, -rig.height), (0, 0), number(rig.height), -rig.outline - 8)
+    bores = f"⌀ {number(bearing.outer)} + 0.05, lip ⌀ {number(2 * bearing.outside)}"
+    dimension(axes, (-bearing.outer / 2, 0), (bearing.outer / 2, 0), bores)
+    low, high = parts.plate_screws(rig)
+    side = rig.distance + 3 + end + 8 - low[0]
+    dimension(axes, low, high, f"{number(high[1] - low[1])}, 2 × M3 for the motor plate", side)
+    right = rig.distance + 3 + end
+    dimension(axes, (-rig.outline, 0), (right, 0), number(rig.outline + right), -rig.height - 8)
+
+
+def holder(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
+    """Draw the holder from the camera, and its upright cut to the right."""
+    solid = solids["holder"]
+    fill(axes, solid.project().mirror((1, 0)), COLOURS["holder"])
+    fill(axes, solid.slice(rig.grip_z - 0.4).mirror((1, 0)), COLOURS["holder"])
+    shift = max(rig.bearing.outer / 2, parts.holder_screws(rig)[0][0]) + 24.0 - rig.grip_z
+    fill(axes, section(solid).translate((shift, 0.0)), COLOURS["holder"])
+    at = max(rig.grip[0], rig.lens + 2.0) / 2 + 4.0
+    axes.set_title(f"4 holder, from the camera, and cut at the height of the axis; plate {number(parts.HOLDER)}")
+    x, _ = parts.holder_screws(rig)[0]
+    low = -max(rig.bearing.outer / 2 + 4.0, x + 4.0)
+    dimension(axes, (-x, low), (x, low), f"{number(2 * x)} square, 4 × ⌀ 2.9", -6)
+    dimension(axes, (-rig.grip[0] / 2, 0), (rig.grip[0] / 2, 0), f"clamp ⌀ {number(rig.grip[0] + 0.2)}")
+    rear = rig.grip_z - rig.grip[1] + 0.1
+    dimension(axes, (rear + shift, low), (shift, low), number(-rear), -6)
+    dimension(axes, (shift, low), (shift + 1.5, low), "1.5", -13)
+    spigot = rig.bearing.outside - 0.05
+    dimension(axes, (shift + 1.5, -spigot), (shift + 1.5, spigot), f"spigot ⌀ {number(2 * spigot)}", 7)
+    dimension(axes, (rear + shift, -at), (rear + shift, at), f"⌀ {number(2 * at)}", -6)
+
+
+def rotor(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
+    """Draw the cut through the rotor with its rings."""
+    bearing = rig.bearing
+    for name in ("rotor", "wedge", "wedge ring", "spacer", "rear ring"):
+        fill(axes, section(solids[name]), COLOURS[name])
+    axes.set_title(
+        f"12 rotor with 17 wedge ({number(rig.apex_deg)}°), 18 and 7 rings, 9 spacer; {rig.teeth[0]} teeth GT2"
+    )
+    tip = rig.pitch(rig.teeth[0]) - parts.PITCH_LINE
+    diameters(
+        axes,
+        [
+            (rig.clear, rig.front_z + 2, number(2 * rig.clear)),
+            (rig.wedge / 2 + rig.seat, rig.seat_z + 2, number(rig.wedge + 2 * rig.seat)),
+            (tip, rig.front_z - 3, f"{number(2 * tip)} teeth"),
+            (rig.flange, rig.front_z, number(2 * rig.flange)),
+        ],
+        rig.front_z + 8,
+    )
+    half = bearing.bore / 2
+    for y in (-half, half):
+        axes.plot([rig.bearing_z[0] - 9, rig.bearing_z[0]], [y, y], color="#666666", linewidth=0.4)
+    dimension(axes, (rig.bearing_z[0], -half), (rig.bearing_z[0], half), f"⌀ {number(bearing.bore)} − 0.02", -9)
+    y = -rig.flag
+    start = rig.bearing_z[0] + 0.2
+    dimension(axes, (start, y), (rig.shoulder_z, y), number(rig.shoulder_z - start), -5)
+    dimension(axes, (rig.pulley_z, y), (rig.front_z, y), number(rig.front_z - rig.pulley_z), -5)
+    dimension(axes, (rig.seat_z, -rig.flange), (rig.front_z, -rig.flange), number(rig.front_z - rig.seat_z), 5)
+    dimension(axes, (rig.bearing_z[0], 0), (rig.bearing_z[0], y), f"flag {number(rig.flag)}", -18)
+
+
+def cover(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
+    """Draw the cover from the scene."""
+    solid, inside = solids["cover"], rig.cover_z + 1.0
+    fill(axes, solid.slice(inside) + solid.slice(rig.face_z + 1.0), COLOURS["cover"])
+    axes.set_title(f"19 cover, from the scene; depth {number(rig.cover_z + 2 - rig.face_z)}, walls 2")
+    dimension(axes, (-rig.opening, 0), (rig.opening, 0), f"⌀ {number(2 * rig.opening)} inside")
+    dimension(axes, (-rig.outline, 0), (rig.outline, 0), f"⌀ {number(2 * rig.outline)}", -rig.outline - 7)
+    low, high = parts.lugs(rig)[3], parts.lugs(rig)[2]
+    dimension(axes, low, high, f"{number(high[1] - low[1])}, 4 × ⌀ 3.4", 14)
+
+
+def base(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
+    """Draw the base from above."""
+    shape = solids["base"].rotate((90, 0, 0)).project().mirror((0, 1))
+    fill(axes, shape, COLOURS["base"])
+    low_x, low_z, high_x, high_z = shape.bounds()
+    axes.set_title("1 base, from above (scene up); 6 thick, 8 × ⌀ 4.4")
+    dimension(axes, (low_x, low_z), (high_x, low_z), number(high_x - low_x), -6)
+    dimension(axes, (low_x, low_z), (low_x, high_z), number(high_z - low_z), -6)
+    (x, near), (_, far) = parts.foot_holes(rig)[2:]
+    dimension(axes, (-x, far), (x, far), number(2 * x))
+    dimension(axes, (x, near), (x, far), number(far - near))
+    dimension(axes, (low_x + 6, high_z - 6), (high_x - 6, high_z - 6), number(high_x - low_x - 12))
+    dimension(axes, (high_x - 6, low_z + 6), (high_x - 6, high_z - 6), number(high_z - low_z - 12), 14)
+
+
+def rings(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
+    """Draw the cuts through the small round parts, in a row."""
+    axes.set_title("cuts: 7 rear ring, 9 spacer, 18 wedge ring, 14 motor pulley, 15 magnet cup")
+    at = 0.0
+    for name, x in (
+        ("rear ring", 0.0),
+        ("spacer", 0.0),
+        ("wedge ring", 0.0),
+        ("motor pulley", rig.distance),
+        ("magnet cup", rig.distance),
+    ):
+        shape = section(solids[name].translate((-x, 0, 0)))
+        low, bottom, high, top = shape.bounds()
+        fill(axes, shape.translate((at - low, 0)), COLOURS[name])
+        end = at + high - low
+        dimension(axes, (at, bottom), (end, bottom), number(high - low), -5)
+        dimension(axes, (end, bottom), (end, top), f"⌀ {number(top - bottom)}", 6)
+        inner = [abs(y) for polygon in shape.to_polygons() for _, y in polygon]
+        if name != "magnet cup":
+            bore = min(inner)
+            dimension(axes, (at, -bore), (at, bore), f"⌀ {number(2 * bore)}", -4)
+        at = end + 26.0
+
+
+def plate(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
+    """Draw the motor plate from the scene."""
+    fill(axes, solids["motor plate"].project().translate((-rig.distance, 0)), COLOURS["motor plate"])
+    axes.set_title(f"22 motor plate, from the scene; {number(parts.MOTOR_PLATE)} thick, slots for M3 ± 3")
+    half, low = rig.motor_screws[0] / 2, rig.motor[0] / 2 + 3.0
+    boss = rig.motor_screws[1] / 2 + 0.1
+    dimension(axes, (-boss, 0), (boss, 0), f"⌀ {number(2 * boss)}")
+    dimension(axes, (0, -half), (0, half), f"{number(2 * half)}, 2 × ⌀ 3.4, countersunk", half + 8)
+    dimension(axes, (-8, -low), (-8, low), number(2 * low), -12)
+
+
+def bearing_cap(axes: Any, rig: Rig, solids: dict[str, Manifold]) -> None:
+    """Draw the bearing cap from the scene."""
+    fill(axes, solids["bearing cap"].project(), COLOURS["bearing cap"])
+    axes.set_title("11 bearing cap, from the scene; 1.9 thick, 3 × ⌀ 3.4")
+    out = math.hypot(*parts.cap_screws(rig)[0])
+    dimension(axes, (-rig.bearing.outside, 0), (rig.bearing.outside, 0), f"⌀ {number(2 * rig.bearing.outside)}")
+    dimension(axes, (-out - 3, 0), (out + 3, 0), f"⌀ {number(2 * out + 6)}, screws on ⌀ {number(2 * out)}", -out - 9)
 
 
 def mesh_of(part: Part) -> Any:
@@ -197,27 +283,37 @@ def mesh_of(part: Part) -> Any:
 def exploded(made: Sequence[Part], out: Path, *, apart: float = 1.5, size: tuple[int, int] = (1600, 900)) -> None:
     """Write a picture of the parts, moved apart, with their numbers in the list of :func:`rig.parts.assembly`."""
     import pyvista
+    from PIL import Image
 
     plotter = pyvista.Plotter(off_screen=True, window_size=size)
     plotter.set_background("white")
     meshes = [mesh_of(part).translate([apart * v for v in part.apart], inplace=False) for part in made]
-    top = max(mesh.bounds[3] for mesh in meshes)
-    points = []
-    for k, (part, mesh) in enumerate(zip(made, meshes, strict=True)):
+    view, up = np.array([-0.8, 0.42, 0.55]), np.array([0.0, 1.0, 0.0])
+    for part, mesh in zip(made, meshes, strict=True):
         clear = 0.45 if part.kind == "glass" else 1.0
         plotter.add_mesh(mesh, color=COLOURS.get(part.name, SCREWS), opacity=clear, smooth_shading=False, specular=0.2)
         plotter.add_mesh(mesh.extract_feature_edges(35), color="#303030", line_width=0.6)
-        tip = np.array([mesh.center[0], mesh.bounds[3], mesh.center[2]])
-        end = np.array([tip[0], top + 6.0 + 9.0 * (k % 3), tip[2]])
-        if part.kind != "screws":
-            points.append(end)
-        if apart and part.kind != "screws":
-            plotter.add_mesh(pyvista.Line(tip, end), color="#808080", line_width=1)
     if apart:
+        tips = np.array(
+            [
+                (mesh.center[0], mesh.bounds[3], mesh.center[2])
+                for part, mesh in zip(made, meshes, strict=True)
+                if part.kind != "screws"
+            ]
+        )
+        # The labels stand in rows parallel to the rig's axis in the picture, and neighbours in different rows.
+        right = np.cross(up, view) / np.hypot(view[0], view[2])
+        above = np.cross(view, right) / np.linalg.norm(view)
+        slope = above[2] / right[2]
+        rows = (tips @ above - slope * (tips @ right)).max() + 8.0 + 12.0 * (np.arange(len(tips)) % 4)
+        ends, order = tips.copy(), np.argsort(tips @ right)
+        ends[order, 1] += (rows - (tips @ above - slope * (tips @ right))[order]) / above[1]
+        for tip, end in zip(tips, ends, strict=True):
+            plotter.add_mesh(pyvista.Line(tip, end), color="#808080", line_width=1)
         plotter.add_point_labels(
-            np.array(points),
-            [str(k) for k in range(1, len(points) + 1)],
-            font_size=18,
+            ends,
+            [str(k) for k in range(1, len(ends) + 1)],
+            font_size=20,
             shape_color="white",
             shape_opacity=0.9,
             text_color="black",
@@ -226,8 +322,11 @@ def exploded(made: Sequence[Part], out: Path, *, apart: float = 1.5, size: tuple
             margin=2,
         )
     plotter.enable_parallel_projection()
-    plotter.view_vector((-0.8, 0.42, 0.55), viewup=(0, 1, 0))
+    plotter.view_vector(view, viewup=up)
     plotter.reset_camera()
-    plotter.camera.zoom(1.45)
-    plotter.screenshot(out)
+    plotter.camera.zoom(1.7 if apart else 1.1)
+    picture = plotter.screenshot(return_img=True)
     plotter.close()
+    rows, columns = (np.flatnonzero((picture < 255).any(axis=(2, other))) for other in (1, 0))
+    shown = picture[max(rows[0] - 8, 0) : rows[-1] + 9, max(columns[0] - 8, 0) : columns[-1] + 9]
+    Image.fromarray(shown).quantize(128).save(out, optimize=True)

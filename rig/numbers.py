@@ -71,6 +71,14 @@ def to_mesh(part: Part):
     return trimesh.Trimesh(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts), process=False)
 
 
+def in_file(part: Part):
+    """Return a part as a mesh of trimesh with the float32 numbers of an STL file, where near points become one."""
+    import trimesh
+
+    mesh = to_mesh(part)
+    return trimesh.Trimesh(mesh.vertices.astype(np.float32), mesh.faces, process=True)
+
+
 @lru_cache(maxsize=4)
 def bodies(rig: Rig) -> tuple[Body, ...]:
     """Return the mass properties of all parts."""
@@ -218,8 +226,22 @@ SENSORS = {
 """Sensors: columns, rows, pixel pitch [mm]."""
 
 
+def lenses(rig: Rig) -> dict[str, Rig]:
+    """Return a rig with different lenses, by their names.
+
+    A lens with M12 thread ends about 22 mm before the sensor. On a camera with CS-mount, that is 10 mm before the
+    camera, and 5 mm before the adapter.
+    """
+    slim = replace(rig, lens=17.0, reach=5.0, pupil=4.0)
+    short, long = (replace(rig, lens=34.0, reach=reach, pupil=10.0) for reach in (30.0, 40.0))
+    found = {"M12, 17 mm wide, 5 mm before its CS adapter": slim}
+    if short.enters:
+        return {**found, "C-mount, 34 mm wide, 30 mm long": short, "C-mount, 34 mm wide, 40 mm long": long}
+    return {**found, "C-mount, 34 mm wide, any length, behind the rotor": short}
+
+
 def clear_of_stops(
-    rig: Rig, sensor: tuple[int, int, float], focal: float, number: float = 2.0, back: float = 0.0
+    rig: Rig, sensor: tuple[int, int, float], focal: float, number: float = 2.0, off: float = 0.0
 ) -> float:
     """Return the smallest distance of the image's rays from the rim of an aperture [mm]; negative if some are cut off.
 
@@ -232,8 +254,8 @@ def clear_of_stops(
         Focal length [mm].
     number : float
         F-number.
-    back : float
-        Distance by which the lens stands further from the wedge than drawn [mm].
+    off : float
+        Distance of the lens's axis from that of the rotor [mm].
     """
     columns, rows, pitch = sensor
     focal_px = focal / pitch
@@ -247,7 +269,7 @@ def clear_of_stops(
     inside = camera.pixels_to_rays(pixels)
     outside = camera.pixels_to_rays(model.compensate_points(pixels, angles))
     steep, after = (np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2] for rays in (inside, outside))
-    pupil, at = focal / (2 * number), rig.lens_z - rig.pupil - back
+    pupil, at = focal / (2 * number) + off, rig.lens_z - rig.pupil
     glass = rig.seat_z + rig.thickness
     left = []
     for _, z, radius in rig.stops:
@@ -256,10 +278,10 @@ def clear_of_stops(
     return min(left)
 
 
-def shortest_focal(rig: Rig, sensor: tuple[int, int, float], number: float = 2.0, back: float = 0.0) -> float:
-    """Return the shortest focal length without vignetting [mm], in steps of 0.1 mm."""
+def shortest_focal(rig: Rig, sensor: tuple[int, int, float], number: float = 2.0, off: float = 0.0) -> float:
+    """Return the shortest focal length without vignetting [mm], in steps of 0.1 mm, or infinity if there is none."""
     for tenth in range(20, 1000):
-        if clear_of_stops(rig, sensor, tenth / 10, number, back) >= 0:
+        if clear_of_stops(rig, sensor, tenth / 10, number, off) >= 0:
             return tenth / 10
     return math.inf
 
@@ -279,6 +301,25 @@ class Tolerance:
     """Error of the measured angle: factors of cos θ, sin θ, cos 2θ, sin 2θ."""
     shake: tuple[float, float] = (0.0, 0.0)
     """Rotation of the camera once a turn [rad]: in phase with the prism, and a quarter turn later."""
+
+
+def offset_error(rig: Rig, off: float, distance: float, width: int = 640, fov_deg: float = 60.0) -> float:
+    """Return how far a point at the border of the image moves if the lens is off the rotor's axis [px].
+
+    Off the axis by d, the light passes glass that is thicker or thinner by d tan α. At the angle i from the axis, this
+    shifts it by d tan α (tan i - tan r), with sin i = n sin r. Without wedge, an offset changes nothing that turns.
+
+    Parameters
+    ----------
+    off : float
+        Distance of the lens's axis from that of the rotor [mm].
+    distance : float
+        Distance of the scene [mm].
+    """
+    half = math.radians(fov_deg / 2)
+    inside = math.asin(math.sin(half) / amiwarp.Prism(math.radians(rig.apex_deg)).index)
+    shift = off * math.tan(math.radians(rig.apex_deg)) * (math.tan(half) - math.tan(inside))
+    return shift / distance * width / (2 * math.tan(half))
 
 
 def error(

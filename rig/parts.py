@@ -18,15 +18,18 @@ SEGMENTS = 180
 """Number of sides of a circle."""
 PETG, GLASS, STEEL, RUBBER = 1.27e-3, 2.51e-3, 7.85e-3, 1.2e-3
 """Densities [g/mm³] of the printed material (solid), N-BK7, steel and rubber."""
-BELT_PITCH, BELT_WIDTH, PITCH_LINE, TOOTH_DEPTH, BELT_BACK = 2.0, 6.0, 0.254, 0.75, 0.63
+BELT_PITCH, BELT_WIDTH, PITCH_LINE, TOOTH_DEPTH, BELT_BACK = 2.0, 6.0, 0.254, 0.75, 0.77
 """GT2 belt [mm]: pitch, width, distance of the pitch line from the tips of the pulley's teeth, depth of a tooth, and
-thickness without teeth."""
+thickness without teeth (1.52 in all by SDP/SI's handbook, 1.4 by other makers)."""
 FLANGE, BELT_ROOM = 1.2, 7.0
 """Thickness of a pulley's flange, and distance between its flanges [mm]."""
 SPRING = 1.5
 """Length of the compressed wave spring [mm]."""
 PLATE, MOTOR_PLATE, SLIDE = 5.0, 4.0, 3.0
 """Thickness of the housing's plate and of the motor's plate behind it, and travel of the latter to either side [mm]."""
+HOLDER, LIP, SLIT = 3.0, 1.0, 0.8
+"""Holder of the camera [mm]: thickness of its plate, width of the lip in front of the gripped ring, and width of the
+slit that frees the clamp from the plate."""
 CORD, SQUEEZED = 1.0, 0.75
 """Thickness of the O-ring, free and between wedge and ring [mm]."""
 HEADS = {2.0: (3.8, 2.0, 1.6), 2.5: (4.5, 2.5, 2.05), 3.0: (5.5, 3.0, 2.5), 4.0: (7.0, 4.0, 3.3)}
@@ -99,7 +102,9 @@ class Rig:
     series : str
         Series of the bearings, 67 or 68.
     lens : float
-        Outer diameter of the lens, which reaches into the rotor.
+        Outer diameter of the lens. It reaches into the rotor if it is slim enough.
+    reach : float
+        Distance of the lens's front from the front of the ring that the holder grips.
     pupil : float
         Distance of the lens's entrance pupil behind its front.
     """
@@ -112,13 +117,17 @@ class Rig:
     belt: float
     series: str
     lens: float
+    reach: float
     pupil: float
     motor: tuple[float, float, float]
     """Motor: diameter of body, length of body, diameter of shaft."""
     motor_screws: tuple[float, float]
     """Motor: distance of its two M3 threads, and diameter of its centring boss."""
-    camera: tuple[float, float, float, float] = (40.0, 40.0, 30.0, 20.0)
-    """Camera body: width, height, length, and height of the optical axis above its tripod thread's face."""
+    camera: tuple[float, float, float] = (40.0, 60.0, 30.0)
+    """Camera body: width, height and length. The optical axis is in its middle."""
+    grip: tuple[float, float] = (30.0, 5.0)
+    """What the holder grips: diameter, and width. By default the ring of 5 mm between a camera with CS-mount (12.526 mm
+    from flange to sensor) and a lens with C-mount (17.526 mm), which is of metal and does not turn when one focuses."""
     screw: tuple[float, float] = (1.6, 2.0)
     """Set screws that balance the rotor: core hole, and thread."""
     seat: float = 0.1
@@ -181,9 +190,20 @@ class Rig:
         return self.front_z - 1.3 - self.edge
 
     @property
+    def enters(self) -> bool:
+        """Whether the lens is slim enough to reach into the rotor."""
+        return self.lens / 2 + 1.5 <= self.clear
+
+    @property
     def lens_z(self) -> float:
-        """Front of the lens."""
-        return self.seat_z - 2.0
+        """Front of the lens: as near to the wedge as the holder allows, or behind the rotor."""
+        nearest = -(HOLDER + SLIT + LIP) + self.reach
+        return min(self.seat_z - 2.0, nearest) if self.enters else -1.5
+
+    @property
+    def grip_z(self) -> float:
+        """Front of the ring that the holder grips."""
+        return self.lens_z - self.reach
 
     @property
     def cover_z(self) -> float:
@@ -250,9 +270,21 @@ class Rig:
         return self.clear + 1.0 * (self.cover_z - self.front_z)
 
 
-ONE_INCH = Rig("one-inch", 25.4, 3.5, 1.0, (60, 30), 180.0, "67", 17.0, 4.0, (28.0, 40.0, 4.0), (17.0, 7.0))
+ONE_INCH = Rig("one-inch", 25.4, 3.5, 1.0, (60, 30), 180.0, "67", 17.0, 5.0, 4.0, (28.0, 40.0, 4.0), (17.0, 7.0))
 TWO_INCH = Rig(
-    "two-inch", 50.8, 5.0, 1.0, (100, 50), 280.0, "68", 40.0, 10.0, (36.0, 45.0, 5.0), (25.0, 10.0), screw=(2.5, 3.0)
+    "two-inch",
+    50.8,
+    5.0,
+    1.0,
+    (100, 50),
+    280.0,
+    "68",
+    40.0,
+    30.0,
+    10.0,
+    (36.0, 45.0, 5.0),
+    (25.0, 10.0),
+    screw=(2.5, 3.0),
 )
 RIGS = (ONE_INCH, TWO_INCH)
 
@@ -466,7 +498,10 @@ def housing(rig: Rig) -> Manifold:
     """Return the housing: barrel of the bearings, plate with a slot for the motor's shaft, foot."""
     bearing, face = rig.bearing, rig.face_z
     barrel = bearing.outer / 2 + 4.0
-    out = with_lugs(rig).extrude(PLATE).translate((0, 0, face - PLATE)) + ring(0, barrel, 0, face)
+    circle = CrossSection.circle(barrel, SEGMENTS)
+    eyes = [(circle + CrossSection.circle(3.2, 48).translate(point)).hull() for point in holder_screws(rig)]
+    out = with_lugs(rig).extrude(PLATE).translate((0, 0, face - PLATE))
+    out += CrossSection.batch_boolean(eyes, ADD).extrude(face)
     out += box((-barrel, barrel), (-rig.height, 0), (face - PLATE, face))
     out += box((-barrel, barrel), (-rig.height, -rig.height + PLATE), (0, face + 20))
     for x in (-barrel, barrel - 4):
@@ -475,7 +510,7 @@ def housing(rig: Rig) -> Manifold:
     out -= rod(bearing.outside, -1, 3, sides=SEGMENTS)
     out -= slots([(rig.distance, 0)], rig.motor[2] + 2.0, SLIDE, face - PLATE - 1, face + 1)
     out -= holes([*cap_screws(rig), *lugs(rig), *plate_screws(rig)], 2.5, face - PLATE - 1, face + 1)
-    out -= holes(rear_plate_screws(rig), 1.6, -1, 8)
+    out -= holes(holder_screws(rig), HEADS[2.5][2], -1, 8)
     return out - upright_holes(rig, foot_holes(rig), 3.3)
 
 
@@ -594,45 +629,62 @@ def magnet_z(rig: Rig) -> float:
     return rig.cover_z + 2.0 - 2.1
 
 
-def rear_plate_screws(rig: Rig) -> list[tuple[float, float]]:
-    """Return the points of the M2 screws of the rear plate."""
-    return around(rig.bearing.outer / 2 + 2.0, (60, 180, 300))
+def holder_screws(rig: Rig) -> list[tuple[float, float]]:
+    """Return the points of the M2.5 screws that hold the holder on the housing. A key passes beside the camera."""
+    x = max(rig.camera[0] / 2 + HEADS[2.5][0] / 2 + 0.1, (rig.bearing.outer / 2 + 2.0) / math.sqrt(2))
+    return [(i * x, j * x) for i, j in ((1, 1), (-1, 1), (-1, -1), (1, -1))]
 
 
-def rear_plate(rig: Rig) -> Manifold:
-    """Return the plate that closes the rear against light and fingers; a ring of black foam seals it to the lens."""
-    out = ring(rig.lens / 2 + 1.0, rig.bearing.outer / 2 + 4.0, -2.0, 0.0)
-    out -= holes(rear_plate_screws(rig), 2.4, -3, 1)
-    return out - sinks(rear_plate_screws(rig), 2.0, -2.0, rear=True)
+def holder(rig: Rig) -> Manifold:
+    """Return the holder of the camera: plate with a spigot in the housing's bore, and a split clamp behind it.
+
+    The clamp grips the ring between camera and lens. If the lens is slimmer than the ring, the ring lies on a lip.
+    """
+    bearing, (wide, _), front = rig.bearing, rig.grip, rig.grip_z
+    rear, outer = front - rig.grip[1] + 0.1, max(rig.grip[0], rig.lens + 2.0) / 2 + 4.0
+    eyes = [CrossSection.circle(4.0, 48).translate(point) for point in holder_screws(rig)]
+    plate = CrossSection.batch_boolean([CrossSection.circle(bearing.outer / 2 + 4.0, SEGMENTS), *eyes], ADD).hull()
+    out = plate.extrude(HOLDER).translate((0, 0, -HOLDER)) + ring(0, outer, rear, -HOLDER)
+    out += ring(0, bearing.outside - 0.05, -0.1, 1.5)
+    y = clamp_y(rig)
+    out += box((-CLAMP, CLAMP), (outer - 3.0, y + 3.5), (rear, front + LIP))
+    out -= box((-50, 50), (-0.35 * outer, 100), (front + LIP, front + LIP + SLIT))
+    out -= box((-1, 1), (0, 100), (rear - 1, front + LIP + SLIT))
+    spigot = bearing.inner + rig.clearance + 0.05
+    out -= rod(rig.lens / 2 + 1.0, front - 0.1, 2.0 if rig.enters else -1.0, sides=SEGMENTS)
+    out -= rod(spigot, 0.0, 2.0, sides=SEGMENTS) + rod(min(spigot, rig.lens / 2 + 1.0), -1.1, 2.0, sides=SEGMENTS)
+    out -= rod(wide / 2 + 0.1, rear - 1, front, sides=SEGMENTS)
+    out -= rod(1.35, -20, 20).rotate((0, 90, 0)).translate((0, y, clamp_z(rig)))
+    points = holder_screws(rig)
+    return out - holes(points, 2.9, -HOLDER - 1, 1) - holes(points, 5.2, rear - 1, -HOLDER)
 
 
-def riser(rig: Rig) -> Manifold:
-    """Return the block under the camera."""
-    width, _, length, _ = rig.camera
-    top, (low, high) = -rig.camera[3], camera_z(rig)
-    out = box((-width / 2, width / 2), (-rig.height, top), (low, low + length))
-    hole = (
-        Manifold.cylinder(rig.height, 3.3, 3.3, 32)
-        .rotate((-90, 0, 0))
-        .translate((0, -rig.height - 1, (low + high) / 2))
-    )
-    return out - hole
+CLAMP = 6.0
+"""Distance of the clamp's outer faces from the middle [mm]."""
+
+
+def clamp_y(rig: Rig) -> float:
+    """Return the height of the clamp's M2.5 screw above the axis."""
+    return max(rig.grip[0], rig.lens + 2.0) / 2 + 4.0 + 3.5
+
+
+def clamp_z(rig: Rig) -> float:
+    """Return z of the clamp's screw, in the middle of the clamp."""
+    return rig.grip_z + (LIP - rig.grip[1] + 0.1) / 2
 
 
 def camera_z(rig: Rig) -> tuple[float, float]:
     """Return the rear and the front face of the camera's body."""
-    high = -4.0
+    high = rig.grip_z - rig.grip[1]
     return high - rig.camera[2], high
 
 
 def base(rig: Rig) -> Manifold:
     """Return the base plate."""
-    x, (low, high) = rig.bearing.outer / 2 + 8.0, camera_z(rig)
+    x, low = rig.bearing.outer / 2 + 8.0, camera_z(rig)[0]
     y = (-rig.height - 6.0, -rig.height)
     out = box((-x, x), y, (low - 12, rig.face_z + 32))
     out -= upright_holes(rig, foot_holes(rig), 4.4)
-    slot = [upright_holes(rig, [(0, (low + high) / 2 + z)], 6.6) for z in (-12.0, 12.0)]
-    out -= (slot[0] + slot[1]).hull()
     corners = [(side, z) for side in (-x + 6, x - 6) for z in (low - 6, rig.face_z + 26)]
     return out - upright_holes(rig, corners, 4.4)
 
@@ -690,11 +742,15 @@ def encoder(rig: Rig) -> Manifold:
     return out.translate((rig.distance, 0, 0)) - holes(board_screws(rig), 2.7, low - 1, low + 3)
 
 
-def lens(rig: Rig) -> Manifold:
-    """Return the lens and the camera's body."""
-    width, tall, _, up = rig.camera
-    (low, high), radius = camera_z(rig), rig.lens / 2
-    return box((-width / 2, width / 2), (-up, tall - up), (low, high)) + rod(radius, high, rig.lens_z, sides=96)
+def camera(rig: Rig) -> Manifold:
+    """Return the camera's body."""
+    width, tall, _ = rig.camera
+    return box((-width / 2, width / 2), (-tall / 2, tall / 2), camera_z(rig))
+
+
+def mount_ring(rig: Rig) -> Manifold:
+    """Return the ring between camera and lens, which the holder grips, without its threads."""
+    return ring(11.0, rig.grip[0] / 2, rig.grip_z - rig.grip[1], rig.grip_z)
 
 
 def bearing_solids(rig: Rig) -> list[Manifold]:
@@ -706,7 +762,7 @@ def bearing_solids(rig: Rig) -> list[Manifold]:
 def screw_solids(rig: Rig) -> list[tuple[str, str, Manifold, tuple[float, float, float]]]:
     """Return the screws: name, what they move with, solids, and how far the exploded view moves them.
 
-    Left out are the set screws, and the screw of the camera.
+    Left out are the set screws.
     """
     behind, aside, up = (180.0, 0.0, 0.0), (-90.0, 0.0, 0.0), (90.0, 0.0, 0.0)
     low, board = rig.face_z - PLATE, rig.cover_z + 3.6
@@ -714,16 +770,20 @@ def screw_solids(rig: Rig) -> list[tuple[str, str, Manifold, tuple[float, float,
     nuts -= holes(board_screws(rig), 2.5, rig.cover_z - 3.0, rig.cover_z + 1.0)
     fork = [(x, y + 1.6, z) for x, y, z in fork_screws(rig)]
     foot = [(x, -rig.height - 6.0, z) for x, z in foot_holes(rig)]
+    y, z = clamp_y(rig), clamp_z(rig)
+    clamp = screws(2.5, 16.0, 16.0, [(-CLAMP, y, z)], (0.0, -90.0, 0.0))
+    clamp += (rod(2.75, CLAMP, CLAMP + 2.0, sides=6) - rod(1.25, 0, 20)).rotate((0, 90, 0)).translate((0, y, z))
     cap_at, cover_at = at_z(cap_screws(rig), cap_z(rig)), at_z(lugs(rig), rig.face_z + 4.0)
     ring_at, rear_at = at_z(ring_screws(rig)[1], rig.front_z + 2.0), at_z(rear_screws(rig), rig.bearing_z[0] - 2.5)
-    light_at, motor_at = at_z(rear_plate_screws(rig), -2.0), at_z(motor_points(rig), low)
+    holder_at, motor_at = at_z(holder_screws(rig), -HOLDER), at_z(motor_points(rig), low)
     plate_at, board_at = at_z(plate_screws(rig), low - MOTOR_PLATE), at_z(board_screws(rig), board)
     return [
         ("screws of the cap", "", screws(3.0, 6.0, 1.9, cap_at), (0, 0, 64)),
         ("screws of the cover", "", screws(3.0, 8.0, 4.0, cover_at), (0, 0, 132)),
         ("screws of the wedge ring", "prism", screws(2.0, 8.0, 2.0, ring_at), (0, 0, 106)),
         ("screws of the rear ring", "prism", screws(2.0, 8.0, 2.5, rear_at, behind, sunk=True), (0, 0, 12)),
-        ("screws of the rear plate", "", screws(2.0, 6.0, 2.0, light_at, behind, sunk=True), (0, 0, -30)),
+        ("screws of the holder", "", screws(2.5, 8.0, HOLDER, holder_at, behind), (0, 0, -40)),
+        ("screw of the clamp", "", clamp, (0, 12, -24)),
         ("screws of the motor", "", screws(3.0, 8.0, MOTOR_PLATE, motor_at, sunk=True), (0, 0, -8)),
         ("screws of the motor plate", "", screws(3.0, 8.0, MOTOR_PLATE, plate_at, behind), (0, 0, -20)),
         ("screws of the base", "", screws(4.0, 12.0, 6.0, foot, up), (0, -42, 0)),
@@ -747,9 +807,9 @@ def assembly(rig: Rig) -> tuple[Part, ...]:
     magnet = rod(3.0, magnet_z(rig) - 2.0, magnet_z(rig), rig.distance)
     return (
         printed("base", base(rig), "", (0, -30, 0)),
-        printed("riser", riser(rig), "", (0, -12, -62)),
-        Part("camera with lens", lens(rig), "bought", "", 130.0, (0, 0, -62)),
-        printed("rear plate", rear_plate(rig), "", (0, 0, -24)),
+        Part("mount ring", mount_ring(rig), "bought", "", 10.0, (0, 0, -68)),
+        Part("camera", camera(rig), "bought", "", 80.0, (0, 0, -88)),
+        printed("holder", holder(rig), "", (0, 0, -24)),
         Part("motor", motor(rig), "bought", "", 90.0 if rig.motor[0] < 30 else 160.0, (0, 0, -24)),
         printed("housing", housing(rig), "", (0, 0, 0)),
         printed("rear ring", rear_ring(rig), "prism", (0, 0, 18)),
@@ -769,6 +829,7 @@ def assembly(rig: Rig) -> tuple[Part, ...]:
         Part("encoder board", encoder(rig), "bought", "", 4.0, (0, 0, 138)),
         printed("motor plate", motor_plate(rig), "", (0, 0, -14)),
         Part("O-ring", rubber, "bought", "prism", rubber.volume() * RUBBER, (0, 0, 94)),
+        Part("lens", ring(0, rig.lens / 2, rig.grip_z, rig.lens_z), "bought", "", 50.0, (0, 0, -46)),
         *(Part(n, each, "screws", moves, each.volume() * STEEL, apart) for n, moves, each, apart in screw_solids(rig)),
     )
 

@@ -13,6 +13,7 @@ from manifold3d import Manifold
 
 trimesh = pytest.importorskip("trimesh", reason="the rig's parts need trimesh: pip install 'amiwarp[rig]'")
 
+import amiwarp  # noqa: E402
 from rig import __main__ as command  # noqa: E402
 from rig import numbers, parts  # noqa: E402
 from rig.parts import ONE_INCH, RIGS, TWO_INCH, Part, Rig  # noqa: E402
@@ -41,10 +42,10 @@ def test_a_steeper_wedge_fits(rig: Rig) -> None:
 
 def test_an_overlap_a_narrow_gap_and_a_loose_piece_are_seen(made: Sequence[Part], rig: Rig) -> None:
     by_name = {part.name: part for part in made}
-    turning, still = by_name["rear ring"], by_name["rear plate"]  # 1 mm apart
+    turning, still = by_name["rear ring"], by_name["holder"]
     assert parts.problems(rig, [turning, still]) == []
     low = replace(turning, solid=turning.solid.translate((0, 0, -0.5)))
-    assert parts.problems(rig, [low, still]) == ["rear ring and rear plate are 0.50 mm apart, less than 0.7 mm"]
+    assert parts.problems(rig, [low, still]) == ["rear ring and holder are 0.50 mm apart, less than 0.7 mm"]
     lower = replace(turning, solid=turning.solid.translate((0, 0, -2.0)))
     assert any("overlap" in text for text in parts.problems(rig, [lower, still]))
     pieces = replace(still, solid=still.solid + still.solid.translate((0, 0, 50)))
@@ -66,22 +67,22 @@ def test_a_screw_head_under_the_flange_is_seen() -> None:
 
 
 def test_heads_that_stand_out_are_seen(rig: Rig, made: Sequence[Part]) -> None:
-    """Cylinder heads on the rear ring touch the rear plate, and under the motor's pulley they touch that."""
+    """Cylinder heads on the rear ring touch the holder, and under the motor's pulley they touch that."""
     behind, low = (180.0, 0.0, 0.0), rig.bearing_z[0] - 2.5
     ring = parts.screws(2.0, 8.0, 2.5, parts.at_z(parts.rear_screws(rig), low), behind)
     wrong = parts.problems(rig, replaced(made, "screws of the rear ring", ring))
-    assert any(text.startswith("rear plate and screws of the rear ring overlap") for text in wrong)
+    assert any(text.startswith("holder and screws of the rear ring overlap") for text in wrong)
     on_face = parts.screws(3.0, 8.0, 5.0, parts.at_z(parts.motor_points(rig), rig.face_z))
     wrong = parts.problems(rig, replaced(made, "screws of the motor", on_face))
     assert any(text.startswith("motor pulley and screws of the motor overlap") for text in wrong)
 
 
 def test_a_screw_that_is_too_long_is_seen(rig: Rig, made: Sequence[Part]) -> None:
-    """The rear plate's threads end 8 mm deep; a longer screw of the fork barrier reaches the flag's path."""
-    at = parts.at_z(parts.rear_plate_screws(rig), -2.0)
-    long = parts.screws(2.0, 12.0, 2.0, at, (180.0, 0.0, 0.0), sunk=True)
-    wrong = parts.problems(rig, replaced(made, "screws of the rear plate", long))
-    assert any(text.startswith("housing and screws of the rear plate overlap") for text in wrong)
+    """The holder's threads end 8 mm deep; a longer screw of the fork barrier reaches the flag's path."""
+    at = parts.at_z(parts.holder_screws(rig), -parts.HOLDER)
+    long = parts.screws(2.5, 12.0, parts.HOLDER, at, (180.0, 0.0, 0.0))
+    wrong = parts.problems(rig, replaced(made, "screws of the holder", long))
+    assert any(text.startswith("housing and screws of the holder overlap") for text in wrong)
     board = [(x, y + 1.6, z) for x, y, z in parts.fork_screws(rig)]
     long = parts.screws(2.0, 8.0, 1.6, board, (-90.0, 0.0, 0.0))
     wrong = parts.problems(rig, replaced(made, "screws of the fork barrier", long))
@@ -100,6 +101,51 @@ def test_a_key_reaches_the_screws_that_tighten_the_belt(rig: Rig, made: Sequence
     front = parts.holes(parts.motor_points(rig), 2.9, rig.face_z, rig.front_z)
     pulley = next(part for part in made if part.name == "motor pulley")
     assert (pulley.solid ^ front).volume() > 1.0
+
+
+LENSES = [(rig, name) for rig in RIGS for name in numbers.lenses(rig)]
+
+
+@pytest.mark.parametrize(("rig", "name"), LENSES, ids=lambda value: value if isinstance(value, str) else value.name)
+def test_the_holder_grips_each_lens(rig: Rig, name: str) -> None:
+    """Nothing overlaps, the lens's front is at its distance from the ring, and before the rotor if it is too wide."""
+    own = numbers.lenses(rig)[name]
+    made = parts.assembly(own)
+    assert parts.problems(own, made) == []
+    assert all(numbers.in_file(part).is_watertight for part in made)
+    solid = {part.name: part.solid for part in made}
+    low, high = np.array(solid["lens"].bounding_box()).reshape(2, 3)[:, 2]
+    assert high - low == pytest.approx(own.reach)
+    assert solid["mount ring"].bounding_box()[5] == pytest.approx(low)
+    assert solid["camera"].bounding_box()[5] == pytest.approx(low - 5.0)  # from CS-mount to C-mount
+    assert high <= own.seat_z - 2.0 + 1e-9
+    assert own.lens / 2 < own.clear if high > -1.0 else own.lens / 2 > own.clear
+
+
+def test_the_clamp_fits_its_ring_and_opens_at_the_screw(rig: Rig, made: Sequence[Part]) -> None:
+    """A bore 0.2 mm wider than the ring, cut by the slit that the screw closes; the spigot fits the housing's bore."""
+    solid = {part.name: part.solid for part in made}
+    jaws = solid["holder"].slice(rig.grip_z - 1.0)
+    radius = rig.grip[0] / 2 + 0.1
+    disc = Manifold.cylinder(1.0, radius - 0.01, radius - 0.01, 180).slice(0.5)
+    assert (jaws ^ disc).area() == pytest.approx(0.0, abs=1e-9)
+    assert (jaws ^ disc.scale((1.02, 1.02))).area() > 0.9 * (math.pi * ((1.02 * radius) ** 2 - radius**2))
+    slit = parts.box((-0.9, 0.9), (radius - 1.0, radius + 20.0), (rig.grip_z - 4.0, rig.grip_z + 0.5))
+    assert (solid["holder"] ^ slit).volume() == pytest.approx(0.0, abs=1e-9)
+    screw = np.array(solid["screw of the clamp"].bounding_box()).reshape(2, 3)
+    assert screw[0, 0] < -parts.CLAMP
+    assert screw[1, 0] > parts.CLAMP
+    moved = solid["holder"].translate((0.04, 0, 0))
+    assert (moved ^ solid["housing"]).volume() < 0.01
+    assert (solid["holder"].translate((0.2, 0, 0)) ^ solid["housing"]).volume() > 0.1
+
+
+def test_a_key_reaches_the_screws_of_the_holder(rig: Rig, made: Sequence[Part]) -> None:
+    """From behind, beside the camera, which is clamped before."""
+    face = -parts.HOLDER - parts.HEADS[2.5][1]
+    key = parts.holes(parts.holder_screws(rig), 2.3, face - 100.0, face)
+    for part in made:
+        assert (part.solid ^ key).volume() < 1e-9, part.name
 
 
 @pytest.mark.parametrize("travel", [-parts.SLIDE, parts.SLIDE])
@@ -158,13 +204,22 @@ def test_bearings_and_belt_fit(rig: Rig) -> None:
 def test_written_files_are_watertight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command.main([str(tmp_path), "--rig", "one-inch"])
     files = sorted((tmp_path / "one-inch").glob("*.stl"))
-    assert len(files) == 13
-    assert "13 parts to print" in capsys.readouterr().out
+    assert len(files) == 12
+    assert "12 parts to print" in capsys.readouterr().out
     for file in files:
         mesh = trimesh.load(file)
         assert mesh.is_watertight, file.name
         assert mesh.is_winding_consistent, file.name
         assert mesh.volume > 0, file.name
+
+
+def test_lens_and_ring_are_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A long lens stands 2 mm behind the wedge, and the clamp far behind the plate."""
+    command.main([str(tmp_path), "--rig", "two-inch", "--lens-mm", "34", "45", "--grip-mm", "32", "5"])
+    assert "its front is 2.0 mm from the wedge" in capsys.readouterr().out
+    low, high = trimesh.load(tmp_path / "two-inch" / "holder.stl").bounds
+    front = TWO_INCH.seat_z - 2.0 - 45.0
+    assert (low[2], high[2]) == pytest.approx((front - 4.9, 1.5), abs=1e-3)
 
 
 def test_wedge_unbalance_is_that_of_its_mesh(rig: Rig) -> None:
@@ -205,8 +260,28 @@ def test_lens_is_clear_of_the_stops(rig: Rig) -> None:
     left = min(radius - focal / (2 * number) - (z - at) * corner for _, z, radius in flat.stops)
     assert numbers.clear_of_stops(flat, sensor, focal, number) == pytest.approx(left, abs=1e-3)
     shortest = numbers.shortest_focal(rig, sensor)
-    assert shortest == {"one-inch": 4.5, "two-inch": 3.2}[rig.name]
+    assert shortest == {"one-inch": 13.7, "two-inch": 3.5}[rig.name]
     assert numbers.clear_of_stops(rig, sensor, shortest - 0.1) < 0 <= numbers.clear_of_stops(rig, sensor, shortest)
+
+
+def test_a_lens_off_the_axis(rig: Rig) -> None:
+    """It takes its offset from what is left to each stop; a point moves by what a traced ray does."""
+    sensor = numbers.SENSORS["640×480, 9 µm"]
+    centred, off = (numbers.clear_of_stops(rig, sensor, 16.0, 2.0, by) for by in (0.0, 0.3))
+    assert off == pytest.approx(centred - 0.3)
+
+    def traced(x: float, angle: float) -> float:
+        """Return where a ray from x in the plane of the wedge's flat face meets a wall 1 m away [mm]."""
+        n, tilt = amiwarp.Prism(0.01).index, math.radians(rig.apex_deg)
+        inside = math.asin(math.sin(angle) / n)
+        # The second face: z = thickness + x tan(tilt); its normal leans by the tilt.
+        z = (rig.thickness + x * math.tan(tilt)) / (1 - math.tan(inside) * math.tan(tilt))
+        at, out = x + z * math.tan(inside), math.asin(n * math.sin(inside + tilt)) - tilt
+        return at + (1000.0 - z) * math.tan(out)
+
+    edge = math.radians(30.0)
+    shift = (traced(0.3, edge) - 0.3) - traced(0.0, edge)
+    assert numbers.offset_error(rig, 0.3, 1000.0) == pytest.approx(abs(shift) / 1000.0 * 320 / math.tan(edge), rel=0.1)
 
 
 def test_wobble_costs_little_and_nothing_once_it_is_freed() -> None:
@@ -217,6 +292,6 @@ def test_wobble_costs_little_and_nothing_once_it_is_freed() -> None:
 
 
 def test_page_states_what_is_computed() -> None:
-    for row in [*command.balance_rows([ONE_INCH], [1.0]), *command.speed_rows()]:
+    for row in [*command.balance_rows([ONE_INCH], [1.0]), *command.speed_rows(), *command.lens_rows([TWO_INCH])]:
         assert "| " + " | ".join(row) + " |" in PAGE
     assert TWO_INCH.bearing.name in PAGE
