@@ -161,7 +161,8 @@ def unknown_commands(text: str) -> list[str]:
     """Return what code on a page names and does not exist: dotted names, commands, programs and their options."""
     commands = {name: options_of(one) for name, one in typer.main.get_command(app).commands.items()}
     programs = {path.stem: path.read_text() for path in (ROOT / "benchmarks").glob("*.py")}
-    anywhere = set().union(*commands.values()) | {o for source in programs.values() for o in OPTION.findall(source)}
+    sources = [*programs.values(), (ROOT / "rig" / "__main__.py").read_text()]
+    anywhere = set().union(*commands.values()) | {option for source in sources for option in OPTION.findall(source)}
     out = []
     for line in code_lines(text):
         out += [name for name in DOTTED.findall(line) if not resolves(name)]
