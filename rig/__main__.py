@@ -153,6 +153,7 @@ def simulated_rows() -> list[tuple[str, ...]]:
         ("as drawn", 0.0, 0.0, 0.0),
         ("wobble 0.4°", 0.0, 0.4, 0.0),
         ("tilt 1°", 1.0, 0.0, 0.0),
+        ("tilt 2.3°, a ring askew in its clamp", 2.3, 0.0, 0.0),
         ("angle off by 0.5° twice a turn", 0.0, 0.0, 0.5),
         ("all three", 1.0, 0.4, 0.5),
     ):
