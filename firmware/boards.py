@@ -16,6 +16,8 @@ from typing import Any
 
 HERE = Path(__file__).parent
 BUILD = HERE / "build"
+COUNTS = (4096, 16384)
+"""Counts per turn of the quadrature encoder, and of the magnetic one if it turns with the prism."""
 
 
 class NativeBoard:
@@ -25,25 +27,22 @@ class NativeBoard:
     """
 
     VALUES = (
-        "jammed", "driver_fault", "no_index", "dead_a", "reversed_motor", "bad_spi", "runaway", "angle", "rpm", "",
+        "jammed", "driver_fault", "no_index", "dead_a", "reversed_motor", "bad_spi", "runaway", "angle", "rpm",
         "now", "late_us", "pulses",
     )  # fmt: skip
     """What :meth:`get` returns; the names before ``angle`` are faults that :meth:`set` switches."""
     plugged = True
 
     def __init__(
-        self, *, counts_per_turn: int = 4096, magnetic: bool = False, pulses: int = 0, drift_ppm: float = 0.0,
+        self, *, counts_per_turn: int | None = None, magnetic: bool = False, pulses: int = 0, drift_ppm: float = 0.0,
         clock_start: float = 0.0, seed: int = 1, library: Path = BUILD / "libboard.so",
     ) -> None:  # fmt: skip
         self.library = ctypes.CDLL(str(library))
         self.library.board_new.restype = ctypes.c_void_p
         self.library.board_get.restype = ctypes.c_double
         self.library.board_advance.restype = ctypes.c_uint32
-        self._board = ctypes.c_void_p(
-            self.library.board_new(
-                counts_per_turn, int(magnetic), pulses, ctypes.c_double(drift_ppm), ctypes.c_double(clock_start), seed
-            )
-        )
+        counts, numbers = counts_per_turn or COUNTS[magnetic], map(ctypes.c_double, (drift_ppm, clock_start))
+        self._board = ctypes.c_void_p(self.library.board_new(counts, int(magnetic), pulses, *numbers, seed))
         self._out = ctypes.create_string_buffer(1 << 20)
 
     def advance(self, now_us: int) -> bytes:
@@ -85,15 +84,15 @@ class NativeBoard:
 class SimulatedBoard:
     """The image for the RP2040 on rp2040js (needs Node.js and ``npm install`` in ``simulator``), in simulated time.
 
-    ``image``: flash image (``.bin``). Times are in us.
+    ``image``: flash image (``.bin``); ``counts_per_turn`` of the prism is that for which it was built. Times are in us.
     """
 
     plugged = True
 
-    def __init__(self, image: Path, *, magnetic: bool = False) -> None:
-        kind = "MAGNETIC" if magnetic else "QUADRATURE"
+    def __init__(self, image: Path, *, magnetic: bool = False, counts_per_turn: int | None = None) -> None:
+        kind, counts = "MAGNETIC" if magnetic else "QUADRATURE", counts_per_turn or COUNTS[magnetic]
         self._process = subprocess.Popen(
-            ["node", str(HERE / "simulator" / "board.mjs"), str(image), kind],
+            ["node", str(HERE / "simulator" / "board.mjs"), str(image), kind, str(counts)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
         )  # fmt: skip
         self._inbox = b""
@@ -163,11 +162,11 @@ class SimulatedWire:
         return True
 
 
-def make(name: str) -> Any:
+def make(name: str, counts_per_turn: int | None = None) -> Any:
     """Return the board ``native``, ``native-magnetic``, or the one that runs an image."""
     if name.startswith("native"):
-        return NativeBoard(magnetic=name.endswith("magnetic"))
-    return SimulatedBoard(Path(name), magnetic="MAGNETIC" in name)
+        return NativeBoard(magnetic=name.endswith("magnetic"), counts_per_turn=counts_per_turn)
+    return SimulatedBoard(Path(name), magnetic="MAGNETIC" in name, counts_per_turn=counts_per_turn)
 
 
 def serve(board: Any, link: Path, seconds: float) -> None:
@@ -194,10 +193,11 @@ def main() -> int:
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("board", help="native, native-magnetic, or a flash image (.bin)")
     options.add_argument("--link", type=Path, help="symbolic link for the serial port")
+    options.add_argument("--counts-per-turn", type=int, help="of the prism, for which the image was built")
     options.add_argument("--seconds", type=float, default=3600.0)
     options.add_argument("--rpm", type=float, default=240.0)
     chosen = options.parse_args()
-    board = make(chosen.board)
+    board = make(chosen.board, chosen.counts_per_turn)
     if chosen.link is not None:
         serve(board, chosen.link, chosen.seconds)
         return 0

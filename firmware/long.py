@@ -1,4 +1,4 @@
-"""Run the image for the RP2040 in the simulator for minutes, and count losses: ``python long.py IMAGE SECONDS RPM``.
+"""Run an image in its simulator for minutes, and count losses: ``python long.py IMAGE SECONDS RPM COUNTS_PER_TURN``.
 
 Ends with status 1 after a damaged or lost frame, a lost sample, a fault, or an index pulse latched more than 2 us late.
 """
@@ -7,14 +7,14 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from boards import SimulatedBoard
+from boards import make
 
 from amiwarp.live.link.protocol import ControllerStatus, FrameDecoder, Index, Ping, Samples, SetSpeed, encode
 
 
-def main(image: Path, seconds: float, rpm: float) -> bool:
+def main(image: Path, seconds: float, rpm: float, counts_per_turn: int) -> bool:
     """Run, print the results and return whether all is well."""
-    board, decoder = SimulatedBoard(image, magnetic="MAGNETIC" in image.name), FrameDecoder()
+    board, decoder = make(str(image), counts_per_turn), FrameDecoder()
     number, sent = 1, 0
     samples, gaps, last, faults = 0, 0, None, 0
     pulses: list[int] = []
@@ -56,4 +56,4 @@ def main(image: Path, seconds: float, rpm: float) -> bool:
 
 
 if __name__ == "__main__":
-    sys.exit(not main(Path(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])))
+    sys.exit(not main(Path(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])))

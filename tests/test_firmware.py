@@ -201,10 +201,22 @@ def test_the_motor_follows_its_ramp_and_stops(board: Callable[..., Any], rpm: fl
     assert host.decoder.received == protocol.FrameCounters(frames=host.decoder.received.frames)
 
 
-@pytest.mark.parametrize(("rpm", "magnetic"), [(720.0, False), (-720.0, False), (300.0, True)])
-def test_angles_on_the_host_are_those_of_the_shaft(board: Callable[..., Any], rpm: float, magnetic: bool) -> None:
+GEARED = 32768
+"""Counts per turn of a prism whose magnetic encoder turns twice as fast."""
+
+
+@pytest.mark.parametrize(
+    ("rpm", "magnetic", "counts"),
+    [
+        (720.0, False, 4096), (-720.0, False, 4096), (300.0, True, 16384),
+        (720.0, True, GEARED), (-300.0, True, GEARED), (300.0, True, 24576),
+    ],
+)  # fmt: skip
+def test_angles_on_the_host_are_those_of_the_shaft(
+    board: Callable[..., Any], rpm: float, magnetic: bool, counts: int
+) -> None:
     """The clock and the counts wrap on the way."""
-    turning = board(magnetic=magnetic, clock_start=WRAP - 2.2 * S, drift_ppm=80.0)
+    turning = board(magnetic=magnetic, counts_per_turn=counts, clock_start=WRAP - 2.2 * S, drift_ppm=80.0)
     host, follower = Host(turning), Follower("port")
     if not magnetic:
         turning.library.board_tamper(turning._board, (1 << 31) - 50_000 if rpm > 0 else 50_000 - (1 << 31))
@@ -314,8 +326,12 @@ def test_counts_are_not_changed_while_the_prism_turns(board: Callable[..., Any])
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"magnetic": True, "drift_ppm": -80.0}, {"pulses": 1, "counts_per_turn": 1000}]
-)
+    "settings",
+    [
+        {}, {"magnetic": True, "drift_ppm": -80.0}, {"pulses": 1, "counts_per_turn": 1000},
+        {"magnetic": True, "counts_per_turn": GEARED, "pulses": 1},
+    ],
+)  # fmt: skip
 def test_the_firmware_passes_the_conformance_suite(board: Callable[..., Any], settings: dict[str, Any]) -> None:
     checks = check_controller(VirtualWire(board(**settings)), 240.0)
     assert [check.name for check in checks if not check.passed] == []
@@ -404,6 +420,28 @@ def test_a_reset_stops_the_motor_and_the_host_reports_it(board: Callable[..., An
     assert follower.status is not None
     assert (follower.status.state, follower.status.target_rpm) == (0, 0.0)
     assert host.board.get("rpm") == 0.0
+
+
+@pytest.mark.parametrize(("rpm", "message"), [(700.0, Stop()), (-700.0, Stop()), (700.0, SetSpeed(-200.0, 2000.0))])
+def test_a_prism_that_runs_down_follows_the_ramp_of_the_next_command(
+    board: Callable[..., Any], rpm: float, message: Message
+) -> None:
+    """After a reset, the reference begins at the speed of the prism: no full voltage brakes it."""
+    host = Host(board())
+    host.command(SetSpeed(rpm, 3000.0))
+    host.run(1.0)
+    host.board.reset()
+    host.run(0.2)
+    begun, start = host.board.now, host.board.get("rpm")
+    assert 500.0 < abs(start) < 690.0
+    host.send(message)
+    target = message.rpm if isinstance(message, SetSpeed) else 0.0
+    for _ in range(100):
+        host.run(0.005)
+        ramped = 2000.0 * (host.board.now - begun) / S
+        expected = start + math.copysign(min(ramped, abs(target - start)), target - start)
+        assert host.board.get("rpm") == pytest.approx(expected, abs=100.0)
+    assert host.status.faults == 0
 
 
 # Damaged lines.
@@ -594,16 +632,16 @@ def test_the_command_sets_shows_and_stops(desk: Desk) -> None:
 
 
 @pytest.fixture(scope="module")
-def images(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Path]:
-    """Build the image for an encoder and a source of pulses."""
+def images(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Build the image for an encoder, a source of pulses and other settings of make."""
     if shutil.which("arm-none-eabi-gcc") is None:
         pytest.skip("needs arm-none-eabi-gcc (Debian: gcc-arm-none-eabi)")
     if shutil.which("node") is None or not (FIRMWARE / "simulator" / "node_modules" / "rp2040js").is_dir():
         pytest.skip("needs Node.js, and rp2040js: npm install --prefix firmware/simulator")
     folder = tmp_path_factory.mktemp("rp2040")
 
-    def build(encoder: str, pulses: str) -> Path:
-        options = (f"BUILD={folder}", f"ENCODER={encoder}", f"PULSES={pulses}", f"PYTHON={sys.executable}")
+    def build(encoder: str, pulses: str, *settings: str) -> Path:
+        options = (f"BUILD={folder}", f"ENCODER={encoder}", f"PULSES={pulses}", f"PYTHON={sys.executable}", *settings)
         make = ("make", "-s", "-C", str(FIRMWARE), *options, "rp2040")
         done = subprocess.run(make, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
@@ -613,12 +651,15 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Pat
 
 
 @pytest.fixture
-def chip(images: Callable[[str, str], Path]) -> Iterator[Callable[..., Any]]:
-    """Start the simulator on an image."""
+def chip(images: Callable[..., Path]) -> Iterator[Callable[..., Any]]:
+    """Start the simulator on an image; ``counts`` of the prism are those of the ``settings`` of make."""
     started = []
 
-    def start(encoder: str = "QUADRATURE", pulses: str = "PULSES_TIMED") -> Any:
-        started.append(load("boards").SimulatedBoard(images(encoder, pulses), magnetic=encoder == "MAGNETIC"))
+    def start(
+        encoder: str = "QUADRATURE", pulses: str = "PULSES_TIMED", *settings: str, counts: int | None = None
+    ) -> Any:
+        image, magnetic = images(encoder, pulses, *settings), encoder == "MAGNETIC"
+        started.append(load("boards").SimulatedBoard(image, magnetic=magnetic, counts_per_turn=counts))
         return started[-1]
 
     yield start
@@ -688,6 +729,37 @@ def test_the_image_with_each_source_of_pulses_and_each_encoder(chip: Callable[..
         host.board.set("bad_spi")
         host.run(0.05)
         assert host.status.faults == FAULT["encoder lost"]
+
+
+def test_the_image_with_a_magnet_that_turns_twice_per_turn_of_the_prism(chip: Callable[..., Any]) -> None:
+    host = Host(chip("MAGNETIC", "PULSES_INDEX", "RATIO=2", counts=GEARED))
+    assert host.command(SetSpeed(-600.0, 5000.0)) == 0
+    host.run(0.8)
+    pulses, edges, turned = of(Index, host.messages), np.array(host.board.get("index_us")), host.board.get("angle")
+    assert len(pulses) == len(edges) > 4
+    assert np.abs([m.t_us - edge for m, edge in zip(pulses, edges, strict=True)]).max() <= 2.0
+    assert np.abs([b.count - a.count + GEARED for a, b in itertools.pairwise(pulses)]).max() < 10  # noise
+    last = of(Samples, host.messages)[-1]
+    angle = (last.count[-1] - pulses[-1].count) / GEARED - 10e-6 * (host.board.now - last.t_us[-1])
+    assert math.remainder(turned - angle * math.tau, math.tau) == pytest.approx(0.0, abs=0.02)
+    assert [m.t_us for m in of(Sync, host.messages)] == [m.t_us for m in pulses]
+    assert (host.status.counts_per_turn, host.status.faults) == (GEARED, 0)
+    assert host.status.rpm == pytest.approx(-600.0, abs=60.0)
+    host.board.set("no_index")
+    host.run(0.3)
+    assert host.status.faults == FAULT["index missed"]
+
+
+def test_settings_of_make_are_those_of_the_image(chip: Callable[..., Any]) -> None:
+    host = Host(chip("QUADRATURE", "PULSES_TIMED", "COUNTS=2000", "RATIO=3/2", "MOST_RPM=500", counts=3000))
+    host.run(0.1)
+    assert host.status.counts_per_turn == 3000
+    assert host.command(SetSpeed(500.5, 5000.0)) == 2
+    assert host.command(SetSpeed(500.0, 5000.0)) == 0
+    host.run(0.5)
+    pulses = of(Index, host.run(0.4))
+    assert {b.count - a.count for a, b in itertools.pairwise(pulses)} == {3000}
+    assert (host.status.state, host.status.faults) == (1, 0)
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@
 #define STOPPING (FAULT(STALL) | FAULT(OVER_CURRENT) | FAULT(ENCODER_LOST) | FAULT(OVER_SPEED))
 
 const struct settings default_settings = {
-    .counts_per_turn = 4096, .encoder = QUADRATURE, .pulses = PULSES_TIMED, .has_index = true,
-    .most_rpm = 3000, .most_ramp = 5000, .stop_ramp = 2000, .stall_ms = 1000,
+    .counts_per_turn = (uint32_t)COUNTS * RATIO, .encoder = QUADRATURE, .pulses = PULSES_TIMED, .has_index = true,
+    .most_rpm = MOST_RPM, .most_ramp = 5000, .stop_ramp = 2000, .stall_ms = 1000,
     .gains = {.no_load_rpm = 4000, .friction = 600, .kp = 20 * 256, .ki = 100 * 256, .duty_slew = 1500},
 };
 
@@ -134,7 +134,7 @@ static void protect(struct controller *c) {
         c->lost_ms = 0;
     }
     /* No index pulse for one and a half turns. */
-    if (s->has_index && s->encoder == QUADRATURE) {
+    if (s->has_index && !has_absolute_angle(s)) {
         uint32_t since = (uint32_t)size_of(step_of(c->last.count, c->last_index.count));
         if (since > s->counts_per_turn + s->counts_per_turn / 2) c->faults |= FAULT(INDEX_MISSED);
     }
@@ -142,7 +142,7 @@ static void protect(struct controller *c) {
 
 static void take_index(struct controller *c, struct stamp at) {
     uint32_t per_turn = c->settings.counts_per_turn;
-    if (c->indexed && c->settings.encoder == QUADRATURE) {
+    if (c->indexed && !has_absolute_angle(&c->settings)) {
         uint32_t turned = (uint32_t)size_of(step_of(at.count, c->last_index.count)), off = turned % per_turn;
         /* Counts that do not make whole turns, or stand still from pulse to pulse: an encoder's wire is broken. */
         bool whole = turned > 0 && turned >= per_turn / 2 && (off < per_turn / 8 || off > per_turn - per_turn / 8);
@@ -157,7 +157,7 @@ static void take_index(struct controller *c, struct stamp at) {
     send_two(c, INDEX_TYPE, at.t, (uint32_t)at.count);
 }
 
-/* A magnetic encoder has its index where its angle passes zero; the time is interpolated. */
+/* The index of an absolute angle is where it passes zero; the time is interpolated. */
 static void pass_zero(struct controller *c, struct stamp at) {
     int32_t step = step_of(at.count, c->last.count);
     if (!c->sampled || c->last.count >> 14 == at.count >> 14 || size_of(c->speed) < RPM(5)) return;
@@ -166,10 +166,20 @@ static void pass_zero(struct controller *c, struct stamp at) {
     take_index(c, (struct stamp){c->last.t + (uint32_t)(share / step), zero});
 }
 
+/* A magnetic encoder has no count at the time of an index pulse: interpolate it between the samples around. */
+static struct stamp latched(const struct controller *c, struct stamp pulse) {
+    if (c->settings.encoder == QUADRATURE || !c->sampled) return pulse;
+    const struct stamp *next = FIRST(c->samples, WAITING_SAMPLES);
+    int64_t share = (int64_t)(int32_t)(pulse.t - c->last.t) * step_of(next->count, c->last.count);
+    pulse.count = (int32_t)((uint32_t)c->last.count + (uint32_t)(share / (int32_t)(next->t - c->last.t)));
+    return pulse;
+}
+
 static void take_sample(struct controller *c, struct stamp at) {
     if (!c->sampled) tracker_begin(&c->tracker, at.count, c->settings.counts_per_turn);
     c->speed = tracker_step(&c->tracker, at.count);
-    if (c->settings.encoder == MAGNETIC) pass_zero(c, at);
+    if (has_absolute_angle(&c->settings)) pass_zero(c, at);
+    if (c->settings.encoder == MAGNETIC && size_of(c->speed) > RPM(1)) c->backwards = c->speed < 0;
     if (!c->sampled) c->last_index = at;
     c->last = at;
     c->sampled = true;
@@ -191,6 +201,7 @@ static uint8_t set_speed(struct controller *c, const uint8_t *payload) {
     if (c->faults & STOPPING) return REFUSED_NOT_POSSIBLE_NOW;           /* a stop clears the faults */
     if (!q16_from_f32(slope, &ramp) || ramp > RPM(most)) ramp = RPM(most);
     ramp /= TICK_HZ;
+    if (!c->enabled) speed_catch(&c->control, c->speed);
     c->control.target = rpm;
     c->control.ramp = ramp > 0 ? ramp : 1;
     c->target_bits = rpm == 0 ? 0 : bits;
@@ -203,6 +214,7 @@ static uint8_t stop(struct controller *c) {
     c->faults &= (uint16_t)~STOPPING;
     c->over_ms = c->runaway_ms = c->stalled_ms = c->current_ms = c->bad_turns = 0;
     c->commanded = true;
+    if (!c->enabled) speed_catch(&c->control, c->speed);
     c->control.target = 0;
     c->control.ramp = RPM(c->settings.stop_ramp) / TICK_HZ;
     c->target_bits = 0;
@@ -263,8 +275,9 @@ void controller_poll(struct controller *c, uint32_t now) {
         uint32_t at = sample ? FIRST(c->samples, WAITING_SAMPLES)->t : 0;
         const struct stamp *pulse = index ? FIRST(c->index, WAITING_PULSES) : 0;
         const struct stamp *trigger = sync ? FIRST(c->sync, WAITING_PULSES) : 0;
+        if (index && !sample && c->settings.encoder == MAGNETIC) break; /* its count needs the next sample */
         if (index && (!sample || before(pulse->t, at)) && (!sync || !before(trigger->t, pulse->t))) {
-            take_index(c, *pulse);
+            take_index(c, latched(c, *pulse));
             DROP(c->index);
         } else if (sync && (!sample || before(trigger->t, at))) {
             send_two(c, SYNC_TYPE, trigger->t, c->pulse_number++);

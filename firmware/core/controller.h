@@ -23,6 +23,20 @@
 #define WAITING_PULSES 8u
 #define BATCH 5u /* samples per packet */
 
+/* Settings that make may give to a port: COUNTS and RATIO (also a fraction: 3/2) are the encoder's counts per turn and
+   its turns per turn of the prism, MOST_RPM is the limit of the prism's speed. */
+#ifndef COUNTS
+#define COUNTS 4096
+#endif
+#ifndef RATIO
+#define RATIO 1
+#endif
+#ifndef MOST_RPM
+#define MOST_RPM 3000
+#endif
+_Static_assert((int32_t)COUNTS * RATIO > 0 && (int32_t)COUNTS * RATIO < (int32_t)1 << 24, "COUNTS * RATIO: 1 to 16777215");
+_Static_assert(MOST_RPM > 0 && MOST_RPM <= 13000, "MOST_RPM: 1 to 13000"); /* over-speed is seen up to 16000 rpm */
+
 enum encoder { QUADRATURE, MAGNETIC };
 enum pulses {
     PULSES_TIMED,  /* ten per second, sent to the camera's trigger input */
@@ -31,7 +45,7 @@ enum pulses {
 };
 
 struct settings {
-    uint32_t counts_per_turn;
+    uint32_t counts_per_turn; /* of the prism */
     uint8_t encoder, pulses;
     bool has_index;
     int32_t most_rpm, most_ramp, stop_ramp; /* limits of commands [rpm, rpm/s], and slope of a stop */
@@ -55,7 +69,7 @@ struct controller {
     volatile uint32_t ticks, edges_lost, overruns; /* overruns: samples, pulses or bytes that found their ring full */
     volatile uint8_t bad_answers;                  /* of the magnetic encoder, one after the other */
     uint8_t levels;                                /* 2 A + B at the last edge */
-    bool backwards;                                /* direction of the last step */
+    bool backwards;                                /* direction; written by the main loop with a magnetic encoder */
     uint16_t angle;                                /* of the magnetic encoder */
     bool angle_known;
     RING(struct stamp, WAITING_SAMPLES) samples;
@@ -104,6 +118,11 @@ static inline void on_edge(struct controller *c, uint8_t levels) {
         c->count = (int32_t)((uint32_t)c->count + (uint32_t)step); /* wraps */
         c->backwards = step < 0;
     }
+}
+
+/* Whether the encoder gives the angle of the prism itself: the index is then its zero, and no pulse is read. */
+static inline bool has_absolute_angle(const struct settings *s) {
+    return s->encoder == MAGNETIC && s->counts_per_turn == AS5047_COUNTS;
 }
 
 /* Edge of the index pulse at time t [us]. The edge at lower counts is the index, whichever way the prism turns: the

@@ -48,6 +48,19 @@ void speed_release(struct speed_control *c) {
     c->duty = 0;
 }
 
+/* Duty that keeps a speed: the motor's voltage without load, and friction. */
+static int64_t feed_forward(const struct gains *g, int32_t speed) {
+    int64_t duty = (int64_t)speed * FULL_DUTY / ((int64_t)g->no_load_rpm * 65536);
+    return duty + (speed > 0 ? g->friction : speed < 0 ? -g->friction : 0);
+}
+
+void speed_catch(struct speed_control *c, int32_t speed) {
+    speed_release(c);
+    if (speed < CREEP && speed > -CREEP) return;
+    c->reference = speed;
+    c->duty = (int32_t)clamp(feed_forward(&c->gains, speed), FULL_DUTY); /* a lower voltage would brake */
+}
+
 int32_t speed_step(struct speed_control *c, int32_t speed) {
     const struct gains *g = &c->gains;
     int64_t change = clamp((int64_t)c->target - c->reference, c->ramp);
@@ -57,9 +70,7 @@ int32_t speed_step(struct speed_control *c, int32_t speed) {
         return c->duty = 0;
     }
     int64_t error = (int64_t)c->reference - speed;
-    int64_t wanted = (int64_t)c->reference * FULL_DUTY / ((int64_t)g->no_load_rpm * 65536);
-    wanted += c->reference > 0 ? g->friction : c->reference < 0 ? -g->friction : 0;
-    wanted += (error * g->kp >> 24) + (c->integral >> 16);
+    int64_t wanted = feed_forward(g, c->reference) + (error * g->kp >> 24) + (c->integral >> 16);
     int64_t duty = clamp(wanted, FULL_DUTY);
     duty = c->duty + clamp(duty - c->duty, g->duty_slew);
     /* The integral stands still while a limit acts in its direction. */

@@ -40,6 +40,7 @@ struct speed_control {
     int32_t duty;           /* output */
 };
 void speed_release(struct speed_control *c);                  /* no voltage, reference and target 0 */
+void speed_catch(struct speed_control *c, int32_t speed);     /* begin at the speed at which a released motor turns */
 int32_t speed_step(struct speed_control *c, int32_t speed);   /* returns the duty for the measured speed [Q16 rpm] */
 
 #endif

@@ -1,34 +1,19 @@
-/* The controller on a computer, with a simulated motor and encoder, in simulated time: a library for Python's ctypes.
-
-   Motor: voltage, back-EMF, inertia, friction, cogging, noise. Encoder: eccentric disc (once per turn), index pulse with
-   a width, or a magnetic encoder with noise. Faults are switched by board_set(). */
-#include <math.h>
+/* The controller on a computer, with a simulated motor and encoder, in simulated time: a library for Python's ctypes. */
 #include <stdlib.h>
 #include <string.h>
 
-#include "controller.h"
+#include "motor.h"
 
-#define STEP_US 50
-#define TAU 6.283185307179586
-
-enum value { JAMMED, DRIVER_FAULT, NO_INDEX, DEAD_A, REVERSED_MOTOR, BAD_SPI, RUNAWAY, ANGLE, SPEED, VALUES, TIME, LATE, SYNC };
+enum { TIME = VALUES, LATE, SYNC };
 
 struct board {
     struct controller c;
     struct settings settings;
     uint64_t now, booted, ticked; /* simulated time; of the reset; of the last tick [us] */
     double clock_start, rate;     /* controller's clock at the reset [us], and its rate */
-    double turns, rpm, late_us;   /* state of the motor; largest delay of an index latch [us] */
-    double values[VALUES];
-    int64_t position;             /* counts of the disc */
-    int in_pulse;
-    uint32_t random;
+    double late_us;               /* largest delay of an index latch [us] */
+    struct motor motor;
 };
-
-static double uniform(struct board *b) { /* -1 to 1 */
-    b->random = b->random * 1664525u + 1013904223u;
-    return (double)(b->random >> 8) / 8388608.0 - 1.0;
-}
 
 static uint32_t clock_at(const struct board *b, double now) {
     return (uint32_t)(int64_t)floor(b->clock_start + (now - (double)b->booted) * b->rate);
@@ -44,74 +29,43 @@ struct board *board_new(uint32_t counts, int magnetic, int pulses, double drift_
     struct board *b = calloc(1, sizeof *b);
     if (!b) return 0;
     b->settings = default_settings;
-    b->settings.counts_per_turn = magnetic ? AS5047_COUNTS : counts;
+    b->settings.counts_per_turn = counts;
     b->settings.encoder = magnetic ? MAGNETIC : QUADRATURE;
     b->settings.pulses = (uint8_t)pulses;
     b->rate = 1 + drift_ppm * 1e-6;
-    b->random = seed;
-    b->turns = 0.3;
-    b->position = (int64_t)floor(b->turns * b->settings.counts_per_turn);
+    motor_begin(&b->motor, counts, seed);
     board_reset(b);
     b->clock_start = clock_start;
     b->c.heard = b->c.checked_at = clock_at(b, 0);
     return b;
 }
 
-void board_set(struct board *b, int what, double value) { b->values[what] = value; }
+void board_set(struct board *b, int what, double value) { b->motor.values[what] = value; }
 double board_get(const struct board *b, int what) {
-    if (what == ANGLE) return b->turns * TAU;
-    if (what == SPEED) return b->rpm;
-    return what == LATE ? b->late_us : what == TIME ? (double)b->now : what == SYNC ? b->c.pulse_number : b->values[what];
+    if (what < VALUES) return motor_get(&b->motor, what);
+    return what == LATE ? b->late_us : what == TIME ? (double)b->now : b->c.pulse_number;
 }
-
-static void turn(struct board *b) {
-    double dt = STEP_US * 1e-6, drive = b->c.enabled ? b->c.duty / (double)FULL_DUTY : 0;
-    if (b->values[REVERSED_MOTOR] != 0) drive = -drive;
-    if (b->values[RUNAWAY] != 0) drive = 1.3;
-    double pull = b->c.enabled || b->values[RUNAWAY] != 0 ? (4000.0 * drive - b->rpm) / 0.15 : 0;      /* rpm per second */
-    pull += 200.0 * sin(12 * TAU * b->turns + 1.0) + 40.0 * sin(TAU * b->turns); /* cogging, unbalance */
-    pull += 3000.0 * uniform(b) * fmin(1, fabs(b->rpm) / 50); /* noise, none at rest */
-    double friction = (200.0 + 0.1 * fabs(b->rpm)) * dt;
-    b->rpm += pull * dt;
-    b->rpm = fabs(b->rpm) > friction ? b->rpm - copysign(friction, b->rpm) : 0;
-    if (b->values[JAMMED] != 0) b->rpm = 0;
-    b->turns += b->rpm / 60.0 * dt;
-}
-
-static double read_turns(const struct board *b) { return b->turns + 2e-4 * sin(TAU * b->turns); } /* eccentric disc */
 
 static void move(struct board *b, double before) {
-    double per_turn = b->settings.counts_per_turn, after = read_turns(b) * per_turn;
-    int64_t to = (int64_t)floor(after), first = b->position, span = llabs(to - first);
-    static const uint8_t levels[4] = {0, 2, 3, 1}; /* 2 A + B, A leads */
-    while (b->position != to) {
-        b->position += to > b->position ? 1 : -1;
-        double at = (double)(to > first ? b->position : b->position + 1);
-        double share = fabs(after - before) > 0 ? (at - before) / (after - before) : 0;
-        double when = (double)b->now + STEP_US * (span ? share : 0);
-        uint8_t now = levels[b->position & 3];
-        on_edge(&b->c, b->values[DEAD_A] != 0 ? now & 1u : now);
-        int64_t phase = b->position % (int64_t)per_turn;
-        if (phase < 0) phase += (int64_t)per_turn;
-        int in_pulse = phase < (int64_t)(per_turn / 256) + 1; /* 1.4 degrees wide */
-        if (in_pulse != b->in_pulse && b->values[NO_INDEX] == 0) {
-            double late = 0.5 * (uniform(b) + 1.0); /* delay of the interrupt [us] */
-            uint32_t t = clock_at(b, when + late);
-            if (on_index(&b->c, t, in_pulse)) {
-                b->late_us = fmax(b->late_us, late);
-                if (b->settings.pulses == PULSES_INDEX) on_sync(&b->c, t);
-            }
+    for (double share; motor_count(&b->motor, before, &share);) {
+        if (b->settings.encoder == QUADRATURE) on_edge(&b->c, motor_levels(&b->motor));
+        if (has_absolute_angle(&b->settings) || !motor_index(&b->motor)) continue;
+        double late = 0.5 * (uniform(&b->motor) + 1.0); /* delay of the interrupt [us] */
+        uint32_t t = clock_at(b, (double)b->now + STEP_US * share + late);
+        if (on_index(&b->c, t, b->motor.in_pulse)) {
+            b->late_us = fmax(b->late_us, late);
+            if (b->settings.pulses == PULSES_INDEX) on_sync(&b->c, t);
         }
-        b->in_pulse = in_pulse;
     }
 }
 
 static void magnetic(struct board *b) {
-    double angle = read_turns(b) * AS5047_COUNTS + 1.5 * uniform(b);
+    double angle = read_turns(&b->motor) * b->settings.counts_per_turn + 1.5 * uniform(&b->motor);
     uint16_t frame = (uint16_t)((int64_t)floor(angle) & 0x3FFF), parity = frame;
     for (int k = 8; k; k /= 2) parity ^= parity >> k;
     frame |= (uint16_t)((parity & 1u) << 15);
-    if (fabs(b->values[BAD_SPI]) > 0 && (b->values[BAD_SPI] >= 1 || fabs(uniform(b)) < b->values[BAD_SPI])) frame ^= 1u;
+    double bad = b->motor.values[BAD_SPI];
+    if (bad > 0 && (bad >= 1 || fabs(uniform(&b->motor)) < bad)) frame ^= 1u;
     on_answer(&b->c, frame);
 }
 
@@ -128,12 +82,12 @@ void board_pulse(struct board *b) { on_sync(&b->c, clock_at(b, (double)b->now));
 uint32_t board_advance(struct board *b, uint64_t until, uint8_t *out, uint32_t room) {
     uint32_t written = 0;
     while (b->now < until) {
-        double before = read_turns(b) * b->settings.counts_per_turn;
-        turn(b);
-        if (b->settings.encoder == QUADRATURE) move(b, before);
+        double before = read_turns(&b->motor);
+        motor_turn(&b->motor, b->c.enabled, b->c.enabled ? b->c.duty / (double)FULL_DUTY : 0);
+        move(b, before);
         b->now += STEP_US;
         uint32_t t = clock_at(b, (double)b->now);
-        b->c.driver_fault = b->values[DRIVER_FAULT] != 0;
+        b->c.driver_fault = b->motor.values[DRIVER_FAULT] != 0;
         if (b->now - b->ticked >= 1000000 / TICK_HZ) {
             b->ticked = b->now;
             if (b->settings.encoder == MAGNETIC) magnetic(b);

@@ -9,6 +9,8 @@
 #define PULSES PULSES_TIMED /* or PULSES_INDEX, PULSES_CAMERA */
 #endif
 
+_Static_assert(ENCODER == QUADRATURE || COUNTS == AS5047_COUNTS, "the magnetic encoder has 16384 counts per turn");
+
 #define REG(address) (*(volatile uint32_t *)(address))
 #define SET(address) REG((address) + 0x2000u)
 #define CLEAR(address) REG((address) + 0x3000u)
@@ -54,7 +56,7 @@ static uint32_t next_tick;
 void io_interrupt(void) {
     uint32_t t = REG(TIMERAWL), pending = REG(IO_INTS0), in = REG(GPIO_IN);
     REG(IO_INTR0) = pending;
-    on_edge(&c, (uint8_t)((in >> (PIN_A - 1) & 2u) | (in >> PIN_B & 1u)));
+    if (ENCODER == QUADRATURE) on_edge(&c, (uint8_t)((in >> (PIN_A - 1) & 2u) | (in >> PIN_B & 1u)));
     if (pending & (EDGE_LOW(PIN_INDEX) | EDGE_HIGH(PIN_INDEX))) {
         bool rising = pending & EDGE_HIGH(PIN_INDEX);
         if (on_index(&c, t, rising) && c.settings.pulses == PULSES_INDEX) {
@@ -178,12 +180,11 @@ int main(void) {
     start_peripherals();
     struct settings settings = default_settings;
     settings.encoder = ENCODER, settings.pulses = PULSES;
-    if (ENCODER == MAGNETIC) settings.counts_per_turn = AS5047_COUNTS;
     controller_begin(&c, &settings, REG(TIMERAWL));
     uint32_t in = REG(GPIO_IN), ticks = 0;
     c.levels = (uint8_t)((in >> (PIN_A - 1) & 2u) | (in >> PIN_B & 1u));
-    REG(IO_INTE0) = (ENCODER == QUADRATURE ? EDGE_LOW(PIN_A) | EDGE_HIGH(PIN_A) | EDGE_LOW(PIN_B) | EDGE_HIGH(PIN_B)
-                         | EDGE_LOW(PIN_INDEX) | EDGE_HIGH(PIN_INDEX) : 0u)
+    REG(IO_INTE0) = (ENCODER == QUADRATURE ? EDGE_LOW(PIN_A) | EDGE_HIGH(PIN_A) | EDGE_LOW(PIN_B) | EDGE_HIGH(PIN_B) : 0u)
+        | (has_absolute_angle(&settings) ? 0u : EDGE_LOW(PIN_INDEX) | EDGE_HIGH(PIN_INDEX))
         | (PULSES == PULSES_CAMERA ? EDGE_HIGH(PIN_CAMERA_SYNC) : 0u);
     REG(NVIC_PRIORITY(0)) = 0x40u;         /* timer 0 */
     REG(NVIC_PRIORITY(5)) = 0x80u;         /* UART 0 */

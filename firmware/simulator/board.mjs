@@ -7,12 +7,12 @@ import { readFileSync } from 'node:fs';
 import { createInterface } from 'node:readline';
 import { RP2040 } from 'rp2040js';
 
-const [path, kind] = process.argv.slice(2);
+const [path, kind, counts] = process.argv.slice(2);
 const image = readFileSync(path);
 const magnetic = kind === 'MAGNETIC';
 const STEP_NS = 50_000, TAU = 2 * Math.PI, BYTE_NS = 10e9 / 460_800;
 const PIN = { a: 2, b: 3, index: 4, sync: 5, trigger: 6, direction: 9, enable: 10, fault: 11, cs: 17 };
-const perTurn = magnetic ? 16384 : 4096;
+const perTurn = Number(counts), absolute = magnetic && perTurn === 16384;  // then there is no index pulse
 const faults = { jammed: 0, driver_fault: 0, no_index: 0, dead_a: 0, reversed_motor: 0, bad_spi: 0, runaway: 0 };
 
 let mcu, clock, cycleNs = 8, out = [], inbox = [], arrivesNs = 0, resets = 0, watchdogs = 0;
@@ -74,9 +74,9 @@ const now = () => offset + clock.nanos;
 function levels() {
   const [a, b] = [[0, 0], [1, 0], [1, 1], [0, 1]][position & 3];
   const set = (pin, value) => { if (mcu.gpio[pin].rawInputValue !== !!value) mcu.gpio[pin].setInputValue(!!value); };
-  set(PIN.a, a && !faults.dead_a);
-  set(PIN.b, b);
-  const phase = ((position % perTurn) + perTurn) % perTurn, pulse = phase < perTurn / 256 + 1 && !magnetic;
+  set(PIN.a, a && !faults.dead_a && !magnetic);
+  set(PIN.b, b && !magnetic);
+  const phase = ((position % perTurn) + perTurn) % perTurn, pulse = phase < perTurn / 256 + 1 && !absolute;
   if (pulse !== inPulse) {
     inPulse = pulse;
     if (!faults.no_index) {
@@ -142,7 +142,7 @@ function step() {
   const from = now(), before = disc();
   turn();
   const after = disc(), to = Math.floor(after), forward = to > position;
-  if (!magnetic) while (position !== to) {
+  if (!absolute) while (position !== to) {
     position += forward ? 1 : -1;
     const at = forward ? position : position + 1;
     execute(from + (STEP_NS * (at - before)) / (after - before));

@@ -1,0 +1,88 @@
+/* Simulated motor and encoder, for the core on a computer (native/board.c) and for the image on simavr (avr/board.c).
+
+   Motor: voltage, back-EMF, inertia, friction, cogging, noise. Encoder: eccentric disc (once per turn), index pulse with
+   a width, or a magnetic encoder with noise. Faults are switched by setting `values`. */
+#ifndef MOTOR_H
+#define MOTOR_H
+
+#include <math.h>
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "controller.h"
+
+#define STEP_US 50
+#define TAU 6.283185307179586
+
+/* What boards.py sets and gets, in this order. */
+enum value { JAMMED, DRIVER_FAULT, NO_INDEX, DEAD_A, REVERSED_MOTOR, BAD_SPI, RUNAWAY, ANGLE, SPEED, VALUES };
+
+struct motor {
+    double turns, rpm, values[VALUES];
+    uint32_t per_turn, random;
+    int64_t position; /* counts of the disc */
+    bool in_pulse;
+};
+
+static double uniform(struct motor *m) { /* -1 to 1 */
+    m->random = m->random * 1664525u + 1013904223u;
+    return (double)(m->random >> 8) / 8388608.0 - 1.0;
+}
+
+static double read_turns(const struct motor *m) { return m->turns + 2e-4 * sin(TAU * m->turns); } /* eccentric disc */
+
+static void motor_begin(struct motor *m, uint32_t per_turn, uint32_t seed) {
+    m->per_turn = per_turn;
+    m->random = seed;
+    m->turns = 0.3;
+    m->position = (int64_t)floor(read_turns(m) * per_turn);
+}
+
+/* Turn for one step with a voltage of -1 to 1, if the driver is enabled. */
+static void motor_turn(struct motor *m, bool enabled, double drive) {
+    double dt = STEP_US * 1e-6;
+    if (m->values[REVERSED_MOTOR] != 0) drive = -drive;
+    if (m->values[RUNAWAY] != 0) drive = 1.3;
+    double pull = enabled || m->values[RUNAWAY] != 0 ? (4000.0 * drive - m->rpm) / 0.15 : 0; /* rpm per second */
+    pull += 200.0 * sin(12 * TAU * m->turns + 1.0) + 40.0 * sin(TAU * m->turns); /* cogging, unbalance */
+    pull += 3000.0 * uniform(m) * fmin(1, fabs(m->rpm) / 50); /* noise, none at rest */
+    double friction = (200.0 + 0.1 * fabs(m->rpm)) * dt;
+    m->rpm += pull * dt;
+    m->rpm = fabs(m->rpm) > friction ? m->rpm - copysign(friction, m->rpm) : 0;
+    if (m->values[JAMMED] != 0) m->rpm = 0;
+    m->turns += m->rpm / 60.0 * dt;
+}
+
+/* Move the disc by one count towards the place that it has after a step, which began at `before` turns. Returns false if
+   it is there, else sets `share`, the time of the count as a part of the step. */
+static bool motor_count(struct motor *m, double before, double *share) {
+    double from = before * m->per_turn, after = read_turns(m) * m->per_turn;
+    int64_t to = (int64_t)floor(after);
+    if (m->position == to) return false;
+    bool forward = to > m->position;
+    m->position += forward ? 1 : -1;
+    double at = (double)(forward ? m->position : m->position + 1);
+    *share = fabs(after - from) > 0 ? fmin(fmax((at - from) / (after - from), 0), 1) : 0;
+    return true;
+}
+
+static uint8_t motor_levels(const struct motor *m) { /* 2 A + B, A leads */
+    static const uint8_t levels[4] = {0, 2, 3, 1};
+    uint8_t now = levels[m->position & 3];
+    return m->values[DEAD_A] != 0 ? now & 1u : now;
+}
+
+/* Whether the level of the index has changed; the pulse is 1.4 degrees wide. */
+static bool motor_index(struct motor *m) {
+    int64_t phase = m->position % (int64_t)m->per_turn;
+    if (phase < 0) phase += m->per_turn;
+    bool in_pulse = phase < m->per_turn / 256 + 1, changed = in_pulse != m->in_pulse;
+    m->in_pulse = in_pulse;
+    return changed && m->values[NO_INDEX] == 0;
+}
+
+static inline double motor_get(const struct motor *m, int what) {
+    return what == ANGLE ? m->turns * TAU : what == SPEED ? m->rpm : m->values[what];
+}
+
+#endif
