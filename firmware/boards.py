@@ -37,16 +37,19 @@ class NativeBoard:
         self, *, counts_per_turn: int | None = None, magnetic: bool = False, pulses: int = 0, drift_ppm: float = 0.0,
         clock_start: float = 0.0, seed: int = 1, library: Path = BUILD / "libboard.so",
     ) -> None:  # fmt: skip
+        self._load(library)
+        counts, numbers = counts_per_turn or COUNTS[magnetic], map(ctypes.c_double, (drift_ppm, clock_start))
+        self._board = ctypes.c_void_p(self.library.board_new(counts, int(magnetic), pulses, *numbers, seed))
+
+    def _load(self, library: Path) -> None:
         self.library = ctypes.CDLL(str(library))
         self.library.board_new.restype = ctypes.c_void_p
         self.library.board_get.restype = ctypes.c_double
         self.library.board_advance.restype = ctypes.c_uint32
-        counts, numbers = counts_per_turn or COUNTS[magnetic], map(ctypes.c_double, (drift_ppm, clock_start))
-        self._board = ctypes.c_void_p(self.library.board_new(counts, int(magnetic), pulses, *numbers, seed))
         self._out = ctypes.create_string_buffer(1 << 20)
 
     def advance(self, now_us: int) -> bytes:
-        """Run until a simulated time and return the bytes sent; the simulated line is infinitely fast."""
+        """Run until a simulated time and return the bytes sent; the simulated line of the core is infinitely fast."""
         size = self.library.board_advance(self._board, ctypes.c_uint64(max(now_us, 0)), self._out, len(self._out))
         return self._out.raw[:size] if size else b""
 
@@ -87,6 +90,7 @@ class SimulatedBoard:
     ``image``: flash image (``.bin``); ``counts_per_turn`` of the prism is that for which it was built. Times are in us.
     """
 
+    MHZ = 125
     plugged = True
 
     def __init__(self, image: Path, *, magnetic: bool = False, counts_per_turn: int | None = None) -> None:
@@ -126,6 +130,12 @@ class SimulatedBoard:
         """Return a value of the simulated board."""
         return json.loads(self._ask(f"get {name}"))
 
+    def interrupts(self) -> dict[str, dict[str, int]]:
+        """Return the longest run and the sum of the runs [cycles], by interrupt."""
+        worst, busy = self.get("worst"), self.get("busy")
+        names = {"16": "tick", "29": "edges", "36": "UART"}
+        return {name: {"worst": worst[key], "busy": busy[key]} for key, name in names.items() if key in worst}
+
     def reset(self) -> None:
         """Reset the chip."""
         self._ask("reset")
@@ -137,6 +147,47 @@ class SimulatedBoard:
     def close(self) -> None:
         """End the simulator."""
         self._process.communicate()
+
+
+class AvrBoard(NativeBoard):
+    """The image for the ATmega2560 (``.elf``) on simavr, see :class:`NativeBoard`. Times are in us, others cycles."""
+
+    MHZ = 16
+    VALUES = (*NativeBoard.VALUES[:9], "now", "cycles", "watchdogs", "boot_us", "enable", "sync")
+    LISTS = ("index_us", "trigger_us", "enabled_us")
+    INTERRUPTS = {  # noqa: RUF012
+        "edge A": 5, "edge B": 6, "tick": 17, "UART in": 25, "UART out": 26, "index": 41, "camera": 46,
+    }  # fmt: skip
+    """Numbers of the vectors."""
+
+    def __init__(self, image: Path, *, counts_per_turn: int | None = None, library: Path = BUILD / "libavr.so") -> None:
+        self._load(library)
+        self._board = ctypes.c_void_p(self.library.board_new(str(image).encode(), counts_per_turn or COUNTS[0]))
+        if not self._board:
+            raise FileNotFoundError(f"{image} cannot be read: run make -C firmware avr")
+
+    def get(self, name: str) -> Any:
+        """Return a value, or a list of times."""
+        if name in self.LISTS:
+            times = ctypes.POINTER(ctypes.c_double)()
+            size = self.library.board_times(self._board, self.LISTS.index(name), ctypes.byref(times))
+            return times[:size]
+        return super().get(name)
+
+    def interrupts(self) -> dict[str, dict[str, int]]:
+        """Return the longest run, the longest delay of the start, and the sum of the runs [cycles], by interrupt."""
+        out, found = (ctypes.c_double * 3)(), {}
+        for name, vector in self.INTERRUPTS.items():
+            self.library.board_interrupt(self._board, vector, out)
+            found[name] = dict(zip(("worst", "late", "busy"), map(int, out), strict=True))
+        return found
+
+    def hang(self, where: str) -> None:
+        """Let the program hang in its main ``loop`` or its ``tick``'s interrupt, or stop the ticks (``no-tick``)."""
+        self.library.board_hang(self._board, ("loop", "tick", "no-tick").index(where))
+
+    def close(self) -> None:
+        """Do nothing: the board ends with the process."""
 
 
 class SimulatedWire:
@@ -163,9 +214,11 @@ class SimulatedWire:
 
 
 def make(name: str, counts_per_turn: int | None = None) -> Any:
-    """Return the board ``native``, ``native-magnetic``, or the one that runs an image."""
+    """Return the board ``native``, ``native-magnetic``, or the one that runs an image (``.bin`` or ``.elf``)."""
     if name.startswith("native"):
         return NativeBoard(magnetic=name.endswith("magnetic"), counts_per_turn=counts_per_turn)
+    if name.endswith(".elf"):
+        return AvrBoard(Path(name), counts_per_turn=counts_per_turn)
     return SimulatedBoard(Path(name), magnetic="MAGNETIC" in name, counts_per_turn=counts_per_turn)
 
 
@@ -191,7 +244,7 @@ def main() -> int:
     from amiwarp.live.link.conformance import check_controller
 
     options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("board", help="native, native-magnetic, or a flash image (.bin)")
+    options.add_argument("board", help="native, native-magnetic, or an image (.bin for the RP2040, .elf for the AVR)")
     options.add_argument("--link", type=Path, help="symbolic link for the serial port")
     options.add_argument("--counts-per-turn", type=int, help="of the prism, for which the image was built")
     options.add_argument("--seconds", type=float, default=3600.0)

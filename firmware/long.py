@@ -19,7 +19,7 @@ def main(image: Path, seconds: float, rpm: float, counts_per_turn: int) -> bool:
     samples, gaps, last, faults = 0, 0, None, 0
     pulses: list[int] = []
     speeds: list[float] = []
-    board.feed(encode(SetSpeed(rpm, 500.0), 0), 0)
+    board.feed(encode(SetSpeed(rpm, 500.0), 0), board.now)
     while board.now < seconds * 1e6:
         data = board.advance(board.now + 10_000)
         sent += len(data)
@@ -41,16 +41,18 @@ def main(image: Path, seconds: float, rpm: float, counts_per_turn: int) -> bool:
                 print(f"{board.now / 1e6:.0f} s: {decoder.received}", flush=True)
     received, true = decoder.received, np.array(board.get("index_us"))
     late = np.array(pulses) - true[: len(pulses)] if pulses and "MAGNETIC" not in image.name else np.zeros(1)
-    cycles, busy, worst = (board.get(name) for name in ("cycles", "busy", "worst"))
+    cycles, interrupts = board.get("cycles"), board.interrupts()
     board.close()
     print(
         f"{board.now / 1e6:.0f} s at {np.mean(speeds):.1f} rpm (status, deviation {np.std(speeds):.1f} rpm): {received}"
     )
     print(f"{samples:,} samples, {gaps} gaps, {sent / board.now * 1e6:.0f} bytes/s, faults {faults:#x}")
     print(f"{len(pulses)} index pulses, latched {late.min():.2f} to {late.max():.2f} us after the edge")
-    names = {"16": "tick", "29": "edges", "36": "UART"}
-    print("longest interrupts [cycles]:", ", ".join(f"{names[key]} {n}" for key, n in worst.items()))
-    print(f"cycles in interrupts: {sum(busy.values()):,} of {board.now * 125:,}, executed {cycles:,}")
+    for name, measured in interrupts.items():
+        print(f"interrupt {name} [cycles]: {measured}")
+    total = board.now * board.MHZ
+    share = sum(measured["busy"] for measured in interrupts.values()) / total
+    print(f"{cycles / total:.1%} of the cycles were used, {share:.1%} by interrupts")
     good = received.damaged + received.lost + received.unknown + gaps + faults == 0
     return good and samples > 990 * seconds and late.max() <= 2.0
 

@@ -17,10 +17,6 @@ static int32_t size_of(int32_t x) { return x == INT32_MIN ? INT32_MAX : x < 0 ? 
 static int32_t step_of(int32_t to, int32_t from) { return (int32_t)((uint32_t)to - (uint32_t)from); } /* may wrap */
 static bool before(uint32_t a, uint32_t b) { return (int32_t)(a - b) < 0; }
 
-#define WAITING(ring) ((ring_index)((ring).head - (ring).tail))
-#define FIRST(ring, n) (&(ring).items[(ring).tail & ((n) - 1u)])
-#define DROP(ring) ((ring).tail = (ring_index)((ring).tail + 1u))
-
 /* Sending. */
 
 static void send(struct controller *c, uint8_t type, const uint8_t *payload, uint32_t size) {
@@ -30,7 +26,7 @@ static void send(struct controller *c, uint8_t type, const uint8_t *payload, uin
     put16(packet + 2, c->sequence++);
     for (uint32_t k = 0; k < size; k++) packet[HEADER_BYTES + k] = payload[k];
     uint32_t bytes = frame_encode(packet, HEADER_BYTES + size, frame);
-    if (bytes > TX_BYTES - WAITING(c->tx)) return; /* lost as a whole; the host sees it by the sequence number */
+    if (bytes >= TX_BYTES - WAITING(c->tx)) return; /* lost as a whole; the host sees it by the sequence number */
     for (uint32_t k = 0; k < bytes; k++) c->tx.items[(ring_index)(c->tx.head + k) & (TX_BYTES - 1u)] = frame[k];
     __asm__ volatile("" ::: "memory");
     c->tx.head = (ring_index)(c->tx.head + bytes);
@@ -119,7 +115,7 @@ static void protect(struct controller *c) {
     bool turning = reference > RPM(20);
     bool away = speed > reference + reference / 2 + RPM(300)
         || (turning && speed > RPM(30) && (c->speed < 0) != (c->control.reference < 0));
-    if (lasts(&c->over_ms, speed / 6 > RPM(s->most_rpm) / 5, 20)) fail(c, FAULT(OVER_SPEED));
+    if (lasts(&c->over_ms, speed > c->over_speed, 20) || c->too_fast) fail(c, FAULT(OVER_SPEED));
     if (lasts(&c->runaway_ms, c->enabled && away, 500)) fail(c, FAULT(OVER_SPEED));
     if (lasts(&c->stalled_ms, turning && speed < reference / 8, s->stall_ms)) fail(c, FAULT(STALL));
     if (lasts(&c->current_ms, c->driver_fault, 2)) fail(c, FAULT(OVER_CURRENT));
@@ -213,6 +209,7 @@ static uint8_t set_speed(struct controller *c, const uint8_t *payload) {
 static uint8_t stop(struct controller *c) {
     c->faults &= (uint16_t)~STOPPING;
     c->over_ms = c->runaway_ms = c->stalled_ms = c->current_ms = c->bad_turns = 0;
+    c->too_fast = false;
     c->commanded = true;
     if (!c->enabled) speed_catch(&c->control, c->speed);
     c->control.target = 0;
@@ -257,7 +254,8 @@ void controller_begin(struct controller *c, const struct settings *settings, uin
     uint8_t *bytes = (uint8_t *)c;
     for (uint32_t k = 0; k < sizeof *c; k++) bytes[k] = 0;
     c->settings = *settings;
-    c->control.gains = settings->gains;
+    speed_begin(&c->control, &settings->gains);
+    c->over_speed = RPM(settings->most_rpm) / 5 * 6;
     tracker_begin(&c->tracker, 0, settings->counts_per_turn);
     c->heard = now;
     c->checked_at = now;
@@ -295,9 +293,3 @@ void controller_poll(struct controller *c, uint32_t now) {
     }
 }
 
-int controller_take(struct controller *c) {
-    if (!WAITING(c->tx)) return -1;
-    uint8_t byte = *FIRST(c->tx, TX_BYTES);
-    DROP(c->tx);
-    return byte;
-}

@@ -32,7 +32,11 @@
 #define RATIO 1
 #endif
 #ifndef MOST_RPM
+#ifdef __AVR__
+#define MOST_RPM 1000
+#else
 #define MOST_RPM 3000
+#endif
 #endif
 _Static_assert((int32_t)COUNTS * RATIO > 0 && (int32_t)COUNTS * RATIO < (int32_t)1 << 24, "COUNTS * RATIO: 1 to 16777215");
 _Static_assert(MOST_RPM > 0 && MOST_RPM <= 13000, "MOST_RPM: 1 to 13000"); /* over-speed is seen up to 16000 rpm */
@@ -55,7 +59,7 @@ struct settings {
 extern const struct settings default_settings;
 
 #ifdef __AVR__
-typedef uint8_t ring_index; /* read and written at once; rings of 128 items at most */
+typedef uint8_t ring_index; /* read and written at once; rings of 128 items at most, 256 of bytes to send */
 #else
 typedef uint16_t ring_index;
 #endif
@@ -67,7 +71,9 @@ struct controller {
     /* Written by interrupts. */
     volatile int32_t count;
     volatile uint32_t ticks, edges_lost, overruns; /* overruns: samples, pulses or bytes that found their ring full */
+    volatile bool too_fast;                        /* more edges than the port counts */
     volatile uint8_t bad_answers;                  /* of the magnetic encoder, one after the other */
+    uint8_t since_pulse;                           /* ticks since the last tenth of a second */
     uint8_t levels;                                /* 2 A + B at the last edge */
     bool backwards;                                /* direction; written by the main loop with a magnetic encoder */
     uint16_t angle;                                /* of the magnetic encoder */
@@ -89,15 +95,18 @@ struct controller {
     uint16_t sequence, stalled_ms, runaway_ms, over_ms, current_ms, bad_turns, lost_ms;
     uint16_t faults, sent_faults;
     uint8_t batched, state, sent_state, still;
-    int32_t speed;
+    int32_t speed, over_speed;
     bool indexed, sampled, told, driver_fault, commanded;
 };
 
 void controller_begin(struct controller *c, const struct settings *settings, uint32_t now);
 void controller_poll(struct controller *c, uint32_t now);
-int controller_take(struct controller *c); /* next byte to send, or -1 */
 
 /* What follows is called by interrupts. */
+
+#define WAITING(ring) ((ring_index)((ring).head - (ring).tail))
+#define FIRST(ring, n) (&(ring).items[(ring).tail & ((n) - 1u)])
+#define DROP(ring) ((ring).tail = (ring_index)((ring).tail + 1u))
 
 #define PUT(c, ring, n, ...) do { \
         ring_index head_ = (ring).head; \
@@ -106,6 +115,14 @@ int controller_take(struct controller *c); /* next byte to send, or -1 */
         __asm__ volatile("" ::: "memory"); /* the item is written before the head */ \
         (ring).head = (ring_index)(head_ + 1u); \
     } while (0)
+
+/* Next byte to send, or -1. One reader: an interrupt or the main loop. */
+static inline int controller_take(struct controller *c) {
+    if (!WAITING(c->tx)) return -1;
+    uint8_t byte = *FIRST(c->tx, TX_BYTES);
+    DROP(c->tx);
+    return byte;
+}
 
 static inline void on_byte(struct controller *c, uint8_t byte) { PUT(c, c->rx, RX_BYTES, byte); }
 
@@ -125,11 +142,11 @@ static inline bool has_absolute_angle(const struct settings *s) {
     return s->encoder == MAGNETIC && s->counts_per_turn == AS5047_COUNTS;
 }
 
-/* Edge of the index pulse at time t [us]. The edge at lower counts is the index, whichever way the prism turns: the
+/* Edge of the index pulse at time t [us] and its count. The edge at lower counts is the index, whichever way the prism turns: the
    pulse's first edge forwards, its last edge backwards. Returns whether this is the index. */
-static inline bool on_index(struct controller *c, uint32_t t, bool rising) {
+static inline bool on_index(struct controller *c, uint32_t t, int32_t count, bool rising) {
     if (rising == c->backwards) return false;
-    PUT(c, c->index, WAITING_PULSES, (struct stamp){t, c->count});
+    PUT(c, c->index, WAITING_PULSES, (struct stamp){t, count});
     return true;
 }
 
@@ -140,7 +157,9 @@ static inline void on_sync(struct controller *c, uint32_t t) { PUT(c, c->sync, W
 static inline bool on_tick(struct controller *c, uint32_t t, int32_t count) {
     c->ticks++;
     PUT(c, c->samples, WAITING_SAMPLES, (struct stamp){t, count});
-    return c->settings.pulses == PULSES_TIMED && c->ticks % (TICK_HZ / 10u) == 0;
+    if (++c->since_pulse < TICK_HZ / 10u) return false;
+    c->since_pulse = 0;
+    return c->settings.pulses == PULSES_TIMED;
 }
 
 /* Answer of the magnetic encoder, before on_tick(): updates the count. */

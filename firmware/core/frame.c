@@ -42,7 +42,7 @@ uint32_t frame_encode(uint8_t *packet, uint32_t size, uint8_t *frame) {
 static void begin(struct frame_decoder *d) {
     d->size = d->received = 0;
     d->block = d->left = 0;
-    d->crc = ~0u;
+    d->crc = ~(uint32_t)0; /* ~0u has 16 bits on an AVR */
 }
 
 static void keep(struct frame_decoder *d, uint8_t byte) {

@@ -1,10 +1,11 @@
 #include "speed.h"
 
-#define ALPHA 12288 /* Q16: 1 - z^2 for a double pole z = 0.9014 */
-#define BETA 640    /* Q16: (1 - z)^2 */
+#define ALPHA 3 /* in 1/16: 1 - z^2 for a double pole z = 0.9014 */
+#define BETA 5  /* in 1/512: (1 - z)^2 */
 #define CREEP RPM(10) /* below this speed a stopping motor is released */
 
-static int64_t clamp(int64_t value, int64_t limit) { return value > limit ? limit : value < -limit ? -limit : value; }
+/* No division and no multiplication of 64 bits is here once per sample: they are slow on 8 bits. */
+static int32_t clamp(int32_t value, int32_t limit) { return value > limit ? limit : value < -limit ? -limit : value; }
 
 bool q16_from_f32(uint32_t bits, int32_t *q16) {
     int exponent = (int)(bits >> 23 & 255u) - 127;
@@ -34,12 +35,29 @@ void tracker_begin(struct tracker *t, int32_t count, uint32_t counts_per_turn) {
 }
 
 int32_t tracker_step(struct tracker *t, int32_t count) {
-    t->position += (uint64_t)t->speed;
-    int32_t whole = (int32_t)((uint32_t)count - (uint32_t)(t->position >> 16));
-    int64_t error = (int64_t)whole * 65536 - (int64_t)(t->position & 0xFFFFu);
-    t->position += (uint64_t)(error * ALPHA >> 16);
-    t->speed = clamp(t->speed + (error * BETA >> 16), (int64_t)1 << 30); /* 16384 counts per tick */
-    return (int32_t)clamp(t->speed * t->scale >> 16, RPM(16000));
+    t->position += (uint64_t)(int64_t)t->speed;
+    int32_t whole = clamp((int32_t)((uint32_t)count - (uint32_t)(t->position >> 16)), 16383);
+    int32_t error = whole * 65536 - (int32_t)(t->position & 0xFFFFu);
+    t->position += (uint64_t)(int64_t)((error >> 4) * ALPHA);
+    t->speed = clamp(t->speed + (error >> 9) * BETA, (int32_t)1 << 30); /* 16384 counts per tick */
+    int64_t rpm = t->speed * t->scale >> 16;
+    return rpm > RPM(16000) ? RPM(16000) : rpm < -RPM(16000) ? -RPM(16000) : (int32_t)rpm;
+}
+
+static int32_t times(int32_t speed, int32_t gain) { return (int32_t)((int64_t)speed * gain >> 32); }
+
+/* Duty that keeps a speed: the motor's voltage without load, and friction. */
+static int32_t feed_forward(const struct speed_control *c, int32_t speed) {
+    return times(speed, c->forward) + (speed > 0 ? c->friction : speed < 0 ? -c->friction : 0);
+}
+
+void speed_begin(struct speed_control *c, const struct gains *g) {
+    c->friction = g->friction;
+    c->duty_slew = g->duty_slew;
+    c->forward = (int32_t)((int64_t)FULL_DUTY * 65536 / g->no_load_rpm);
+    c->kp = g->kp * 256;
+    c->ki = (int32_t)((int64_t)g->ki * 16777216 / TICK_HZ);
+    speed_release(c);
 }
 
 void speed_release(struct speed_control *c) {
@@ -48,34 +66,27 @@ void speed_release(struct speed_control *c) {
     c->duty = 0;
 }
 
-/* Duty that keeps a speed: the motor's voltage without load, and friction. */
-static int64_t feed_forward(const struct gains *g, int32_t speed) {
-    int64_t duty = (int64_t)speed * FULL_DUTY / ((int64_t)g->no_load_rpm * 65536);
-    return duty + (speed > 0 ? g->friction : speed < 0 ? -g->friction : 0);
-}
-
 void speed_catch(struct speed_control *c, int32_t speed) {
     speed_release(c);
     if (speed < CREEP && speed > -CREEP) return;
     c->reference = speed;
-    c->duty = (int32_t)clamp(feed_forward(&c->gains, speed), FULL_DUTY); /* a lower voltage would brake */
+    c->duty = clamp(feed_forward(c, speed), FULL_DUTY); /* a lower voltage would brake */
 }
 
 int32_t speed_step(struct speed_control *c, int32_t speed) {
-    const struct gains *g = &c->gains;
-    int64_t change = clamp((int64_t)c->target - c->reference, c->ramp);
-    c->reference += (int32_t)change;
+    c->reference += clamp(c->target - c->reference, c->ramp);
     if (c->target == 0 && c->reference == 0 && speed < CREEP && speed > -CREEP) {
         c->integral = 0;
         return c->duty = 0;
     }
-    int64_t error = (int64_t)c->reference - speed;
-    int64_t wanted = feed_forward(g, c->reference) + (error * g->kp >> 24) + (c->integral >> 16);
-    int64_t duty = clamp(wanted, FULL_DUTY);
-    duty = c->duty + clamp(duty - c->duty, g->duty_slew);
+    int32_t error = c->reference - speed;
+    int32_t wanted = feed_forward(c, c->reference) + times(error, c->kp) + (c->integral >> 16);
+    int32_t duty = c->duty + clamp(clamp(wanted, FULL_DUTY) - c->duty, c->duty_slew);
     /* The integral stands still while a limit acts in its direction. */
     if ((duty >= wanted || error < 0) && (duty <= wanted || error > 0)) {
-        c->integral = clamp(c->integral + error * g->ki / ((int64_t)TICK_HZ * 256), (int64_t)FULL_DUTY << 16);
+        int32_t most = (int32_t)FULL_DUTY << 16, change = times(error, c->ki);
+        if (change > 0) c->integral = c->integral > most - change ? most : c->integral + change;
+        else c->integral = c->integral < -most - change ? -most : c->integral + change;
     }
-    return c->duty = (int32_t)duty;
+    return c->duty = duty;
 }

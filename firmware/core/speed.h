@@ -18,7 +18,7 @@ uint32_t f32_from_q16(int32_t q16);
 /* Alpha-beta filter (time constant 10 ms) from counts to speed. */
 struct tracker {
     uint64_t position; /* counts in Q16, modulo 2^48 */
-    int64_t speed;     /* counts per tick in Q16 */
+    int32_t speed;     /* counts per tick in Q16 */
     int64_t scale;     /* factor from `speed` to Q16 rpm, in Q16 */
 };
 void tracker_begin(struct tracker *t, int32_t count, uint32_t counts_per_turn);
@@ -33,12 +33,14 @@ struct gains {
 };
 
 struct speed_control {
-    struct gains gains;
+    int32_t friction, duty_slew;
+    int32_t forward, kp, ki; /* duty per Q16 rpm in 1/2^32: feed-forward, proportional, and per tick in 1/65536 */
     int32_t target, ramp;   /* commanded speed [Q16 rpm] and its change per tick */
     int32_t reference;      /* ramped target [Q16 rpm] */
-    int64_t integral;       /* duty in Q16 */
+    int32_t integral;       /* duty in Q16 */
     int32_t duty;           /* output */
 };
+void speed_begin(struct speed_control *c, const struct gains *g);
 void speed_release(struct speed_control *c);                  /* no voltage, reference and target 0 */
 void speed_catch(struct speed_control *c, int32_t speed);     /* begin at the speed at which a released motor turns */
 int32_t speed_step(struct speed_control *c, int32_t speed);   /* returns the duty for the measured speed [Q16 rpm] */

@@ -52,7 +52,7 @@ static void move(struct board *b, double before) {
         if (has_absolute_angle(&b->settings) || !motor_index(&b->motor)) continue;
         double late = 0.5 * (uniform(&b->motor) + 1.0); /* delay of the interrupt [us] */
         uint32_t t = clock_at(b, (double)b->now + STEP_US * share + late);
-        if (on_index(&b->c, t, b->motor.in_pulse)) {
+        if (on_index(&b->c, t, b->c.count, b->motor.in_pulse)) {
             b->late_us = fmax(b->late_us, late);
             if (b->settings.pulses == PULSES_INDEX) on_sync(&b->c, t);
         }

@@ -59,7 +59,7 @@ void io_interrupt(void) {
     if (ENCODER == QUADRATURE) on_edge(&c, (uint8_t)((in >> (PIN_A - 1) & 2u) | (in >> PIN_B & 1u)));
     if (pending & (EDGE_LOW(PIN_INDEX) | EDGE_HIGH(PIN_INDEX))) {
         bool rising = pending & EDGE_HIGH(PIN_INDEX);
-        if (on_index(&c, t, rising) && c.settings.pulses == PULSES_INDEX) {
+        if (on_index(&c, t, c.count, rising) && c.settings.pulses == PULSES_INDEX) {
             REG(GPIO_SET) = BIT(PIN_TRIGGER);
             on_sync(&c, t);
         }
