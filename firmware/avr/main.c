@@ -22,7 +22,7 @@ _Static_assert((uint32_t)COUNTS * RATIO * MOST_RPM / 60 <= 75000, "75,000 edges 
 static struct controller c;
 static volatile uint32_t tick_us; /* time of the last tick */
 
-/* An edge takes a third of the time of on_edge(), as its interrupt changes bytes alone: the count modulo 256, the number
+/* An edge takes half of the time of on_edge(), as its interrupt changes bytes alone: the count modulo 256, the number
    of lost edges and the levels (B, A) are in registers of general purpose. take_edges() adds them to those of the core.
    Table: quadrature_step by the levels before (bits 1 and 0) and now (bits 5 and 4, as in the port). */
 #define COUNT GPIOR0
@@ -44,7 +44,7 @@ INLINE uint32_t time_before(uint16_t ago) {
 }
 INLINE uint32_t now(void) { return time_before(0); }
 
-INLINE void take_edges(void) { /* with interrupts disabled, at least once in 127 edges */
+INLINE void take_edges(void) { /* with interrupts disabled; at least once in 127 edges */
     uint8_t count = COUNT, lost = LOST;
     int8_t step = (int8_t)(count - seen);
     c.count = (int32_t)((uint32_t)c.count + (uint32_t)(int32_t)step); /* wraps */
