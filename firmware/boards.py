@@ -230,7 +230,7 @@ def serve(board: Any, link: Path, seconds: float) -> None:
 
     def now_us() -> int:
         now = time.monotonic()
-        state[1] += min(now - state[0], 0.005) * 1e6
+        state[1] += min(now - state[0], 0.05) * 1e6
         state[0] = now
         return int(state[1])
 

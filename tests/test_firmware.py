@@ -794,6 +794,20 @@ def test_settings_of_make_are_those_of_the_image(chip: Callable[..., Any]) -> No
     assert (host.status.state, host.status.faults) == (1, 0)
 
 
+def test_the_image_catches_a_prism_that_runs_down(image: Callable[..., Any]) -> None:
+    host = Host(image())
+    host.command(SetSpeed(600.0, 5000.0))
+    host.run(0.4)
+    host.board.reset()
+    host.run(0.15)
+    start = host.board.get("rpm")
+    assert (host.board.get("enable"), start > 450.0) == (False, True)
+    host.send(Stop())
+    host.run(0.1)
+    assert host.board.get("rpm") == pytest.approx(start - 200.0, abs=100.0)  # the ramp of a stop is 2000 rpm/s
+    host.run_until(lambda: host.status.state == 0, 1.0)
+
+
 @pytest.mark.parametrize("port", ["chip", "avr"])
 @pytest.mark.parametrize(
     ("switch", "fault", "encoder"),
