@@ -782,6 +782,15 @@ def test_the_image_with_a_magnet_that_turns_twice_per_turn_of_the_prism(chip: Ca
     assert host.status.faults == FAULT["index missed"]
 
 
+def test_the_image_with_a_magnet_that_counts_backwards(chip: Callable[..., Any]) -> None:
+    host = Host(chip("MAGNETIC", "PULSES_TIMED", "REVERSED=1"))
+    host.board.set("reversed_motor")
+    assert host.command(SetSpeed(400.0, 4000.0)) == 0
+    host.run_until(lambda: host.status.state == 1, 1.0)
+    assert (host.status.target_rpm, host.status.faults) == (400.0, 0)
+    assert host.board.get("rpm") == pytest.approx(-400.0, abs=80.0)  # it overshoots
+
+
 def test_settings_of_make_are_those_of_the_image(chip: Callable[..., Any]) -> None:
     host = Host(chip("QUADRATURE", "PULSES_TIMED", "COUNTS=2000", "RATIO=3/2", "MOST_RPM=500", counts=3000))
     host.run(0.1)

@@ -38,6 +38,9 @@
 #define MOST_RPM 3000
 #endif
 #endif
+#ifndef REVERSED
+#define REVERSED 0 /* 1: the magnetic encoder counts backwards */
+#endif
 _Static_assert((int32_t)COUNTS * RATIO > 0 && (int32_t)COUNTS * RATIO < (int32_t)1 << 24, "COUNTS * RATIO: 1 to 16777215");
 _Static_assert(MOST_RPM > 0 && MOST_RPM <= 13000, "MOST_RPM: 1 to 13000"); /* over-speed is seen up to 16000 rpm */
 
@@ -170,6 +173,7 @@ static inline void on_answer(struct controller *c, uint16_t frame) {
         return;
     }
     c->bad_answers = 0;
+    if (REVERSED) angle = (int)AS5047_COUNTS - 1 - angle;
     if (!c->angle_known) c->count = angle;
     else { /* the shortest way in 14 bits */
         int16_t step = (int16_t)((((uint16_t)angle - c->angle + 8192u) & 16383u) - 8192u);
