@@ -23,7 +23,8 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 LONGEST_FIRST = (
-    "test_photometric", "test_lens", "test_consistency", "test_sensor_timing", "test_moving", "test_world_truth",
+    "test_vibration", "test_mirror", "test_firmware", "test_photometric", "test_lens", "test_consistency",
+    "test_sensor_timing", "test_moving", "test_world_truth",
     "test_prism_path", "test_stability", "test_view_browser", "test_live_writer", "test_named_worlds", "test_window",
     "test_io_mutation", "test_public_values", "test_reconstruct", "test_chart", "test_refusals", "test_cli",
     "test_dataset", "test_examples", "test_pixels", "test_compensate", "test_structure", "test_link", "test_demo",
