@@ -138,20 +138,22 @@ def test_rows_are_selected_and_summarised(extension: Any) -> None:
 
 
 def test_a_report_of_evaluations_becomes_a_page(extension: Any, tmp_path: Path) -> None:
+    from amiwarp.studies.evaluate.claims import judge
     from amiwarp.studies.evaluate.evaluation import write
-    from amiwarp.studies.evaluate.study import QUICK, Chart, Claim, Table
+    from amiwarp.studies.evaluate.study import QUICK, Chart, Table
 
     report, page = extension("amiwarp.studies.evaluate.evaluation"), extension("paper_results")
     chart = Chart("x", "y", "s", panels=("p",))
     tables = [Table("curve", "Curve", ("p", "s", "x", "y"), [("a", "b", k, 2.0 * k) for k in range(3)], "Up.", chart),
               Table("few", "Few", ("name", "y"), [("one | two", 0.5)]),
               Table("all", "All", ("y",), [(1.0,)], long=True)]  # fmt: skip
-    claims = [Claim.judge("More is more.", "2", "3", True, "larger")]
+    claims = [judge(10, "More is more.", {"a": {1: 3.0, 2: 3.5}}, "the rest", above=0.0)]
     section = report.Section("n", "Name", "How.", "Else.", claims, tables, [], 1, [], {"room": "1 of 2"}, 0.0)
     data = json.loads(write(tmp_path, [section], QUICK, 1.0)["data"].read_text())
     other = json.loads(json.dumps(data).replace("More is more.", "Less."))
     text = page.content({"cpu": data, "gpu": other}, tmp_path)
-    assert "| More is more. *Rule: larger.* | 2 | 3 | **reproduced** | not run | – |" in text
+    assert "| 10. More is more. *Rule: the 95 % interval over the seeds of the rest lies above 0.* | +0.19 px |" in text
+    assert "| 3.25 [0.0734, 6.43], 2 seeds | **reproduced** | not run | – |" in text
     assert "![Curve](paper-results/curve.png)" in text
     assert "| one \\| two | 0.5 |" in text
     assert (tmp_path / "curve.png").stat().st_size > 1000

@@ -23,6 +23,7 @@ from amiwarp.cli.common import made_again
 from amiwarp.io.json_files import sealed
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.evaluate import apex_speed, corners, fading, texture
+from amiwarp.studies.evaluate.claims import Verdict
 from amiwarp.studies.evaluate.edges import Counts, best_f, binary_entropy, geometric_edges, match
 from amiwarp.studies.evaluate.evaluation import (
     EVALUATIONS,
@@ -41,20 +42,15 @@ from amiwarp.studies.evaluate.study import (
     IDEAL,
     QUICK,
     CellResult,
-    Claim,
     Condition,
     DiscTarget,
     RecordedStreams,
     Stream,
     Streams,
     Table,
-    Verdict,
-    by_case,
-    compared,
     encode_picture,
     grouped,
     robust_spread,
-    where_calibrated,
 )
 from amiwarp.studies.evaluate.texture import density_variance, event_counts
 from amiwarp.tasks import silent
@@ -224,31 +220,6 @@ def test_fading_classes() -> None:
 def test_grouped_rows() -> None:
     rows = [{"a": 1, "v": 1.0}, {"a": 1, "v": 3.0}, {"a": 2, "v": None}]
     assert grouped(rows, ["a"], ["v"]) == [(1, 2, 2.0, 1.0), (2, 1, None, None)]
-
-
-def test_verdicts() -> None:
-    verdicts = [Claim.judge("", "", "", holds, "").verdict for holds in (True, False, None)]
-    assert verdicts == [Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.NOT_TESTABLE]
-
-
-def stream_rows(scene: str, **scores: list[float | None]) -> list[dict[str, object]]:
-    """Return one row per stream and seed with its score. None as a score leaves the row out."""
-    return [{"scene": scene, "camera": "fast", "seed": seed, "stream": Stream[name].value, "score": value}
-            for name, values in scores.items() for seed, value in enumerate(values) if value is not None]  # fmt: skip
-
-
-def test_a_comparison_needs_most_recordings_to_be_calibrated() -> None:
-    good = stream_rows("desk", PLAIN=[1.0, 1.2, 1.4, 1.2], TRUE=[2.0] * 4, CALIBRATED=[1.9, 2.0, None, None])
-    bad = stream_rows("room", PLAIN=[1.0, 1.2, 1.4, 1.2], TRUE=[2.0] * 4, CALIBRATED=[9.0, None, None, None])
-    one = compared(by_case(good, ("scene",), "score"), Stream.PLAIN, "higher", larger=True)
-    assert one == (True, "AMI-EV 1.950 ± 0.050, S-EV 1.200 ± 0.141")
-    both = compared(by_case(good + bad, ("scene",), "score"), Stream.PLAIN, "higher", larger=True)
-    assert both == (False, "higher in 1 of 2 cases, with the true model in 2; calibration mostly refused in 1")
-    assert compared(by_case(good, ("scene",), "score"), Stream.RAW, "higher", larger=True) == (None, "no result")
-    assert {r["seed"] for r in where_calibrated(good)} == {0, 1}
-    none = [r for r in good if r["stream"] != Stream.CALIBRATED]
-    refused_all = compared(by_case(none, ("scene",), "score"), Stream.PLAIN, "higher", larger=True)
-    assert refused_all == (None, "the calibration refused all recordings")
 
 
 def test_the_report_tells_what_the_calibration_refused() -> None:

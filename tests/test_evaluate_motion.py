@@ -28,6 +28,7 @@ from amiwarp import (
 )
 from amiwarp.simulation.worlds.world import looking_at
 from amiwarp.studies.evaluate import flow, pictures, pose, segmentation, study
+from amiwarp.studies.evaluate.claims import Verdict
 from amiwarp.studies.evaluate.flow import flow_by_contrast, flow_by_dis, flow_error, rotation_flow
 from amiwarp.studies.evaluate.pose import PROPORTIONS
 from amiwarp.studies.evaluate.segmentation import SegmentationSettings, moving_events
@@ -38,7 +39,6 @@ from amiwarp.studies.evaluate.study import (
     Stream,
     Streams,
     Table,
-    Verdict,
     estimate_rotation,
     rotated_back,
 )

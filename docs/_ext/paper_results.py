@@ -46,7 +46,8 @@ def verdicts(reports: dict[str, Any]) -> str:
         rows = []
         for claim in section["claims"]:
             cells = (cell for report in reports.values() for cell in judged(report, claim))
-            rows.append([f"{claim['text']} *Rule: {claim['rule']}.*", claim["paper"], *cells])
+            number = "" if claim.get("number") is None else f"{claim['number']}. "
+            rows.append([f"{number}{claim['text']} *Rule: {claim['rule']}.*", claim["paper"], *cells])
         names = [cell for name in reports for cell in (f"here ({name})", "verdict")]
         text += f"### {section['title']}\n\n" + markdown_table(["claim", "paper", *names], rows)
     return text

@@ -9,7 +9,8 @@ import numpy as np
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import edge_blur
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
+from amiwarp.studies.evaluate.claims import Claim, differences, judge
+from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Settings, Stream, Streams, Table
 
 TITLE = "Apex angle and speed"
 PROTOCOL = (
@@ -190,39 +191,19 @@ def _name(cutoff_hz: float | None) -> str:
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
-    """Return the verdicts on the surge above 720 rpm, on its cause, and on a prism of 2 deg."""
-    rows = _rows(results, "rows")
-    whole = [r for r in rows if r["only"] is None]
-    bandwidths = sorted({r["cutoff_hz"] for r in whole}, key=lambda hz: hz or np.inf, reverse=True)
-    found = [
-        _surge(whole, f"The error surges above 720 rpm (apex 0.5°, bandwidth {_name(hz)}).", "curve", cutoff_hz=hz)
-        for hz in bandwidths
-    ]
-    found.append(_surge(whole, "The paper's own measure surges (apex 0.5°, lowest bandwidth).", "curve", "edge_blur",
-                        cutoff_hz=min((hz for hz in bandwidths if hz), default=0.0)))  # fmt: skip
-    small, large = (_mean(whole, "mev_per_s", rpm=USUAL_RPM, degrees=d, cutoff_hz=0.0) for d in (0.5, 2.0))
-    known = small is not None and large is not None
-    found.append(Claim.judge(
-        "A prism of 2° is impractical: it gives too many events.", "text",
-        f"{large:.2f} Mev/s at 2°, {small:.2f} at 0.5°" if known else study.NO_RESULT,
-        large > 2.0 * small if small is not None and large is not None else None,
-        "the event rate at 2° is more than twice that at 0.5° (720 rpm, unlimited bandwidth)",
-    ))  # fmt: skip
-    return found
-
-
-def _surge(rows: Sequence[dict[str, Any]], text: str, paper: str, measure: str = "blur", **where: float) -> Claim:
-    """Judge whether a measure of blur grows much from 720 to 1440 turns/min."""
-    below, above = (_mean(rows, measure, rpm=rpm, degrees=0.5, **where) for rpm in (USUAL_RPM, 2 * USUAL_RPM))
-    rule = f"the mean blur at 1440 rpm is more than {SURGE:g} times that at 720 rpm"
-    if below is None or above is None:
-        return Claim.judge(text, paper, study.NO_RESULT, None, rule)
-    return Claim.judge(
-        text, paper, f"{below:.2f} px at 720 rpm, {above:.2f} px at 1440 rpm", above > SURGE * below, rule
-    )
-
-
-def _mean(rows: Sequence[dict[str, Any]], name: str, **where: float) -> float | None:
-    """Return the mean of a column over the rows with the given values, or None without any."""
-    given = [r[name] for r in rows if all(r[k] == v for k, v in where.items()) and r[name] is not None]
-    return float(np.mean(given)) if given else None
+    """Return the verdicts on the surge above 720 rpm, and on the error and the number of events of a prism of 2 deg."""
+    rows = [r for r in _rows(results, "rows") if r["only"] is None]
+    bandwidths = sorted({r["cutoff_hz"] for r in rows}, key=lambda hz: hz or np.inf, reverse=True)
+    usual = [r for r in rows if (r["rpm"], r["cutoff_hz"]) == (USUAL_RPM, 0.0)]
+    large, small = {"degrees": 2.0}, {"degrees": 0.5}
+    return [
+        *(judge(13, f"The error surges above 720 rpm (apex 0.5°, bandwidth {_name(hz)}).",
+                differences([r for r in rows if (r["cutoff_hz"], r["degrees"]) == (hz, 0.5)], "blur",
+                            {"rpm": 2 * USUAL_RPM}, {"rpm": USUAL_RPM}, by=("apex_name",), relative=True),
+                "the blur at 1440 rpm relative to that at 720 rpm", above=SURGE - 1.0) for hz in bandwidths),
+        judge(14, "The error of a prism of 2° is larger than that of 0.5° (720 rpm).",
+              differences(usual, "blur", large, small, by=("rpm",)), "the blur at 2° less that at 0.5°", above=0.0,
+              unit="px"),
+        judge(14, "A prism of 2° gives more events.", differences(usual, "mev_per_s", large, small, by=("rpm",)),
+              "the event rate at 2° less that at 0.5°", above=0.0, unit="Mev/s"),
+    ]  # fmt: skip

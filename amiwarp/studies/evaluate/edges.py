@@ -14,8 +14,9 @@ from amiwarp.events.recording import Events
 from amiwarp.events.truth import FrameTruth
 from amiwarp.imaging.iwe import iwe
 from amiwarp.studies.evaluate import study
+from amiwarp.studies.evaluate.claims import Claim, differences, judge, ranges
 from amiwarp.studies.evaluate.evaluation import CHANCE
-from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
+from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Settings, Stream, Streams, Table
 
 # Agreement of edge pixels with true edges: one-to-one matches within a tolerance, precision, recall and F-score.
 
@@ -179,6 +180,10 @@ CANNY, GEOMETRY = "Canny", "geometry"
 SIGMAS = {1.0: "Canny, σ 1 px", CANNY_SIGMA: CANNY, 3.0: "Canny, σ 3 px"}
 """Standard deviations of Canny's Gaussian in the sensitivity curve [px], and the kinds of edges that they give. The
 curve is that at the strict tolerance."""
+VALUES_IN_WORDS = {"f": "the ODS-F", "margin": "the margin of the ODS-F over chance", "entropy": "the entropy"}
+"""What the values are called in the claims."""
+SET = ("scene", "camera", "stream", "truth", "tolerance")
+"""Columns whose values make a set of images with one best threshold."""
 SECTORS = 6
 """Number of classes of the angle between image motion and the normal of an edge."""
 SLOWEST = 5.0
@@ -392,34 +397,56 @@ def _shown(image: NDArray[Any]) -> str:
     return study.encode_picture(np.asarray(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0, np.uint8))
 
 
-def scores(results: Sequence[CellResult]) -> list[dict[str, Any]]:
-    """Return the ODS-F of each world, motion, stream, kind of truth and tolerance, with its precision and recall."""
+def _sets(results: Sequence[CellResult]) -> dict[tuple[Any, ...], list[tuple[int, Counts, list[float]]]]:
+    """Return seed, counts and entropies of the recordings of each scene, motion, stream, truth and tolerance."""
     images = {(_recording(r), r["stream"]): r for r in study.rows_of(results, "images")}
-    sets: dict[tuple[Any, ...], list[tuple[Counts, list[float]]]] = {}
+    sets: dict[tuple[Any, ...], list[tuple[int, Counts, list[float]]]] = {}
     for row in study.rows_of(results, "rows"):
         seen = images[_recording(row), row["stream"]]
-        key = tuple(row[c] for c in ("scene", "camera", "stream", "truth", "tolerance"))
-        sets.setdefault(key, []).append((_counts(row, seen), seen["entropy"]))
+        key = tuple(row[c] for c in SET)
+        sets.setdefault(key, []).append((row["seed"], _counts(row, seen), seen["entropy"]))
+    return sets
+
+
+def _best(members: Sequence[tuple[int, Counts, list[float]]]) -> tuple[Counts, int]:
+    """Return the counts of a set, and the index of its best threshold."""
+    total = Counts(*(np.sum([getattr(c, n) for _, c, _ in members], axis=0) for n in ("matched", "found", "true")))
+    return total, best_f(total)[0]
+
+
+def scores(results: Sequence[CellResult]) -> list[dict[str, Any]]:
+    """Return the ODS-F of each world, motion, stream, kind of truth and tolerance, with its precision and recall."""
     out = []
-    for (scene, camera, stream, truth, tolerance), members in sets.items():
-        total = Counts(*(np.sum([getattr(c, n) for c, _ in members], axis=0) for n in ("matched", "found", "true")))
-        best, score = best_f(total)
+    for key, members in _sets(results).items():
+        total, best = _best(members)
         out.append({
-            "scene": scene, "camera": camera, "stream": stream, "truth": truth, "tolerance": tolerance, "f": score,
-            "std": float(np.std([c.f_score[best] for c, _ in members])), "precision": float(total.precision[best]),
+            **dict(zip(SET, key, strict=True)), "f": float(total.f_score[best]),
+            "std": float(np.std([c.f_score[best] for _, c, _ in members])), "precision": float(total.precision[best]),
             "seeds": len(members), "recall": float(total.recall[best]),
-            "entropy": float(np.mean([entropy[best] for _, entropy in members])),
+            "entropy": float(np.mean([entropy[best] for _, _, entropy in members])),
         })  # fmt: skip
-    chance = {_case(r): r["f"] for r in out if r["stream"] == CHANCE}
-    return [r | {"chance": chance[_case(r)], "margin": r["f"] - chance[_case(r)]} for r in out]
+    return _over_chance(out, SET[:2] + SET[3:])
+
+
+def _by_seed(results: Sequence[CellResult]) -> list[dict[str, Any]]:
+    """Return score, margin over chance and entropy of each recording, at the best threshold of its set."""
+    out = []
+    for key, members in _sets(results).items():
+        _, best = _best(members)
+        out += [{**dict(zip(SET, key, strict=True)), "seed": seed, "f": float(c.f_score[best]),
+                 "entropy": entropy[best]} for seed, c, entropy in members]  # fmt: skip
+    return _over_chance(out, (*SET[:2], *SET[3:], "seed"))
+
+
+def _over_chance(rows: Sequence[dict[str, Any]], by: Sequence[str]) -> list[dict[str, Any]]:
+    """Return rows with the score of chance in their case, and the margin over it."""
+    chance = {tuple(r[name] for name in by): r["f"] for r in rows if r["stream"] == CHANCE}
+    found = ((r, chance[tuple(r[name] for name in by)]) for r in rows)
+    return [r | {"chance": level, "margin": r["f"] - level} for r, level in found]
 
 
 def _recording(row: dict[str, Any]) -> tuple[Any, ...]:
     return row["scene"], row["camera"], row["seed"]
-
-
-def _case(row: dict[str, Any]) -> tuple[Any, ...]:
-    return row["scene"], row["camera"], row["truth"], row["tolerance"]
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
@@ -485,55 +512,45 @@ def _mosaic(images: Sequence[NDArray[np.uint8]], columns: int = 3) -> NDArray[np
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
-    """Return the verdicts on the ranking at both tolerances, on the still camera, and on the fading of edges."""
-    found = scores(results)
-    moving = [r for r in found if r["camera"] != "still"]
-    still = [r for r in found if r["camera"] == "still"]
+    """Return the verdicts on the F-score, its steadiness, the entropy and the recall by direction; and robustness."""
+    rows = _by_seed(results)
 
-    def of(rows: Sequence[dict[str, Any]], *tolerances: float, truth: str = CANNY) -> list[dict[str, Any]]:
-        return [r for r in rows if r["tolerance"] in tolerances and r["truth"] == truth]
+    def more(number: int | None, text: str, value: str, *, other: Stream = Stream.PLAIN, moving: bool = True,
+             tolerance: float = USUAL, truth: str = CANNY) -> Claim:  # fmt: skip
+        chosen = [r for r in rows if r["tolerance"] == tolerance and r["truth"] == truth
+                  and (r["camera"] != "still") == moving]  # fmt: skip
+        found = differences(chosen, value, {"stream": Stream.CALIBRATED}, {"stream": other})
+        return judge(number, text, found, f"{VALUES_IN_WORDS[value]} of '{Stream.CALIBRATED}' less that of '{other}'",
+                     above=0.0)  # fmt: skip
 
+    steady = ranges([r for r in rows if r["tolerance"] == USUAL and r["truth"] == CANNY], "f")
     return [
-        _ranking(of(moving, USUAL), Stream.PLAIN, "Event images of the moving AMI-EV fit the picture's edges better "
-                 "(tolerance 6 px).", "curves"),
-        _ranking(of(moving, STRICT), Stream.PLAIN, "The same at a tolerance of 1.5 px.", "not in the paper"),
-        _ranking(of(moving, *TOLERANCES, truth=GEOMETRY), Stream.PLAIN, "The same for geometric edges, at every "
-                 "tolerance.", "not in the paper"),
-        _ranking(of(moving, STRICT), Stream.SAME_COUNT, "The same at 1.5 px when the S-EV has as many events.",
-                 "not in the paper"),
-        _ranking(of(still, *TOLERANCES), Stream.PLAIN, "At rest the AMI-EV sees edges and the S-EV does not.",
-                 "curves"),
-        _fading(study.where_calibrated(study.rows_of(results, "sectors"))),
+        more(2, "Event images of the moving AMI-EV fit the picture's edges better (Canny, 6 px).", "f"),
+        more(2, "So they do at rest, where the S-EV sees nothing.", "f", moving=False),
+        judge(2, "Their score is steadier over the camera's motions.",
+              differences(steady, "f", {"stream": Stream.CALIBRATED}, {"stream": Stream.PLAIN}, by=("scene",)),
+              f"the range of the F-score over the motions of '{Stream.CALIBRATED}' less that of '{Stream.PLAIN}'",
+              below=0.0),
+        more(2, "Their entropy is higher (moving camera).", "entropy"),
+        _fading(study.rows_of(results, "sectors")),
+        more(None, "The margin over chance is larger at 6 px, where chance scores high.", "margin"),
+        more(None, "It is larger at a tolerance of 1.5 px.", "margin", tolerance=STRICT),
+        more(None, "It is larger for geometric edges, at 1.5 px.", "margin", tolerance=STRICT, truth=GEOMETRY),
+        more(None, "It is larger at 1.5 px than that of an S-EV with as many events.", "margin", tolerance=STRICT,
+             other=Stream.SAME_COUNT),
     ]  # fmt: skip
-
-
-def _ranking(rows: Sequence[dict[str, Any]], other: Stream, text: str, paper: str) -> Claim:
-    """Judge whether the calibrated AMI-EV has the larger margin over chance in each case."""
-    by: dict[tuple[Any, ...], dict[str, study.Score]] = {}
-    for r in rows:
-        score = study.Score(max(r["margin"], 0.0), r["std"], r["seeds"])
-        by.setdefault((r["scene"], r["camera"], r["tolerance"]), {})[r["stream"]] = score
-    holds, ours = study.compared(by, other, "larger margin", larger=True)
-    rule = (
-        f"the margin of the ODS-F over chance, at least 0, of '{Stream.CALIBRATED}' is above that of '{other}' by more "
-        "than either spread in every case"
-    )
-    return Claim.judge(text, paper, ours, holds, rule)
 
 
 def _fading(rows: Sequence[dict[str, Any]]) -> Claim:
     """Judge whether edges along the motion fade for the S-EV, and not as much for the AMI-EV."""
-    ratio = {}
-    for stream in (Stream.PLAIN, Stream.CALIBRATED):
-        mine = [r for r in rows if r["stream"] == stream]
-        along, across = (
-            [r["recall"] for r in mine if r["angle"] > 60.0],
-            [r["recall"] for r in mine if r["angle"] < 30],
-        )
-        if along and across:
-            ratio[stream] = float(np.mean(along) / max(np.mean(across), 1e-9))
-    ours = ", ".join(f"{s} {r:.2f}" for s, r in ratio.items()) or study.NO_RESULT
-    holds = ratio[Stream.PLAIN] < ratio[Stream.CALIBRATED] if len(ratio) == 2 else None
-    rule = "recall at more than 60° over recall below 30° is lower for the S-EV than for the calibrated AMI-EV"
-    text = "Edges along the motion fade from the S-EV, and not from the AMI-EV."
-    return Claim.judge(text, "shown", ours, holds, rule)
+    sides = [r | {"along": r["angle"] > 60.0} for r in rows if r["angle"] > 60.0 or r["angle"] < 30.0]
+    found = {}
+    for stream in (Stream.CALIBRATED, Stream.PLAIN):
+        across = {"stream": stream, "along": False}
+        found[stream] = differences(sides, "recall", across | {"along": True}, across, relative=True)
+    ours, plain = found[Stream.CALIBRATED], found[Stream.PLAIN]
+    gain = {case: {seed: value - plain[case][seed] for seed, value in values.items() if seed in plain.get(case, {})}
+            for case, values in ours.items()}  # fmt: skip
+    return judge(3, "Edges along the motion fade from the S-EV, and not from the AMI-EV.", gain,
+                 "the recall at more than 60° over that below 30°, of the calibrated AMI-EV less that of the S-EV,",
+                 above=0.0)  # fmt: skip

@@ -28,7 +28,8 @@ from amiwarp.kernels.launch import load_all, load_kernels
 from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs, start_workers, versions, worker_count
 from amiwarp.studies.demo import EXACT_KERNELS
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Table, Value
+from amiwarp.studies.evaluate.claims import PAPER, Claim
+from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Settings, Stream, Table, Value
 from amiwarp.tasks import Progress, cpu_threads, limited_cpu_threads, silent
 from amiwarp.translation.sources import limited_opencv
 from amiwarp.validation import guarded, real, whole
@@ -72,7 +73,7 @@ class Evaluation(Protocol):
         """Return the tables of all results, each with its chart. Results of failed cells have no values."""
 
     def claims(self, results: Sequence[CellResult]) -> list[Claim]:
-        """Return the paper's claims with the verdicts that follow from the results.
+        """Return the paper's claims, and checks of their robustness, with the verdicts that follow from the results.
 
         The function ``pictures(results)``, which returns the pictures of the evaluation, is optional.
         """
@@ -253,7 +254,7 @@ class Section:
     differences: str
     """How that differs from the paper."""
     claims: list[Claim]
-    """Claims of the paper with verdicts."""
+    """Claims of the paper, and checks of their robustness, with verdicts."""
     tables: list[Table]
     """Tables."""
     pictures: list[study.Picture]
@@ -328,7 +329,7 @@ def _json(one: Section) -> dict[str, Any]:
     """Return a section as JSON data, without its pictures."""
     data = {name: value for name, value in vars(one).items() if name not in ("pictures", "claims", "tables")}
     tables = [asdict(t) for t in one.tables if not t.long]
-    return {**data, "claims": [asdict(c) for c in one.claims], "tables": tables}
+    return {**data, "claims": [asdict(c) | {"paper": c.paper} for c in one.claims], "tables": tables}
 
 
 def _write_csv(path: Path, table: Table) -> None:
@@ -373,8 +374,9 @@ def _page(
     kinds = {p.name: _kind(p) for s in sections for p in s.pictures}
     images |= {name: _data(f"image/{kinds[name]}", data) for name, data in films.items()}
     compact = {t.name: pivoted(t) for s in sections for t in s.tables if not t.long}
+    claims = {n: (paper, [c for s in sections for c in s.claims if c.number == n]) for n, paper in PAPER.items()}
     template = environment.get_template("report.html.j2")
-    return template.render(sections=sections, images=images, compact=compact, about=about)
+    return template.render(sections=sections, claims=claims, images=images, compact=compact, about=about)
 
 
 def _data(kind: str, data: bytes) -> str:
@@ -568,7 +570,7 @@ class EvaluationSummary:
     failed: int
     """Number of cells that ended with an error, which the report states."""
     verdicts: dict[str, int]
-    """Number of claims of the paper by the verdict on them."""
+    """Number of tested parts of the paper's claims, by the verdict on them."""
     files: dict[str, Path]
     """Files of the report, ``report`` and ``data``."""
     seconds: float
@@ -661,7 +663,7 @@ def evaluate(
         for own in (folder, folder / "tables", folder / "figures") if earlier else ():
             stack.enter_context(own_folder(own))
         files = write(folder, sections, settings, processor_s)
-    verdicts = [claim.verdict.value for s in sections for claim in s.claims]
+    verdicts = [claim.verdict.value for s in sections for claim in s.claims if claim.number is not None]
     return EvaluationSummary(
         len(results), new, sum(bool(r.error) for r in results), {v: verdicts.count(v) for v in dict.fromkeys(verdicts)},
         files, time.perf_counter() - began, processor_s, tuple(store.damaged),

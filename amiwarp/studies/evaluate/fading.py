@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.prism import Prism
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
+from amiwarp.studies.evaluate.claims import Claim, differences, judge
+from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Settings, Stream, Streams, Table
 from amiwarp.validation import whole
 
 TITLE = "Perceptual fading"
@@ -213,14 +214,10 @@ def pictures(results: Sequence[CellResult]) -> list[study.Picture]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdict on the dip of the event rate."""
-    rows = [r for r in study.rows_of(results, "rows") if r["camera"] == "fast"]
-    dip, usual = ([r["rate"] for r in rows if low <= r["speed"] <= high] for low, high in (DIP, USUAL))
-    known = bool(dip and usual)
-    ours = "the camera never came near the prism's speed"
-    if known:
-        ours = f"relative rate {np.mean(dip):.2f} where they cancel, {np.mean(usual):.2f} at the prism's speed"
-    return [Claim.judge(
-        "Texture fades for a moment where the camera's motion cancels the prism's.", "film", ours,
-        bool(np.mean(dip) < 0.75 * np.mean(usual)) if known else None,
-        "the mean relative rate below half of the speed δ·2πf is less than 0.75 of that between 0.75 and 1.25 of it",
-    )]  # fmt: skip
+    classes = {"dip": DIP, "usual": USUAL}
+    rows = [r | {"class": name} for r in study.rows_of(results, "rows") if r["camera"] == "fast"
+            for name, (low, high) in classes.items() if low <= r["speed"] <= high]  # fmt: skip
+    found = differences(rows, "rate", {"class": "dip"}, {"class": "usual"}, by=("scene", "rpm"), relative=True)
+    return [judge(5, "Texture fades for a moment where the camera's motion cancels the prism's.", found,
+                  "the event rate below half of the speed δ·2πf relative to that at 0.75 to 1.25 of it",
+                  below=-0.25)]  # fmt: skip

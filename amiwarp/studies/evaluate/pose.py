@@ -10,8 +10,9 @@ from scipy import ndimage
 from amiwarp.errors import AmiwarpError
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.studies.evaluate import study
+from amiwarp.studies.evaluate.claims import Claim, untestable
 from amiwarp.studies.evaluate.pictures import PictureMaker, Window, reconstructed_streams
-from amiwarp.studies.evaluate.study import CellResult, Chart, Claim, Condition, Settings, Stream, Streams, Table
+from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Settings, Stream, Streams, Table
 
 # Detector of a figure's joints that only checks the plumbing of the pose evaluation. It is no pose estimator.
 
@@ -239,5 +240,5 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return that the paper's claim cannot be tested without a pose network."""
-    return [Claim("Pose is better with the AMI-EV, above all at high picture rates.", "curves of PDJ and IoU", "–",
-                  study.Verdict.NOT_TESTABLE, "needs a pose network, and no weights are part of amiwarp")]  # fmt: skip
+    return [untestable(9, "Pose is better with the AMI-EV, above all at high picture rates.",
+                       "needs a pose network, and no weights are part of amiwarp")]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What all evaluations share: conditions, streams of events, measures, results, tables with charts, and verdicts."""
+"""What all evaluations share: conditions, streams of events, measures, results, and tables with charts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import importlib
 import io
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
@@ -444,7 +444,7 @@ class Streams(RecordedStreams):
         return (self.true_model, self.recording.encoder) if stream is Stream.TRUE else super()._optics(stream)
 
 
-# What evaluations return: results of cells, tables with their charts, pictures, and verdicts on the paper's claims.
+# What evaluations return: results of cells, tables with their charts, and pictures.
 
 Share = Annotated[float, partial(real, low=0.0, high=1.0)]
 """Type of a share in a cell, 0 to 1."""
@@ -578,93 +578,8 @@ class Picture:
     """Time that a frame of a film is shown [s]."""
 
 
-class Verdict(enum.StrEnum):
-    """Verdict on a claim of the paper."""
-
-    REPRODUCED = "reproduced"
-    NOT_REPRODUCED = "not reproduced"
-    NOT_TESTABLE = "not testable"
-
-
-@dataclass(frozen=True)
-class Claim:
-    """Claim of the paper with the verdict on it, which follows from the results by a stated rule."""
-
-    text: str
-    """What the paper says."""
-    paper: str
-    """Value in the paper, or the place of a curve without published numbers."""
-    ours: str
-    """Our value."""
-    verdict: Verdict
-    """Verdict."""
-    rule: str
-    """Rule by which the verdict follows from our results."""
-
-    @classmethod
-    def judge(cls, text: str, paper: str, ours: str, holds: bool | None, rule: str) -> Claim:
-        """Return a claim that is reproduced if it ``holds``; None if there are no results to judge it by."""
-        verdict = {True: Verdict.REPRODUCED, False: Verdict.NOT_REPRODUCED, None: Verdict.NOT_TESTABLE}[holds]
-        return cls(text, paper, ours, verdict, rule)
-
-
 MOST_PIXELS = 1 << 22
 """Largest number of pixels of a picture in a cell."""
-NO_RESULT = "no result"
-"""Text for a comparison without values."""
-
-
-@dataclass(frozen=True)
-class Score:
-    """Score of a stream in a case, over the seeds."""
-
-    mean: float
-    """Mean."""
-    std: float
-    """Standard deviation."""
-    seeds: int
-    """Number of seeds that have a score."""
-
-
-def compared(
-    cases: Mapping[Any, Mapping[str, Score]], other: Stream, word: str, *, larger: bool
-) -> tuple[bool | None, str]:
-    """Compare the calibrated AMI-EV with another stream, and return whether it is better in each case, and a text.
-
-    Better means ``larger`` or smaller by more than either standard deviation. A case in which fewer than half of the
-    recordings could be calibrated counts as not better; the text also says in how many cases the true model is better.
-    ``word``: comparative for the text. The first value is None if no case has the other stream, or if no recording
-    could be calibrated.
-    """
-    given = [case for case in cases.values() if other in case]
-    if not given:
-        return None, NO_RESULT
-    if not any(Stream.CALIBRATED in case for case in given):
-        return None, "the calibration refused all recordings"
-    sign = 1.0 if larger else -1.0
-
-    def better(stream: Stream) -> int:
-        pairs = [(case[stream], case[other]) for case in given if _most_have(stream, case, other)]
-        return sum(sign * (ours.mean - theirs.mean) > max(ours.std, theirs.std) for ours, theirs in pairs)
-
-    wins, refused = better(Stream.CALIBRATED), sum(not _most_have(Stream.CALIBRATED, case, other) for case in given)
-    text = f"{word} in {wins} of {len(given)} cases, with the true model in {better(Stream.TRUE)}"
-    if len(given) == 1 and not refused:
-        ours, theirs = given[0][Stream.CALIBRATED], given[0][other]
-        text = f"AMI-EV {ours.mean:.3f} ± {ours.std:.3f}, {other} {theirs.mean:.3f} ± {theirs.std:.3f}"
-    return wins == len(given), text + (f"; calibration mostly refused in {refused}" if refused else "")
-
-
-def _most_have(stream: Stream, case: Mapping[str, Score], other: Stream) -> bool:
-    """Return whether a stream exists in at least half of the recordings of a case that have the other one."""
-    return stream in case and 2 * case[stream].seeds >= case[other].seeds
-
-
-def where_calibrated(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows of the recordings that have a calibrated stream, so that all streams are of the same ones."""
-    names = ("scene", "camera", "seed")
-    there = {tuple(row[n] for n in names) for row in rows if row["stream"] == Stream.CALIBRATED}
-    return [row for row in rows if tuple(row[n] for n in names) in there]
 
 
 def rows_of(results: Sequence[CellResult], name: str) -> list[dict[str, Any]]:
@@ -701,19 +616,6 @@ def grouped(rows: Sequence[dict[str, Any]], by: Sequence[str], values: Sequence[
             cells += [float(given.mean()), float(given.std())] if given.size else [None, None]
         out.append(tuple(cells))
     return out
-
-
-def by_case(rows: Sequence[dict[str, Any]], by: Sequence[str], value: str) -> dict[tuple[Value, ...], dict[str, Score]]:
-    """Return the score of a column by case, the columns ``by``, and stream, for :func:`compared`."""
-    rows = [r for r in rows if r.get(value) is not None]
-    seeds: dict[tuple[Value, ...], set[int]] = {}
-    for row in rows:
-        seeds.setdefault(tuple(row[name] for name in (*by, "stream")), set()).add(row["seed"])
-    cases: dict[tuple[Value, ...], dict[str, Score]] = {}
-    for *case, stream, _, mean, std in grouped(rows, (*by, "stream"), [value]):
-        if isinstance(mean, float) and isinstance(std, float):
-            cases.setdefault(tuple(case), {})[str(stream)] = Score(mean, std, len(seeds[*case, stream]))
-    return cases
 
 
 def finite(value: float) -> float | None:

@@ -1,0 +1,98 @@
+"""Verdicts on the paper's claims: paired differences, their interval, and limits, with made-up numbers."""
+
+import math
+
+import numpy as np
+import pytest
+
+from amiwarp.studies.evaluate.claims import PAPER, Interval, Verdict, differences, judge, ranges, untestable
+
+T_975 = {1: 12.7062, 2: 4.30265, 4: 2.77645, 9: 2.26216}
+"""Quantiles of Student's t for a two-sided interval of 95 %, by degrees of freedom, as printed tables have them."""
+
+
+@pytest.mark.parametrize("seeds", [2, 3, 5, 10])
+def test_an_interval_is_that_of_student(seeds: int) -> None:
+    values = np.random.default_rng(seeds).normal(0.3, 1.2, seeds)
+    deviations = values - values.sum() / seeds
+    error = math.sqrt((deviations**2).sum() / (seeds - 1) / seeds)
+    found = Interval.of(values.tolist())
+    expected = [values.mean() - T_975[seeds - 1] * error, values.mean() + T_975[seeds - 1] * error]
+    np.testing.assert_allclose([found.low, found.high], expected, rtol=1e-5)
+    assert found.seeds == seeds
+
+
+def test_an_interval_holds_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(0)
+    held = [found.low < 0.5 < found.high for found in (Interval.of(rng.normal(0.5, 2.0, 6)) for _ in range(2000))]
+    assert 0.935 < np.mean(held) < 0.965
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "above", "below", "verdict"),
+    [
+        (0.1, 0.3, 0.0, math.inf, Verdict.REPRODUCED),
+        (-0.3, -0.1, 0.0, math.inf, Verdict.NOT_REPRODUCED),
+        (-0.1, 0.3, 0.0, math.inf, Verdict.UNDECIDED),
+        (-0.04, 0.01, -0.05, math.inf, Verdict.REPRODUCED),  # no worse by 0.05
+        (-0.06, 0.01, -0.05, math.inf, Verdict.UNDECIDED),
+        (-0.2, -0.06, -0.05, math.inf, Verdict.NOT_REPRODUCED),
+        (0.1, 0.18, -math.inf, 0.19, Verdict.REPRODUCED),
+        (1.2, 1.9, 1.0, 2.0, Verdict.REPRODUCED),  # about 1.5
+        (0.9, 1.9, 1.0, 2.0, Verdict.UNDECIDED),
+        (2.1, 2.9, 1.0, 2.0, Verdict.NOT_REPRODUCED),
+        (-math.inf, math.inf, 0.0, math.inf, Verdict.UNDECIDED),
+    ],
+)
+def test_verdicts(low: float, high: float, above: float, below: float, verdict: Verdict) -> None:
+    assert Interval((low + high) / 2.0, low, high, 5).verdict(above, below) is verdict
+
+
+def rows(scene: str, **scores: list[float | None]) -> list[dict[str, object]]:
+    """Return one row per stream and seed with its score."""
+    return [{"scene": scene, "camera": "fast", "seed": seed, "stream": stream, "score": value}
+            for stream, values in scores.items() for seed, value in enumerate(values)]  # fmt: skip
+
+
+def test_pairs_are_those_of_one_seed_and_case() -> None:
+    """The spread over the seeds is larger than the difference, which pairs alone show."""
+    room = rows("room", ami=[1.1, 5.1, 9.2, None], sev=[1.0, 5.0, 9.0, 2.0])
+    desk = rows("desk", ami=[2.3, 4.3, None, 6.3], sev=[2.0, 4.0, 3.0, 6.0])
+    found = differences(room + desk, "score", {"stream": "ami"}, {"stream": "sev"})
+    assert {case: list(values) for case, values in found.items()} == {"room, fast": [0, 1, 2], "desk, fast": [0, 1, 3]}
+    claim = judge(1, "More.", found, "the score", above=0.0)
+    means = [0.2, 0.2, 0.2, 0.3]  # the mean over the cases that a seed has
+    half = 3.18245 * np.std(means, ddof=1) / 2.0
+    assert claim.ours == f"{np.mean(means):.3g} [{np.mean(means) - half:.3g}, {np.mean(means) + half:.3g}], 4 seeds"
+    assert claim.verdict is Verdict.REPRODUCED
+    assert claim.rule == "the 95 % interval over the seeds of the score lies above 0"
+    assert claim.paper == PAPER[1].value
+    assert list(claim.cases) == ["room, fast", "desk, fast"]
+    assert claim.cases["desk, fast"].startswith("0.3 [0.3, 0.3], 3 seeds")
+
+
+def test_relative_differences_and_levels() -> None:
+    given = rows("room", ami=[3.0, 2.0, 5.0], sev=[2.0, 0.0, 4.0])
+    relative = differences(given, "score", {"stream": "ami"}, {"stream": "sev"}, relative=True)
+    assert relative == {"room, fast": {0: 0.5, 2: 0.25}}
+    assert differences(given, "score", {"stream": "ami"}, by=("scene",)) == {"room": {0: 3.0, 1: 2.0, 2: 5.0}}
+    twice = differences(given + given, "score", {"stream": "ami"}, {"stream": "sev"})
+    assert twice == {"room, fast": {0: 1.0, 1: 2.0, 2: 1.0}}  # rows of one seed are no further seeds
+
+
+def test_ranges_over_the_motions() -> None:
+    given = [{"scene": "room", "seed": 1, "stream": "ami", "camera": camera, "v": v}
+             for camera, v in (("still", 1.0), ("fast", 4.0), ("fast", 2.0), ("fast", None))]  # fmt: skip
+    assert ranges(given, "v") == [{"scene": "room", "seed": 1, "stream": "ami", "v": 2.0}]
+    assert ranges(given[:1], "v") == []
+
+
+def test_claims_without_results() -> None:
+    assert judge(None, "", {"room": {}}, "the score", above=0.0).verdict is Verdict.NOT_TESTABLE
+    assert judge(None, "", {"room": {1: 9.0}}, "the score", above=0.0).verdict is Verdict.UNDECIDED
+    assert judge(None, "", {}, "the score", above=0.0).paper == "not in the paper"
+    assert untestable(9, "Pose.", "no network").verdict is Verdict.NOT_TESTABLE
+
+
+def test_the_paper_has_seventeen_claims() -> None:
+    assert list(PAPER) == list(range(1, 18))
