@@ -385,6 +385,7 @@ OWN: dict[str, dict[str, Any]] = {
     "PictureStack": _all(STACK),
     "VideoFile": _all(VIDEO),
     "TruthRenderer.at": {"t_us": 0, "next_us": 100},
+    "TruthRenderer.luminance": {"t_us": 0},
     "named_world": {"name": "person"},
     "Lamp": {"position": (0.0, 0.0, 0.0)},
     "Mesh": {"vertices": [[0, 0, 2], [1, 0, 2], [0, 1, 2]], "faces": [[0, 1, 2]]},

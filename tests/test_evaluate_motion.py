@@ -63,7 +63,7 @@ def panel(name: str, centre: Any, side: float, seed: int, cells: int, path: Traj
 class FewStreams(Streams):
     """Streams without calibration, for which the recording is too short, and without that of equal count."""
 
-    calibration = None
+    setup = study.Setup(None, 0.0, 0.0)
     names = (Stream.PLAIN, Stream.TRUE, Stream.RAW)
 
 
@@ -86,7 +86,7 @@ def streams() -> FewStreams:
         WorldScene(World("board", bodies, ambient=1.0, joints=joints()), camera, motion_px=2.0), CAMERA,
         Prism(math.radians(0.5)), DURATION_S, motion=PrismMotion(RPM), seed=1,
     )  # fmt: skip
-    condition: Any = SimpleNamespace(simulation=lambda device: simulation, rpm=RPM, seed=1)
+    condition: Any = SimpleNamespace(simulation=lambda device: simulation, rpm=RPM, seed=1, trajectory="handheld")
     return FewStreams(condition)
 
 
@@ -175,7 +175,7 @@ def test_the_board_is_segmented_in_each_stream(streams: Streams, monkeypatch: py
 
 def test_flow_of_still_objects(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
     """The wall moves by 0.4 px per window; the board, which moves by more than 2 px, is left out."""
-    monkeypatch.setattr(flow, "TURNS", (0.25,))
+    monkeypatch.setattr(flow, "QUICK_TURNS", (0.25,))
     values = flow.measure(streams, QUICK)
     check_tables(flow, values)
     errors = {(row["stream"], row["method"]): row["epe"] for row in values["rows"] if row["pixels"] == "edges"}
@@ -203,7 +203,7 @@ def test_pose_over_the_rate_of_pictures(streams: Streams, monkeypatch: pytest.Mo
 
 
 def test_a_learned_reconstruction_is_judged_next_to_ours(streams: Streams, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pictures, "PICTURES", 1)
+    monkeypatch.setattr(pictures, "QUICK_PICTURES", 1)
     monkeypatch.setattr(pictures, "TURNS", (pictures.STANDARD_TURNS,))
     monkeypatch.setattr(study, "MOST_EVENTS", 5_000)
     given: list[Events] = []

@@ -889,7 +889,7 @@ def run_evaluate(
     only: Annotated[
         str | None,
         typer.Option(
-            help="Evaluations to run, such as texture,flow. Default: with --full all, with --quick the short ones.",
+            help="Evaluations to run, such as texture,flow. Default: all.",
             metavar="NAME,...",
         ),
     ] = None,

@@ -138,12 +138,28 @@ class TruthRenderer:
             moved_through.astype(np.float32).reshape(*size, 2),
             occluded.reshape(size),
             occluded_through.reshape(size),
-            self._intensity(t_us, prism=False).reshape(size),
+            self.luminance(t_us),
             self._intensity(t_us, prism=True).reshape(size),
             rotation @ scenery.mirrored(self._simulation).T,
             position,
             {name: path.poses([t])[1][0] for name, path in scene.world.joints.items()},
         )
+
+    def luminance(self, t_us: int) -> NDArray[np.float32]:
+        """Return the linear luminance without the prism at a time, which takes a fraction of the time of :meth:`at`.
+
+        Parameters
+        ----------
+        t_us : int
+            Time from the start of the recording [us].
+
+        Returns
+        -------
+        numpy.ndarray
+            Luminance of all pixels, shape ``(height, width)``.
+        """
+        camera = self._simulation.camera
+        return self._intensity(t_us, prism=False).reshape(camera.height, camera.width)
 
     def _poses(self, t: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return how directions of the camera at rest look in the world at times [s], (n, 3, 3), and its places."""

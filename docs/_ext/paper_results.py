@@ -78,9 +78,6 @@ def sections(report: dict[str, Any], folder: Path) -> Iterator[str]:
     for section in report["evaluations"]:
         yield f"## {section['title']}\n\n{section['protocol']}\n\n"
         yield f"*Different from the paper.* {section['differences']}\n\n"
-        if refused := section["not_calibrated"]:
-            shares = "; ".join(f"{share} recordings of {case}" for case, share in refused.items())
-            yield f"The calibration refused {shares}. They have no calibrated stream.\n\n"
         for table in map(table_of, section["tables"]):
             figure = draw(table)
             if figure is not None:

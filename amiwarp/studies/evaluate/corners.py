@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 import warp as wp
@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.choices import CornerMethod
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.truth import FrameTruth
+from amiwarp.events.truth import Cause, FrameTruth
 from amiwarp.imaging.corners import detect_corners
 from amiwarp.kernels import corners, launch
 from amiwarp.optics.camera import Camera
 from amiwarp.simulation.worlds.world import Trajectory, WorldScene
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.claims import Claim, differences, judge
-from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Settings, Stream, Streams, Table
+from amiwarp.studies.evaluate.claims import Claim, differences, judge, untestable
+from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Frames, Settings, Stream, Streams, Table
 
 # Tracks of corner events, and their lifetime, error and update rate against truth.
 
@@ -93,6 +93,51 @@ def _chains(t: NDArray[np.int64], xy: NDArray[np.float64], radius_px: float, gap
     chains.head = wp.full(columns * rows, -1, dtype=int, device="cpu")
     chains.after, chains.last = (wp.zeros(len(t), dtype=int, device="cpu") for _ in range(2))
     return chains
+
+
+MOST_CORNERS, QUALITY, APART_PX = 500, 0.01, 5.0
+"""Largest number of corners of a frame, least quality relative to the best, and least distance [px]."""
+BACK_PX = 1.0
+"""Largest distance between a corner and the same corner tracked to the next frame and back [px]."""
+
+
+def track_frames(grey: Sequence[NDArray[np.uint8]], t_us: Sequence[int]) -> Tracks:
+    """Track corners through the frames of a standard camera (Shi and Tomasi; Lucas and Kanade, by OpenCV).
+
+    ``t_us``: times of the frames [us]. In each frame, new corners are added away from those that are tracked. The
+    ``index`` of a point is the index of its frame.
+    """
+    cv2 = study.library("cv2")
+    number, xy = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+    found: list[tuple[NDArray[np.int64], NDArray[np.float32], int]] = []
+    total = 0
+    for k, frame in enumerate(grey):
+        if k and len(xy):
+            there, ok, _ = cv2.calcOpticalFlowPyrLK(grey[k - 1], frame, xy, None)
+            back, also, _ = cv2.calcOpticalFlowPyrLK(frame, grey[k - 1], there, None)
+            kept = (ok.ravel() == 1) & (also.ravel() == 1) & (np.hypot(*(back - xy).T) < BACK_PX)
+            number, xy = number[kept], there[kept]
+        free = np.full(frame.shape, 255, np.uint8)
+        for x, y in np.rint(xy).astype(int).tolist():
+            cv2.circle(free, (x, y), round(APART_PX), 0, -1)
+        new = cv2.goodFeaturesToTrack(frame, MOST_CORNERS, QUALITY, APART_PX, mask=free)
+        new = np.zeros((0, 2), np.float32) if new is None else new.reshape(-1, 2)
+        number = np.concatenate([number, total + np.arange(len(new))])
+        xy, total = np.concatenate([xy, new]), total + len(new)
+        found.append((number, xy, k))
+    index = np.repeat([k for _, _, k in found], [len(n) for n, _, _ in found]).astype(np.int64)
+    numbers, places = (np.concatenate([part[i] for part in found]) for i in (0, 1))
+    return sorted_tracks(numbers, np.asarray(t_us, np.int64)[index], places, index)
+
+
+def seen_places(frame: FrameTruth, camera: Camera, trajectory: Trajectory, xy: NDArray[np.floating]) -> NDArray[Any]:
+    """Return what a camera without a prism sees at places [px], in the world [m], shape (n, 3); NaN for the sky."""
+    column, row = (np.clip(np.rint(v).astype(int), 0, n - 1)
+                   for v, n in zip(xy.T, frame.depth.shape[::-1], strict=True))  # fmt: skip
+    (rotation,), (position,) = trajectory.poses([frame.t_us * 1e-6])
+    rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float64)))
+    depth = np.where(np.isfinite(frame.depth), frame.depth, np.nan)[row, column]
+    return np.asarray(position + (rays * (depth / rays[:, 2])[:, None]) @ rotation.T)
 
 
 def project(
@@ -216,13 +261,15 @@ PROTOCOL = (
     "eFAST and Arc* detect corners in the events as recorded. The events are then compensated, and corner events up to "
     f"3 px and {GAP_US / 1000:.0f} ms apart are joined to tracks. The truth of a track is the point of the world that "
     "its first event saw, projected to the image without the prism. A track ends where it is further from the truth "
-    "than a limit (5 px in the comparison), or where the point is hidden. Apex 1°."
+    "than a limit (5 px in the comparison), or where the point is hidden. Apex 1°. In frames of the standard camera, "
+    "corners are those of Shi and Tomasi, tracked by Lucas and Kanade (OpenCV). The error of the compensation is the "
+    "median distance of events from where a camera without a prism would see their points."
 )
 DIFFERENCES = (
     "The paper's main text gives neither the tracker nor the limit at which a track ends. The ranking depends on the "
     "limit: see the curves. Scenes are simulated."
 )
-VERSION = 2
+VERSION = 3
 NEEDS_TRUTH = True
 
 APEX = math.radians(1.0)
@@ -235,7 +282,7 @@ INSTANTS = 5
 """Number of instants whose depth tells which points are hidden."""
 SOURCES = {
     Stream.PLAIN: (Stream.PLAIN,),
-    Stream.RAW: (Stream.TRUE, Stream.CALIBRATED, Stream.RAW),
+    Stream.RAW: (Stream.TRUE, Stream.CALIBRATED, Stream.SELF, Stream.RAW),
 }
 """Streams whose positions are those of the events of another stream, by that stream."""
 PAPER_ERROR_PX, SAME_PX = (1.0, 2.0), 0.5
@@ -246,9 +293,13 @@ VALUES = ("number", "lifetime_ms", "error_px", "update_hz")
 """Names of the values of each row."""
 
 
+FRAME_CORNERS = "frames"
+"""Detector of the corners of a standard camera, among those of events."""
+
+
 class _Row(TypedDict):
-    detector: CornerMethod
-    stream: Stream
+    detector: Literal["frames", *CornerMethod]  # type: ignore[valid-type]
+    stream: study.Compared
     limit: study.Amount
     gap: study.Amount
     number: study.Amount | None
@@ -257,11 +308,17 @@ class _Row(TypedDict):
     update_hz: study.Amount | None
 
 
+class _Error(TypedDict):
+    stream: Stream
+    median_px: study.Amount | None
+
+
 class Values(TypedDict):
     """What :func:`measure` returns."""
 
     rows: list[_Row]
     gaps: list[_Row]
+    errors: list[_Error]
 
 
 def conditions(settings: Settings) -> list[Condition]:
@@ -276,6 +333,7 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     frames = [streams.frame(int(t)) for t in instants]
     rows: list[dict[str, Any]] = []
     gaps: list[dict[str, Any]] = []
+    names = streams.names_with_own(settings)
     for source, members in SOURCES.items():
         span = streams.start_us, streams.end_us
         raw, indices = streams.indexed_window(source, *span)
@@ -283,14 +341,45 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
         assert place is not None
         for detector in CornerMethod:
             found = detect_corners(raw, streams.size, detector=detector)
-            for stream in (s for s in members if s in streams.names):
+            for stream in (s for s in members if s in names):
                 known = {"detector": detector.value, "stream": stream.value}
                 t, xy, which = _corners(streams, stream, found, indices)
                 for gap_us in GAPS_US:
                     curve = [known | row for row in _quality(streams, t, xy, place[which], frames, gap_us)]
                     rows += curve if gap_us == GAP_US else []
                     gaps += [row for row in curve if row["limit"] == LIMIT_PX]
-    return {"rows": rows, "gaps": gaps}
+    for kind in Frames:
+        seen = {"detector": FRAME_CORNERS, "stream": kind.value, "gap": kind.interval_us / 1e3}
+        rows += [seen | row for row in _frame_quality(streams, kind, frames)]
+    errors = [
+        {"stream": s.value, "median_px": _compensation_error(streams, s)} for s in SOURCES[Stream.RAW] if s in names
+    ]
+    return {"rows": rows, "gaps": gaps, "errors": errors}
+
+
+def _frame_quality(streams: Streams, kind: Frames, frames: Sequence[FrameTruth]) -> list[dict[str, Any]]:
+    """Return the quality of the tracks in the frames of a standard camera, for each limit."""
+    scene, times = streams.simulation.scene, streams.exposures(kind).tolist()
+    assert isinstance(scene, WorldScene)
+    tracks = track_frames([streams.grey_frame(t) for t in times], times)
+    begin = tracks.first
+    places = np.full((len(begin), 3), np.nan)
+    for k in np.unique(tracks.index[begin]).tolist():
+        of = np.flatnonzero(tracks.index[begin] == k)
+        seen = streams.frame(times[k] if scene.trajectory.moves else streams.start_us)
+        places[of] = seen_places(seen, streams.camera, scene.trajectory, tracks.xy[begin[of]])
+    truth = true_paths(tracks, places, streams.camera, scene.trajectory, frames)
+    return [_values(q) for q in quality_curve(tracks, truth, LIMITS_PX)]
+
+
+def _compensation_error(streams: Streams, stream: Stream) -> float | None:
+    """Return the median distance of a stream's events from the true places of what they saw [px]."""
+    span = streams.start_us, streams.end_us
+    events, truth = streams.window(stream, *span), streams.event_truth(stream, *span)
+    assert truth.points is not None
+    assert truth.cause is not None
+    apart = np.hypot(events.x - truth.points[:, 0], events.y - truth.points[:, 1])[truth.cause == Cause.SIGNAL.code]
+    return study.finite(float(np.nanmedian(apart))) if len(apart) else None
 
 
 def _corners(
@@ -316,13 +405,13 @@ def _quality(
     assert isinstance(scene, WorldScene)
     tracks = link_corners(t, xy, gap_us=gap_us)
     truth = true_paths(tracks, place[tracks.index[tracks.first]], streams.camera, scene.trajectory, frames)
-    found = []
-    for q in quality_curve(tracks, truth, LIMITS_PX):
-        values = (float(q.number), 1e3 * q.lifetime_s, q.error_px, q.update_hz)
-        found.append(
-            {"limit": q.limit_px, "gap": gap_us / 1e3, **dict(zip(VALUES, map(study.finite, values), strict=True))}
-        )
-    return found
+    return [_values(q) | {"gap": gap_us / 1e3} for q in quality_curve(tracks, truth, LIMITS_PX)]
+
+
+def _values(q: TrackQuality) -> dict[str, Any]:
+    """Return the quality of tracks as values of a row."""
+    values = (float(q.number), 1e3 * q.lifetime_s, q.error_px, q.update_hz)
+    return {"limit": q.limit_px, **dict(zip(VALUES, map(study.finite, values), strict=True))}
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
@@ -346,6 +435,9 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
               "A plain camera at rest has no tracks.",
               Chart("camera", "lifetime [ms]", "stream", "std", panels=("scene", "detector"),
                     kind=study.ChartKind.BARS)),
+        Table("corners_compensation", "Error of the compensation, apex 1°", ("scene", "camera", "stream", "seeds",
+              "median [px]", "std"), study.grouped(study.rows_of(results, "errors"), ("scene", "camera", "stream"),
+              ["median_px"]), "Events of signals; rounding to pixels does not count, as both share a pixel."),
         over_limit("corners_lifetime", "lifetime_ms", "lifetime [ms]"),
         over_limit("corners_error", "error_px", "error [px]"),
         Table("corners_gap", "Lifetime over the largest time between two corner events of a track",
@@ -384,6 +476,16 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
               differences(change, "error_px", ami | {"moves": True}, ami | {"moves": False}),
               f"the error of '{Stream.CALIBRATED}' in motion less that at rest", above=-SAME_PX, below=SAME_PX,
               unit="px"),
+        untestable(6, "More corners are tracked than by a standard camera in hard light.", "no world has dim light"),
+        *(judge(7, f"The update rate of the {name} is far above that of a standard camera: more than twice 60/s.",
+                differences([r for r in moving if r["limit"] == LIMIT_PX], "update_hz",
+                            stream | {"detector": CornerMethod.EFAST},
+                            {"stream": Frames.FAST, "detector": FRAME_CORNERS}, relative=True),
+                "the rate of updates of a track (eFAST) less that of frames, relative to the latter,", above=1.0)
+          for name, stream in (("S-EV", plain), ("AMI-EV", ami))),
+        judge(11, "The median error of the compensation is at most 2 px (apex 1°).",
+              differences(study.rows_of(results, "errors"), "median_px", ami), f"the error of '{Stream.CALIBRATED}'",
+              below=2.0, unit="px"),
         *(longer(None, f"Longer with {name} and a limit of {limit:g} px.", of(moving, method, limit))
           for name, method in (("eFAST", CornerMethod.EFAST), ("Arc*", CornerMethod.ARC))
           for limit in (LIMITS_PX[0], LIMIT_PX, LIMITS_PX[-1]) if (method, limit) != (CornerMethod.EFAST, LIMIT_PX)),

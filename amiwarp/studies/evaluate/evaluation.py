@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 
 EVALUATIONS = ("texture", "edges", "pictures", "corners", "segmentation", "flow", "pose", "apex_speed", "fading")
 """Names of the evaluations, in the order of the report: each is a module of this folder, see :class:`Evaluation`."""
-SHORT = ("texture", "edges", "apex_speed", "fading")
-"""Names of the evaluations that together take under ten minutes on two cores in their quick form."""
+UNCALIBRATED = ("apex_speed", "fading")
+"""Names of the evaluations that need no calibration."""
 
 
 class Evaluation(Protocol):
@@ -99,14 +99,17 @@ STYLE = {
 }  # fmt: skip
 """Settings of Matplotlib."""
 GREY = "0.55"
-STREAM_COLOURS = {
+STREAM_COLOURS: dict[str, str] = {
     Stream.PLAIN: BLUE,
     Stream.SAME_COUNT: SKY_BLUE,
     Stream.TRUE: GREEN,
     Stream.CALIBRATED: VERMILION,
+    Stream.SELF: PINK,
     Stream.RAW: ORANGE,
+    study.Frames.SLOW: "0.75",
+    study.Frames.FAST: "0.3",
 }
-"""Colours of the streams, the same in all charts."""
+"""Colours of the streams and of the standard cameras, the same in all charts."""
 OTHERS = (VERMILION, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, BLACK, GREY)
 """Colours of other series, in their order."""
 CHANCE = "chance"
@@ -212,7 +215,7 @@ def _colour(name: Value, k: int) -> str:
     """Return the colour of a stream, or of the k-th other series."""
     if name in REFERENCE_COLOURS:
         return REFERENCE_COLOURS[str(name)]
-    return STREAM_COLOURS[Stream(name)] if name in set(Stream) else OTHERS[k % len(OTHERS)]
+    return STREAM_COLOURS.get(str(name), OTHERS[k % len(OTHERS)])
 
 
 def to_svg(figure: Figure) -> bytes:
@@ -263,8 +266,6 @@ class Section:
     """Number of cells."""
     errors: list[str]
     """Messages of cells that failed."""
-    not_calibrated: dict[str, str]
-    """Share of the recordings that the calibration refused, by scene and motion of the camera."""
     processor_s: float
     """Processor time of the measures [s]."""
 
@@ -278,21 +279,8 @@ def section(name: str, results: Sequence[CellResult]) -> Section:
     pictures: list[study.Picture] = getattr(evaluation, "pictures", lambda _: [])(good)
     return Section(
         name, evaluation.TITLE, evaluation.PROTOCOL, evaluation.DIFFERENCES, evaluation.claims(good), shown,
-        pictures, len(results), errors, refused(good), sum(r.processor_s for r in results),
+        pictures, len(results), errors, sum(r.processor_s for r in results),
     )  # fmt: skip
-
-
-def refused(results: Sequence[CellResult]) -> dict[str, str]:
-    """Return the share of recordings without a calibrated stream, by scene and motion of the camera."""
-    counts: dict[str, list[bool]] = {}
-    for result in results:
-        lists = (name for name, value in result.values.items() if isinstance(value, list) and value)
-        tables = [name for name in lists if "stream" in result.values[name][0]]
-        rows = study.rows_of([result], tables[0]) if tables else []
-        streams = {row["stream"] for row in rows}
-        if Stream.RAW in streams:
-            counts.setdefault(f"{rows[0]['scene']}, {rows[0]['camera']}", []).append(Stream.CALIBRATED not in streams)
-    return {case: f"{sum(missing)} of {len(missing)}" for case, missing in counts.items() if any(missing)}
 
 
 def write(out: Path, sections: Sequence[Section], settings: Settings, processor_s: float) -> dict[str, Path]:
@@ -423,7 +411,7 @@ def shown(value: Value, digits: int = 3) -> str:
 # Run on local processes or a cluster. A cell is one evaluation under one condition. Each is a file, so that a stopped
 # run can be continued.
 
-FORMAT = 4
+FORMAT = 5
 """Version of the files of cells, and of the streams and measures that all evaluations share."""
 
 
@@ -439,6 +427,14 @@ class Job:
     """Size of the run."""
     threads: int | None = None
     """Number of CPU threads; None for all."""
+    setup: study.Setup | None = None
+    """What is known of the prism from another recording; None if that is not needed."""
+
+    @property
+    def setup_condition(self) -> Condition | None:
+        """Condition of the recording that the prism is calibrated from, if an evaluation needs that."""
+        needed = isinstance(self.condition, Condition) and not set(self.evaluations) <= set(UNCALIBRATED)
+        return self.condition.setup if needed and isinstance(self.condition, Condition) else None
 
 
 @dataclass(frozen=True)
@@ -457,13 +453,22 @@ def run_job(job: Job) -> JobResult:
     with limited_cpu_threads(job.threads), limited_opencv(study.library("cv2"), cpu_threads()):
         try:
             if isinstance(job.condition, Condition):
-                streams: study.RecordedStreams = study.Streams(job.condition, job.settings.device)
+                streams: study.RecordedStreams = study.Streams(job.condition, job.settings.device, job.setup)
             else:
                 streams = study.RecordedStreams(open_recording(job.condition.path), job.settings.device)
             cells = [_run_cell(name, streams, job) for name in job.evaluations]
         except AmiwarpError as error:
             cells = [CellResult(name, job.condition, error=str(error)) for name in job.evaluations]
     return JobResult(cells, time.process_time() - began)
+
+
+def run_setup(job: Job) -> tuple[study.Setup, float]:
+    """Return what is known of the prism of a job from one recording of it, and the processor time [s]."""
+    began = time.process_time()
+    assert job.setup_condition is not None
+    with limited_cpu_threads(job.threads):
+        found = study.known_setup(job.setup_condition, job.settings.device)
+    return found, time.process_time() - began
 
 
 def compile_kernels(names: Sequence[str], device: str) -> float:
@@ -604,8 +609,7 @@ def evaluate(
     out : str or Path
         Folder for the report, its tables and figures, and the cells.
     only : sequence of str, optional
-        Names of the evaluations. By default a full run has all of them, and a quick run the short ones: texture,
-        edges, apex_speed and fading.
+        Names of the evaluations, by default all.
     full : bool, optional
         Run the full study: 320×240, ten seeds, all values. By default the run is quick: 240×180, two seeds.
     seeds : int, optional
@@ -649,7 +653,7 @@ def evaluate(
     earlier = any((folder / "cells").iterdir())  # an existing report was made from these cells and may be replaced
     for name in () if earlier else REPORT_FILES:
         check_output(folder / name)
-    chosen = only or (EVALUATIONS if full else SHORT)
+    chosen = only or EVALUATIONS
     jobs = plan(chosen, settings, [Path(r) for r in recordings], worlds=bool(only) or not recordings)
     count = worker_count(workers, device)
     if scheduler is None:
@@ -687,6 +691,13 @@ def _run(
         names = dict.fromkeys(name for job in todo for name in job.evaluations)
         compiling = workers.executor.submit(compile_kernels, tuple(names), todo[0].settings.device)
         processor_s = compiling.result()
+    setups: dict[Condition | None, study.Setup | None] = {None: None}
+    needed = {job.setup_condition: job for job in todo if job.setup_condition is not None}
+    for begun, calibrated in run_jobs(workers, run_setup, needed.values()):
+        setups[begun.setup_condition], seconds = result_of(calibrated)
+        processor_s += seconds
+        progress(f"calibrated {len(setups) - 1} of {len(needed)} prisms", 0.0)
+    todo = [replace(job, setup=setups[job.setup_condition]) for job in todo]
     with contextlib.closing(run_jobs(workers, run_job, todo)) as running:
         for job, future in running:
             result = result_of(future)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import enum
 import hashlib
 import importlib
@@ -13,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,6 +139,18 @@ FAST_CALIBRATION = CalibrationSettings(
 They take two fifths of the time of the default ones. On a recording of the room with a handheld camera, the result is
 0.011 px (rms) from theirs.
 """
+SETUP_SEED, SETUP_S = 1_000_003, 2.0
+"""Seed of the recording that a prism is calibrated from once, which no evaluation scores, and its duration [s]."""
+LONGEST_DELAY_US = 4000.0
+"""Longest mean delay of a sensor that is looked for [us]."""
+DELAY_EVENTS = 300_000
+"""Largest number of events from which it is determined; more are thinned evenly."""
+EXPOSURE_US = 8000
+"""Exposure of a frame of the standard camera [us]."""
+EXPOSURE_STEPS = {"still": 1, "handheld": 4, "fast": 12}
+"""Number of moments of an exposure that are rendered and averaged, by the camera's motion: about one per pixel."""
+GAMMA = 1.0 / 2.2
+"""Exponent from luminance to the grey values of a picture."""
 FRAMES_KEPT = 64
 """Number of instants whose ground truth is kept; more than an evaluation uses for several streams."""
 ENOUGH = 0.95
@@ -150,13 +163,29 @@ class Stream(enum.StrEnum):
     PLAIN = "S-EV"
     """Plain event camera: same world, sensor and seed without the prism."""
     TRUE = "AMI-EV, true"
-    """Events behind the prism, compensated by the true model."""
+    """Events behind the prism, compensated by the true model, with the sensor's mean delay."""
     CALIBRATED = "AMI-EV, calibrated"
+    """Events behind the prism, compensated as calibrated once, from another recording with the same prism."""
+    SELF = "AMI-EV, self-calibrated"
     """Events behind the prism, compensated as calibrated from the recording itself."""
     RAW = "AMI-EV, raw"
     """Events behind the prism, as recorded."""
     SAME_COUNT = "S-EV, same count"
     """Plain events, thinned, or from a longer window, to the number of events of the AMI-EV."""
+
+
+class Frames(enum.StrEnum):
+    """Standard cameras that are compared: their frames have an exposure of :data:`EXPOSURE_US` and 8 bits."""
+
+    SLOW = "camera, 30/s"
+    """30 frames per second."""
+    FAST = "camera, 60/s"
+    """60 frames per second."""
+
+    @property
+    def interval_us(self) -> int:
+        """Time between two frames [us]."""
+        return 33_333 if self is Frames.SLOW else 16_667
 
 
 @dataclass(frozen=True)
@@ -193,15 +222,24 @@ class Condition:
         """Short text that identifies the condition."""
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:12]
 
+    @property
+    def phase(self) -> float:
+        """Azimuth of the prism at the start of the recording [rad], which depends on the seed."""
+        return float(np.random.default_rng(self.seed).uniform(0.0, 2.0 * math.pi))
+
+    @property
+    def setup(self) -> Condition:
+        """Recording of a still scene that the same prism and sensor are calibrated from."""
+        return replace(self, world="room", trajectory="still", seed=SETUP_SEED, duration_s=SETUP_S)
+
     def simulation(self, device: str) -> Simulation:
         """Return the simulation of the AMI-EV under this condition."""
-        phase = float(np.random.default_rng(self.seed).uniform(0.0, 2.0 * math.pi))
         return Simulation(
             self._scene(),
             Camera.from_fov(self.width, self.height, 2.0 * math.atan(self.width / (2.0 * self.focal_px))),
             Prism(self.apex, INDEX),
             self.duration_s,
-            motion=PrismMotion(self.rpm, phase),
+            motion=PrismMotion(self.rpm, self.phase),
             sensor=self._sensor(),
             nominal_prism=Prism(NOMINAL * self.apex, INDEX),
             seed=self.seed,
@@ -265,17 +303,20 @@ class RecordedStreams:
         """Streams that exist: a recording without encoder is one of a plain event camera."""
         if self.recording.encoder is None:
             return (Stream.PLAIN,)
-        return (Stream.RAW,) if self.calibration is None else (Stream.CALIBRATED, Stream.RAW)
+        return (Stream.RAW,) if self.own_calibration is None else (Stream.SELF, Stream.RAW)
+
+    def names_with_own(self, settings: Settings) -> tuple[Stream, ...]:
+        """Return the streams, in a full run with that of the recording's own calibration."""
+        known = self.names
+        more = not settings.quick and Stream.SELF not in known and self.recording.encoder is not None
+        return (*known, Stream.SELF) if more and self.own_calibration is not None else known
 
     @cached_property
-    def calibration(self) -> Calibration | None:
-        """Calibration from the recording, or None if that fails; then :attr:`refusal` says why."""
-        self.refusal = ""
-        try:
+    def own_calibration(self) -> Calibration | None:
+        """Calibration from the recording itself, or None if it is refused."""
+        with contextlib.suppress(AmiwarpError):
             return calibrate(self.recording, self._calibration_settings(), device=self.device)
-        except AmiwarpError as error:
-            self.refusal = str(error)
-            return None
+        return None
 
     def _calibration_settings(self) -> CalibrationSettings:
         """Return the settings of the calibration: the defaults."""
@@ -312,28 +353,78 @@ class RecordedStreams:
 
     def _compensated(self, stream: Stream, raw: Events, first: int) -> NDArray[np.float32] | None:
         """Return the places of the events from index ``first`` without the prism; None if they are not compensated."""
-        model, encoder = self._optics(stream)
+        model, encoder = self.optics(stream)
         return None if model is None else compensate_events(raw, model, encoder, device=self.device)
 
-    def _optics(self, stream: Stream) -> tuple[Model | None, Any]:
+    def optics(self, stream: Stream) -> tuple[Model | None, Any]:
         """Return the model and the encoder that compensate a stream; both are None without compensation."""
-        if stream is not Stream.CALIBRATED or self.calibration is None:
+        return self._calibrated(self.own_calibration) if stream is Stream.SELF else (None, None)
+
+    def _calibrated(self, found: Calibration | None) -> tuple[Model | None, Any]:
+        """Return the model and the encoder of a calibration."""
+        if found is None:
             return None, None
-        recording = self.recording
-        assert recording.encoder is not None
-        events = recording.events
-        return self.calibration.model, self.calibration.encoder_for(recording.encoder, events.t_first, events.t_last)
+        recording, events = self.recording, self.recording.events
+        return found.model, found.encoder_for(recording.encoder, events.t_first, events.t_last)
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What one recording of a still scene says about a prism and its sensor; it holds for all of their recordings."""
+
+    calibration: Calibration | None
+    """Calibration, or None if it is refused."""
+    delay_us: float
+    """Mean delay of the sensor [us], see :func:`sensor_delay`."""
+    phase: float
+    """Azimuth of the prism at the start of the recording [rad]."""
+
+
+@lru_cache(maxsize=8)
+def known_setup(condition: Condition, device: str) -> Setup:
+    """Simulate and calibrate the recording of a :attr:`Condition.setup`, once in a process."""
+    streams = Streams(condition, device)
+    return Setup(streams.own_calibration, sensor_delay(streams), condition.phase)
+
+
+def sensor_delay(streams: Streams) -> float:
+    """Return the delay of the events [us] at which their image, compensated by the true model, is sharpest.
+
+    At a constant speed ω, a delay τ of all events is the same as a phase of the prism that is smaller by ωτ. The delay
+    holds the latency of the sensor and the mean lag of its photoreceptors.
+    """
+    from scipy.optimize import minimize_scalar
+
+    events = thinned(streams.recording.events.slice(0, len(streams.recording.events)), DELAY_EVENTS)
+    encoder, votes = streams.recording.encoder, Votes(CanvasShape(*streams.size), "cpu")
+    assert encoder is not None
+
+    def blur(delay_us: float) -> float:
+        late = encoder.with_clock_offset(encoder.clock_offset_us - delay_us)
+        xy = compensate_events(events, streams.true_model, late, device=streams.device)
+        kept = np.isfinite(xy).all(axis=1)
+        moved = Events(xy[kept, 0], xy[kept, 1], events.t[kept], events.p[kept])
+        return -float(smooth_image(moved, votes, DENSITY_PX).var())
+
+    found = minimize_scalar(blur, bounds=(0.0, LONGEST_DELAY_US), method="bounded", options={"xatol": 10.0})
+    return float(found.x)
 
 
 class Streams(RecordedStreams):
-    """Streams of a simulated recording with ground truth."""
+    """Streams of a simulated recording with ground truth, and frames of a standard camera.
 
-    def __init__(self, condition: Condition, device: str = "cpu") -> None:
+    Without ``setup``, its prism is calibrated when a stream first needs that.
+    """
+
+    def __init__(self, condition: Condition, device: str = "cpu", setup: Setup | None = None) -> None:
         self.condition = condition
+        if setup is not None:
+            self.setup = setup
         self.simulation = condition.simulation(device)
         super().__init__(self.simulation.run(), device)
         self._places: dict[Stream, NDArray[np.float32] | None] = {}
         self.frame = lru_cache(maxsize=FRAMES_KEPT)(self._frame)
+        self._exposed = lru_cache(maxsize=FRAMES_KEPT)(self._exposure)
 
     @property
     def start_us(self) -> int:
@@ -363,8 +454,26 @@ class Streams(RecordedStreams):
 
     @property
     def names(self) -> tuple[Stream, ...]:
-        """Streams that exist: all, but not the calibrated one if the calibration refuses the recording."""
-        return tuple(s for s in Stream if s is not Stream.CALIBRATED or self.calibration is not None)
+        """Streams that exist without a calibration from the recording itself."""
+        missing = {Stream.SELF} | (set() if self.calibration is not None else {Stream.CALIBRATED})
+        return tuple(s for s in Stream if s not in missing)
+
+    @cached_property
+    def setup(self) -> Setup:
+        """What is known of the prism and the sensor from another recording."""
+        return known_setup(self.condition.setup, self.device)
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """Calibration of the prism, or None if it was refused.
+
+        Its phase is that at the start of this recording: the encoder is absolute, but a simulated one starts at 0.
+        """
+        found = self.setup.calibration
+        if found is None:
+            return None
+        phase = found.parameters["phase"] + self.condition.phase - self.setup.phase
+        return replace(found, parameters={**found.parameters, "phase": math.remainder(phase, 2.0 * math.pi)})
 
     @cached_property
     def true_model(self) -> Model:
@@ -440,12 +549,60 @@ class Streams(RecordedStreams):
         first = max(0, min(middle - count // 2, total - count))
         return np.arange(first, min(first + count, total))
 
-    def _optics(self, stream: Stream) -> tuple[Model | None, Any]:
-        return (self.true_model, self.recording.encoder) if stream is Stream.TRUE else super()._optics(stream)
+    def optics(self, stream: Stream) -> tuple[Model | None, Any]:
+        """Return the model and the encoder that compensate a stream; both are None without compensation."""
+        if stream is Stream.TRUE:
+            encoder = self.recording.encoder
+            assert encoder is not None
+            return self.true_model, encoder.with_clock_offset(encoder.clock_offset_us - self.setup.delay_us)
+        return self._calibrated(self.calibration) if stream is Stream.CALIBRATED else super().optics(stream)
+
+    def exposures(self, camera: Frames) -> NDArray[np.int64]:
+        """Return the middles of the exposures of a standard camera's frames [us]; the first depends on the seed."""
+        interval = camera.interval_us
+        first = int(np.random.default_rng([self.condition.seed, 2]).integers(0, interval))
+        starts = np.arange(self.start_us + first, self.end_us - EXPOSURE_US, interval)
+        return np.asarray(starts + EXPOSURE_US // 2)
+
+    def last_exposure(self, camera: Frames, t_us: int) -> int | None:
+        """Return the middle of the exposure of the last frame that is complete at a time [us], or None."""
+        complete = [int(m) for m in self.exposures(camera) if m + EXPOSURE_US // 2 <= t_us]
+        return complete[-1] if complete else None
+
+    def grey_frame(self, middle_us: int) -> NDArray[np.uint8]:
+        """Return the frame of a standard camera, without the prism, whose exposure has the given middle [us]."""
+        scaled = np.clip(self._exposed(middle_us) / self._white, 0.0, 1.0) ** GAMMA
+        return np.asarray(np.rint(255.0 * scaled), np.uint8)
+
+    def frame_luminance(self, middle_us: int) -> NDArray[np.float64]:
+        """Return the luminance that a frame of the standard camera states."""
+        return np.asarray(self._white * (self.grey_frame(middle_us) / 255.0) ** (1.0 / GAMMA))
+
+    @cached_property
+    def _white(self) -> float:
+        """Luminance that a standard camera renders white: half a percent of the first frame is brighter."""
+        return float(np.percentile(self._exposed(EXPOSURE_US // 2), 99.5)) or 1.0
+
+    def _exposure(self, middle_us: int) -> NDArray[np.float64]:
+        """Return the mean luminance over an exposure, by moments that divide it evenly."""
+        if not self._changes and middle_us != EXPOSURE_US // 2:
+            return self._exposed(EXPOSURE_US // 2)
+        steps = EXPOSURE_STEPS[self.condition.trajectory] if self._changes else 1
+        moments = middle_us + EXPOSURE_US * ((np.arange(steps) + 0.5) / steps - 0.5)
+        return np.mean([self._truth.luminance(round(t)) for t in moments], axis=0, dtype=np.float64)
+
+    @cached_property
+    def _changes(self) -> bool:
+        """Whether the picture changes: the camera or a body moves."""
+        scene = self.simulation.scene
+        assert isinstance(scene, WorldScene)
+        return scene.trajectory.moves or bool(scene.world.moving)
 
 
 # What evaluations return: results of cells, tables with their charts, and pictures.
 
+Compared = Literal[*Stream, *Frames]  # type: ignore[valid-type]
+"""Type of what is compared: a stream of events or a standard camera."""
 Share = Annotated[float, partial(real, low=0.0, high=1.0)]
 """Type of a share in a cell, 0 to 1."""
 Amount = Annotated[float, partial(real, low=0.0, high=1e6)]
