@@ -1,13 +1,18 @@
-"""Evaluation of apex and speed: blur of edges and event rate, for sensors of several bandwidths."""
+"""Evaluation of apex and speed: blur of edges for several bandwidths, timing errors and models, and event rate."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any, Literal, TypedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.metrics import edge_blur
+from amiwarp.optics.camera import Camera
+from amiwarp.optics.models import CircleModel, ExactModel, Model, ModelError, predicted_error, rms
+from amiwarp.optics.prism import Prism
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.claims import Claim, differences, judge
 from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Settings, Stream, Streams, Table
@@ -21,7 +26,12 @@ PROTOCOL = (
     "calibration adds to it. The constant delay of the sensor shifts the phase and is removed as a calibration would: "
     "by the delay up to 8 ms at which the blur is smallest. Bandwidth is that of the photoreceptors at white; a "
     "darker pixel is slower in proportion, so that 100 Hz is also a sensor of 1000 Hz in a tenth of the light. To "
-    "find what limits the speed, an ideal sensor is given one limit of the DVXplorer's model at a time."
+    "find what limits the speed, an ideal sensor is given one limit of the DVXplorer's model at a time. Errors of "
+    "synchronisation are added to the encoder's times of the same recordings: independent errors of its samples, a "
+    "slow wander with knots every 20 ms, a constant offset that a calibration at 720 rpm has absorbed, and the offset "
+    "that a clock's drift makes after the calibration (1 ms is 17 ppm of a minute). The displacement error is the rms "
+    "distance of the compensated events from where the true model at the true angle puts them. It is also given for "
+    "the paper's circle, whose deflection fits the true model best."
 )
 DIFFERENCES = (
     "The paper measures one sensor, whose bandwidth and light it does not state, with events of real edges; a motor "
@@ -29,7 +39,7 @@ DIFFERENCES = (
     "other values are those of the DVXplorer's model. The paper's measure leaves out events over 3 px from an edge, so "
     "it saturates near 1 px."
 )
-VERSION = 2
+VERSION = 3
 NEEDS_TRUTH = True
 
 APEX_DEG = (0.5, 1.0, 2.0)
@@ -38,12 +48,27 @@ SPEEDS, QUICK_SPEEDS = (180.0, 360.0, 720.0, 1440.0, 2880.0), (360.0, 720.0, 144
 """Speeds of the prism [turns/min]."""
 BANDWIDTHS, QUICK_BANDWIDTHS = (0.0, 1000.0, 300.0, 100.0), (0.0, 1000.0, 100.0)
 """Bandwidths of the photoreceptors at white [Hz]; 0 for unlimited."""
+WHOLE = (640, 480)
+"""Width and height of the whole sensor [px]."""
 USUAL_DEG, USUAL_HZ = 0.5, 1000.0
 """Apex angle [deg] and bandwidth [Hz] of the sensors with one limit."""
 DELAYS_US, COARSE = np.arange(0, 8001, 100), 10
 """Delays that are tried [us]; of each ``COARSE`` of them one at first."""
 BLUR_EVENTS, MOST_EVENTS = 30_000, 200_000
 """Largest number of events of which the blur is measured, and the edge blur."""
+NONE, SAMPLES, WANDER = "none", "error of each sample", "slow wander"
+OFFSET, DRIFT = "offset, calibrated at 720 rpm", "drift"
+"""Kinds of timing errors of the encoder."""
+ERRORS_US, QUICK_ERRORS_US = (250.0, 500.0, 1000.0, 2000.0), (1000.0,)
+"""Sizes of the timing errors: their rms [us]."""
+USUAL_US = 1000.0
+"""Size of the timing error in the verdicts [us]."""
+WANDER_US = 20_000.0
+"""Time between the knots of a slow wander [us]."""
+EXACT, CIRCLE = "exact model", "circle"
+"""Models that compensate: the true one, and the paper's."""
+PRACTICAL_PX = 2.0
+"""Largest compensation error that the paper states for its system [px]."""
 USUAL_RPM = 720.0
 """Speed above which the paper reports a surge [turns/min]."""
 SURGE = 1.25
@@ -66,21 +91,35 @@ class _Light(TypedDict):
     own_blur: study.Amount | None
 
 
+class _Error(TypedDict):
+    degrees: study.Amount
+    model: Literal["exact model", "circle"]
+    timing: Literal["none", "error of each sample", "slow wander", "offset, calibrated at 720 rpm", "drift"]
+    error_us: study.Amount
+    displacement: study.Amount
+    blur: study.Amount | None
+    edge_blur: study.Amount | None
+
+
 class Values(TypedDict):
     """What :func:`measure` returns."""
 
     rows: list[_Row]
     light: list[_Light]
+    errors: list[_Error]
 
 
 def conditions(settings: Settings) -> list[Condition]:
-    """Return a turn of the prism for each apex, speed and bandwidth, and for sensors with one limit."""
+    """Return a turn of the prism for each apex, speed and bandwidth, and for sensors with one limit.
+
+    At the usual speed and bandwidth there is also the whole sensor, at whose border the circle is worst.
+    """
     speeds, bandwidths = (QUICK_SPEEDS, QUICK_BANDWIDTHS) if settings.quick else (SPEEDS, BANDWIDTHS)
     size = replace(settings, width=min(settings.width, 320), height=min(settings.height, 240))
     grid: list[dict[str, Any]] = [{"apex": a, "cutoff_hz": hz} for a in APEX_DEG for hz in bandwidths]
     grid += [{"apex": USUAL_DEG, "only": limit} for limit in (study.IDEAL, *study.LIMITS)]
     grid.append({"apex": USUAL_DEG, "only": study.BANDWIDTH, "cutoff_hz": min(bandwidths[1:])})
-    return [
+    turns = [
         replace(condition, rpm=rpm, duration_s=60.0 / rpm)
         for values in grid
         for rpm in speeds
@@ -88,57 +127,134 @@ def conditions(settings: Settings) -> list[Condition]:
             world=study.DISCS, trajectory="still", **{**values, "apex": float(np.radians(values["apex"]))}
         )
     ]
+    usual = [c for c in turns if (c.only, c.cutoff_hz, c.rpm) == (None, USUAL_HZ, USUAL_RPM)]
+    return turns + [replace(c, width=WHOLE[0], height=WHOLE[1]) for c in usual]
 
 
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     """Return blur [px], the delay that was removed [us], edge blur [px] and event rate [Mev/s].
 
-    The blur is also given for the edges of bright and of dark discs alone, with the delay of both and with their own.
+    The blur is also given for the edges of bright and of dark discs alone, with the delay of both and with their own;
+    and, for the usual sensor, under timing errors and with the paper's circle.
     """
-    discs = study.DiscTarget.of_seed(streams.size, streams.condition.seed)
-    blur = {delay: _blur(streams, discs, delay) for delay in DELAYS_US[::COARSE].tolist()}
+    seen = _Seen(streams)
+    blur = {delay: seen.blur(delay) for delay in DELAYS_US[::COARSE].tolist()}
     for name in ("all", "bright", "dark"):
         rough = min(blur, key=lambda d: blur[d][name])
         for delay in DELAYS_US[np.abs(DELAYS_US - rough) < 100 * COARSE].tolist():
             if delay not in blur:
-                blur[delay] = _blur(streams, discs, delay)
+                blur[delay] = seen.blur(delay)
     best = {name: min(blur, key=lambda d: blur[d][name]) for name in ("all", "bright", "dark")}
-    known = {"degrees": round(float(np.degrees(streams.condition.apex)), 3)}
+    condition = streams.condition
+    known = {"degrees": round(float(np.degrees(condition.apex)), 3)}
     count = streams.count(Stream.RAW, 0, streams.end_us)
-    row = {"blur": _finite(blur[best["all"]]["all"]), "delay": best["all"],
-           "edge_blur": _edge_blur(streams, best["all"]), "mev_per_s": count / streams.end_us}  # fmt: skip
-    light = [known | {"light": name, "blur": _finite(blur[best["all"]][name]), "own_delay": best[name],
-                      "own_blur": _finite(blur[best[name]][name])} for name in ("bright", "dark")]  # fmt: skip
-    return {"rows": [known | row], "light": light}
+    row = {"blur": study.finite(blur[best["all"]]["all"]), "delay": best["all"],
+           "edge_blur": seen.edge_blur(best["all"]), "mev_per_s": count / streams.end_us}  # fmt: skip
+    light = [known | {"light": name, "blur": study.finite(blur[best["all"]][name]), "own_delay": best[name],
+                      "own_blur": study.finite(blur[best[name]][name])} for name in ("bright", "dark")]  # fmt: skip
+    usual = (condition.only, condition.cutoff_hz) == (None, USUAL_HZ)
+    errors = seen.errors(best["all"], QUICK_ERRORS_US if settings.quick else ERRORS_US) if usual else []
+    return {"rows": [known | row], "light": light, "errors": [known | error for error in errors]}
 
 
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+class _Seen:
+    """Events of a turn of a prism of constant speed before the discs, and what a compensation makes of them."""
+
+    def __init__(self, streams: Streams) -> None:
+        self._streams = streams
+        self._discs = study.DiscTarget.of_seed(streams.size, streams.condition.seed)
+        encoder = streams.recording.encoder
+        assert encoder is not None
+        self._events = study.thinned(streams.recording.events.slice(0, len(streams.recording.events)), MOST_EVENTS)
+        self._angle = encoder.angle_at(self._events.t)
+        self._interval_us = encoder.interval_us
+
+    def places(self, late_us: float | NDArray[np.float64], most: int, model: Model | None = None) -> NDArray[Any]:
+        """Return where a model puts the events if they are late by ``late_us``, shape (n, 2), by default the true one.
+
+        At most ``most`` events are used. ``late_us``: delay of all, or of each event [us].
+        """
+        angle = self._angle - np.radians(6.0 * self._streams.condition.rpm) * np.asarray(late_us) * 1e-6
+        step = max(1, -(-len(angle) // most))
+        xy = np.stack([self._events.x, self._events.y], axis=1)[::step].astype(np.float32)
+        return np.asarray((model or self._streams.true_model).compensate_points(xy, angle[::step]))
+
+    def blur(
+        self, late_us: float | NDArray[np.float64], model: Model | None = None, most: int = BLUR_EVENTS
+    ) -> dict[str, float]:
+        """Return the blur of all edges, and of those of bright and of dark discs [px]; inf without events."""
+        xy = self.places(late_us, most, model)
+        distance, luminance = self._discs.distances(xy[np.isfinite(xy).all(axis=1)])
+        bright = luminance > study.BACKGROUND
+        return {
+            "all": study.robust_spread(distance, luminance),
+            "bright": study.robust_spread(distance[bright], luminance[bright]),
+            "dark": study.robust_spread(distance[~bright], luminance[~bright]),
+        }
+
+    def edge_blur(self, late_us: float | NDArray[np.float64], model: Model | None = None) -> float | None:
+        """Return the paper's measure [px], or None if there are no edges."""
+        xy = self.places(late_us, MOST_EVENTS, model)
+        try:
+            return edge_blur(xy[np.isfinite(xy).all(axis=1)], *self._streams.size)
+        except AmiwarpError:
+            return None
+
+    def errors(self, delay_us: float, sizes_us: Sequence[float]) -> list[dict[str, Any]]:
+        """Return displacement error, blur and edge blur [px] of both models, without and with timing errors."""
+        circle = best_circle(self._streams.true_model)
+        true = self.places(delay_us, MOST_EVENTS)
+        cases = [(NONE, 0.0), *((kind, us) for kind in (SAMPLES, WANDER, OFFSET, DRIFT) for us in sizes_us)]
+        rows = []
+        for kind, us in cases:
+            late = delay_us + self._timing(kind, us)
+            for name, model in ((EXACT, self._streams.true_model), (CIRCLE, circle)):
+                rows.append({
+                    "model": name, "timing": kind, "error_us": us,
+                    "displacement": rms(self.places(late, MOST_EVENTS, model) - true),
+                    "blur": study.finite(self.blur(late, model)["all"]), "edge_blur": self.edge_blur(late, model),
+                })  # fmt: skip
+        return rows
+
+    def _timing(self, kind: str, us: float) -> NDArray[np.float64]:
+        """Return the timing error of each event [us], shape (n,): those drawn at random have the rms ``us``."""
+        t = (self._events.t - self._events.t[0]).astype(np.float64)
+        if kind not in (SAMPLES, WANDER):
+            absorbed = USUAL_RPM / self._streams.condition.rpm if kind == OFFSET else 0.0  # by the calibrated phase
+            return np.full(len(t), us * (1.0 - absorbed))
+        knots = np.arange(0.0, t[-1] + 2.0 * WANDER_US, self._interval_us if kind == SAMPLES else WANDER_US)
+        drawn = np.random.default_rng([self._streams.condition.seed, 2]).normal(size=len(knots))
+        error = np.interp(t, knots, drawn)
+        return np.asarray(us * error / np.sqrt(np.mean(error**2)))
 
 
-def _blur(streams: Streams, discs: study.DiscTarget, delay_us: int) -> dict[str, float]:
-    """Return the blur of all edges, and of those of bright and of dark discs, of events that are ``delay_us`` late."""
-    distance, luminance = discs.distances(streams.compensated_late(delay_us, BLUR_EVENTS))
-    bright = luminance > study.BACKGROUND
-    return {
-        "all": study.robust_spread(distance, luminance),
-        "bright": study.robust_spread(distance[bright], luminance[bright]),
-        "dark": study.robust_spread(distance[~bright], luminance[~bright]),
-    }
+def best_circle(true: Model) -> CircleModel:
+    """Return the paper's circle whose deflection fits the true model best, over the image and a turn."""
+    from scipy.optimize import minimize_scalar
+
+    assert isinstance(true, ExactModel)
+    middle = true.prism.deflection
+
+    def circle(deflection: float) -> CircleModel:
+        return CircleModel(true.camera, deflection, true.phase, true.prism.flat_side)
+
+    bounds = (0.8 * middle, 1.3 * middle)
+    return circle(minimize_scalar(lambda d: predicted_error(circle(d), true, grid=12).rms, bounds=bounds,
+                                  method="bounded", options={"xatol": 1e-4 * middle}).x)  # fmt: skip
 
 
-def _edge_blur(streams: Streams, delay_us: int) -> float | None:
-    """Return the paper's measure, or None if there are no edges."""
-    try:
-        return edge_blur(streams.compensated_late(delay_us, MOST_EVENTS), *streams.size)
-    except AmiwarpError:
-        return None
+@cache
+def circle_error(degrees: float, fov_deg: float) -> ModelError:
+    """Return how far the best circle is from the true model of an apex angle, over the whole sensor."""
+    camera = Camera.from_fov(*WHOLE, float(np.radians(fov_deg)))
+    true = ExactModel.from_prism(camera, Prism(float(np.radians(degrees)), study.INDEX), 0.0)
+    return predicted_error(best_circle(true), true)
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return blur, edge blur, delay and event rate over speed, apex and bandwidth; and the blur of single limits."""
     rows = _rows(results, "rows")
-    whole = [r for r in rows if r["only"] is None]
+    whole = [r for r in rows if r["only"] is None and r["width"] < WHOLE[0]]
     columns = ("apex", "bandwidth", "speed [rpm]")
 
     def over_speed(name: str, title: str, value: str, label: str, caption: str) -> Table:
@@ -146,6 +262,12 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
         return Table(name, title, (*columns, "seeds", label, "std"),
                      study.grouped(whole, ("apex_name", "bandwidth", "rpm"), [value]), caption, chart)  # fmt: skip
 
+    errors = [r | {"size": f"{r['error_us'] * 1e-3:g} ms"} for r in _rows(results, "errors")]
+    crop = [r for r in errors if r["width"] < WHOLE[0] and r["model"] == EXACT]
+    timings = [r for r in crop if r["error_us"] in (0.0, USUAL_US)]
+    sizes = [r for r in crop if r["timing"] in (NONE, WANDER)]
+    models = [r | {"timing": f"{r['timing']}, {r['size']}" if r["error_us"] else NONE} for r in _whole_sensor(errors)]
+    measures = ("displacement [px]", "std of displacement", "blur [px]", "std", "edge blur [px]", "std of edge blur")
     return [
         over_speed("apex_speed_blur", "Blur of edges over speed", "blur", "blur [px]",
                    "Distance of events from the true edges, compensated by the true model with the best delay."),
@@ -163,6 +285,28 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
                       ("bandwidth", "light", "rpm"), ["blur", "own_delay", "own_blur"]),
               "One phase for all pixels removes the mean delay, not its difference between bright and dark pixels.",
               Chart("speed [rpm]", "blur [px]", "edges of discs", "std", panels=("bandwidth",), log_x=True)),
+        Table("apex_speed_timing", "Error over speed with timing errors of 1 ms",
+              ("apex", "timing error", "speed [rpm]", "seeds", *measures),
+              study.grouped(timings, ("apex_name", "timing", "rpm"), ["displacement", "blur", "edge_blur"]),
+              f"True model, {USUAL_HZ:g} Hz. Displacement: rms distance from the places without the timing error.",
+              Chart("speed [rpm]", "blur [px]", "timing error", "std", panels=("apex",), log_x=True)),
+        Table("apex_speed_timing_size", "Error over speed with a slow wander of the encoder's clock",
+              ("apex", "rms timing error", "speed [rpm]", "seeds", *measures),
+              study.grouped(sizes, ("apex_name", "size", "rpm"), ["displacement", "blur", "edge_blur"]),
+              f"True model, {USUAL_HZ:g} Hz.",
+              Chart("speed [rpm]", "blur [px]", "rms timing error", "std", panels=("apex",), log_x=True)),
+        Table("apex_speed_models", "Error of the circle and of the exact model over the whole sensor",
+              ("apex", "timing error", "model", "seeds", *measures),
+              study.grouped(models, ("apex_name", "timing", "model"), ["displacement", "blur", "edge_blur"]),
+              "640x480 px, 720 rpm. Displacement: rms distance of the events from their places by the true model.",
+              Chart("apex", "displacement [px]", "model", "std of displacement", panels=("timing error",),
+                    kind=study.ChartKind.BARS, marks={"the paper's system": PRACTICAL_PX})),
+        Table("apex_speed_circle", "Distance of the best circle from exact refraction, computed",
+              ("apex", "field of view", "rms [px]", "largest [px]"),
+              [(f"apex {degrees:g}°", f"{fov:g}°", error.rms, error.worst)
+               for degrees in (APEX_DEG if models else ()) for fov in (60.0, 90.0)
+               for error in (circle_error(degrees, fov),)],
+              "Over 640x480 px and a turn. The paper states 2 px in 90°, without apex angle and focal length."),
         over_speed("apex_speed_delay", "Delay of the sensor over speed", "delay", "delay [us]",
                    "Delay at which the blur is smallest."),
         over_speed("apex_speed_rate", "Event rate over speed", "mev_per_s", "rate [Mev/s]",
@@ -191,19 +335,60 @@ def _name(cutoff_hz: float | None) -> str:
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
-    """Return the verdicts on the surge above 720 rpm, and on the error and the number of events of a prism of 2 deg."""
-    rows = [r for r in _rows(results, "rows") if r["only"] is None]
-    bandwidths = sorted({r["cutoff_hz"] for r in rows}, key=lambda hz: hz or np.inf, reverse=True)
+    """Return the verdicts on the surge above 720 rpm and its cause, and on the error of a prism of 2 deg."""
+    rows = [r for r in _rows(results, "rows") if r["only"] is None and r["width"] < WHOLE[0]]
+    bandwidths = sorted({r["cutoff_hz"] for r in rows if r["cutoff_hz"] != USUAL_HZ}, key=lambda hz: hz or np.inf)
     usual = [r for r in rows if (r["rpm"], r["cutoff_hz"]) == (USUAL_RPM, 0.0)]
-    large, small = {"degrees": 2.0}, {"degrees": 0.5}
+    errors = _rows(results, "errors")
+    crop = [r for r in errors if r["width"] < WHOLE[0] and r["model"] == EXACT]
+    timed, none = (
+        [r for r in crop if (r["timing"], r["error_us"]) == kind] for kind in ((WANDER, USUAL_US), (NONE, 0.0))
+    )
+    fast, slow = {"rpm": 2 * USUAL_RPM}, {"rpm": USUAL_RPM}
+    growth = [{"degrees": float(degrees), "seed": seed, "growth": value}
+              for degrees, values in differences(timed, "blur", fast, slow, by=("degrees",)).items()
+              for seed, value in values.items()]  # fmt: skip
+    surge = "the blur at 1440 rpm relative to that at 720 rpm"
+
+    def surges(rows: Sequence[dict[str, Any]], degrees: float) -> dict[str, dict[int, float]]:
+        chosen = [r for r in rows if r["degrees"] == degrees]
+        return differences(chosen, "blur", fast, slow, by=("apex_name",), relative=True)
+
+    def of(degrees: float, model: str) -> dict[str, Any]:
+        return {"degrees": degrees, "model": model}
+
     return [
-        *(judge(13, f"The error surges above 720 rpm (apex 0.5°, bandwidth {_name(hz)}).",
-                differences([r for r in rows if (r["cutoff_hz"], r["degrees"]) == (hz, 0.5)], "blur",
-                            {"rpm": 2 * USUAL_RPM}, {"rpm": USUAL_RPM}, by=("apex_name",), relative=True),
-                "the blur at 1440 rpm relative to that at 720 rpm", above=SURGE - 1.0) for hz in bandwidths),
-        judge(14, "The error of a prism of 2° is larger than that of 0.5° (720 rpm).",
-              differences(usual, "blur", large, small, by=("rpm",)), "the blur at 2° less that at 0.5°", above=0.0,
-              unit="px"),
-        judge(14, "A prism of 2° gives more events.", differences(usual, "mev_per_s", large, small, by=("rpm",)),
+        *(judge(13, f"With timing errors of 1 ms rms, the error surges above 720 rpm (apex {degrees:g}°).",
+                surges(timed, degrees), surge, above=SURGE - 1.0) for degrees in (0.5, 1.0)),
+        *(judge(13, f"Without timing errors, the error does not surge above 720 rpm (apex {degrees:g}°).",
+                surges(none, degrees), surge, below=SURGE - 1.0) for degrees in (0.5, 1.0)),
+        judge(13, "With timing errors of 1 ms rms, the error grows more at 1° than at 0.5° (720 to 1440 rpm).",
+              differences(growth, "growth", {"degrees": 1.0}, {"degrees": 0.5}, by=()),
+              "the growth of the blur at 1° less that at 0.5°", above=0.0, unit="px"),
+        *(judge(None, f"The error surges above 720 rpm without timing errors (apex 0.5°, bandwidth {_name(hz)}).",
+                surges([r for r in rows if r["cutoff_hz"] == hz], 0.5), surge, above=SURGE - 1.0) for hz in bandwidths),
+        judge(14, "With the circle and timing errors of 1 ms, the error of 2° is above what the paper states for its "
+              "system (720 rpm, whole sensor).",
+              differences(_whole_sensor(errors, USUAL_US), "displacement", of(2.0, CIRCLE), by=()),
+              "the rms displacement error", above=PRACTICAL_PX, unit="px"),
+        *(judge(number, f"With {word}, {timing}, the error of 2° is {more} than that of 1° with the circle (720 rpm, "
+                "whole sensor).",
+                differences(_whole_sensor(errors, us), "displacement", of(2.0, model), of(1.0, CIRCLE), by=()),
+                "the difference of the rms displacement errors", above=low, below=high, unit="px")
+          for number, model, word, more, low, high in (
+              (14, CIRCLE, "the circle", "larger", 0.0, np.inf),
+              (None, EXACT, "exact refraction", "smaller", -np.inf, 0.0))
+          for timing, us in (("without timing errors", 0.0), ("with timing errors of 1 ms", USUAL_US))),
+        judge(14, "A prism of 2° gives more events.",
+              differences(usual, "mev_per_s", {"degrees": 2.0}, {"degrees": 0.5}, by=("rpm",)),
               "the event rate at 2° less that at 0.5°", above=0.0, unit="Mev/s"),
     ]  # fmt: skip
+
+
+def _whole_sensor(rows: Sequence[dict[str, Any]], *sizes_us: float) -> list[dict[str, Any]]:
+    """Return the errors of the whole sensor without timing errors, and with a slow wander of the usual size.
+
+    ``sizes_us``: sizes of the timing errors, by default both.
+    """
+    kinds = [(NONE if us == 0.0 else WANDER, us) for us in sizes_us or (0.0, USUAL_US)]
+    return [r for r in rows if r["width"] == WHOLE[0] and (r["timing"], r["error_us"]) in kinds]

@@ -71,8 +71,7 @@ PAPER = {
     15: PaperClaim("A larger apex and a higher speed give more events and more error; a quarter turn must fit the "
                    "window.", "455 rpm at least"),
     16: PaperClaim("Recordings of 2 s calibrate well; the optimum is unique, and the cost is convex in a domain.",
-                   "costs 29,569 and 2,382",
-                   "see the chapters on calibration and on its reliability in the documentation"),
+                   "costs 29,569 and 2,382"),
     17: PaperClaim("Future: adaptive speed, no moving parts, an ellipse, polarity, the motion used without moving "
                    "events, a learned compensation.", "–",
                    "no claim to test: see 'The paper's results' in the documentation for what exists"),

@@ -40,9 +40,11 @@ if TYPE_CHECKING:
 
 # Evaluations by name. A new one needs its module in this folder and its name in :data:`EVALUATIONS`.
 
-EVALUATIONS = ("texture", "edges", "pictures", "corners", "segmentation", "flow", "pose", "apex_speed", "fading")
+EVALUATIONS = (
+    "texture", "edges", "pictures", "corners", "segmentation", "flow", "pose", "apex_speed", "fading", "convexity",
+)  # fmt: skip
 """Names of the evaluations, in the order of the report: each is a module of this folder, see :class:`Evaluation`."""
-UNCALIBRATED = ("apex_speed", "fading")
+UNCALIBRATED = ("apex_speed", "fading", "convexity")
 """Names of the evaluations that need no calibration."""
 
 

@@ -480,20 +480,6 @@ class Streams(RecordedStreams):
         """True model of the prism."""
         return self.simulation.bending
 
-    def compensated_late(self, delay_us: int, most: int) -> NDArray[np.float32]:
-        """Return the places of events that the true model gives if the events are late by ``delay_us``, shape (n, 2).
-
-        At most ``most`` events are used, spread evenly over the recording. Those without a position are left out.
-        """
-        count = len(self.recording.events)
-        raw = self.recording.events.slice(0, count)[:: max(1, -(-count // most))]
-        encoder = self.recording.encoder
-        assert encoder is not None
-        covered = raw.t >= encoder.coverage[0] + delay_us
-        early = Events(raw.x[covered], raw.y[covered], raw.t[covered] - delay_us, raw.p[covered])
-        xy = compensate_events(early, self.true_model, encoder, device=self.device)
-        return xy[np.isfinite(xy).all(axis=1)]
-
     def event_truth(self, stream: Stream, start_us: int, end_us: int) -> EventTruth:
         """Return the ground truth of the events that :meth:`window` returns, in the same order."""
         _, rows = self.indexed_window(stream, start_us, end_us)
