@@ -1,4 +1,4 @@
-"""Evaluations of timing errors, of the circle, of segmentation by object and of the calibration's cost."""
+"""Evaluations of timing errors, of the circle, of segmentation by object, of the calibration's cost and of fading."""
 
 import json
 import math
@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from amiwarp import Camera, Events, ExactModel, Prism
-from amiwarp.studies.evaluate import apex_speed, convexity, segmentation
+from amiwarp.studies.evaluate import apex_speed, convexity, fading, segmentation
 from amiwarp.studies.evaluate.claims import Verdict
 from amiwarp.studies.evaluate.study import DISCS, IDEAL, QUICK, CellResult, Condition, Streams, Table
 
@@ -192,3 +192,16 @@ def test_the_cost_of_a_recording() -> None:
     (picture,) = convexity.pictures([result])
     assert picture.frames[0].ndim == 3
     assert "ideal sensor" in picture.caption
+
+
+# Fading.
+
+
+def test_fading_is_judged_by_its_size_and_by_how_rare_it_is() -> None:
+    """Where motions cancel, 5 % of the tiles and moments, the rate falls to 0.2 of the usual one."""
+    classes = [{"speed": 0.125, "rate": 0.2, "tiles": 5}, {"speed": 0.875, "rate": 1.0, "tiles": 95}]
+    cells = [CellResult("fading", Condition("room", "fast", seed=seed), {"rows": classes}) for seed in (1, 2)]
+    assert [c.verdict for c in fading.claims(cells)] == [
+        Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.REPRODUCED,
+    ]  # fmt: skip
+    assert fading.claims(cells)[2].ours.startswith("0.05 ")

@@ -253,8 +253,8 @@ def circle_error(degrees: float, fov_deg: float) -> ModelError:
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return blur, edge blur, delay and event rate over speed, apex and bandwidth; and the blur of single limits."""
-    rows = _rows(results, "rows")
-    whole = [r for r in rows if r["only"] is None and r["width"] < WHOLE[0]]
+    rows = _rows(results, "rows", cropped=True)
+    whole = [r for r in rows if r["only"] is None]
     columns = ("apex", "bandwidth", "speed [rpm]")
 
     def over_speed(name: str, title: str, value: str, label: str, caption: str) -> Table:
@@ -263,10 +263,11 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
                      study.grouped(whole, ("apex_name", "bandwidth", "rpm"), [value]), caption, chart)  # fmt: skip
 
     errors = [r | {"size": f"{r['error_us'] * 1e-3:g} ms"} for r in _rows(results, "errors")]
-    crop = [r for r in errors if r["width"] < WHOLE[0] and r["model"] == EXACT]
+    crop = [r for r in errors if _cropped(r) and r["model"] == EXACT]
     timings = [r for r in crop if r["error_us"] in (0.0, USUAL_US)]
     sizes = [r for r in crop if r["timing"] in (NONE, WANDER)]
-    models = [r | {"timing": f"{r['timing']}, {r['size']}" if r["error_us"] else NONE} for r in _whole_sensor(errors)]
+    models = [r | {"timing": f"{r['timing']} of {r['size']}" if r["error_us"] else "no timing error"}
+              for r in _whole_sensor(errors)]  # fmt: skip
     measures = ("displacement [px]", "std of displacement", "blur [px]", "std", "edge blur [px]", "std of edge blur")
     return [
         over_speed("apex_speed_blur", "Blur of edges over speed", "blur", "blur [px]",
@@ -281,7 +282,8 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
         Table("apex_speed_light", "Blur and delay of bright and dark edges (apex 0.5°)",
               ("bandwidth", "edges of discs", "speed [rpm]", "seeds", "blur [px]", "std", "own delay [us]",
                "std of delay", "blur with own delay [px]", "std of blur"),
-              study.grouped([r for r in _rows(results, "light") if r["only"] is None and r["degrees"] == USUAL_DEG],
+              study.grouped([r for r in _rows(results, "light", cropped=True)
+                       if r["only"] is None and r["degrees"] == USUAL_DEG],
                       ("bandwidth", "light", "rpm"), ["blur", "own_delay", "own_blur"]),
               "One phase for all pixels removes the mean delay, not its difference between bright and dark pixels.",
               Chart("speed [rpm]", "blur [px]", "edges of discs", "std", panels=("bandwidth",), log_x=True)),
@@ -324,9 +326,17 @@ def _limits(rows: Sequence[dict[str, Any]]) -> list[tuple[study.Value, ...]]:
     return study.grouped(chosen, ("limit", "rpm"), ["blur"])
 
 
-def _rows(results: Sequence[CellResult], name: str) -> list[dict[str, Any]]:
-    """Return rows with the names of apex and bandwidth; those without events are left out."""
-    rows = [r for r in study.rows_of(results, name) if r["blur"] is not None]
+def _cropped(row: dict[str, Any]) -> bool:
+    """Return whether a row is that of the middle of the sensor."""
+    return (row["width"], row["height"]) != WHOLE
+
+
+def _rows(results: Sequence[CellResult], name: str, *, cropped: bool = False) -> list[dict[str, Any]]:
+    """Return rows with the names of apex and bandwidth; those without events are left out.
+
+    With ``cropped``, those of the whole sensor are left out, too.
+    """
+    rows = [r for r in study.rows_of(results, name) if r["blur"] is not None and (_cropped(r) or not cropped)]
     return [{**r, "bandwidth": _name(r["cutoff_hz"]), "apex_name": f"apex {r['degrees']:g}°"} for r in rows]
 
 
@@ -336,11 +346,11 @@ def _name(cutoff_hz: float | None) -> str:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the surge above 720 rpm and its cause, and on the error of a prism of 2 deg."""
-    rows = [r for r in _rows(results, "rows") if r["only"] is None and r["width"] < WHOLE[0]]
+    rows = [r for r in _rows(results, "rows", cropped=True) if r["only"] is None]
     bandwidths = sorted({r["cutoff_hz"] for r in rows if r["cutoff_hz"] != USUAL_HZ}, key=lambda hz: hz or np.inf)
     usual = [r for r in rows if (r["rpm"], r["cutoff_hz"]) == (USUAL_RPM, 0.0)]
     errors = _rows(results, "errors")
-    crop = [r for r in errors if r["width"] < WHOLE[0] and r["model"] == EXACT]
+    crop = [r for r in errors if _cropped(r) and r["model"] == EXACT]
     timed, none = (
         [r for r in crop if (r["timing"], r["error_us"]) == kind] for kind in ((WANDER, USUAL_US), (NONE, 0.0))
     )
@@ -391,4 +401,4 @@ def _whole_sensor(rows: Sequence[dict[str, Any]], *sizes_us: float) -> list[dict
     ``sizes_us``: sizes of the timing errors, by default both.
     """
     kinds = [(NONE if us == 0.0 else WANDER, us) for us in sizes_us or (0.0, USUAL_US)]
-    return [r for r in rows if r["width"] == WHOLE[0] and (r["timing"], r["error_us"]) in kinds]
+    return [r for r in rows if not _cropped(r) and (r["timing"], r["error_us"]) in kinds]

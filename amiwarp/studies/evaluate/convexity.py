@@ -291,7 +291,8 @@ def contours(surfaces: Sequence[dict[str, Any]]) -> NDArray[np.uint8]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the calibration from 2 s: its optimum, and the convexity of the cost around it."""
-    rows = [r for r in _rows(results) if r["window"] == WINDOW_US * 1e-6]
+    rows = [r | {"convex_deg": r["phase_half"] * r["found"]}
+            for r in _rows(results) if r["window"] == WINDOW_US * 1e-6]  # fmt: skip
     ideal = [r for r in rows if r["only"] is not None]
     noisy = [r for r in rows if r["only"] is None]
     found = []
@@ -302,7 +303,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
         for text, value, what, limits in (
             ("the optimum is the true one", "error", "the error of the optimum", {"below": FOUND_PX, "unit": "px"}),
             ("the optimum is unique", "minima", "the number of minima on the grid", {"above": 0.5, "below": 1.5}),
-            ("the cost is convex around the optimum", "phase_half", "half the range of convex phases",
+            ("the cost is convex around the true values", "convex_deg", "half the range of convex phases",
              {"above": LEAST_PHASE_DEG, "unit": "°"}),
         ):  # fmt: skip
             values = differences(chosen, value, {"cost": cost}, by=("scene",))

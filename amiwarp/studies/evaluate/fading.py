@@ -40,6 +40,8 @@ LEAST_RATE = 20.0
 """Smallest mean number of events of a tile in a part of a turn. Tiles with less texture say nothing."""
 DIP, USUAL = (0.0, 0.5), (0.75, 1.25)
 """Classes of the relative speed that are compared: cancelling motion, and the prism alone."""
+RARE = 0.1
+"""Share of tiles and moments up to which cancelling motion counts as rare."""
 TILE_COLUMNS = ("camera", "rpm", "time_ms", "column", "row", "rate", "speed", "camera_speed", "marked")
 """Values of the table of tiles."""
 RED = (213, 94, 0)
@@ -213,11 +215,20 @@ def pictures(results: Sequence[CellResult]) -> list[study.Picture]:
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
-    """Return the verdict on the dip of the event rate."""
+    """Return the verdicts on the dip of the event rate, on its size, and on how rare it is."""
+    rows = [r for r in study.rows_of(results, "rows") if r["camera"] == "fast"]
     classes = {"dip": DIP, "usual": USUAL}
-    rows = [r | {"class": name} for r in study.rows_of(results, "rows") if r["camera"] == "fast"
-            for name, (low, high) in classes.items() if low <= r["speed"] <= high]  # fmt: skip
-    found = differences(rows, "rate", {"class": "dip"}, {"class": "usual"}, by=("scene", "rpm"), relative=True)
-    return [judge(5, "Texture fades for a moment where the camera's motion cancels the prism's.", found,
-                  "the event rate below half of the speed δ·2πf relative to that at 0.75 to 1.25 of it",
-                  below=-0.25)]  # fmt: skip
+    two = [r | {"class": name} for r in rows for name, (low, high) in classes.items() if low <= r["speed"] <= high]
+    found = differences(two, "rate", {"class": "dip"}, {"class": "usual"}, by=("scene", "rpm"), relative=True)
+    what = "the event rate below half of the speed δ·2πf relative to that at 0.75 to 1.25 of it"
+    shares: dict[str, dict[int, float]] = {}
+    for rpm, seed in dict.fromkeys((r["rpm"], r["seed"]) for r in rows):
+        own = [r for r in rows if (r["rpm"], r["seed"]) == (rpm, seed)]
+        dip = sum(r["tiles"] for r in own if r["speed"] < DIP[1])
+        shares.setdefault(f"{rpm:g} rpm", {})[seed] = dip / sum(r["tiles"] for r in own)
+    return [
+        judge(5, "Texture fades where the camera's motion cancels the prism's.", found, what, below=-0.25),
+        judge(5, "The degradation is small: the event rate falls by less than half.", found, what, above=-0.5),
+        judge(5, "These moments are rare.", shares,
+              "the share of tiles and moments below half of the speed δ·2πf", below=RARE),
+    ]  # fmt: skip
