@@ -88,7 +88,22 @@ def test_tables_and_verdicts_of_timing_errors(cells: list[CellResult]) -> None:
     assert ours == [Verdict.REPRODUCED, Verdict.NOT_REPRODUCED]  # 0 < 0.57 px, but 0.8 > 0.7 px
     assert [v for text, v in verdict.items() if "is larger than that of 1°" in text] == [Verdict.REPRODUCED] * 2
     assert [v for text, v in verdict.items() if "what the paper states" in text] == [Verdict.NOT_REPRODUCED]
-    assert [v for text, v in verdict.items() if "(apex 1°)" in text] == [Verdict.REPRODUCED] * 2
+
+
+@pytest.mark.parametrize(("timed", "none", "expected"), [
+    (1.0, 0.63, [Verdict.REPRODUCED, Verdict.REPRODUCED]),
+    (0.75, 0.63, [Verdict.NOT_REPRODUCED, Verdict.REPRODUCED]),
+    (1.0, 0.9, [Verdict.REPRODUCED, Verdict.NOT_REPRODUCED]),
+])  # fmt: skip
+def test_a_surge_is_one_with_timing_errors_and_not_without(timed: float, none: float, expected: list[Verdict]) -> None:
+    """Blur at 1440 rpm, with and without timing errors; at 720 rpm it is 0.7 and 0.6 px."""
+    turn = Condition(DISCS, "still", math.radians(1.0), cutoff_hz=1000.0)
+    cells = [CellResult("apex_speed", replace(turn, rpm=rpm, seed=seed), {"errors": [
+                {"degrees": 1.0, "model": apex_speed.EXACT, "timing": timing, "error_us": us, "displacement": 0.1,
+                 "blur": blur + 0.001 * seed, "edge_blur": None}
+                for timing, us, blur in ((apex_speed.WANDER, 1000.0, first), (apex_speed.NONE, 0.0, second))]})
+             for rpm, first, second in ((720.0, 0.7, 0.6), (1440.0, timed, none)) for seed in (1, 2)]  # fmt: skip
+    assert [c.verdict for c in apex_speed.claims(cells) if "(apex 1°)" in c.text] == expected
 
 
 def test_the_best_circle_is_the_least_squares_one() -> None:
