@@ -154,6 +154,9 @@ def test_a_report_of_evaluations_becomes_a_page(extension: Any, tmp_path: Path) 
     text = page.content({"cpu": data, "gpu": other}, tmp_path)
     assert "| 10. More is more. *Rule: the 95 % interval over the seeds of the rest lies above 0.* | +0.19 px |" in text
     assert "| 3.25 [0.0734, 6.43], 2 seeds | **reproduced** | not run | – |" in text
+    assert (
+        "| 10 | Optical flow of static objects gets slightly worse. | +0.19 px | 1 reproduced | 1 reproduced |" in text
+    )
     assert "![Curve](paper-results/curve.png)" in text
     assert "| one \\| two | 0.5 |" in text
     assert (tmp_path / "curve.png").stat().st_size > 1000

@@ -374,9 +374,11 @@ def test_a_quick_run_holds_every_evaluation() -> None:
     jobs = plan(EVALUATIONS, QUICK, [])
     assert {name for job in jobs for name in job.evaluations} == set(EVALUATIONS)
     for job in jobs:
-        calibrated = not set(job.evaluations) <= {"apex_speed", "fading"}
+        calibrated = not set(job.evaluations) <= {"apex_speed", "fading", "convexity"}
         assert (job.setup_condition is not None) == calibrated
-    assert len({job.setup_condition for job in jobs}) == 4  # none, and one for each apex and focal length
+    setups = {c for job in jobs if (c := job.setup_condition) is not None}
+    assert len(setups) == len({(c.apex, c.focal_px, c.width) for c in setups})  # seeds and scenes share them
+    assert {c.apex for c in setups} == {math.radians(0.5), math.radians(1.0)}
 
 
 def test_jobs_share_conditions() -> None:

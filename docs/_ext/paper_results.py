@@ -14,6 +14,7 @@ from typing import Any
 from generated_files import write_page
 from sphinx.application import Sphinx
 
+from amiwarp.studies.evaluate.claims import PAPER
 from amiwarp.studies.evaluate.evaluation import draw, pivoted, save
 from amiwarp.studies.evaluate.study import Chart, ChartKind, Table
 
@@ -46,11 +47,25 @@ def verdicts(reports: dict[str, Any]) -> str:
         rows = []
         for claim in section["claims"]:
             cells = (cell for report in reports.values() for cell in judged(report, claim))
-            number = "" if claim.get("number") is None else f"{claim['number']}. "
+            number = "" if claim["number"] is None else f"{claim['number']}. "
             rows.append([f"{number}{claim['text']} *Rule: {claim['rule']}.*", claim["paper"], *cells])
         names = [cell for name in reports for cell in (f"here ({name})", "verdict")]
         text += f"### {section['title']}\n\n" + markdown_table(["claim", "paper", *names], rows)
     return text
+
+
+def overview(reports: dict[str, Any]) -> str:
+    """Return the paper's claims with the verdicts on their parts in each report."""
+    rows = []
+    for number, paper in PAPER.items():
+        verdicts = []
+        for report in reports.values():
+            found = [c["verdict"] for s in report["evaluations"] for c in s["claims"] if c["number"] == number]
+            counts = (f"{found.count(verdict)} {verdict}" for verdict in dict.fromkeys(found))
+            verdicts.append(", ".join(counts) or paper.elsewhere or "not part of this run")
+        rows.append([str(number), paper.text, paper.value, *verdicts])
+    names = (f"parts of the claim ({name})" for name in reports)
+    return markdown_table(["", "the paper says", "its number", *names], rows)
 
 
 def judged(report: dict[str, Any], claim: dict[str, Any]) -> tuple[str, str]:
@@ -94,8 +109,8 @@ def content(reports: dict[str, Any], folder: Path) -> str:
     runs = "".join(run_of(name, report) for name, report in reports.items())
     first = next(iter(reports))
     return (
-        f"## Verdicts\n\n{runs}\n{verdicts(reports)}Figures and tables below are those of the run {first}.\n\n"
-        + "".join(sections(reports[first], folder))
+        f"## Verdicts\n\n{runs}\n{overview(reports)}{verdicts(reports)}"
+        f"Figures and tables below are those of the run {first}.\n\n" + "".join(sections(reports[first], folder))
     )
 
 
