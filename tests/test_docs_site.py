@@ -155,13 +155,19 @@ def test_a_report_of_evaluations_becomes_a_page(extension: Any, tmp_path: Path) 
     assert "| 10. More is more. *Rule: the 95 % interval over the seeds of the rest lies above 0.* | +0.19 px |" in text
     assert "| 3.25 [0.0734, 6.43], 2 seeds | **reproduced** | not run | – |" in text
     assert (
-        "| 10 | Optical flow of static objects gets slightly worse. | +0.19 px | 1 reproduced | 1 reproduced |" in text
+        "| 10 | Optical flow of static objects gets slightly worse. | +0.19 px | 1 reproduced | 1 reproduced |  |"
+        in text
     )
     assert "![Curve](paper-results/curve.png)" in text
     assert "| one \\| two | 0.5 |" in text
     assert (tmp_path / "curve.png").stat().st_size > 1000
     assert (tmp_path / "tables" / "all.csv").read_text() == "y\n1.0\n"
     assert "All" not in text
+    for one in data["evaluations"]:
+        one["claims"] = []  # a report without verdicts
+    (tmp_path / "old").mkdir()
+    listed = page.content({"old": data}, tmp_path / "old")
+    assert "| 10 | Optical flow of static objects gets slightly worse. | +0.19 px |  |" in listed
     assert page.content({}, tmp_path).startswith("No report")
 
 

@@ -62,10 +62,10 @@ def overview(reports: dict[str, Any]) -> str:
         for report in reports.values():
             found = [c["verdict"] for s in report["evaluations"] for c in s["claims"] if c["number"] == number]
             counts = (f"{found.count(verdict)} {verdict}" for verdict in dict.fromkeys(found))
-            verdicts.append(", ".join(counts) or paper.elsewhere or "not part of this run")
-        rows.append([str(number), paper.text, paper.value, *verdicts])
+            verdicts.append(", ".join(counts) or "–")
+        rows.append([str(number), paper.text, paper.value, *verdicts, paper.elsewhere])
     names = (f"parts of the claim ({name})" for name in reports)
-    return markdown_table(["", "the paper says", "its number", *names], rows)
+    return markdown_table(["", "the paper says", "its number", *names, "without a recording"], rows)
 
 
 def judged(report: dict[str, Any], claim: dict[str, Any]) -> tuple[str, str]:
@@ -108,9 +108,11 @@ def content(reports: dict[str, Any], folder: Path) -> str:
         return "No report lies in `benchmarks/results/evaluate`.\n"
     runs = "".join(run_of(name, report) for name, report in reports.items())
     first = next(iter(reports))
+    judging = {name: report for name, report in reports.items() if any(s["claims"] for s in report["evaluations"])}
     return (
-        f"## Verdicts\n\n{runs}\n{overview(reports)}{verdicts(reports)}"
-        f"Figures and tables below are those of the run {first}.\n\n" + "".join(sections(reports[first], folder))
+        f"## The claims, and verdicts on them\n\n{overview(judging)}{verdicts(judging) if judging else ''}"
+        f"## Reports\n\n{runs}\nFigures and tables below are those of the run {first}.\n\n"
+        + "".join(sections(reports[first], folder))
     )
 
 
