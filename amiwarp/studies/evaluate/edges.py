@@ -168,7 +168,7 @@ NEEDS_TRUTH = True
 
 WINDOW_US = 33_000
 """Length of a window [us]."""
-TOLERANCES = (1.0, 1.5, 2.0, 3.0, 4.5, 6.0)
+TOLERANCES, QUICK_TOLERANCES = (1.0, 1.5, 2.0, 3.0, 4.5, 6.0), (1.5, 3.0, 6.0)
 """Tolerances [px]."""
 USUAL, STRICT = 6.0, 1.5
 """Tolerances of the comparison with the paper and of the strict one [px]."""
@@ -275,7 +275,7 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
         windows = [_image(streams, name, t) for t in middles]
         masks = [window.masks() for window in windows]
         images.append(_summary(name, masks))
-        counted = _count(name, windows, masks)
+        counted = _count(name, windows, masks, QUICK_TOLERANCES if settings.quick else TOLERANCES)
         rows += counted
         if name != CHANCE:
             strict = next(r for r in counted if (r["truth"], r["tolerance"]) == (CANNY, STRICT))
@@ -338,11 +338,13 @@ def _summary(name: str, masks: Sequence[Sequence[Masks]]) -> dict[str, Any]:
     return {"stream": name, "found": found.tolist(), "entropy": entropy.round(4).tolist()}
 
 
-def _count(name: str, images: Sequence[_Image], masks: Sequence[Sequence[Masks]]) -> list[dict[str, Any]]:
-    """Return the number of matches over the thresholds for each kind of true edges and tolerance."""
+def _count(
+    name: str, images: Sequence[_Image], masks: Sequence[Sequence[Masks]], usual: Sequence[float]
+) -> list[dict[str, Any]]:
+    """Return the number of matches over the thresholds for each kind of true edges and tolerance, usually ``usual``."""
     rows = []
     for truth in images[0].true:
-        tolerances = TOLERANCES if truth in (CANNY, GEOMETRY) else (STRICT,)
+        tolerances = usual if truth in (CANNY, GEOMETRY) else (STRICT,)
         matched = np.sum([_matched(m, image.true[truth], tolerances) for m, image in zip(masks, images, strict=True)],
                          axis=0)  # fmt: skip
         true = sum(int(image.true[truth].sum()) for image in images)

@@ -84,8 +84,9 @@ class Values(TypedDict):
 
 
 def conditions(settings: Settings) -> list[Condition]:
-    """Return fast motion through the room, whose speed comes near that of the prism; and rest."""
-    cases = [("still", 720.0), ("fast", 720.0)] + ([] if settings.quick else [("fast", 360.0), ("fast", 1440.0)])
+    """Return fast motion through the room, whose speed comes near that of the prism; in full also rest."""
+    more = [("still", 720.0), ("fast", 360.0), ("fast", 1440.0)]
+    cases = [("fast", 720.0)] + ([] if settings.quick else more)
     return [c for motion, rpm in cases for c in settings.conditions(world="room", trajectory=motion, rpm=rpm)]
 
 

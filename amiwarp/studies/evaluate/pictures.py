@@ -132,7 +132,7 @@ STEP_US = 1000
 """Time between the pictures [us]: 1,000 pictures/s."""
 STANDARD_TURNS = 0.25
 """Length of the windows of the pictures over time [turns]."""
-TURNS = (0.25, 0.5, 1.0)
+TURNS, QUICK_TURNS = (0.25, 0.5, 1.0), (0.25, 1.0)
 """Lengths in the sensitivity curve [turns]."""
 RATES_HZ, HOLD = (30.0, 100.0, 1000.0), (0.0, 0.5, 1.0)
 """Rates of the pictures in the sensitivity curve [1/s], and times of comparison as shares of the interval."""
@@ -190,7 +190,7 @@ def measure(
             maker = PictureMaker(streams, stream, reconstructor)
             known = {"stream": stream.value, "method": method}
             over_time += [{**known, **row} for row in _scores(streams, _made(maker, STANDARD_TURNS, count))]
-            for turns in TURNS:
+            for turns in QUICK_TURNS if settings.quick else TURNS:
                 made = _made(maker, turns, 1)
                 over_length += [{**known, "turns": turns, **row} for row in _scores(streams, made)]
                 if turns == STANDARD_TURNS:
