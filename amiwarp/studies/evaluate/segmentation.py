@@ -238,7 +238,7 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
         frames = [streams.frame(t).instance for t in (start, (start + end) // 2, end)]
         masks = [np.logical_or.reduce([frame == k for frame in frames]) for k in moving_instances(streams)]
         bodies = [mask for mask in masks if np.count_nonzero(mask) >= LEAST_PIXELS]
-        names = [s for s in streams.names if s in QUICK_STREAMS or not settings.quick]
+        names = [s for s in streams.names_with_own(settings) if s in QUICK_STREAMS or not settings.quick]
         windows = {stream: streams.window(stream, start, end) for stream in names}
         fewest = min(map(len, windows.values()))
         for stream, events in windows.items():
