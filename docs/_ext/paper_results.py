@@ -47,7 +47,7 @@ def verdicts(reports: dict[str, Any]) -> str:
         rows = []
         for claim in section["claims"]:
             cells = (cell for report in reports.values() for cell in judged(report, claim))
-            number = "" if claim["number"] is None else f"{claim['number']}. "
+            number = "*Robustness:* " if claim["number"] is None else f"{claim['number']}. "
             rows.append([f"{number}{claim['text']} *Rule: {claim['rule']}.*", claim["paper"], *cells])
         names = [cell for name in reports for cell in (f"here ({name})", "verdict")]
         text += f"### {section['title']}\n\n" + markdown_table(["claim", "paper", *names], rows)
