@@ -897,7 +897,7 @@ def run_evaluate(
         bool,
         typer.Option(
             "--full/--quick",
-            help="Full study: 320x240, ten seeds, all values; or quick: 240x180, two seeds, a sample of all evaluations.",
+            help="Full study: 320x240, ten seeds, all values; or quick: 240x180, two seeds, a sample of each.",
         ),
     ] = False,
     seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds instead.")] = None,
