@@ -879,6 +879,7 @@ class Engine:
         cut = self._sort(keys, total, limit << steps.shift, top)
         keys, self._carry = keys[:cut], wp.clone(keys[cut:total]) if cut < total else self._nothing
         if len(self._carry):  # key times are relative to the start of their chunk
+            launch.load(event_keys.rebase, self._device)
             wp.launch(event_keys.rebase, dim=len(self._carry), inputs=[self._carry, count * self._step << steps.shift],
                       device=self._device)  # fmt: skip
         return keys
