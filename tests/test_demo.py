@@ -125,3 +125,11 @@ def test_threads_share_the_compiled_header(tmp_path: Path) -> None:
     )  # fmt: skip
     assert len(list((tmp_path / "cache").rglob("*.o"))) == 3
     assert done.stdout.split()[-1] == "1", done.stdout
+
+
+def test_compiling_while_the_command_loads_is_quiet() -> None:
+    command = [sys.executable, "-m", "amiwarp", "demo", "--unknown"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "--unknown" in done.stderr
+    assert "Warp" not in done.stderr

@@ -196,11 +196,11 @@ def _run(demo: Demo, files: dict[str, Path], aside: ThreadPoolExecutor, report: 
     """Run the demo. What only the figure and the comparison with the truth need is computed ``aside``."""
     began = time.perf_counter()
     grid = aside.submit(Grid.make, demo.width, demo.height)  # loads Matplotlib
-    simulated = simulation(demo)
-    simulated.write(files["recording"], progress=report)
-    simulated_s = time.perf_counter() - began
-    recording = open_recording(files["recording"])
     with Renderer() as renderer:  # loads VTK meanwhile
+        simulated = simulation(demo)
+        simulated.write(files["recording"], progress=report)
+        simulated_s = time.perf_counter() - began
+        recording = open_recording(files["recording"])
         found = calibrate(
             recording, seed=demo.seed, device=demo.device, photometric=PhotometricSettings(sensor=KNOWN_SENSOR),
             progress=report,
