@@ -37,6 +37,7 @@ COLOURS = {
     "motor plate": "#8fb0cc",
     "O-ring": "#1a1a1a",
     "lens": "#56657a",
+    "wave spring": "#7a8fb0",
 }
 """Colour of each part in all pictures."""
 SCREWS = "#3f3f3f"
@@ -285,48 +286,67 @@ def exploded(made: Sequence[Part], out: Path, *, apart: float = 1.5, size: tuple
     import pyvista
     from PIL import Image
 
-    plotter = pyvista.Plotter(off_screen=True, window_size=size)
-    plotter.set_background("white")
     meshes = [mesh_of(part).translate([apart * v for v in part.apart], inplace=False) for part in made]
-    view, up = np.array([-0.8, 0.42, 0.55]), np.array([0.0, 1.0, 0.0])
-    for part, mesh in zip(made, meshes, strict=True):
-        clear = 0.45 if part.kind == "glass" else 1.0
-        plotter.add_mesh(mesh, color=COLOURS.get(part.name, SCREWS), opacity=clear, smooth_shading=False, specular=0.2)
-        plotter.add_mesh(mesh.extract_feature_edges(35), color="#303030", line_width=0.6)
+    shots = []
+    for flat in (False, True):  # a second picture has one colour for each part, and so shows where it can be seen
+        plotter = pyvista.Plotter(off_screen=True, window_size=size)
+        plotter.set_background("white")
+        for k, (part, mesh) in enumerate(zip(made, meshes, strict=True), 1):
+            if flat:
+                plotter.ren_win.SetMultiSamples(0)
+                plotter.add_mesh(mesh, color=(k, k, k), lighting=False)
+                continue
+            clear = 0.45 if part.kind == "glass" else 1.0
+            colour = COLOURS.get(part.name, SCREWS)
+            plotter.add_mesh(mesh, color=colour, opacity=clear, smooth_shading=False, specular=0.2)
+            plotter.add_mesh(mesh.extract_feature_edges(35), color="#303030", line_width=0.6)
+        plotter.enable_parallel_projection()
+        plotter.view_vector((-0.8, 0.42, 0.55), viewup=(0.0, 1.0, 0.0))
+        plotter.reset_camera()
+        plotter.camera.zoom(1.7 if apart else 1.1)
+        shots.append(plotter.screenshot(return_img=True))
+        plotter.close()
+    picture = Image.fromarray(shots[0])
     if apart:
-        tips = np.array(
-            [
-                (mesh.center[0], mesh.bounds[3], mesh.center[2])
-                for part, mesh in zip(made, meshes, strict=True)
-                if part.kind != "screws"
-            ]
-        )
-        # The labels stand in rows parallel to the rig's axis in the picture, and neighbours in different rows.
-        right = np.cross(up, view) / np.hypot(view[0], view[2])
-        above = np.cross(view, right) / np.linalg.norm(view)
-        slope = above[2] / right[2]
-        rows = (tips @ above - slope * (tips @ right)).max() + 8.0 + 12.0 * (np.arange(len(tips)) % 4)
-        ends, order = tips.copy(), np.argsort(tips @ right)
-        ends[order, 1] += (rows - (tips @ above - slope * (tips @ right))[order]) / above[1]
-        for tip, end in zip(tips, ends, strict=True):
-            plotter.add_mesh(pyvista.Line(tip, end), color="#808080", line_width=1)
-        plotter.add_point_labels(
-            ends,
-            [str(k) for k in range(1, len(ends) + 1)],
-            font_size=20,
-            shape_color="white",
-            shape_opacity=0.9,
-            text_color="black",
-            always_visible=True,
-            point_size=1,
-            margin=2,
-        )
-    plotter.enable_parallel_projection()
-    plotter.view_vector(view, viewup=up)
-    plotter.reset_camera()
-    plotter.camera.zoom(1.7 if apart else 1.1)
-    picture = plotter.screenshot(return_img=True)
-    plotter.close()
+        label(picture, shots[1][..., 0], sum(part.kind != "screws" for part in made))
+    picture = np.asarray(picture)
     rows, columns = (np.flatnonzero((picture < 255).any(axis=(2, other))) for other in (1, 0))
     shown = picture[max(rows[0] - 8, 0) : rows[-1] + 9, max(columns[0] - 8, 0) : columns[-1] + 9]
     Image.fromarray(shown).quantize(128).save(out, optimize=True)
+
+
+def label(picture: Any, seen: np.ndarray, count: int) -> None:
+    """Write the numbers of the first ``count`` parts around a picture, with a line to a visible point of each.
+
+    ``seen`` has the number of the part at each pixel, and 255 for none, shape (height, width). Each line is upright and
+    crosses as little of other parts as it can. Hidden parts have none.
+    """
+    from PIL import ImageDraw, ImageFont
+    from scipy.ndimage import distance_transform_edt
+
+    draw, font, taken = ImageDraw.Draw(picture), ImageFont.load_default(20), seen != 255
+    points = {}
+    for k in range(1, count + 1):
+        own = seen == k
+        if not own.any():
+            continue
+        depth = np.minimum(distance_transform_edt(own), 5.0)
+        above = np.cumsum(np.where(own, 0.2, taken), axis=0)
+        crossed = np.stack([above, above[-1] - above])
+        for x, _, _ in points.values():
+            crossed[:, :, max(x - 20, 0) : x + 21] += 30.0
+        costs = np.where(own & (depth >= depth.max() - 1.0), crossed - depth, np.inf)
+        down, y, x = np.unravel_index(np.argmin(costs), costs.shape)
+        points[k] = int(x), int(y), -1 + 2 * int(down)
+    for k, (x, y, step) in sorted(points.items(), key=lambda item: item[1]):
+        end = y
+        while taken[max(end - 18, 0) : end + 19, x - 18 : x + 19].any():
+            end += step
+        taken[end - 12 : end + 13, x - 14 : x + 15] = True
+        points[k] = x, y, end
+        draw.line([(x, y), (x, end)], fill="white", width=4)
+    for k, (x, y, end) in points.items():
+        draw.line([(x, y), (x, end)], fill="#505050", width=1)
+        draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill="black", outline="white")
+        draw.rectangle((x - 13, end - 12, x + 13, end + 12), fill="white")
+        draw.text((x, end), str(k), fill="black", font=font, anchor="mm")

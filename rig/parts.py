@@ -23,8 +23,8 @@ BELT_PITCH, BELT_WIDTH, PITCH_LINE, TOOTH_DEPTH, BELT_BACK = 2.0, 6.0, 0.254, 0.
 thickness without teeth (1.52 in all by SDP/SI's handbook, 1.4 by other makers)."""
 FLANGE, BELT_ROOM = 1.2, 7.0
 """Thickness of a pulley's flange, and distance between its flanges [mm]."""
-SPRING = 1.5
-"""Length of the compressed wave spring [mm]."""
+SPRING, BAND = 1.5, 0.4
+"""Length of the compressed wave spring, and thickness of its band [mm]."""
 PLATE, MOTOR_PLATE, SLIDE = 5.0, 4.0, 3.0
 """Thickness of the housing's plate and of the motor's plate behind it, and travel of the latter to either side [mm]."""
 HOLDER, LIP, SLIT = 3.0, 1.0, 0.8
@@ -576,6 +576,12 @@ def o_ring(rig: Rig) -> Manifold:
     return out - beyond(rig, out, SQUEEZED)
 
 
+def wave_spring(rig: Rig) -> Manifold:
+    """Return the space of the compressed wave spring: between the bore and the rear ring, which turns within it."""
+    inner = rig.bearing.inner + rig.clearance + 0.02
+    return ring(inner, rig.bearing.outer / 2 - 0.25, rig.bearing_z[0] - SPRING, rig.bearing_z[0])
+
+
 def wedge(rig: Rig) -> Manifold:
     """Return the wedge. Its flat face points to the camera."""
     out = rod(rig.wedge / 2, rig.seat_z, rig.seat_z + 2 * rig.edge, sides=SEGMENTS)
@@ -779,7 +785,7 @@ def screw_solids(rig: Rig) -> list[tuple[str, str, Manifold, tuple[float, float,
     plate_at, board_at = at_z(plate_screws(rig), low - MOTOR_PLATE), at_z(board_screws(rig), board)
     return [
         ("screws of the cap", "", screws(3.0, 6.0, 1.9, cap_at), (0, 0, 64)),
-        ("screws of the cover", "", screws(3.0, 8.0, 4.0, cover_at), (0, 0, 132)),
+        ("screws of the cover", "", screws(3.0, 8.0, 4.0, cover_at), (0, 0, 162)),
         ("screws of the wedge ring", "prism", screws(2.0, 8.0, 2.0, ring_at), (0, 0, 106)),
         ("screws of the rear ring", "prism", screws(2.0, 8.0, 2.5, rear_at, behind, sunk=True), (0, 0, 12)),
         ("screws of the holder", "", screws(2.5, 8.0, HOLDER, holder_at, behind), (0, 0, -40)),
@@ -787,8 +793,8 @@ def screw_solids(rig: Rig) -> list[tuple[str, str, Manifold, tuple[float, float,
         ("screws of the motor", "", screws(3.0, 8.0, MOTOR_PLATE, motor_at, sunk=True), (0, 0, -8)),
         ("screws of the motor plate", "", screws(3.0, 8.0, MOTOR_PLATE, plate_at, behind), (0, 0, -20)),
         ("screws of the base", "", screws(4.0, 12.0, 6.0, foot, up), (0, -42, 0)),
-        ("screws of the fork barrier", "", screws(2.0, 5.0, 1.6, fork, aside), (0, 38, 120)),
-        ("screws of the encoder board", "", screws(2.5, 8.0, 8.0, board_at) + nuts, (0, 0, 146)),
+        ("screws of the fork barrier", "", screws(2.0, 5.0, 1.6, fork, aside), (0, 38, 150)),
+        ("screws of the encoder board", "", screws(2.5, 8.0, 8.0, board_at) + nuts, (0, 0, 176)),
     ]
 
 
@@ -803,7 +809,7 @@ def assembly(rig: Rig) -> tuple[Part, ...]:
     glass = wedge(rig)
     rear, front = bearing_solids(rig)
     mass = rig.bearing.mass
-    rubber = o_ring(rig)
+    rubber, spring = o_ring(rig), wave_spring(rig)
     magnet = rod(3.0, magnet_z(rig) - 2.0, magnet_z(rig), rig.distance)
     return (
         printed("base", base(rig), "", (0, -30, 0)),
@@ -824,12 +830,13 @@ def assembly(rig: Rig) -> tuple[Part, ...]:
         Part("magnet", magnet, "bought", "motor", magnet.volume() * 7.5e-3, (0, 0, 92)),
         Part("wedge", glass, "glass", "prism", glass.volume() * GLASS, (0, 0, 88)),
         printed("wedge ring", wedge_ring(rig), "prism", (0, 0, 100)),
-        printed("cover", cover(rig), "", (0, 0, 120)),
-        Part("fork barrier", fork(rig), "bought", "", 2.0, (0, 30, 120)),
-        Part("encoder board", encoder(rig), "bought", "", 4.0, (0, 0, 138)),
+        printed("cover", cover(rig), "", (0, 0, 150)),
+        Part("fork barrier", fork(rig), "bought", "", 2.0, (0, 30, 150)),
+        Part("encoder board", encoder(rig), "bought", "", 4.0, (0, 0, 168)),
         printed("motor plate", motor_plate(rig), "", (0, 0, -14)),
         Part("O-ring", rubber, "bought", "prism", rubber.volume() * RUBBER, (0, 0, 94)),
         Part("lens", ring(0, rig.lens / 2, rig.grip_z, rig.lens_z), "bought", "", 50.0, (0, 0, -46)),
+        Part("wave spring", spring, "bought", "", spring.volume() / SPRING * BAND * STEEL, (0, 0, 25)),
         *(Part(n, each, "screws", moves, each.volume() * STEEL, apart) for n, moves, each, apart in screw_solids(rig)),
     )
 

@@ -91,6 +91,15 @@ def test_a_screw_that_is_too_long_is_seen(rig: Rig, made: Sequence[Part]) -> Non
     assert any(text.startswith("rotor and screws of the fork barrier") for text in wrong)
 
 
+def test_a_wave_spring_that_rubs_is_seen(rig: Rig, made: Sequence[Part]) -> None:
+    """The rear ring turns inside the spring: a wider band comes too close."""
+    spring = next(part.solid for part in made if part.name == "wave spring")
+    low, high = spring.bounding_box()[2], spring.bounding_box()[5]
+    wider = parts.ring(rig.bearing.inner + 0.3, rig.bearing.outer / 2 - 0.25, low, high)
+    wrong = parts.problems(rig, replaced(made, "wave spring", wider))
+    assert wrong == ["rear ring and wave spring are 0.30 mm apart, less than 0.7 mm"]
+
+
 def test_a_key_reaches_the_screws_that_tighten_the_belt(rig: Rig, made: Sequence[Part]) -> None:
     """From behind, wherever the motor stands. From the front, the pulley covers the motor's own screws."""
     face = rig.face_z - parts.PLATE - parts.MOTOR_PLATE - parts.HEADS[3.0][1]
