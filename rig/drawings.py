@@ -319,13 +319,13 @@ def label(picture: Any, seen: np.ndarray, count: int) -> None:
     """Write the numbers of the first ``count`` parts around a picture, with a line to a visible point of each.
 
     ``seen`` has the number of the part at each pixel, and 255 for none, shape (height, width). Each line is upright and
-    crosses as little of other parts as it can. Hidden parts have none.
+    crosses as little of other parts as it can, and keeps away from the other lines. Hidden parts have none.
     """
     from PIL import ImageDraw, ImageFont
     from scipy.ndimage import distance_transform_edt
 
     draw, font, taken = ImageDraw.Draw(picture), ImageFont.load_default(20), seen != 255
-    points = {}
+    points, columns = {}, np.arange(seen.shape[1])
     for k in range(1, count + 1):
         own = seen == k
         if not own.any():
@@ -334,8 +334,8 @@ def label(picture: Any, seen: np.ndarray, count: int) -> None:
         above = np.cumsum(np.where(own, 0.2, taken), axis=0)
         crossed = np.stack([above, above[-1] - above])
         for x, _, _ in points.values():
-            crossed[:, :, max(x - 20, 0) : x + 21] += 30.0
-        costs = np.where(own & (depth >= depth.max() - 1.0), crossed - depth, np.inf)
+            crossed += np.maximum(500.0 - 20.0 * np.abs(columns - x), 0.0)
+        costs = np.where(own & (depth >= min(depth.max(), 3.0)), crossed - depth, np.inf)
         down, y, x = np.unravel_index(np.argmin(costs), costs.shape)
         points[k] = int(x), int(y), -1 + 2 * int(down)
     for k, (x, y, step) in sorted(points.items(), key=lambda item: item[1]):
@@ -346,7 +346,6 @@ def label(picture: Any, seen: np.ndarray, count: int) -> None:
         points[k] = x, y, end
         draw.line([(x, y), (x, end)], fill="white", width=4)
     for k, (x, y, end) in points.items():
-        draw.line([(x, y), (x, end)], fill="#505050", width=1)
+        draw.line([(x, y), (x, end + (10 if end < y else -10))], fill="#505050", width=1)
         draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill="black", outline="white")
-        draw.rectangle((x - 13, end - 12, x + 13, end + 12), fill="white")
         draw.text((x, end), str(k), fill="black", font=font, anchor="mm")
