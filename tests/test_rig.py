@@ -42,6 +42,15 @@ def test_a_steeper_wedge_fits(rig: Rig) -> None:
     assert parts.problems(own, parts.assembly(own)) == []
 
 
+def test_wider_bearings_leave_room_for_a_wider_spring() -> None:
+    """The way out that the page names for the one-inch rig: 6806, and a band of 3.3 mm."""
+    own = replace(ONE_INCH, series="68")
+    made = parts.assembly(own)
+    assert parts.problems(own, made) == []
+    inner = own.bearing.inner + own.clearance
+    assert (own.bearing.name, own.bearing.outer / 2 - 0.25 - inner > 3.3) == ("6806", True)
+
+
 def test_an_overlap_a_narrow_gap_and_a_loose_piece_are_seen(made: Sequence[Part], rig: Rig) -> None:
     by_name = {part.name: part for part in made}
     turning, still = by_name["rear ring"], by_name["holder"]
