@@ -71,6 +71,13 @@ def test_pairs_are_those_of_one_seed_and_case() -> None:
     assert claim.cases["desk, fast"].startswith("0.3 [0.3, 0.3], 3 seeds")
 
 
+def test_cases_that_say_otherwise_are_named() -> None:
+    claim = judge(1, "More.", {"room": {1: 5.0, 2: 5.1}, "desk": {1: -1.0, 2: -1.1}, "garden": {1: 1.0, 2: 0.9}},
+                  "the score", above=0.0)  # fmt: skip
+    assert claim.verdict is Verdict.REPRODUCED
+    assert claim.ours.endswith("2 seeds; not reproduced in desk")
+
+
 def test_relative_differences_and_levels() -> None:
     given = rows("room", ami=[3.0, 2.0, 5.0], sev=[2.0, 0.0, 4.0])
     relative = differences(given, "score", {"stream": "ami"}, {"stream": "sev"}, relative=True)

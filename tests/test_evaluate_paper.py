@@ -106,6 +106,20 @@ def test_a_surge_is_one_with_timing_errors_and_not_without(timed: float, none: f
     assert [c.verdict for c in apex_speed.claims(cells) if "(apex 1°)" in c.text] == expected
 
 
+def test_more_events_and_more_error_with_apex_and_speed() -> None:
+    """The event rate grows with apex and speed, the blur with the apex only."""
+    made = [CellResult("apex_speed", Condition(DISCS, "still", math.radians(degrees), rpm, seed, cutoff_hz=1000.0), {
+                "rows": [{"degrees": degrees, "delay": 0.0, "blur": blur + 0.01 * seed, "edge_blur": None,
+                          "mev_per_s": degrees * rpm / 720.0 + 0.01 * seed}]})
+            for degrees, rpm, blur in ((0.5, 720.0, 0.6), (1.0, 720.0, 0.8), (2.0, 720.0, 1.0), (0.5, 1440.0, 0.5))
+            for seed in (1, 2)]  # fmt: skip
+    yes, no = Verdict.REPRODUCED, Verdict.NOT_REPRODUCED
+    events = [c for c in apex_speed.claims(made) if c.number == 14 and "gives more events" in c.text]
+    assert [c.verdict for c in events] == [yes, yes]
+    general = [c for c in apex_speed.claims(made) if c.number == 15 and "with the circle" not in c.text.lower()]
+    assert [c.verdict for c in general] == [yes, yes, yes, no]
+
+
 def test_the_best_circle_is_the_least_squares_one() -> None:
     """Deflections on a grid, with the displacement of both models summed over pixels and angles."""
     camera = Camera.from_fov(64, 48, 1.0)

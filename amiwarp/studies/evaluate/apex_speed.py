@@ -345,15 +345,16 @@ def _name(cutoff_hz: float | None) -> str:
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
-    """Return the verdicts on the surge above 720 rpm and its cause, and on the error of a prism of 2 deg."""
+    """Return the verdicts on the surge above 720 rpm and its cause, on 2 deg, and on apex and speed in general."""
     rows = [r for r in _rows(results, "rows", cropped=True) if r["only"] is None]
     bandwidths = sorted({r["cutoff_hz"] for r in rows if r["cutoff_hz"] != USUAL_HZ}, key=lambda hz: hz or np.inf)
-    usual = [r for r in rows if (r["rpm"], r["cutoff_hz"]) == (USUAL_RPM, 0.0)]
+    usual = [r for r in rows if (r["rpm"], r["cutoff_hz"]) == (USUAL_RPM, USUAL_HZ)]
     errors = _rows(results, "errors")
     crop = [r for r in errors if _cropped(r) and r["model"] == EXACT]
     timed, none = (
         [r for r in crop if (r["timing"], r["error_us"]) == kind] for kind in ((WANDER, USUAL_US), (NONE, 0.0))
     )
+    apex = [r for r in rows if (r["degrees"], r["cutoff_hz"]) == (USUAL_DEG, USUAL_HZ)]
     fast, slow = {"rpm": 2 * USUAL_RPM}, {"rpm": USUAL_RPM}
     growth = [{"degrees": float(degrees), "seed": seed, "growth": value}
               for degrees, values in differences(timed, "blur", fast, slow, by=("degrees",)).items()
@@ -386,12 +387,19 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
                 differences(_whole_sensor(errors, us), "displacement", of(2.0, model), of(1.0, CIRCLE), by=()),
                 "the difference of the rms displacement errors", above=low, below=high, unit="px")
           for number, model, word, more, low, high in (
-              (14, CIRCLE, "the circle", "larger", 0.0, np.inf),
+              (15, CIRCLE, "the circle", "larger", 0.0, np.inf),
               (None, EXACT, "exact refraction", "smaller", -np.inf, 0.0))
           for timing, us in (("without timing errors", 0.0), ("with timing errors of 1 ms", USUAL_US))),
-        judge(14, "A prism of 2° gives more events.",
-              differences(usual, "mev_per_s", {"degrees": 2.0}, {"degrees": 0.5}, by=("rpm",)),
-              "the event rate at 2° less that at 0.5°", above=0.0, unit="Mev/s"),
+        *(judge(14, f"A prism of 2° gives more events than one of {other:g}° (720 rpm).",
+                differences(usual, "mev_per_s", {"degrees": 2.0}, {"degrees": other}, by=("rpm",)),
+                f"the event rate at 2° less that at {other:g}°", above=0.0, unit="Mev/s") for other in (1.0, 0.5)),
+        *(judge(15, f"{word} gives more {what}.", differences(chosen, value, first, second, by=("only",)),
+                f"the {name} {sides}", above=0.0, unit=unit)
+          for value, what, name, unit in (
+              ("mev_per_s", "events", "event rate", "Mev/s"), ("blur", "error", "blur", "px"))
+          for word, chosen, first, second, sides in (
+              ("A larger apex (720 rpm)", usual, {"degrees": 1.0}, {"degrees": 0.5}, "at 1° less that at 0.5°"),
+              ("A higher speed (apex 0.5°)", apex, fast, slow, "at 1440 rpm less that at 720 rpm"))),
     ]  # fmt: skip
 
 

@@ -154,10 +154,14 @@ def judge(
     if not by_seed:
         return Claim(number, text, NO_RESULT, Verdict.NOT_TESTABLE, rule)
     interval = Interval.of([float(np.mean(values)) for values in by_seed.values()])
-    cases = {case: Interval.of(list(values.values())).text(unit) for case, values in found.items() if values}
-    return Claim(
-        number, text, interval.text(unit), interval.verdict(above, below), rule, cases if len(cases) > 1 else {}
-    )
+    inside = {case: Interval.of(list(values.values())) for case, values in found.items() if values}
+    verdict = interval.verdict(above, below)
+    ours = interval.text(unit)
+    for other in (Verdict.REPRODUCED, Verdict.NOT_REPRODUCED):
+        among = [case for case, one in inside.items() if one.verdict(above, below) is other is not verdict]
+        ours += f"; {other} in {' and '.join(among)}" if among else ""
+    cases = {case: one.text(unit) for case, one in inside.items()} if len(inside) > 1 else {}
+    return Claim(number, text, ours, verdict, rule, cases)
 
 
 def untestable(number: int, text: str, reason: str) -> Claim:
