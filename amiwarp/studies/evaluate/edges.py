@@ -527,7 +527,8 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
         return judge(number, text, found, f"{VALUES_IN_WORDS[value]} of '{Stream.CALIBRATED}' less that of '{other}'",
                      above=0.0)  # fmt: skip
 
-    steady = ranges([r for r in rows if r["tolerance"] == USUAL and r["truth"] == CANNY], "f")
+    moving = [r for r in rows if r["camera"] != "still"]
+    steady = ranges([r for r in moving if r["tolerance"] == USUAL and r["truth"] == CANNY], "f")
     return [
         more(2, "Event images of the moving AMI-EV fit the picture's edges better (Canny, 6 px).", "f"),
         more(2, "So they do at rest, where the S-EV sees nothing.", "f", moving=False),
