@@ -504,7 +504,7 @@ class _Output(io.RawIOBase):
         return size
 
     def close(self) -> None:
-        if not self.closed:
+        if not self.closed and hasattr(self, "_handle"):  # without it, the file could not be created
             os.close(self._handle)
         super().close()
 
