@@ -49,12 +49,12 @@ def _main() -> None:
             from amiwarp.io.reading_process import start_ahead
 
             start_ahead("amiwarp.io.hdf5_server")  # loads HDF5 while this process loads the command
-        if sys.argv[1:2] == ["demo"] and not {"--help", "--device"} & set(sys.argv):
+        if sys.argv[1:2] == ["demo"] and "--help" not in sys.argv:
             from amiwarp.kernels.checksum import compute_checksums
             from amiwarp.kernels.launch import load_ahead, start_quietly
 
-            start_quietly()
-            load_ahead([(compute_checksums,)], "cpu")  # precompiles Warp's header meanwhile
+            if start_quietly() == ["cpu"]:  # with a GPU, the demo runs there
+                load_ahead([(compute_checksums,)], "cpu")  # precompiles Warp's header meanwhile
         from amiwarp.cli import app
 
         for number in ending:

@@ -732,20 +732,26 @@ def test_the_image_turns_stops_and_survives_damage_and_resets(image: Callable[..
     assert (host.status.target_rpm, host.status.faults) == (0.0, 0)
 
 
+def camera_pulses(host: Host, pulses: str, number: int) -> list[float]:
+    """Let time pass, with pulses of the camera if the build reads them, and return their times [us]."""
+    times = []
+    for _ in range(number):
+        if pulses == "PULSES_CAMERA":
+            times.append(host.board.now)
+            host.board.set("sync")
+            host.run(0.05)
+            host.board.set("sync", 0)
+        host.run(0.1)
+    return times
+
+
 @pytest.mark.parametrize("pulses", ["PULSES_TIMED", "PULSES_INDEX", "PULSES_CAMERA"])
 def test_the_image_with_each_source_of_pulses_and_each_encoder(chip: Callable[..., Any], pulses: str) -> None:
     magnetic = pulses == "PULSES_TIMED"
     host = Host(chip("MAGNETIC" if magnetic else "QUADRATURE", pulses))
     host.command(SetSpeed(600.0, 5000.0))
     host.run(0.4)
-    edges = []
-    for _ in range(2):
-        if pulses == "PULSES_CAMERA":
-            edges.append(host.board.now)
-            host.board.set("sync")
-            host.run(0.05)
-            host.board.set("sync", 0)
-        host.run(0.1)
+    edges = camera_pulses(host, pulses, 2)
     syncs = of(Sync, host.messages)
     if pulses == "PULSES_INDEX":
         assert [m.t_us for m in syncs] == [m.t_us for m in of(Index, host.messages)]
@@ -922,14 +928,7 @@ def test_the_avr_with_each_source_of_pulses(avr: Callable[..., Any], pulses: str
     host.run(0.05)
     host.command(SetSpeed(600.0, 5000.0))
     host.run(0.4)
-    received = []
-    for _ in range(3):
-        if pulses == "PULSES_CAMERA":
-            received.append(host.board.now)
-            host.board.set("sync")
-            host.run(0.05)
-            host.board.set("sync", 0)
-        host.run(0.1)
+    received = camera_pulses(host, pulses, 3)
     syncs, edges = of(Sync, host.messages), received or host.board.get("trigger_us")
     assert len(syncs) >= 3
     assert max(abs(m.t_us - edge) for m, edge in zip(syncs, edges, strict=True)) <= 2.0
