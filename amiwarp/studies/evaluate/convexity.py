@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Annotated, Any, Literal, TypedDict, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,8 +119,9 @@ PHASES = np.radians(np.arange(-180.0, 180.0, 10.0))
 """Phases of the grid, relative to the true one [rad]."""
 MOST_EVENTS, QUICK_MOST_EVENTS = 4_000_000, 400_000
 """Largest number of events of the longest window."""
-PAPER, PIXELS, OURS = "J, η = 1", "J, large η", "minus contrast"
-"""Names of the costs."""
+CostName = Literal["J, η = 1", "J, large η", "minus contrast"]
+"""Type of the name of a cost."""
+PAPER, PIXELS, OURS = get_args(CostName)
 NOISE_FREE = "ideal sensor"
 """Name of the sensor without limits and noise."""
 SMALL = (160, 120)
@@ -132,7 +133,7 @@ FOUND_PX = 1.0
 
 
 class _Row(TypedDict):
-    cost: Literal["J, η = 1", "J, large η", "minus contrast"]
+    cost: CostName
     window: study.Amount
     events: study.Count
     error: study.Amount
@@ -151,7 +152,7 @@ def _checked_surface(surface: list[list[float]], what: str) -> list[list[float]]
 
 
 class _Surface(TypedDict):
-    cost: Literal["J, η = 1", "J, large η", "minus contrast"]
+    cost: CostName
     window: study.Amount
     values: Annotated[list[list[float]], _checked_surface]
 
