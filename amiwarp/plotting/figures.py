@@ -27,8 +27,7 @@ from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import write_text
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import MODELS
-from amiwarp.plotting import clouds
-from amiwarp.plotting.clouds import Renderer
+from amiwarp.plotting.clouds import Cloud, draw_cloud
 from amiwarp.reconstruction.picture import Picture, limits, tones
 
 EVENTS = 2_000_000
@@ -158,18 +157,15 @@ class EventViews:
     """Images of the events before and after compensation."""
     corner: tuple[int, int]
     """Top left pixel (x, y) of the enlarged region."""
-    clouds: tuple[clouds.Cloud, clouds.Cloud]
+    clouds: tuple[Cloud, Cloud]
     """Events of one turn in the region, before and after compensation."""
-    drawn: list[NDArray[np.uint8]] | None
-    """Pictures of the clouds by VTK; None if it cannot draw here."""
 
     @classmethod
-    def of(cls, recording: Recording, calibration: Calibration, device: Any, renderer: Renderer) -> EventViews:
-        """Compute the images and draw the clouds."""
+    def of(cls, recording: Recording, calibration: Calibration, device: Any) -> EventViews:
+        """Compute the images and the clouds."""
         pair = images(thin(recording, EVENTS), recording, calibration, device=device)
         corner = busiest(pair.after)
-        both = region_clouds(recording, calibration, corner, device)
-        return cls(pair, corner, both, renderer.render(both))
+        return cls(pair, corner, region_clouds(recording, calibration, corner, device))
 
 
 def draw_demo(
@@ -181,11 +177,8 @@ def draw_demo(
     *,
     headline: str,
     truth: tuple[float, float],
-) -> tuple[str, ...]:
-    """Draw images, the enlarged region, point clouds and cost surface of the demo on the axes of ``grid``.
-
-    Return notes on parts that were drawn by a fallback.
-    """
+) -> None:
+    """Draw images, the enlarged region, point clouds and cost surface of the demo on the axes of ``grid``."""
     pair, corner = views.images, views.corner
     found, original = reconstructed.tones()
     figure, ax = grid.figure, grid.axes
@@ -200,11 +193,12 @@ def draw_demo(
     show(ax["part raw"], pair.before[part], pair.top, "marked region: before")
     show(ax["part compensated"], pair.after[part], pair.top, "after compensation")
     show_grey(ax["part picture"], found[part], "reconstructed")
-    notes = _draw_clouds(figure, (ax["cloud before"], ax["cloud after"]), views)
+    for when, cloud in zip(("before", "after"), views.clouds, strict=True):
+        draw_cloud(ax[f"cloud {when}"], cloud)
+        ax[f"cloud {when}"].set_title(f"{when}: one turn of the marked region")
     draw_cost(figure, ax["cost"], calibration, truth)
     enlarge(figure, ax["cost"])
     save(figure, path)
-    return notes
 
 
 @dataclass(frozen=True)
@@ -229,8 +223,9 @@ class Grid:
         height = 0.6 + 2 * (title + tall + gap) + title + third + 0.65
         figure = blank((WIDTH, height))
 
-        def place(left: float, top: float, wide: float, high: float) -> Any:
-            return figure.add_axes((left / WIDTH, 1.0 - (top + high) / height, wide / WIDTH, high / height))
+        def place(left: float, top: float, wide: float, high: float, projection: str | None = None) -> Any:
+            at = (left / WIDTH, 1.0 - (top + high) / height, wide / WIDTH, high / height)
+            return figure.add_axes(at, projection=projection)
 
         axes = {}
         top = 0.6 + title
@@ -243,7 +238,7 @@ class Grid:
             axes[name] = place(gap + width + spare + k * (part + spare), top, part, tall)
         top += tall + gap + title
         for k, name in enumerate(("cloud before", "cloud after")):
-            axes[name] = place(gap + k * (width + gap), top, width, third)
+            axes[name] = place(gap + k * (width + gap), top, width, third, "3d")
         axes["cost"] = place(2 * (width + gap) + 0.75, top, width - 0.65, third)
         return cls(figure, axes, height)
 
@@ -290,24 +285,9 @@ def busiest(image: NDArray[np.float32]) -> tuple[int, int]:
     return max(0, int(column) + margin_x - width // 2), max(0, int(row) + margin_y - height // 2)
 
 
-def _draw_clouds(figure: Any, axes: Any, views: EventViews) -> tuple[str, ...]:
-    """Draw the event clouds before and after compensation; return notes if VTK could not draw them."""
-    for k, (ax, title) in enumerate(zip(axes, ("before", "after"), strict=True)):
-        ax.set_axis_off()
-        ax.set_title(f"{title}: one turn of the marked region")
-        if views.drawn is not None:
-            ax.imshow(views.drawn[k])
-            continue
-        ax.set_visible(False)
-        plain = figure.add_axes(ax.get_position(), projection="3d")
-        plain.set_title(ax.get_title())
-        clouds.draw_plain(plain, views.clouds[k])
-    return () if views.drawn is not None else (clouds.MISSING,)
-
-
 def region_clouds(
     recording: Recording, calibration: Calibration, corner: tuple[int, int], device: Any
-) -> tuple[clouds.Cloud, clouds.Cloud]:
+) -> tuple[Cloud, Cloud]:
     """Return the events of one turn that compensation moves into the region, before and after compensation."""
     source = recording.events
     encoder = calibration.encoder_for(recording.encoder, source.t_first, source.t_last)
@@ -322,7 +302,7 @@ def region_clouds(
     angle = encoder.angle_at(events.t[which])
     height = (angle - angle.mean()) / (2.0 * math.pi) if len(angle) else angle
     on = events.p[which] == 1
-    before, moved = (clouds.Cloud(_box(xy[which], height, corner), on) for xy in (raw, after))
+    before, moved = (Cloud(_box(xy[which], height, corner), on) for xy in (raw, after))
     return before, moved
 
 
