@@ -1,5 +1,6 @@
 """Entry point of ``python -m amiwarp`` and of the ``amiwarp`` command."""
 
+import gc
 import io
 import os
 import signal
@@ -50,11 +51,16 @@ def _main() -> None:
 
             start_ahead("amiwarp.io.hdf5_server")  # loads HDF5 while this process loads the command
         if sys.argv[1:2] == ["demo"] and "--help" not in sys.argv:
+            gc.disable()  # or collections take a quarter of the time of these imports
             from amiwarp.kernels.checksum import compute_checksums
             from amiwarp.kernels.launch import load_ahead, start_quietly
 
             if start_quietly() == ["cpu"]:  # with a GPU, the demo runs there
                 load_ahead([(compute_checksums,)], "cpu")  # precompiles Warp's header meanwhile
+            import amiwarp.studies.demo  # noqa: F401
+
+            gc.freeze()  # later collections leave out what was imported
+            gc.enable()
         from amiwarp.cli import app
 
         for number in ending:

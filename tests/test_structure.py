@@ -243,8 +243,6 @@ OPENED_OTHERWISE = {
     "amiwarp.io.files: open(path, 'r+b')": "lock file",
     "amiwarp.io.native_writer: open(self.part, 'r+b')": "own file",
     "amiwarp.io.plain_files: (folder / name).open('rb')": "own file",
-    "amiwarp.plotting.clouds: np.load(picture)": "own file",
-    "amiwarp.plotting.clouds: np.load(points)": "own file",
     # What is no file.
     "amiwarp.io.plain_files: np.loadtxt(kept, ndmin=2, comments=None, encoding='ascii')": "lines",
     "amiwarp.plotting.figures: Image.open(buffer)": "bytes",

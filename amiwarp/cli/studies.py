@@ -65,13 +65,13 @@ def run_demo(
     picture: Annotated[
         Path | None, typer.Option(help="Picture to use as the scene. Default: a map of the earth.")
     ] = None,
-    size: Annotated[str, typer.Option(help="Size of the camera's image (px).", metavar="WIDTHxHEIGHT")] = "640x480",
-    duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 0.5,
+    size: Annotated[str, typer.Option(help="Size of the camera's image (px).", metavar="WIDTHxHEIGHT")] = "480x360",
+    duration: Annotated[float, typer.Option(help="Length of the recording (s).")] = 0.25,
     common: Common,
 ) -> None:
     """Simulate a recording, calibrate it without an initial guess, compensate it and reconstruct the picture.
 
-    Takes about 15 s on two idle CPU cores, longer the first time, when kernels are compiled, and on a busy machine.
+    Takes about 10 s on two idle CPU cores, longer the first time, when kernels are compiled, and on a busy machine.
     """
     began = time.perf_counter()
     device = choose_device(common.device)

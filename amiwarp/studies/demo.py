@@ -20,6 +20,7 @@ from amiwarp import kernels
 from amiwarp.brightness.solver import SensorTiming
 from amiwarp.calib import Calibration, calibrate
 from amiwarp.calib.calibration_events import thin
+from amiwarp.calib.model_choice import CIRCLES
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.events.recording import Recording
@@ -37,7 +38,7 @@ from amiwarp.kernels.equations_cpu import apply_normal, make_chains
 from amiwarp.kernels.event_keys import unpack
 from amiwarp.kernels.iwe import CPU_WIDTH, find_largest, read_sums, smooth, smooth_and_sum
 from amiwarp.kernels.known_nodes import find_large_regions, mark_known
-from amiwarp.kernels.launch import load_ahead, load_all
+from amiwarp.kernels.launch import load_ahead, load_all, load_kernels
 from amiwarp.kernels.map_positions import find_places, place_blocks
 from amiwarp.kernels.multilevel import prolong_rows
 from amiwarp.kernels.pairs import mark_spans
@@ -48,7 +49,7 @@ from amiwarp.kernels.refraction import ExactParams, compensate_points
 from amiwarp.kernels.slow_pixels import find_time_constants
 from amiwarp.kernels.votes import turn_events
 from amiwarp.optics.camera import Camera
-from amiwarp.optics.models import ExactModel
+from amiwarp.optics.models import MODELS, ExactModel
 from amiwarp.optics.prism import Prism, as_wedge
 from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
 from amiwarp.reconstruction.picture import Picture, Reconstruction, save_picture
@@ -94,6 +95,8 @@ SIMULATION_KERNELS = (
     (unpack,),
 )
 """Kernels of a simulation of the exact model, in the order of their use."""
+CHOICE_KERNELS = tuple((compensate_points, MODELS[name].STRUCT) for name in CIRCLES)
+"""Kernels of the choice among optical models, which the demo leaves out and ``calibrate`` makes by default."""
 
 
 # Demo: a recording is simulated from a picture, calibrated, compensated and reconstructed.
@@ -107,8 +110,8 @@ NOMINAL_APEX = math.radians(1.2)
 """
 KNOWN_SENSOR = SensorTiming(SensorModel().latency_us, SensorModel().refractory_us)
 """Latency and refractory period of the sensor, as a data sheet would state them."""
-BRIEF = PhotometricSettings(pairs=100_000, density=1.0, sensor=KNOWN_SENSOR)
-"""Settings of the photometric stage: a third of the pairs and half the density of the defaults, in half their time."""
+BRIEF = PhotometricSettings(pairs=100_000, sensor=KNOWN_SENSOR)
+"""Settings of the photometric stage: a third of the pairs of the defaults, in about half their time."""
 MEASURED = 300_000
 """Largest number of events on which blur is measured; larger numbers are thinned evenly."""
 
@@ -121,11 +124,11 @@ class Demo:
     """Folder to which the demo's files are written."""
     picture: Path | None = None
     """Picture file that the scene shows; None for the map of the earth that comes with PyVista."""
-    width: int = 640
+    width: int = 480
     """Width of the image [px]."""
-    height: int = 480
+    height: int = 360
     """Height of the image [px]."""
-    duration_s: float = 0.5
+    duration_s: float = 0.25
     """Duration of the recording [s]."""
     seed: int = 0
     """Seed of the simulator and of the search."""
@@ -358,6 +361,7 @@ def warm_up(devices: Sequence[str], progress: Progress = silent) -> WarmUp:
         share = part(progress, k / len(devices), (k + 1) / len(devices))
         with tempfile.TemporaryDirectory(prefix="amiwarp-") as folder:
             run_demo(Demo(Path(folder), width=120, height=90, duration_s=0.17, device=device), part(share, 0.0, 0.6))
+        load_kernels(CHOICE_KERNELS, device)
         load_all(device, part(share, 0.6, 1.0))
     after = _binaries(cache)
     return WarmUp(len(after - before), len(after), str(cache), time.perf_counter() - began)

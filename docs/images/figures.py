@@ -2,7 +2,7 @@
 
     python docs/images/figures.py DEMO [NAME ...]
 
-``DEMO`` is the folder of ``amiwarp demo --size 160x120``. Without names, all pictures are drawn.
+``DEMO`` is the folder of ``amiwarp demo --size 160x120 --duration 0.5``. Without names, all pictures are drawn.
 """
 
 import math
