@@ -122,7 +122,8 @@ def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:
     if isinstance(error, socket.gaierror):
         return AmiwarpError(f"--host {host!r}: unknown name or address; give one of this machine, such as 127.0.0.1")
     usual = f"{given}: cannot listen: {error.strerror or error}; give another host or port"
-    return AmiwarpError(known.get(error.errno or 0, usual))
+    # newer asyncio gives no number if no address of the host is one of this machine
+    return AmiwarpError(known.get(error.errno or errno.EADDRNOTAVAIL, usual))
 
 
 # Filter for messages from a page: known calls whose arguments have the expected type and size. Drops all others.
