@@ -1,5 +1,6 @@
 """Files of data sets, of ROS and of older cameras: read exactly, or named for what they are."""
 
+import contextlib
 import gzip
 import io
 import json
@@ -638,7 +639,7 @@ def test_each_message_of_a_bag_can_be_read_alone(tmp_path):
     events = Events.from_arrays(np.arange(n) % 320, np.full(n, 7), 5000 + 100 * np.arange(n), np.arange(n) % 2)
     save_recording(tmp_path / "a.h5", Recording(MemoryEvents(events, *SIZE)))
     convert(tmp_path / "a.h5", tmp_path / "a.db3")
-    with sqlite3.connect(tmp_path / "a.db3") as database:
+    with contextlib.closing(sqlite3.connect(tmp_path / "a.db3")) as database:
         rows = database.execute("SELECT data FROM messages ORDER BY id").fetchall()
     store = typestore(False)
     messages = [store.deserialize_cdr(data, "event_camera_msgs/msg/EventPacket") for (data,) in rows]
