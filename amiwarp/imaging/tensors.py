@@ -24,7 +24,7 @@ from amiwarp.imaging.positions import LaunchPlan
 from amiwarp.kernels import tensors as kernels
 from amiwarp.kernels.events import NEVER, find_times, take_times
 from amiwarp.kernels.launch import launch, load, run_together, slices
-from amiwarp.kernels.tensors import BLOCK
+from amiwarp.kernels.tensors import BLOCK, RUN
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.models import Model
 from amiwarp.tasks import cpu_threads
@@ -412,6 +412,7 @@ class _Grid(NamedTuple):
     layers: int = 1
     low: int = 0
     off: int = 1
+    parts: int = 1
 
 
 def _grid(width: int, height: int, **values: int) -> _Grid:
@@ -455,15 +456,16 @@ def _images(
     span = cut.t_end - cut.t_start
     if grid.rate and len(cut) and int(span.max()) >= (1 << 53) // grid.rate:
         raise AmiwarpError(f"a window lasts {int(span.max())} us; give one below {(1 << 53) // grid.rate} us")
-    bytes_each = grid.steps * group * sums * wp.types.type_size_in_bytes(dtype)
+    groups = grid.steps * grid.parts
+    bytes_each = groups * group * sums * wp.types.type_size_in_bytes(dtype)
     most = min(max(MOST_BYTES["cpu" if device.is_cpu else "cuda"] // bytes_each, 1), len(cut))
     # behind the images there are the spare groups of the slices, and places for the events outside the image
     threads = cpu_threads() if device.is_cpu else 1
-    spare = most * grid.steps
+    spare = most * groups
     trash = (spare + threads - 1) * group
     size = (trash + threads * 2 * (grid.width + 16)) * sums
     if size > MOST_EVENTS:
-        raise AmiwarpError(f"a window has {grid.steps * group} pixels in all its images; give fewer bins")
+        raise AmiwarpError(f"a window has {groups * group} pixels in all its images; give fewer bins")
     in_words = device.is_cpu and on_cpu is kernels.add_event_word_blocks
     images = _take_zeros(size) if in_words else wp.empty(size, dtype=dtype, device=device)
     for first in range(0, len(cut), most or 1):
@@ -480,7 +482,7 @@ def _images(
         yield first, number, images
     if in_words:
         images.numpy()[trash:size] = 0
-        if images.size * 8 <= 2 * MOST_BYTES["cpu"]:
+        if images.size * 8 <= 4 * MOST_BYTES["cpu"]:
             _zeros[:] = [images]
 
 
@@ -506,8 +508,9 @@ def _add_on_cpu(
         return
     parts = []
     for k, (first, stop) in enumerate(slices(blocks, cpu_threads(), SMALLEST)):
-        part = first, spare + k - 1 if k else -1, trash + k * 2 * (grid.width + 16)
-        parts.append((_struct(kernels.Part, *part), stop - first))
+        part = first, spare + k - 1 if k else -1, trash + k * 2 * (grid.width + 16), stop
+        run_of = int(RUN) if kernel is kernels.add_event_word_blocks else 1
+        parts.append((_struct(kernels.Part, *part), -(-(stop - first) // run_of)))
 
     def run(part: Any, n: int) -> None:
         wp.launch(kernel, n, [*inputs, part], outputs, device=images.device)
@@ -549,9 +552,10 @@ def _latest(batch: _Batch, grid: _Grid, *, carry: bool) -> Iterator[tuple[int, i
 def _shares(batch: _Batch, grid: _Grid, bins: int) -> wp.array:
     """Return the bins of all windows, shape (windows, layers * bins, height, width)."""
     out = batch.empty((grid.layers * bins, grid.height, grid.width), wp.float32)
-    fullest = _fullest(batch, grid)
-    in_words = batch.events.whole_pixels and fullest < CAPACITY
-    grid = grid._replace(border=int(not in_words), low=63 - max(fullest.bit_length(), LEAST_BITS))
+    parts, fullest = _parts(batch, grid) if batch.events.whole_pixels else (1, CAPACITY)
+    in_words = fullest < CAPACITY
+    border, low = int(not in_words), 63 - max(fullest.bit_length(), LEAST_BITS)
+    grid = grid._replace(border=border, low=low, parts=parts if in_words else 1)
     kernel, on_cpu, read, sums = kernels.share_events, kernels.share_event_blocks, kernels.read_shares, 2
     if in_words:
         kernel, on_cpu, read, sums = kernels.add_event_words, kernels.add_event_word_blocks, kernels.read_bins, 1
@@ -565,21 +569,34 @@ def _shares(batch: _Batch, grid: _Grid, bins: int) -> wp.array:
 
 
 CAPACITY, LEAST_BITS = 1 << 20, 16
-"""Number of events in a time interval from which words are not used. Fewer events leave more bits for their shares: 22
-bits just below the capacity, and 30 bits below ``2**LEAST_BITS`` events. With 22 bits, the sum of a thousand shares is
-exact to 1e-5."""
+"""Number of events in a part of a time interval from which words are not used. Fewer events leave more bits for their
+shares: 22 bits just below the capacity, and 30 bits below ``2**LEAST_BITS`` events. With 22 bits, the sum of a thousand
+shares is exact to 1e-5."""
+EVENT_BYTES = 13
+"""Memory of an event [bytes]. The images of a window's parts do not take more than its events."""
 
 
-def _fullest(batch: _Batch, grid: _Grid) -> int:
-    """Return an upper bound for the number of events in a time interval of a window; exact if there are many."""
+def _parts(batch: _Batch, grid: _Grid) -> tuple[int, int]:
+    """Return into how many parts each time interval is cut so that words can be used, and the most events in a part.
+
+    The second number is an upper bound, exact if there are many events. Words cannot be used from CAPACITY on.
+    """
     cut = batch.windows
     most = int((cut.stop - cut.start).max(initial=0))
     if most < CAPACITY or not grid.rate:
-        return most
-    edges = [-(-k * (cut.t_end - cut.t_start) // grid.rate) for k in range(1, grid.rate)]
-    inside = np.clip(find_indices(batch.events, (cut.t_start + np.reshape(edges, (-1, len(cut)))).ravel()), 0, None)
-    found = np.stack([cut.start, *np.clip(inside.reshape(-1, len(cut)), cut.start, cut.stop), cut.stop])
-    return int(np.diff(found, axis=0).max())
+        return 1, most
+    span = cut.t_end - cut.t_start
+    parts = 1 << (most // (grid.rate * CAPACITY)).bit_length()
+    image = 8 * grid.layers * grid.width * grid.height
+    while True:
+        number = grid.rate * parts
+        edges = [-(-k * span // number) for k in range(1, number)]
+        inside = find_indices(batch.events, (cut.t_start + np.reshape(edges, (-1, len(cut)))).ravel())
+        found = np.stack([cut.start, *np.clip(inside.reshape(-1, len(cut)), cut.start, cut.stop), cut.stop])
+        fullest = int(np.diff(found, axis=0).max())
+        parts *= 2
+        if fullest < CAPACITY or grid.steps * parts * image > EVENT_BYTES * most or int(span.max()) * number >= 1 << 52:
+            return parts // 2, fullest
 
 
 def _normalise(values: wp.array) -> None:
