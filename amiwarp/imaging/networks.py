@@ -14,10 +14,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, device_for, wait
+from amiwarp.events.device_events import DeviceEvents, device_for, find_indices, wait
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
-from amiwarp.imaging.tensors import ToTensor, Windows, find_indices, on_device, polarity_histogram, voxel_grid
+from amiwarp.imaging.tensors import ToTensor, Windows, on_device, polarity_histogram, voxel_grid
 from amiwarp.io.files import input_path
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import Model

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -17,12 +15,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
-from amiwarp.events.device_events import DeviceEvents, check_sensor, device_for, encoder_params, limits, wait
+from amiwarp.events.device_events import (
+    DeviceEvents,
+    check_sensor,
+    device_for,
+    encoder_params,
+    find_indices,
+    host_numbers,
+    idle_numbers,
+    limits,
+    times_at,
+    wait,
+)
 from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, Recording, check_order
 from amiwarp.imaging.positions import LaunchPlan
 from amiwarp.kernels import tensors as kernels
-from amiwarp.kernels.events import NEVER, find_times, take_times
+from amiwarp.kernels.events import NEVER
 from amiwarp.kernels.launch import launch, load, run_together, slices
 from amiwarp.kernels.tensors import BLOCK, RUN
 from amiwarp.optics.camera import LARGEST_SIZE
@@ -153,7 +162,7 @@ def windows(
         return _at_indices(events, edges[:-1], np.minimum(edges[1:], n))
     if not n:
         return _at_indices(events, np.zeros(0, np.int64), np.zeros(0, np.int64))
-    first, last = _times_at(events, np.array([0, n - 1]))
+    first, last = times_at(events, np.array([0, n - 1]))
     if duration_us is not None:
         duration_us = whole(duration_us, "duration_us", 1, 1 << 62, " us in a window")
         number = (last - first) // duration_us + (1 if incomplete else 0)
@@ -182,55 +191,9 @@ def _at_indices(events: Events | DeviceEvents, start: NDArray[np.int64], stop: N
     """Return windows at indices, which start and end at the times of their first and last events."""
     filled = stop > start
     t_start, t_end = np.zeros(len(start), np.int64), np.zeros(len(start), np.int64)
-    times = _times_at(events, np.concatenate([start[filled], stop[filled] - 1]))
+    times = times_at(events, np.concatenate([start[filled], stop[filled] - 1]))
     t_start[filled], t_end[filled] = np.split(times, 2)
     return Windows(start, stop, t_start, t_end)
-
-
-def _times_at(events: Events | DeviceEvents, indices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the times of a few events [us]."""
-    if isinstance(events, Events) or events.device.is_cpu:
-        return (events.t if isinstance(events, Events) else events.t.numpy())[indices]
-    return _look_up(take_times, events.t, indices)
-
-
-def find_indices(events: Events | DeviceEvents, times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index of the first event at or after each time."""
-    if isinstance(events, Events) or events.device.is_cpu:
-        return np.searchsorted(events.t if isinstance(events, Events) else events.t.numpy(), times).astype(np.int64)
-    return _look_up(find_times, events.t, times)
-
-
-def _look_up(kernel: Any, t: wp.array, given: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return what a kernel finds in the times of events on a device for each given number."""
-    if not len(given):
-        return given.copy()
-    shared = _shared(len(given), wp.int64, t.device)
-    shared.numpy()[: len(given)] = given
-    launch(kernel, len(given), [t, shared], [shared], device=t.device)
-    wait(t.device)
-    found = shared.numpy()[: len(given)].copy()
-    _idle[t.device.is_cpu, wp.int64].append(shared)
-    return found
-
-
-_idle: defaultdict[tuple[bool, Any], list[wp.array]] = defaultdict(list)
-"""Memory of the host that a later call uses again, by whether it is for a CPU, and type. GPUs read it and write to it,
-so it is page-locked for them. Locking takes longer than many calls. What is not used is 0 in arrays of int32."""
-
-
-def _shared(n: int, dtype: Any, device: Any) -> wp.array:
-    """Return at least ``n`` numbers in memory of the host that the device, too, reads and writes.
-
-    A caller that has waited for the device puts it back to ``_idle``.
-    """
-    idle = _idle[device.is_cpu, dtype]
-    while idle:
-        with contextlib.suppress(IndexError):  # another thread took it
-            found = idle.pop()
-            if len(found) >= n:
-                return found
-    return wp.zeros(max(n, 64), dtype=dtype, device="cpu", pinned=device.is_cuda)
 
 
 # Batches of recordings.
@@ -333,7 +296,7 @@ class _Batch:
             for start, stop in zip(self.windows.start.tolist(), self.windows.stop.tolist(), strict=True):
                 check_order(host[start:stop], where="events", first_index=start)
         else:
-            _idle[self.device.is_cpu, wp.int32].append(self.unsorted)
+            idle_numbers[self.device.is_cpu, wp.int32].append(self.unsorted)
         found = out.numpy() if self.on_host else out
         return found[0] if self.single else found
 
@@ -362,7 +325,7 @@ def _batch(
     found = on_device(events, there)
     if model is not None and encoder is not None:
         found = _compensated(found, model, encoder)
-    return _Batch(found, cut, single, on_host, _shared(1, wp.int32, there))
+    return _Batch(found, cut, single, on_host, host_numbers(1, wp.int32, there))
 
 
 def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | None) -> Windows:
@@ -371,7 +334,7 @@ def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | Non
     if limits and not limits[5]:  # known, and the times ascend
         first, last = limits[:2]
     else:
-        first, last = _times_at(events, np.array([0, len(events) - 1])).tolist() if len(events) else (0, 0)
+        first, last = times_at(events, np.array([0, len(events) - 1])).tolist() if len(events) else (0, 0)
     low, high = first if t_start is None else t_start, last if t_end is None else t_end
     if high < low:
         if t_start is not None and t_end is not None:

@@ -1,8 +1,8 @@
 """Event representations for networks: voxel grids, histograms, and latest times.
 
 A launch adds the events of many windows. A window has a group of images for each of its time intervals, or for each
-part of them: one image, or one for OFF and one for ON events. Sums are integers, so that they depend neither on the order of events nor on the
-number of threads.
+part of them: one image, or one for OFF and one for ON events. Sums are integers, so that they depend neither on the
+order of events nor on the number of threads.
 
 A voxel grid shares each event between the bins at both ends of its time interval, so a pixel of an image holds two
 sums. At whole pixels, one 64-bit word holds both: the sum of the events' signs, and in its lower ``low`` bits the sum
@@ -11,9 +11,9 @@ overflows if fewer than 2**(63 - low) events are added to an image, so an interv
 with an image each. If that is not possible, and at positions between pixels, a pixel has two 64-bit sums in units of
 2**-30 event: the shares of the interval's start, and those of its end.
 
-A block is 64 events of one window. A CPU thread processes a block (a run of blocks for words), a GPU thread one event. On a CPU, each slice of the
-blocks adds to groups that no other slice adds to. Times ascend, so a slice can share only its first group with the
-slice before. A spare group replaces it, and is added to it later.
+A block is 64 events of one window. A GPU thread processes one event, a CPU thread a block, or a run of blocks for
+words. On a CPU, each slice of the blocks adds to groups that no other slice adds to. Times ascend, so a slice can share
+only its first group with the slice before. A spare group replaces it, and is added to it later.
 """
 
 from typing import Any
