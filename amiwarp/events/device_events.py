@@ -502,16 +502,17 @@ def wait(device: Any) -> None:
     arrays, and read the results on any stream, also with libraries that ignore streams.
     """
     if device.is_cuda:
-        _keep_memory(device)
+        _keep_memory(device.alias)
         wp.synchronize_stream(device)
 
 
 @cache
-def _keep_memory(device: Any) -> None:
+def _keep_memory(name: str) -> None:
     """Let Warp keep memory that a call gave back, unless a limit is set: at most a GiB, or a sixteenth of the GPU's.
 
     Otherwise each wait returns it to the driver, and the next call takes up to a millisecond to get it again.
     """
+    device = wp.get_device(name)
     if device.is_mempool_enabled and not wp.get_mempool_release_threshold(device):
         wp.set_mempool_release_threshold(device, min(1 << 30, device.total_memory // 16))
 
