@@ -402,7 +402,8 @@ def join(arrays: Sequence[wp.array]) -> wp.array:
 def limits(events: DeviceEvents) -> list[int]:
     """Return first and last time [us], largest x and y [px], largest p, and 1 if times decrease anywhere.
 
-    Largest x and y are 0 for compensated events. Found once. Raises :class:`AmiwarpError` if there are no events.
+    Largest x and y are 0 for compensated events. Found once; those of a part of :class:`DeviceMemoryEvents` are limits
+    of all its events. Raises :class:`AmiwarpError` if there are no events.
     """
     if not len(events):
         raise AmiwarpError("there are no events, so there is no first or last time; check len() first")
@@ -580,7 +581,11 @@ class DeviceMemoryEvents(EventSource):
 
     def __getitem__(self, which: slice) -> DeviceEvents:  # type: ignore[override]
         """Return the events of a slice without steps where they are: as views on the device."""
-        return self._events[which]
+        found = self._events[which]
+        if len(found):
+            ends = times_at(found, np.array([0, len(found) - 1])).tolist()
+            found._limits.extend([*ends, *limits(self._events)[2:]])
+        return found
 
     def slice(self, start: int, stop: int) -> Events:
         return self.slice_on_device(start, stop).to_host()
@@ -598,7 +603,7 @@ class DeviceMemoryEvents(EventSource):
         DeviceEvents
             The events.
         """
-        return self._events[max(start, 0) : max(stop, 0)]
+        return self[max(start, 0) : max(stop, 0)]
 
     def find(self, t: int) -> int:
         return int(find_indices(self._events, np.array([t]))[0])
@@ -620,7 +625,7 @@ class DeviceMemoryEvents(EventSource):
             The events.
         """
         start, stop = find_indices(self._events, np.array([t_start, t_end])).tolist()
-        return self._events[start:stop]
+        return self[start:stop]
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
         chunks = (self.slice(start, start + DEFAULT_BLOCK) for start in range(0, len(self), DEFAULT_BLOCK))
