@@ -460,8 +460,8 @@ WRONG_EDGES: dict[str, tuple[Change, str]] = {
     "missing": (lambda v: v["rows"][0].pop("truth"), r"values\.rows\[0\]\.truth is missing"),
     "no list": (lambda v: v.update(rows=1), r"values\.rows is 1; expected a list"),
     "short": (lambda v: v["rows"][0]["matched"].pop(), "values has lists of other lengths than the 33 thresholds"),
-    "no images": (lambda v: v["images"].pop(0), "has a row of S-EV, but not its images or its chance"),
-    "no chance": (lambda v: v["rows"].pop(1), "has a row of S-EV, but not its images or its chance"),
+    "no images": (lambda v: v["images"].pop(0), "has a row of S-EV, but not its images"),
+    "no chance": (lambda v: v["rows"][1]["chance"].pop(), "values has lists of other lengths than the 33 thresholds"),
     "no picture": (lambda v: v["pictures"].update(Canny="AAAA"), r"values\.pictures cannot be decoded"),
     "two sizes": (
         lambda v: v["pictures"].update(Canny=encode_picture(np.zeros((3, 5), np.uint8))), "expected one shape of 2 axes"

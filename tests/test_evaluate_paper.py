@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from amiwarp import Camera, Events, ExactModel, Prism
-from amiwarp.studies.evaluate import apex_speed, convexity, fading, segmentation
+from amiwarp.studies.evaluate import apex_speed, convexity, edges, fading, segmentation
 from amiwarp.studies.evaluate.claims import Verdict
-from amiwarp.studies.evaluate.study import DISCS, IDEAL, QUICK, CellResult, Condition, Streams, Table
+from amiwarp.studies.evaluate.study import DISCS, IDEAL, QUICK, CellResult, Condition, Stream, Streams, Table
 
 
 def check_tables(evaluation: object, results: list[CellResult]) -> dict[str, Table]:
@@ -134,6 +134,52 @@ def test_the_best_circle_is_the_least_squares_one() -> None:
 
     sizes = true.prism.deflection * np.linspace(0.9, 1.2, 301)
     assert best.deflection == pytest.approx(sizes[np.argmin([cost(d) for d in sizes])], rel=0.01)
+
+
+# Edges.
+
+
+@pytest.mark.parametrize(("column", "chance"), [(10, 0), (29, 40)])
+def test_chance_is_the_score_of_the_turned_image(column: int, chance: int) -> None:
+    """A line in the middle of the image matches itself when it is turned, another line does not."""
+    mask = np.zeros((40, 60), np.bool_)
+    mask[:, column] = True
+    image = edges._Image(mask.astype(np.float64), {edges.CANNY: mask, edges.GEOMETRY: mask}, None)  # type: ignore[arg-type]
+    rows = edges._count("S-EV", [image], [image.masks()], (1.5,))
+    assert {(row["matched"][-1], row["chance"][-1], row["true"]) for row in rows} == {(40, chance, 40)}
+
+
+def edge_cell(seed: int, along: dict[Stream, float]) -> CellResult:
+    """Return a cell in which the moving AMI-EV has a better score and a chance that is better by more."""
+    images = [{"stream": s, "found": [100] * 33, "entropy": [0.5] * 33} for s in along]
+    rows = [{"stream": s, "truth": edges.CANNY, "tolerance": 6.0, "matched": [matched + seed] * 33,
+             "chance": [chance] * 33, "true": 100}
+            for s, matched, chance in ((Stream.PLAIN, 60, 20), (Stream.CALIBRATED, 90, 80))]  # fmt: skip
+    sectors = [{"stream": s, "angle": angle, "recall": 0.5 * share + 0.001 * seed}
+               for s, value in along.items() for angle, share in ((7.5, 1.0), (82.5, value))]  # fmt: skip
+    return CellResult("edges", Condition(seed=seed), {"images": images, "rows": rows, "sectors": sectors})
+
+
+def test_edges_are_judged_by_the_margin_over_chance() -> None:
+    cells = [edge_cell(seed, {Stream.PLAIN: 0.5, Stream.CALIBRATED: 1.0}) for seed in (1, 2)]
+    check_tables(edges, cells)
+    claims = {c.text: c for c in edges.claims(cells)}
+    (margin,) = (c for text, c in claims.items() if text.startswith("Event images of the moving"))
+    assert (margin.verdict, margin.ours) == (Verdict.NOT_REPRODUCED, "-0.3 [-0.3, -0.3], 2 seeds")
+    (score,) = (c for text, c in claims.items() if text.startswith("The score itself"))
+    assert (score.verdict, score.number) == (Verdict.REPRODUCED, None)
+
+
+@pytest.mark.parametrize(("plain", "ami", "expected"), [
+    (0.5, 1.0, [Verdict.REPRODUCED, Verdict.REPRODUCED]),
+    (0.5, 0.8, [Verdict.REPRODUCED, Verdict.NOT_REPRODUCED]),
+    (1.1, 0.95, [Verdict.NOT_REPRODUCED, Verdict.REPRODUCED]),
+])  # fmt: skip
+def test_edges_along_the_motion_are_judged_in_both_directions(
+    plain: float, ami: float, expected: list[Verdict]
+) -> None:
+    cells = [edge_cell(seed, {Stream.PLAIN: plain, Stream.CALIBRATED: ami}) for seed in (1, 2)]
+    assert [c.verdict for c in edges.claims(cells) if c.number == 3] == expected
 
 
 # Segmentation by object.
