@@ -211,7 +211,7 @@ def stored_fading() -> CellResult:
     tiles = {"part_ms": 1.0, "columns": 2, "rate": [[1.0, 2.0]], "speed": [[1.0, 2.0]], "camera_speed": [[0.0, 1.0]]}
     film = [encode_picture(np.zeros((3, 4, 3), np.uint8))] * 2
     rows = [{"speed": speed, "rate": 1.0, "tiles": 5} for speed in (0.25, 1.0)]
-    return CellResult("fading", Condition(), {"rows": rows, "film": film, "tiles": tiles}, "", 1.0)
+    return CellResult("fading", Condition(), {"rows": rows, "whole": [], "film": film, "tiles": tiles}, "", 1.0)
 
 
 def stored_texture() -> CellResult:

@@ -323,10 +323,23 @@ def test_places_that_a_camera_sees(streams: Streams) -> None:
     scene = streams.simulation.scene
     assert isinstance(scene, amiwarp.WorldScene)
     xy = np.array([[10.0, 20.0], [40.0, 30.0]])
-    places = corners.seen_places(streams.frame(50_000), streams.camera, scene.trajectory, xy)
+    places = corners.seen_places(streams.frame(50_000), streams.camera, scene.trajectory, xy, [50_000, 50_000])
     found, depth = corners.project(streams.camera, scene.trajectory, places, [50_000, 50_000])
     np.testing.assert_allclose(found, xy, rtol=0, atol=1e-3)  # px
     np.testing.assert_allclose(depth, streams.frame(50_000).depth[[20, 30], [10, 40]], rtol=1e-5)
+
+
+def test_corners_at_random_places_are_joined_within_the_radius(streams: Streams) -> None:
+    """Where corners are dense, the tracker's radius of 3 px alone gives errors of about 2 px and many tracks."""
+    t = np.sort(np.random.default_rng(0).integers(0, streams.end_us, 20_000))
+    frames = [streams.frame(t_us) for t_us in (0, 50_000, 99_999)]
+    row = next(r for r in corners._chance_quality(streams, t, frames) if r["limit"] == corners.LIMIT_PX)
+    assert 1.5 < row["error_px"] < 3.0
+    assert row["number"] > 100
+    tracks = corners.link_corners(t, np.random.default_rng(1).uniform(-0.5, [63.5, 47.5], (len(t), 2)))
+    curve = corners._curve(streams, tracks, corners._begun_on(streams, tracks, frames), frames)
+    expected = curve[3]["lifetime_ms"] * 1e-3 * len(tracks.first) / (streams.end_us * 1e-6)
+    assert curve[3]["alive"] == pytest.approx(expected)
 
 
 def test_fading_classes() -> None:

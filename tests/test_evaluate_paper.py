@@ -273,10 +273,11 @@ def test_the_cost_of_a_recording() -> None:
 
 
 def test_fading_is_judged_by_its_size_and_by_how_rare_it_is() -> None:
-    """Where motions cancel, 5 % of the tiles and moments, the rate falls to 0.2 of the usual one."""
+    """Where motions cancel, 5 % of the tiles and moments, the rate falls to 0.2 of the usual one; in all, to 0.9."""
     classes = [{"speed": 0.125, "rate": 0.2, "tiles": 5}, {"speed": 0.875, "rate": 1.0, "tiles": 95}]
-    cells = [CellResult("fading", Condition("room", "fast", seed=seed), {"rows": classes}) for seed in (1, 2)]
-    assert [c.verdict for c in fading.claims(cells)] == [
-        Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.REPRODUCED,
-    ]  # fmt: skip
+    values = {"rows": classes, "whole": [{"lowest": 0.9}]}
+    cells = [CellResult("fading", Condition("room", "fast", seed=seed), values) for seed in (1, 2)]
+    yes = Verdict.REPRODUCED
+    assert [c.verdict for c in fading.claims(cells)] == [yes, yes, yes, Verdict.NOT_REPRODUCED]
     assert fading.claims(cells)[2].ours.startswith("0.05 ")
+    check_tables(fading, cells)
