@@ -48,8 +48,10 @@ APEX_DEG = (0.5, 1.0, 2.0)
 """Apex angles [deg]."""
 SPEEDS, QUICK_SPEEDS = (180.0, 360.0, 720.0, 1440.0, 2880.0), (360.0, 720.0, 1440.0)
 """Speeds of the prism [turns/min]."""
-BANDWIDTHS, QUICK_BANDWIDTHS = (0.0, 1000.0, 300.0, 100.0), (0.0, 1000.0, 100.0)
+BANDWIDTHS, QUICK_BANDWIDTHS = (0.0, 1000.0, 300.0, 100.0), (1000.0, 100.0)
 """Bandwidths of the photoreceptors at white [Hz]; 0 for unlimited."""
+LIMITS, QUICK_LIMITS = (study.IDEAL, *study.LIMITS), (study.IDEAL, study.BANDWIDTH)
+"""Single limits of the sensors at the usual apex angle."""
 WHOLE = (640, 480)
 """Width and height of the whole sensor [px]."""
 USUAL_DEG, USUAL_HZ = 0.5, 1000.0
@@ -121,10 +123,12 @@ def conditions(settings: Settings) -> list[Condition]:
 
     At the usual speed and bandwidth there is also the whole sensor, at whose border the circle is worst.
     """
-    speeds, bandwidths = (QUICK_SPEEDS, QUICK_BANDWIDTHS) if settings.quick else (SPEEDS, BANDWIDTHS)
+    speeds, bandwidths, limits = (
+        (QUICK_SPEEDS, QUICK_BANDWIDTHS, QUICK_LIMITS) if settings.quick else (SPEEDS, BANDWIDTHS, LIMITS)
+    )
     size = replace(settings, width=min(settings.width, 320), height=min(settings.height, 240))
     grid: list[dict[str, Any]] = [{"apex": a, "cutoff_hz": hz} for a in APEX_DEG for hz in bandwidths]
-    grid += [{"apex": USUAL_DEG, "only": limit} for limit in (study.IDEAL, *study.LIMITS)]
+    grid += [{"apex": USUAL_DEG, "only": limit} for limit in limits]
     grid.append({"apex": USUAL_DEG, "only": study.BANDWIDTH, "cutoff_hz": min(bandwidths[1:])})
     turns = [
         replace(condition, rpm=rpm, duration_s=60.0 / rpm)

@@ -517,7 +517,8 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
               differences(room, "error_px", ami, by=("scene",)),
               f"the range of the error of '{Stream.CALIBRATED}' over the camera's motions, with rest,", below=SAME_PX,
               unit="px"),
-        untestable(6, "More corners are tracked than by a standard camera in hard light.", "no world has dim light"),
+        untestable(6, "More corners are tracked than by a standard camera in hard light.", "no world has dim light, "
+                   "and the paper states neither the light nor the noise of the cameras in it, which would decide"),
         *(judge(7, f"A track of the {name} gets more than {1.0 + FAR:g} times as many updates per second as one of a "
                 "standard camera with 60 frames/s (eFAST; the paper's 'far above' has no number).",
                 differences([r for r in moving if r["limit"] == LIMIT_PX], "update_hz",
