@@ -277,8 +277,7 @@ def test_intervals_in_parts(burst: int, device: str, every_core: None, monkeypat
     there = put(events, device)
     one, (t0, t1) = tensors._batch(there, None, None, None, None, None, device), (int(t[0]), int(t[-1]))
     parts, fullest = tensors._parts(one, tensors._grid(WIDTH, HEIGHT, steps=BINS - 1, rate=BINS - 1))
-    assert parts > 1
-    assert (fullest < tensors.CAPACITY) == (burst < tensors.CAPACITY)
+    assert (parts > 1) == (fullest < tensors.CAPACITY) == (burst < tensors.CAPACITY)
     found = host(amiwarp.voxel_grid(there, WIDTH, HEIGHT, BINS))
     assert np.abs(found - linear_grid(events, BINS, BINS - 1, t0, t1)).max() < EXACT
     ranges = [(0, 9000), (9000, len(t))]

@@ -445,7 +445,7 @@ def _images(
         yield first, number, images
     if in_words:
         images.numpy()[trash:size] = 0
-        if images.size * 8 <= 4 * MOST_BYTES["cpu"]:
+        if images.size * 8 <= 6 * MOST_BYTES["cpu"]:
             _zeros[:] = [images]
 
 
@@ -518,7 +518,7 @@ def _shares(batch: _Batch, grid: _Grid, bins: int) -> wp.array:
     parts, fullest = _parts(batch, grid) if batch.events.whole_pixels else (1, CAPACITY)
     in_words = fullest < CAPACITY
     border, low = int(not in_words), 63 - max(fullest.bit_length(), LEAST_BITS)
-    grid = grid._replace(border=border, low=low, parts=parts if in_words else 1)
+    grid = grid._replace(border=border, low=low, parts=parts)
     kernel, on_cpu, read, sums = kernels.share_events, kernels.share_event_blocks, kernels.read_shares, 2
     if in_words:
         kernel, on_cpu, read, sums = kernels.add_event_words, kernels.add_event_word_blocks, kernels.read_bins, 1
@@ -531,18 +531,18 @@ def _shares(batch: _Batch, grid: _Grid, bins: int) -> wp.array:
     return out
 
 
-CAPACITY, LEAST_BITS = 1 << 20, 16
+CAPACITY, LEAST_BITS = 1 << 19, 16
 """Number of events in a part of a time interval from which words are not used. Fewer events leave more bits for their
-shares: 22 bits just below the capacity, and 30 bits below ``2**LEAST_BITS`` events. With 22 bits, the sum of a thousand
-shares is exact to 1e-5."""
-EVENT_BYTES = 13
-"""Memory of an event [bytes]. The images of a window's parts do not take more than its events."""
+shares: 24 bits just below the capacity, and 30 bits below ``2**LEAST_BITS`` events. With 24 bits, the sum of ten
+thousand shares is exact to 1e-5."""
+MOST_IMAGES = 52
+"""Largest memory of a window's images for each of its events, if its time intervals are cut into parts [bytes]."""
 
 
 def _parts(batch: _Batch, grid: _Grid) -> tuple[int, int]:
     """Return into how many parts each time interval is cut so that words can be used, and the most events in a part.
 
-    The second number is an upper bound, exact if there are many events. Words cannot be used from CAPACITY on.
+    The second number is an upper bound, exact if there are many events. From CAPACITY on, words cannot be used.
     """
     cut = batch.windows
     most = int((cut.stop - cut.start).max(initial=0))
@@ -551,15 +551,16 @@ def _parts(batch: _Batch, grid: _Grid) -> tuple[int, int]:
     span = cut.t_end - cut.t_start
     parts = 1 << (most // (grid.rate * CAPACITY)).bit_length()
     image = 8 * grid.layers * grid.width * grid.height
-    while True:
+    while grid.steps * parts * image <= MOST_IMAGES * most and int(span.max()) * grid.rate * parts < 1 << 53:
         number = grid.rate * parts
-        edges = [-(-k * span // number) for k in range(1, number)]
-        inside = find_indices(batch.events, (cut.t_start + np.reshape(edges, (-1, len(cut)))).ravel())
-        found = np.stack([cut.start, *np.clip(inside.reshape(-1, len(cut)), cut.start, cut.stop), cut.stop])
+        edges = cut.t_start - -np.arange(1, number)[:, None] * span // number
+        inside = find_indices(batch.events, edges.ravel()).reshape(edges.shape)
+        found = np.stack([cut.start, *np.clip(inside, cut.start, cut.stop), cut.stop])
         fullest = int(np.diff(found, axis=0).max())
+        if fullest < CAPACITY:
+            return parts, fullest
         parts *= 2
-        if fullest < CAPACITY or grid.steps * parts * image > EVENT_BYTES * most or int(span.max()) * number >= 1 << 52:
-            return parts // 2, fullest
+    return 1, most
 
 
 def _normalise(values: wp.array) -> None:
