@@ -161,7 +161,7 @@ def test_chance_is_the_score_of_the_turned_image(column: int, chance: int) -> No
     mask = np.zeros((40, 60), np.bool_)
     mask[:, column] = True
     image = edges._Image(mask.astype(np.float64), {edges.CANNY: mask, edges.GEOMETRY: mask}, None)  # type: ignore[arg-type]
-    rows = edges._count("S-EV", [image], [image.masks()], (1.5,))
+    rows = edges._count("S-EV", image, image.masks(), (1.5,))
     assert {(row["matched"][-1], row["chance"][-1], row["true"]) for row in rows} == {(40, chance, 40)}
 
 

@@ -162,7 +162,7 @@ DIFFERENCES = (
     "also marks the fine texture of walls, so densely that chance scores high at wide tolerances, and the more so the "
     "more events there are. The claims are therefore judged by the margin over chance; scores alone are checks of ours."
 )
-VERSION = 5
+VERSION = 6
 NEEDS_TRUTH = True
 
 WINDOW_US = 33_000
@@ -270,20 +270,20 @@ class _Image:
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     """Return counts of matches over the thresholds, entropies, recall by direction, and example pictures."""
     images, rows, sectors, pictures = [], [], [], {}
-    middles = _middles(streams, settings)
-    names: list[str] = [s.value for s in streams.names if _enough(streams, s, settings)]
+    middle_us = streams.end_us // 2
+    names: list[str] = [s.value for s in streams.names if _enough(streams, s)]
     names += [camera.value for camera in Frames]
     for name in names:
-        windows = [_image(streams, name, t) for t in middles]
-        masks = [window.masks() for window in windows]
+        window = _image(streams, name, middle_us)
+        masks = window.masks()
         images.append(_summary(name, masks))
-        counted = _count(name, windows, masks, QUICK_TOLERANCES if settings.quick else TOLERANCES)
+        counted = _count(name, window, masks, QUICK_TOLERANCES if settings.quick else TOLERANCES)
         rows += counted
         strict = next(r for r in counted if (r["truth"], r["tolerance"]) == (CANNY, STRICT))
         best = best_f(_counts(strict, images[-1]))[0]
-        sectors += _sectors(name, windows, [mask[best][1] for mask in masks])
-        pictures[name] = _shown(windows[0].image)
-    frame = streams.frame(middles[0])
+        sectors += _sectors(name, window, masks[best][1])
+        pictures[name] = _shown(window.image)
+    frame = streams.frame(middle_us)
     pictures["grey picture"] = _shown(grey_picture(frame.intensity))
     true = _true(frame)
     pictures |= {name: _shown(true[name]) for name in (CANNY, GEOMETRY)}
@@ -291,19 +291,12 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     return {"images": images, "rows": rows, "sectors": sectors, "pictures": pictures if first else {}}
 
 
-def _enough(streams: Streams, stream: Stream, settings: Settings) -> bool:
+def _enough(streams: Streams, stream: Stream) -> bool:
     """Return whether the stream with the same count has as many events, which it never has at rest."""
     if stream is not Stream.SAME_COUNT:
         return True
-    spans = [(t - WINDOW_US // 2, t + WINDOW_US // 2) for t in _middles(streams, settings)]
-    return all(len(streams.window(stream, *s)) >= study.ENOUGH * streams.count(Stream.RAW, *s) for s in spans)
-
-
-def _middles(streams: Streams, settings: Settings) -> list[int]:
-    """Return the middles of the windows [us]."""
-    number = 1 if settings.quick else 2
-    half = WINDOW_US // 2
-    return [int(t) for t in np.linspace(half, streams.end_us - half, number + 2)[1:-1]]
+    span = streams.end_us // 2 - WINDOW_US // 2, streams.end_us // 2 + WINDOW_US // 2
+    return len(streams.window(stream, *span)) >= study.ENOUGH * streams.count(Stream.RAW, *span)
 
 
 def _true(frame: FrameTruth) -> dict[str, NDArray[np.bool_]]:
@@ -323,30 +316,26 @@ def _image(streams: Streams, name: str, middle_us: int) -> _Image:
     return _Image(normalised(iwe(events, *streams.size, device=streams.device)), _true(frame), frame)
 
 
-def _summary(name: str, masks: Sequence[Sequence[Masks]]) -> dict[str, Any]:
-    """Return the number of thinned pixels and the entropy of a stream's images over the thresholds."""
-    entropy = np.mean([[binary_entropy(above) for above, _ in mask] for mask in masks], axis=0)
-    found = np.sum([[np.count_nonzero(thin) for _, thin in mask] for mask in masks], axis=0)
-    return {"stream": name, "found": found.tolist(), "entropy": entropy.round(4).tolist()}
+def _summary(name: str, masks: Sequence[Masks]) -> dict[str, Any]:
+    """Return the number of thinned pixels and the entropy of a stream's image over the thresholds."""
+    entropy = np.array([binary_entropy(above) for above, _ in masks])
+    found = [int(np.count_nonzero(thin)) for _, thin in masks]
+    return {"stream": name, "found": found, "entropy": entropy.round(4).tolist()}
 
 
-def _count(
-    name: str, images: Sequence[_Image], masks: Sequence[Sequence[Masks]], usual: Sequence[float]
-) -> list[dict[str, Any]]:
+def _count(name: str, image: _Image, masks: Sequence[Masks], usual: Sequence[float]) -> list[dict[str, Any]]:
     """Return the number of matches over the thresholds for each kind of true edges and tolerance, usually ``usual``.
 
-    ``chance`` is that of the images turned by 180 deg.
+    ``chance`` is that of the image turned by 180 deg.
     """
     rows = []
-    for truth in images[0].true:
+    for truth, edges in image.true.items():
         tolerances = usual if truth in (CANNY, GEOMETRY) else (STRICT,)
-        edges = [image.true[truth] for image in images]
         matched, chance = (
-            np.sum([_matched(m, turned, tolerances) for m, turned in zip(masks, true, strict=True)], axis=0).T.tolist()
-            for true in (edges, [one[::-1, ::-1] for one in edges])
+            np.transpose(_matched(masks, true, tolerances)).tolist() for true in (edges, edges[::-1, ::-1])
         )
-        count = sum(int(one.sum()) for one in edges)
-        rows += [{"stream": name, "truth": truth, "tolerance": tolerance, "matched": m, "chance": c, "true": count}
+        rows += [{"stream": name, "truth": truth, "tolerance": tolerance, "matched": m, "chance": c,
+                  "true": int(edges.sum())}
                  for tolerance, m, c in zip(tolerances, matched, chance, strict=True)]  # fmt: skip
     return rows
 
@@ -366,21 +355,19 @@ def _counts(row: dict[str, Any], images: dict[str, Any], which: str = "matched")
     return Counts(matched, found, np.full(len(found), row["true"]))
 
 
-def _sectors(name: str, images: Sequence[_Image], found: Sequence[NDArray[np.bool_]]) -> list[dict[str, Any]]:
+def _sectors(name: str, image: _Image, found: NDArray[np.bool_]) -> list[dict[str, Any]]:
     """Return the recall of Canny edges by the angle between the image motion and the normal of the edge."""
     edges = np.linspace(0.0, 90.0, SECTORS + 1)
+    at = np.nonzero(image.true[CANNY])
+    seen = match(found, image.true[CANNY], [STRICT])[0][at]
+    angle = _angle(image.frame)[at]
+    sector = np.clip(np.digitize(angle, edges) - 1, 0, SECTORS - 1)
     rows = []
-    for image, mask in zip(images, found, strict=True):
-        at = np.nonzero(image.true[CANNY])
-        seen = match(mask, image.true[CANNY], [STRICT])[0][at]
-        angle = _angle(image.frame)[at]
-        sector = np.clip(np.digitize(angle, edges) - 1, 0, SECTORS - 1)
-        moving = np.isfinite(angle)
-        for k in range(SECTORS):
-            chosen = moving & (sector == k)
-            if chosen.any():
-                middle = float(edges[k : k + 2].mean())
-                rows.append({"stream": name, "angle": middle, "recall": float(seen[chosen].mean())})
+    for k in range(SECTORS):
+        chosen = np.isfinite(angle) & (sector == k)
+        if chosen.any():
+            middle = float(edges[k : k + 2].mean())
+            rows.append({"stream": name, "angle": middle, "recall": float(seen[chosen].mean())})
     return rows
 
 
