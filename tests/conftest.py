@@ -1,8 +1,10 @@
 """Shared fixtures: devices, a headless browser, the folder of real recordings, a picture and a simulated recording."""
 
 import gc
+import importlib
 import math
 import os
+import pkgutil
 import shutil
 import sys
 from collections.abc import Iterator
@@ -13,7 +15,18 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp import Calibration, Camera, PhotometricSettings, Prism, PrismMotion, Recording, calibrate, simulate
+from amiwarp import (
+    Calibration,
+    Camera,
+    PhotometricSettings,
+    Prism,
+    PrismMotion,
+    Recording,
+    calibrate,
+    kernels,
+    simulate,
+)
+from amiwarp.kernels.launch import load_all
 from amiwarp.tasks import limited_cpu_threads
 from tests import SHARE
 
@@ -38,9 +51,17 @@ LONGEST_FIRST = (
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Let xdist keep the order of the files. By itself it begins with the files that have most tests."""
+    """Let xdist keep the order of the files. By itself it begins with the files that have most tests.
+
+    Kernels are compiled before its processes start, or each of them would compile them.
+    """
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
+    if (getattr(config.option, "numprocesses", None) or 0) > 1 and not hasattr(config, "workerinput"):
+        for module in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}."):
+            importlib.import_module(module.name)
+        for device in wp.get_devices():
+            load_all(device)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
