@@ -272,7 +272,7 @@ def test_the_prism_is_calibrated_once_and_the_calibration_reused(monkeypatch: py
         return amiwarp.calibrate(recording, settings, **options)
 
     monkeypatch.setattr(study, "calibrate", counted)
-    conditions = [Condition(width=128, height=96, duration_s=0.05, seed=seed) for seed in (1, 2)]
+    conditions = [Condition(width=96, height=72, duration_s=0.05, seed=seed) for seed in (1, 2)]
     assert conditions[0].setup == conditions[1].setup
     found = [Streams(condition) for condition in conditions]
     for streams in found:
