@@ -36,8 +36,8 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 LONGEST_FIRST = (
-    "test_moving", "test_consistency", "test_view_browser", "test_lens", "test_stream_cli", "test_stability",
-    "test_cli", "test_photometric", "test_dataset", "test_examples", "test_rig", "test_demo", "test_design",
+    "test_photometric", "test_moving", "test_consistency", "test_view_browser", "test_lens", "test_stream_cli",
+    "test_stability", "test_cli", "test_dataset", "test_examples", "test_rig", "test_demo", "test_design",
     "test_named_worlds", "test_io_mutation", "test_refusals", "test_calibrate", "test_evaluate", "test_session",
     "test_public_values", "test_chart", "test_optics_comparison", "test_evaluate_motion", "test_mirror",
     "test_vibration", "test_firmware", "test_window", "test_live_writer", "test_world_truth", "test_sensor_timing",
