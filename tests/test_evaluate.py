@@ -273,7 +273,7 @@ def test_the_prism_is_calibrated_once_and_the_calibration_reused(monkeypatch: py
 
     monkeypatch.setattr(study, "calibrate", counted)
     lenses = (554.0, 200.0)  # px
-    conditions = [Condition(width=128, height=96, duration_s=0.05, seed=k, focal_px=lenses[k - 1]) for k in (1, 2)]
+    conditions = [Condition(width=96, height=72, duration_s=0.05, seed=k, focal_px=lenses[k - 1]) for k in (1, 2)]
     assert conditions[0].setup == conditions[1].setup
     found = [Streams(condition) for condition in conditions]
     for streams in found:
