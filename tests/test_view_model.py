@@ -37,8 +37,10 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.choices import Axis, Colour, View
+from amiwarp.imaging import regions
 from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.metrics import random_variance, relative_variance
+from amiwarp.imaging.regions import suggest_region
 from amiwarp.optics.models import MODELS, Model
 from amiwarp.viewer import drawing, jobs
 from amiwarp.viewer import inspector as timeline
@@ -52,7 +54,6 @@ from amiwarp.viewer.inspector import (
     Source,
     foreign_names,
     size_name,
-    suggest_region,
 )
 from amiwarp.viewer.jobs import (
     calibrated_events,
@@ -493,8 +494,8 @@ def test_of_a_large_image_the_square_with_most_events_is_searched(monkeypatch: p
     before[320:640, 512:832] += 3.0
     after = before.copy()
     after[450:540, 600:700] = np.where(np.arange(100) % 10 < 2, 20.0, 0.0)
-    monkeypatch.setattr(viewer, "MOST_SEARCHED", 330**2)
-    assert viewer.busiest(before) == (512, 320, 832, 640)
+    monkeypatch.setattr(regions, "MOST_SEARCHED", 330**2)
+    assert regions.busiest(before) == (512, 320, 832, 640)
     left, top, right, bottom = suggest_region(before, after)
     assert 590 < left < right < 720
     assert 440 < top < bottom < 560

@@ -27,8 +27,9 @@ from amiwarp import (
 )
 from amiwarp.calib.bad_pixels import MaskedEventSource
 from amiwarp.choices import Axis, Colour, View
+from amiwarp.imaging.residuals import WIDEST_PX, residual
 from amiwarp.optics.models import build_model, rungs
-from amiwarp.viewer.drawing import WIDEST_PX, Look, Scene, axis_range, colours_of, orbit_lines, residual, third_axis
+from amiwarp.viewer.drawing import Look, Scene, axis_range, colours_of, orbit_lines, third_axis
 from amiwarp.viewer.inspector import Inspector, Knobs, Selection, read_span, recorded_counts
 from reference.calibration_sample import exact_calibration
 

@@ -23,6 +23,7 @@ from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.metrics import PictureQuality
 from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
+from amiwarp.imaging.regions import best_box
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import write_text
 from amiwarp.io.formats import check_ending
@@ -37,6 +38,8 @@ POINTS = 60_000
 """Largest number of points in an event cloud."""
 REGION = (64, 80)
 """Width and height of the part of the image that is enlarged and drawn as clouds [px]."""
+BORDER = 8
+"""Distance of the enlarged part from the border of the image, if the image is large enough [px]."""
 WIDTH, TITLE = 15.0, 14.0
 """Width of the demo's figure [inch], and size of its titles [point]."""
 GREYS, FAINT = 128, 8
@@ -167,7 +170,7 @@ class EventViews:
     def of(cls, recording: Recording, calibration: Calibration, device: Any, renderer: Renderer) -> EventViews:
         """Compute the images and draw the clouds."""
         pair = images(thin(recording, EVENTS), recording, calibration, device=device)
-        corner = busiest(pair.after)
+        corner = best_box(pair.after, pair.after, *REGION, BORDER)
         both = region_clouds(recording, calibration, corner, device)
         return cls(pair, corner, both, renderer.render(both))
 
@@ -271,23 +274,6 @@ def show_grey(ax: Any, image: NDArray[np.float32], title: str) -> None:
     ax.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
     ax.set(xticks=(), yticks=())
     ax.set_title(title)
-
-
-def busiest(image: NDArray[np.float32]) -> tuple[int, int]:
-    """Return the top left pixel of the region with the highest contrast, away from the image's border.
-
-    Pixels brighter than the display's white are clipped, so that single hot pixels do not decide.
-    """
-    from scipy.ndimage import uniform_filter
-
-    width, height = REGION
-    clipped = np.minimum(image, Images(image, image).top).astype(np.float64)
-    mean, square = (uniform_filter(power, (height, width)) for power in (clipped, clipped**2))
-    contrast = square - mean**2
-    margin_y, margin_x = min(height // 2 + 8, image.shape[0] // 2 - 1), min(width // 2 + 8, image.shape[1] // 2 - 1)
-    inner = contrast[margin_y:-margin_y, margin_x:-margin_x]
-    row, column = np.unravel_index(int(np.argmax(inner)), inner.shape)
-    return max(0, int(column) + margin_x - width // 2), max(0, int(row) + margin_y - height // 2)
 
 
 def _draw_clouds(figure: Any, axes: Any, views: EventViews) -> tuple[str, ...]:

@@ -11,37 +11,36 @@ from contextlib import closing, suppress
 from ctypes import CDLL, c_void_p
 from ctypes.util import find_library
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.export import GAMMA, PERCENTILE, save_png
 from amiwarp.imaging.metrics import random_variance
 from amiwarp.imaging.palette import BLUE, OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK, ORANGE, PINK, VERMILION
+from amiwarp.imaging.regions import SMOOTHING_PX, Region, inside
+from amiwarp.imaging.residuals import WIDEST_PX, at_pixels, residual
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import check_output, interrupts_later
+from amiwarp.plotting.clouds import check_opengl
 from amiwarp.plotting.figures import SKY, instance_colours
+from amiwarp.plotting.meshes import Box
 from amiwarp.reconstruction.picture import Picture, Reconstruction
-from amiwarp.validation import choice, guarded, vector, whole
+from amiwarp.validation import choice
 from amiwarp.viewer.inspector import (
-    SMOOTHING_PX,
     STORES,
     DisplayedWindow,
     DrawnTruth,
     Inspector,
     Knobs,
     LoadedWindow,
-    Region,
-    Selection,
     colours_on_offer,
-    inside,
     read_span,
 )
 
@@ -428,15 +427,6 @@ def _scale(depth: NDArray[Any]) -> tuple[float, float]:
 
 # Colours of the points in the event clouds, and the quantities that the colours show.
 
-NEAR_PX = 2.0
-"""Standard deviation of the Gaussian weights of the events near an event [px]."""
-WIDEST_PX = 3.0 * NEAR_PX
-"""Largest residual [px]. Wider edges look the same as spread events."""
-ROUNDING_VARIANCE = 1.0 / 12.0
-"""Variance that rounding to a pixel adds to the place of an event in an image [px²]."""
-WIDE_EVENTS = 2.0
-"""Number of spread events that are assumed near each event, so that a lone event has a large residual."""
-
 
 def third_axis(shown: DisplayedWindow, axis: Axis) -> NDArray[np.float64]:
     """Return each point's third coordinate, shape ``(n,)``: prism angle [deg], or time [ms]."""
@@ -497,59 +487,6 @@ def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> NDArray[
         return at_pixels(image, xy)
     left, top, right, bottom = shown.region
     return residual(image, xy, (slice(top, bottom), slice(left, right)))
-
-
-def at_pixels(image: NDArray[Any], xy: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the image's value at each point, 0 outside the image, shape ``(n,)``."""
-    x, y = (np.nan_to_num(xy[:, k], nan=-9.0) for k in (0, 1))
-    column, row = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
-    inside = (column >= 0) & (column < image.shape[1]) & (row >= 0) & (row < image.shape[0])
-    out = np.zeros(len(xy))
-    out[inside] = image[row[inside], column[inside]]
-    return out
-
-
-def residual(
-    image: NDArray[np.float32], xy: NDArray[np.float32], where: tuple[slice, slice] = (slice(None), slice(None))
-) -> NDArray[np.float64]:
-    """Return the width of the edge at each point, or what is left of the prism's motion [px], shape ``(n,)``.
-
-    It is the standard deviation across the edge of the events near the point: near 0 on a sharp edge, and
-    :data:`WIDEST_PX` among spread events and outside the rows and columns ``where``, in which it is computed. The event
-    itself does not count.
-    """
-    wide = np.full(image.shape, WIDEST_PX)
-    spread = _spread_across_edges(image, where)
-    # Gaussian weights of variance n² and an edge of variance w² give a spread of 1 / (1 / n² + 1 / w²).
-    width = spread * NEAR_PX**2 / np.maximum(NEAR_PX**2 - spread, 1e-6) - ROUNDING_VARIANCE
-    wide[where] = np.sqrt(np.clip(width, 1e-6, WIDEST_PX**2))
-    found = at_pixels(wide, xy)
-    return np.where(found > 0.0, found, WIDEST_PX)
-
-
-def _spread_across_edges(image: NDArray[np.float32], where: tuple[slice, slice]) -> NDArray[np.float64]:
-    """Return the smallest variance, over all directions, of the weighted events about each pixel [px²].
-
-    The variance is about the mean of these events, so that it is the same on both sides of an edge and on its middle.
-    Sums with weights G of variance s are s G' for the places, and s G + s² G'' for their squares, so they follow from
-    derivatives of the smoothed image.
-    """
-    from scipy.ndimage import gaussian_filter
-
-    reach, near = 4 * math.ceil(NEAR_PX), NEAR_PX**2
-    rows, columns = (range(size)[axis] for size, axis in zip(image.shape, where, strict=True))
-    top, left = max(rows.start - reach, 0), max(columns.start - reach, 0)
-    part = image[top : rows.stop + reach, left : columns.stop + reach].astype(np.float64)
-    orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-    smooth, y, x, yy, xy, xx = (gaussian_filter(part, NEAR_PX, order=order, mode="constant") for order in orders)
-    own = 1.0 / (math.tau * near)
-    density = np.maximum(smooth - own, 0.0) + WIDE_EVENTS * own
-    mean_y, mean_x = near * y / density, near * x / density
-    yy, xx = (near + near**2 * (second + own / near) / density for second in (yy, xx))
-    yy, xx = yy - mean_y**2, xx - mean_x**2
-    xy = near**2 * xy / density - mean_x * mean_y
-    spread = np.clip(0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy), 0.0, near)
-    return np.asarray(spread[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left])
 
 
 # Legend of the inspector's picture as VTK actors: rows of a coloured mark and the meaning of the colour, or a scale.
@@ -690,8 +627,6 @@ def events_text(shown: DisplayedWindow) -> str:
 
 # VTK scene with the event clouds before and after compensation, drawn off screen without a user interface.
 
-AXIS_HEIGHT = 0.75
-"""Length of the drawn third axis, as a multiple of the region's width."""
 BACKGROUND_AND_INK = {False: ("white", "#333333"), True: ("#15181c", "#d8d8d8")}
 """Colours of background and lines, for light (False) and dark (True) mode."""
 CAMERA_DIRECTIONS = {
@@ -739,49 +674,6 @@ class Look:
     def for_clouds(self, titles: Sequence[str]) -> Look:
         """Return the look for clouds with these titles. A single cloud gets the whole picture."""
         return replace(self, titles=tuple(titles), overlaid=self.overlaid or len(titles) == 1)
-
-
-@dataclass(frozen=True)
-class Box:
-    """Frame of both clouds: a region of the image [px], and the range of the third axis."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
-    low: float
-    """Start of the third axis [deg or ms]."""
-    high: float
-    """End of the third axis [deg or ms]."""
-
-    @property
-    def width(self) -> int:
-        """Width of the shown region of the image [px]."""
-        return self.right - self.left
-
-    @property
-    def axis_height(self) -> float:
-        """Length of the third axis in the scene [px]."""
-        return AXIS_HEIGHT * self.width
-
-    @property
-    def stretch(self) -> float:
-        """Scale of the third axis [px per deg or ms]. The scale of x and y is 1."""
-        return self.axis_height / (self.high - self.low)
-
-    def positions(self, xy: NDArray[Any], third: NDArray[Any]) -> NDArray[np.float32]:
-        """Return points in the scene, shape ``(n, 3)``; y is negated, because the scene's y axis points up."""
-        return np.stack([xy[:, 0], -xy[:, 1], (third - self.low) * self.stretch], axis=1).astype(np.float32)
-
-
-def check_opengl() -> None:
-    """Select EGL for VTK on Linux. Raises :class:`AmiwarpError` without EGL, where VTK would end the process."""
-    if not sys.platform.startswith("linux"):
-        return
-    if find_library("EGL") is None:
-        raise AmiwarpError("VTK needs OpenGL (EGL) to draw; on Debian run: apt-get install libegl1 libgl1-mesa-dri")
-    # by default VTK tries X first, and crashes if libX11 is missing; EGL needs no display
-    os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"
 
 
 def check_display() -> None:
@@ -1290,123 +1182,3 @@ def float_bytes(values: NDArray[Any]) -> bytes:
 def _pixels(colours: NDArray[np.uint8]) -> bytes:
     """Return colours, shape ``(n, 3)``, as opaque pixels of an image in the browser."""
     return np.column_stack([colours, np.full(len(colours), 255, np.uint8)]).tobytes()
-
-
-# Event clouds before and after compensation as PyVista meshes, for scenes and files of other programs.
-
-TRUTHS = {
-    "cause": "stored_causes", "instance": "stored_instances", "depth_m": "stored_depths", "place_m": "stored_places",
-}  # fmt: skip
-"""Arrays of the clouds by name, and the ground truth that they hold."""
-
-
-@guarded
-def event_clouds(
-    recording: Recording,
-    calibration: Calibration,
-    *,
-    window: tuple[int, int] | None = None,
-    region: tuple[int, int, int, int] | None = None,
-    axis: str = "angle",
-    device: Any = "cpu",
-) -> tuple[pyvista.PolyData, pyvista.PolyData]:
-    """Return the events as recorded and compensated as point clouds, to plot, slice and save with PyVista.
-
-    Parameters
-    ----------
-    recording : Recording
-        Events to show.
-    calibration : Calibration
-        Calibration of the recording.
-    window : tuple of int, optional
-        Start and end of the time window on the events' clock [us]; the end is exclusive. Default: the whole recording.
-    region : tuple of int, optional
-        Left, top, right and bottom of a part of the image [px]; right and bottom are exclusive. The clouds hold the
-        events that were recorded in it. Default: the whole image.
-    axis : str
-        Third axis: "angle" or "time".
-    device : str or warp.Device
-        Device that compensates the events.
-
-    Returns
-    -------
-    tuple of pyvista.PolyData
-        Clouds before and after compensation, with one vertex per event.
-
-    Raises
-    ------
-    AmiwarpError
-        If there are no events in window and region, or the calibration belongs to a camera of another size.
-
-    Notes
-    -----
-    A point lies at x [px], -y [px], as VTK's y axis points up, and the prism angle or the time times a scale: the whole
-    third axis is 0.75 times as long as the region is wide. Both clouds have these arrays:
-
-    - ``t_us`` (int64): time after the first event of the recording [us],
-    - ``theta_rad`` (float64): prism angle, from 0 to 2π [rad],
-    - ``polarity`` (uint8): 1 for ON, 0 for OFF,
-    - ``index`` (int64): index of the event in the recording,
-    - ``residual_px`` (float32): standard deviation across the edge on which the event lies [px], up to 6,
-    - of a simulation: ``cause``, ``instance``, ``depth_m`` [m] and ``place_m`` (point in the world that the event saw
-      [m], shape ``(n, 3)``), as far as the recording holds them.
-
-    The field data hold ``axes`` (names and units of the coordinates), ``z_scale`` (length of one unit of the third axis
-    [px]), ``z_start`` (its value at z = 0) and ``t_first_us`` (time of the first event on its clock [us], int64). All
-    events of the window are in the first cloud, but those outside of the encoder's record. Events for which the model
-    has no solution are not in the second cloud.
-
-    Examples
-    --------
-    >>> camera, prism = amiwarp.Camera.from_fov(32, 24, 1.0), amiwarp.Prism(0.02)
-    >>> events = amiwarp.Events.from_arrays([10, 20], [12, 14], [0, 1000], [0, 1])
-    >>> encoder = amiwarp.Encoder.constant_speed(720.0, 0, 2000)
-    >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, 32, 24), camera, encoder, prism)
-    >>> calibration = amiwarp.Calibration(
-    ...     model_name="circle", camera=camera, prism=prism, parameters={"deflection": 0.01, "phase": 0.3},
-    ...     uncertainty={}, free=(), sharpness_name="variance", sharpness_before=1.0, sharpness_after=2.0,
-    ...     stages=(), events=2, seconds=0.0)
-    >>> before, after = amiwarp.event_clouds(recording, calibration)
-    >>> after.n_points, after["t_us"].tolist()
-    (2, [0, 1000])
-    """
-    third, source = choice(Axis, axis, "axis"), recording.events
-    inspector = Inspector(
-        recording, calibration, device=device, most_events=max(len(source), 1), most_points=max(len(source), 1)
-    )
-    integer = partial(whole, low=-(2**62), high=2**62)
-    start, stop = vector((source.t_first, source.t_last + 1) if window is None else window, 2, "window", integer)
-    if stop <= start:
-        raise AmiwarpError(f"window is {window}; give start and end [us], the end after the start")
-    width, height = source.size
-    left, top, right, bottom = vector((0, 0, *source.size) if region is None else region, 4, "region", integer)
-    if not (0 <= left < right <= width and 0 <= top < bottom <= height):
-        raise AmiwarpError(f"region is {region}; give left, top, right and bottom in an image of {width}x{height} px")
-    inspector.open(start, stop - start, Selection(region=None if region is None else (left, top, right, bottom)))
-    shown = inspector.show()
-    before, after = (_cloud(shown, third, after=after) for after in (False, True))
-    return before, after
-
-
-def _cloud(shown: DisplayedWindow, axis: Axis, *, after: bool) -> pyvista.PolyData:
-    """Return one of the clouds."""
-    import pyvista
-
-    box, xy = Box(*shown.region, *axis_range(shown, axis)), shown.after if after else shown.before
-    valid = np.isfinite(xy).all(axis=1)
-    arrays: dict[str, NDArray[Any]] = {
-        "t_us": shown.events.t - shown.span.first_us, "theta_rad": shown.theta, "polarity": shown.events.p,
-        "index": np.concatenate([np.arange(run.start, run.stop) for run in shown.span.runs])[shown.truth.positions],
-        "residual_px": _measure(shown, Colour.RESIDUAL, after=after).astype(np.float32),
-    }  # fmt: skip
-    for name, attribute in TRUTHS.items():
-        if (store := getattr(shown.truth.truth, attribute, None)) is not None:
-            arrays[name] = shown.span.rows(store)[shown.truth.positions]
-    cloud = pyvista.PolyData(box.positions(xy, third_axis(shown, axis))[valid])
-    for name, values in arrays.items():
-        cloud.point_data[name] = values[valid]
-    unit = "theta [deg]" if axis is Axis.ANGLE else "t [ms]"
-    cloud.field_data["axes"] = ["x [px]", "-y [px]", f"({unit} - z_start) * z_scale"]
-    cloud.field_data["z_scale"], cloud.field_data["z_start"] = [box.stretch], [box.low]
-    cloud.field_data["t_first_us"] = np.array([shown.span.first_us], np.int64)
-    return cloud

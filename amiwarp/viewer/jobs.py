@@ -22,6 +22,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, rpm_between
 from amiwarp.events.recording import Events, Recording
 from amiwarp.imaging.export import encode_image
+from amiwarp.imaging.regions import MOST_SEARCHED, busiest
 from amiwarp.io import RecordingWriter
 from amiwarp.io.file_scan import FileEvents
 from amiwarp.io.files import NewFile
@@ -31,7 +32,7 @@ from amiwarp.optics.models import ExactModel, alternatives
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.tasks import Progress, silent
 from amiwarp.viewer.drawing import Look, Scale, Scene, ShownImages, caption, picture_state, select_part, shown_lines
-from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, MOST_SEARCHED, Inspector, Knobs, Source, busiest, size_name
+from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, Inspector, Knobs, Source, size_name
 from amiwarp.viewer.layout import EXPORTS, SLIDERS, UNITS, orbit_text
 
 # Progress of long work in threads.
