@@ -1,14 +1,11 @@
 """The inspector's values for its page: suggested region, sharpness, residuals, event rates and state."""
 
-import asyncio
-import contextlib
 import json
 import math
 import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -41,7 +38,7 @@ from amiwarp.imaging import regions
 from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.metrics import random_variance, relative_variance
 from amiwarp.imaging.regions import suggest_region
-from amiwarp.optics.models import MODELS, Model
+from amiwarp.optics.models import MODELS, Model, size_names
 from amiwarp.viewer import drawing, jobs
 from amiwarp.viewer import inspector as timeline
 from amiwarp.viewer import inspector as viewer
@@ -75,8 +72,8 @@ from amiwarp.viewer.layout import (
     initial_state,
     knob_values,
     orbit_text,
+    sliders,
 )
-from amiwarp.viewer.panel import Panel
 
 TRUE = Prism(math.radians(1.0))
 
@@ -140,7 +137,7 @@ def test_the_slider_of_the_size_has_name_and_unit_of_the_optic_s_own(
     inspector.use_model(model)
     assert size_name(model) == name
     assert SLIDERS[name][:2] == label
-    sizes = [each for each in ("apex", "amplitude", "inverse_depth") if f"model === '{model}'" in SLIDERS[each][3]]
+    sizes = [each["name"] for each in sliders(inspector) if each["name"] in size_names()]
     assert sizes == [name]  # the others are not shown
     assert size_of(inspector.model) > 0.0  # a typical value, at first
     assert inspector.sources[name] is not Source.HAND
@@ -1031,32 +1028,6 @@ def test_a_calibration_is_downloaded(inspector: Inspector, tmp_path: Path) -> No
     inspector.as_calibration().save(tmp_path / "calibration.json")
     data = json.loads((tmp_path / "calibration.json").read_text())
     assert data["parameters"]["apex"]["value"] == TRUE.apex
-
-
-class PageState(dict[str, Any]):
-    """State variables of a page, as attributes and by name."""
-
-    __getattr__ = dict.__getitem__
-    __setattr__ = dict.__setitem__
-
-
-def test_a_number_that_is_typed_during_an_update_stays() -> None:
-    """The page sets the variable while an update is computed in a thread; the end of the update once reset it."""
-    state = PageState(apex=1.0, knob="apex", playing=True, has_model=False)
-
-    async def compute_while_the_user_types(work: Any) -> tuple[None, dict[str, Any]]:
-        state.apex = 2.5
-        return None, {}
-
-    inspector = SimpleNamespace(turn_us=math.inf, knobs=Knobs(), sources={})
-    panel = SimpleNamespace(
-        errors_shown=lambda what: contextlib.nullcontext(), in_thread=compute_while_the_user_types, state=state,
-        inspector=inspector, compensates=False, shown=None, set_knobs=lambda: None,
-        show_knobs=lambda: state.update(apex=1.0), remember=lambda change: None, _compute=None,
-    )  # fmt: skip
-    asyncio.run(Panel.make(panel, {"knobs"}))  # type: ignore[arg-type]
-    assert state.apex == 2.5
-    assert state.curve_mark == 2.5
 
 
 @pytest.mark.parametrize("polarity", [None, 1])

@@ -15,7 +15,6 @@ from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look
 from amiwarp.viewer.inspector import (
     OTHERS,
     SLIDING,
-    WEDGE_SIZES,
     Inspector,
     Knobs,
     Selection,
@@ -25,7 +24,7 @@ from amiwarp.viewer.inspector import (
     size_name,
     truth_text,
 )
-from amiwarp.viewer.serve import FOLDER, Check, flag, number, one_of
+from amiwarp.viewer.serve import Check, flag, number, one_of
 
 # State of the inspector's page: what it shows, with which parameters; its history, and its text in the address.
 
@@ -75,9 +74,7 @@ def current_state(inspector: Inspector, **look: Any) -> ViewState:
     first = inspector.recording.events.t_first
     axis = Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME
     sources = tuple(inspector.sources.items())
-    given = given_state(inspector)
-    of = {"axis": axis, "fov_deg": given["fov_deg"] if given["gives_camera"] else None,
-          "prism_index": given["index"] if given["gives_prism"] else None, **look}  # fmt: skip
+    of = {"axis": axis, **{field["name"]: field["value"] for field in given_fields(inspector)}, **look}
     return ViewState(start_us - first, length_us, inspector.selection, inspector.knobs, sources, **of)
 
 
@@ -98,10 +95,9 @@ def apply_state(inspector: Inspector, state: ViewState) -> None:
 
 def set_given(inspector: Inspector, fov_deg: float | None, index: float | None) -> None:
     """Set the camera and the prism's index by hand where they differ from the inspector's; None keeps them."""
-    given = given_state(inspector)
-    if fov_deg is not None and fov_deg != given["fov_deg"]:
+    if fov_deg is not None and fov_deg != inspector.fov_deg:
         inspector.set_camera(fov_deg)
-    if index is not None and index != given["index"]:
+    if index is not None and index != round(inspector.prism.index, 4):
         inspector.set_index(index)
 
 
@@ -296,36 +292,32 @@ def _within(value: float, low: float, high: float) -> float:
 
 NAMES = ("apex", "phase", "clock_offset", "rpm", *SLIDING)
 """Names of the prism parameters that have a slider."""
-GIVEN = {"fov_deg": ("field of view", "°", "gives_camera"), "index": ("refractive index", "", "gives_prism")}
-"""Properties of camera and prism that a recording may lack: label, unit, and the condition for showing the field."""
-FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, "fov_deg": HAND_LIMITS["fov_deg"],
-                "index": HAND_LIMITS["prism_index"]}  # fmt: skip
+FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, **HAND_LIMITS}
 """Smallest and largest value of the fields of the prism and the camera, in the page's units."""
-
-
-def _if_free(*names: str) -> str:
-    """Return the condition for showing a slider: that the model has one of the parameters."""
-    return " || ".join(f"model === '{kind.NAME}'" for kind in MODELS.values() if {*names} & {*kind.FREE})
-
-
-_OF_MODELS = {
-    name: (
-        p.label,
-        {"rad": "°", "1": ""}.get(p.unit, p.unit),
-        tuple(f"{x:g}" for x in p.slider),
-        f"({_if_free(name)}) && !has_depth" if name in size_names() else _if_free(name),
-    )
-    for name, p in SLIDING.items()
-}
-SLIDERS = {
-    "apex": ("apex angle", "°", ("0", "apex_most", "0.005"), _if_free(*WEDGE_SIZES)),
+_OF_MODELS = {name: (p.label, {"rad": "°", "1": ""}.get(p.unit, p.unit), p.slider) for name, p in SLIDING.items()}
+SLIDERS: dict[str, tuple[str, str, tuple[float, float, float]]] = {
+    "apex": ("apex angle", "°", (0.0, 3.0, 0.005)),
     **{name: slider for name, slider in _OF_MODELS.items() if name in size_names()},
-    "phase": ("phase", "°", ("-180", "180", "0.25"), "true"),
-    "clock_offset": ("clock offset", "µs", ("-20000", "20000", "10"), "has_encoder"),
-    "rpm": ("speed of the prism", "rpm", ("-3000", "3000", "0.5"), "!has_encoder"),
+    "phase": ("phase", "°", (-180.0, 180.0, 0.25)),
+    "clock_offset": ("clock offset", "µs", (-20000.0, 20000.0, 10.0)),
+    "rpm": ("speed of the prism", "rpm", (-3000.0, 3000.0, 0.5)),
     **{name: slider for name, slider in _OF_MODELS.items() if name not in size_names()},
 }
-"""Sliders of the page by parameter: label, unit, (minimum, maximum, step), and the condition for showing the slider."""
+"""Sliders by parameter, in their order: label, unit, and (minimum, maximum, step). That of the apex may be longer."""
+FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, **HAND_LIMITS}
+"""Smallest and largest value of the fields of the prism and the camera, in the page's units."""
+_OF_MODELS = {name: (p.label, {"rad": "°", "1": ""}.get(p.unit, p.unit), p.slider) for name, p in SLIDING.items()}
+SLIDERS: dict[str, tuple[str, str, tuple[float, float, float]]] = {
+    "apex": ("apex angle", "°", (0.0, 3.0, 0.005)),
+    **{name: slider for name, slider in _OF_MODELS.items() if name in size_names()},
+    "phase": ("phase", "°", (-180.0, 180.0, 0.25)),
+    "clock_offset": ("clock offset", "µs", (-20000.0, 20000.0, 10.0)),
+    "rpm": ("speed of the prism", "rpm", (-3000.0, 3000.0, 0.5)),
+    **{name: slider for name, slider in _OF_MODELS.items() if name not in size_names()},
+}
+"""Sliders by parameter, in their order: label, unit, and (minimum, maximum, step). That of the apex may be longer."""
+GIVEN = {"fov_deg": ("field of view", "°"), "prism_index": ("refractive index", "")}
+"""Properties of camera and prism that a recording may lack: label and unit."""
 SCOPES = ("selection", "whole recording")
 """Choices of the events that a calibration uses."""
 KEYS = (
@@ -363,13 +355,13 @@ EXPORTS = {
 FILMS = ("turntable", "film")
 """Downloads that take long."""
 CALLS = (
-    "key", "released", "choose", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
+    "key", "released", "choose", "slide", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
     "resize_window", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline", "undo", "redo",
     "reset", "restore", "answer", "keep_b", "swap_b", "export", "open_file", "use_card", "end_film",
 )  # fmt: skip
 """Methods of the panel that the page may call."""
 SETTABLE: dict[str, Check] = {
-    **dict.fromkeys(NAMES, number()), "point_size": number(1.0, 20.0), "opacity": number(0.0, 1.0),
+    "point_size": number(1.0, 20.0), "opacity": number(0.0, 1.0),
     "speed": number(0.001, 10.0), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
     "colour": one_of(*(each.value for each in Colour)), "axis": one_of(*(each.value for each in Axis)),
     "kind": one_of(*(each.value for each in ImageKind)), "against": one_of(*AGAINST), "scope": one_of(*SCOPES),
@@ -564,34 +556,6 @@ class Actions:
         return self.history
 
 
-def template() -> str:
-    """Return the page's template with its sliders."""
-    fields = "\n".join(map(_given, GIVEN))
-    page = (FOLDER / "page.html").read_text(encoding="utf-8")
-    return page.replace("@KNOBS@", "\n".join(map(_knob, SLIDERS))).replace("@GIVEN@", fields)
-
-
-def _given(name: str) -> str:
-    (label, unit, where), (low, high) = GIVEN[name], FIELD_LIMITS[name]
-    return (
-        f'<label v-if="{where}">{label}{unit and f" ({unit})"}<NumberField id="field-{name}" :low="{low}" '
-        f':high="{high}" unit="{unit}" :value="{name}" '
-        f"@typed=\"trigger('typed', ['{name}', $event])\"></NumberField></label>"
-    )
-
-
-def _knob(name: str) -> str:
-    label, unit, (least, most, step), where = SLIDERS[name]
-    low, high = FIELD_LIMITS[name]
-    return (
-        f'<KnobField v-if="{where}" name="{name}" label="{label}" unit="{unit}" :value="{name}" :least="{least}" '
-        f':most="{most}" :step="{step}" :low="{low:g}" :high="{high:g}" :truth="truths.{name}" '
-        f':note="sources.{name}" @drag="{name} = $event" '
-        f"@typed=\"trigger('typed', ['{name}', $event])\" "
-        f"@chosen=\"trigger('choose', ['{name}'])\"></KnobField>"
-    )
-
-
 # State at the start, and the parts of it that follow from the recording and the inspector's parameters.
 
 
@@ -603,9 +567,9 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         **source_state(inspector), **knob_state(inspector), **prism_state(inspector),
         **NO_ORBIT,
         "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "truth": truth_text(recording.truth),
-        "size": list(size), "live": inspector.latest is not None, "has_encoder": inspector.has_encoder,
-        "models": list(alternatives(inspector.knobs.model)), "apex_most": apex_most(inspector),
-        "truths": truths(inspector), "has_truth": inspector.truth is not None, "beside": inspector.beside is not None,
+        "size": list(size), "live": inspector.latest is not None,
+        "models": list(alternatives(inspector.knobs.model)),
+        "has_truth": inspector.truth is not None, "beside": inspector.beside is not None,
         "exports": [[name, text, name in FILMS] for name, (text, _) in EXPORTS.items()],
         "keys": [[key, words] for key, _, words in KEYS], "scope": SCOPES[0], "scopes": list(SCOPES),
         "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
@@ -624,11 +588,6 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def apex_most(inspector: Inspector) -> float:
-    """Return the end of the slider of the apex angle [deg]."""
-    return max(3.0, round(2.0 * math.degrees(inspector.nominal_apex), 1))
-
-
 def source_state(inspector: Inspector) -> dict[str, Any]:
     """Return the state variables that depend on the events; they change in a live stream."""
     source = inspector.recording.events
@@ -643,8 +602,7 @@ def knob_values(inspector: Inspector) -> dict[str, float]:
 
 def knob_state(inspector: Inspector) -> dict[str, Any]:
     """Return the state variables of the prism's parameters."""
-    sources = {name: str(source.value) for name, source in inspector.sources.items()}
-    return {**knob_values(inspector), **given_state(inspector), "model": inspector.knobs.model, "sources": sources,
+    return {"knobs": sliders(inspector), "given": given_fields(inspector), "model": inspector.knobs.model,
             "notes": notes(inspector)}  # fmt: skip
 
 
@@ -655,15 +613,33 @@ def prism_state(inspector: Inspector) -> dict[str, Any]:
             "step_name": "turn" if turns else "window"}  # fmt: skip
 
 
-def given_state(inspector: Inspector) -> dict[str, Any]:
-    """Return the state variables of the camera and the prism that can be set if the recording lacks them."""
-    return {
-        "fov_deg": inspector.fov_deg, "index": round(inspector.prism.index, 4),
-        "gives_camera": inspector.sources["camera"] in (Source.ASSUMED, Source.HAND),
-        "gives_prism": (
-            inspector.sources["prism"] in (Source.ASSUMED, Source.HAND) and MODELS[inspector.knobs.model].PRISM
-        ),
-    }  # fmt: skip
+def sliders(inspector: Inspector) -> list[dict[str, Any]]:
+    """Return the sliders of the model's parameters: label, unit, ends, step, limits, value, true value and source."""
+    values, known = knob_values(inspector), truths(inspector)
+    shown = {*MODELS[inspector.knobs.model].FREE} - size_names()
+    shown |= {*inspector.orbit_names, "clock_offset" if inspector.has_encoder else "rpm"}
+    out = []
+    for name, (label, unit, (least, most, step)) in SLIDERS.items():
+        if name in shown:
+            end = max(most, round(2.0 * math.degrees(inspector.nominal_apex), 1)) if name == "apex" else most
+            low, high = FIELD_LIMITS[name]
+            out.append({
+                "name": name, "label": label, "unit": unit, "least": least, "most": end, "step": step, "low": low,
+                "high": high, "value": values[name], "truth": known[name], "note": str(inspector.sources[name].value),
+            })  # fmt: skip
+    return out
+
+
+def given_fields(inspector: Inspector) -> list[dict[str, Any]]:
+    """Return the properties of camera and prism that the recording lacks: name, label, unit, value and its limits."""
+    by_hand = {name for name, source in inspector.sources.items() if source in (Source.ASSUMED, Source.HAND)}
+    prism = "prism" in by_hand and MODELS[inspector.knobs.model].PRISM
+    found = {"fov_deg": ("camera" in by_hand, inspector.fov_deg), "prism_index": (prism, inspector.prism.index)}
+    return [
+        {"name": name, "label": label, "unit": unit, "value": round(found[name][1], 4), "low": low, "high": high}
+        for (name, (label, unit)), (low, high) in zip(GIVEN.items(), HAND_LIMITS.values(), strict=True)
+        if found[name][0]
+    ]
 
 
 def truths(inspector: Inspector) -> dict[str, float | None]:
