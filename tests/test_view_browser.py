@@ -828,7 +828,7 @@ def test_counts_and_polarities_are_exact_in_image_colour_pointer_and_file(
     ready(page)
     left, top, right, bottom = region(page)
     loaded = kept[1].inspector.loaded
-    events = loaded.events
+    events = loaded.counted
     counts = np.zeros((2, 96, 128), np.int64)
     np.add.at(counts, (events.p, events.y, events.x), 1)
     inner = np.s_[top + 1 : bottom - 1, left + 1 : right - 1]

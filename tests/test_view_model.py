@@ -553,7 +553,7 @@ def test_counts_and_polarities_are_those_of_the_window(inspector: Inspector) -> 
         np.testing.assert_array_equal(one, of_window[top:bottom, left:right])
         np.testing.assert_array_equal(both.sum(axis=0), one)
         np.testing.assert_array_equal(one, np.rint(one))
-    events = inspector.loaded.events
+    events = inspector.loaded.counted
     expected = np.zeros((inspector.camera.height, inspector.camera.width))
     np.add.at(expected, (events.y, events.x), 1)
     np.testing.assert_array_equal(counts.before, expected[top:bottom, left:right])
@@ -570,7 +570,7 @@ def test_a_time_surface_holds_the_latest_times(inspector: Inspector) -> None:
     found = make_images(inspector, ImageKind.TIME_SURFACE)
     window = inspector.loaded
     expected = np.full(found.after.shape, np.nan)
-    for x, y, t in zip(window.events.x, window.events.y, window.events.t, strict=True):
+    for x, y, t in zip(window.counted.x, window.counted.y, window.counted.t, strict=True):
         expected[y, x] = (t - window.span.start_us) * 1e-3
     assert found.before is not None
     np.testing.assert_allclose(found.before, expected, atol=1e-4)
@@ -974,7 +974,7 @@ def test_the_noise_filter_of_a_download_does_not_restart_at_its_blocks(
 ) -> None:
     window = inspector.first_window()
     inspector.open(*window, Selection(noise_us=300))
-    expected = inspector.loaded.events
+    expected = inspector.loaded.counted
     assert 0.2 * inspector.loaded.span.count < len(expected) < 0.95 * inspector.loaded.span.count
     monkeypatch.setattr(viewer, "MOST_EVENTS", 6400)
     monkeypatch.setattr(jobs, "BLOCK", 500)

@@ -65,13 +65,13 @@ def select_part(
     is used. ``longest_us``: longest duration [us]; of a longer window, and of one with too many events, the middle is
     used.
     """
-    span, events = window.span, window.events
+    span, events = window.span, window.counted
     share = min(1.0, longest_us / span.length_us, MOST_EVENTS / max(span.count, 1))
     length_us = max(1, math.ceil(share * span.length_us))
     start_us = span.start_us + (span.length_us - length_us) // 2
     if span.count > len(span.events):  # the window was read in runs with gaps
         span = read_span(inspector.recording.events, start_us, length_us, most_events=span.count)
-        events = inspector.select(span, inspector.selection).events
+        events = inspector.select(span, inspector.selection).counted
     first, stop = np.searchsorted(events.t, (start_us, start_us + length_us))
     events = events[first:stop]
     left, top, right, bottom = part
@@ -334,7 +334,7 @@ def count_scale(images: Sequence[NDArray[np.float32]], colours: str = "gray") ->
 
 def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:
     """Return the time of the latest event of each pixel from the start of the window on [ms]; NaN without events."""
-    events, (width, height) = window.events, inspector.recording.events.size
+    events, (width, height) = window.counted, inspector.recording.events.size
     x, y = (events.x, events.y) if knobs is None else np.rint(inspector.positions(events, knobs)).T
     within = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     with np.errstate(invalid="ignore"):

@@ -27,7 +27,7 @@ from amiwarp.events.encoder import Encoder, check_prisms, turn_between
 from amiwarp.events.recording import Events, EventSource, Recording
 from amiwarp.events.truth import Cause, EventValues, Truth
 from amiwarp.imaging.corners import find_background_activity
-from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, upload_events
+from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, iwe, upload_events
 from amiwarp.imaging.metrics import SharpnessMeter, relative_variance
 from amiwarp.imaging.regions import SMOOTHING_PX, Region, inside, suggest_region
 from amiwarp.io.depth_map import DepthMap
@@ -286,29 +286,16 @@ class WindowImager:
         see :func:`amiwarp.imaging.metrics.relative_variance`, does not depend on it. ``offset_us`` is added to the
         encoder's clock offset [us].
         """
-        self._votes.clear()
         self._votes.add_events(model, events, drift=offset_us)
         left, top, right, bottom = region
         canvas, meter = CanvasShape(right - left, bottom - top, dither=True), self._meter
         if meter is None or meter.image.shape != canvas.shape:
             meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
             self._meter = meter
-        if meter.image.shape == self._votes.canvas.shape:
-            self._votes.read(meter.image)
-            part = meter.image.numpy()[0]
-        else:
-            part = self._votes.take()[0][top:bottom, left:right]
-            meter.image.write(part[None])
+        part = self._votes.take()[0][top:bottom, left:right]
+        meter.image.write(part[None])
         variance, mean = meter.measure(), float(part.mean())
         return variance, relative_variance(variance, mean, SMOOTHING_PX) if mean > 0.0 else 0.0
-
-
-def recorded_counts(events: Events, size: tuple[int, int], *, per_polarity: bool = False) -> NDArray[np.float32]:
-    """Return the number of events at each pixel, shape ``(height, width)``; with polarities ``(2, height, width)``."""
-    shape, pixel = (*(2,) * per_polarity, *size[::-1]), events.y.astype(np.int64) * size[0] + events.x
-    if per_polarity:
-        pixel += events.p.astype(np.int64) * math.prod(size)
-    return np.bincount(pixel, minlength=math.prod(shape)).astype(np.float32).reshape(shape)
 
 
 # Parameters of the prism and selection of events under which the inspector shows a recording.
@@ -413,22 +400,28 @@ class Selection:
 
 
 @dataclass(frozen=True, eq=False)
-class LoadedWindow:
-    """Selected events of a window, in memory and on the device, and their image without compensation."""
+class DrawnWindow:
+    """Selected events of a time window that are drawn as points."""
 
     span: Span
     """Time window, with all events that were read from it."""
     region: Region
     """Part of the image that is shown."""
     selected: int
-    """Number of events of the selection."""
-    drawn: Events
-    """Selected events that are drawn as points."""
-    truth: DrawnTruth
-    """Ground truth of the drawn events."""
-    xy: NDArray[np.float32]
-    """Pixels of the drawn events [px], shape ``(n, 2)``."""
+    """Number of selected events, which are all in the images."""
     events: Events
+    """Events that are drawn as points."""
+    truth: DrawnTruth
+    """Ground truth of these events."""
+    before: NDArray[np.float32]
+    """Pixels of the drawn events as recorded [px], shape ``(n, 2)``."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedWindow(DrawnWindow):
+    """Selected events of a window, in memory and on the device, and their image without compensation."""
+
+    counted: Events
     """Events of the images: the selected events, and those near the region that compensation may move into it."""
     angles: dict[float, tuple[UploadedEvents, NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
     """Events on the device, prism angles [rad] and speeds [rad/us] of the drawn events, without the clock offset set on
@@ -443,21 +436,9 @@ class LoadedWindow:
 
 
 @dataclass(frozen=True, eq=False)
-class DisplayedWindow:
+class DisplayedWindow(DrawnWindow):
     """Time window shown with the current parameters: images of all events, and points of evenly spaced events."""
 
-    span: Span
-    """Time window, with all events that were read from it."""
-    region: Region
-    """Part of the image that is shown: left, top, right and bottom [px]; right and bottom are exclusive."""
-    selected: int
-    """Number of selected events, which are all in the images."""
-    events: Events
-    """Events that are drawn as points."""
-    truth: DrawnTruth
-    """Ground truth of these events."""
-    before: NDArray[np.float32]
-    """Pixels of the drawn events as recorded [px], shape ``(n, 2)``."""
     after: NDArray[np.float32]
     """Compensated positions of the drawn events [px], shape ``(n, 2)``; NaN if the model has no solution."""
     theta: NDArray[np.float64]
@@ -831,7 +812,7 @@ class Inspector:
         return Calibration(
             model_name=k.model, camera=self.camera, prism=nominal(self.prism, kind), parameters=kept, uncertainty={},
             free=(), sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before, sharpness_after=after,
-            stages=(), events=len(w.events), seconds=0.0, warnings=("set by hand in the inspector",),
+            stages=(), events=len(w.counted), seconds=0.0, warnings=("set by hand in the inspector",),
             zero_us=None if self.has_encoder else self.zero_us, harmonics=self._harmonics,
         )  # fmt: skip
 
@@ -894,7 +875,7 @@ class Inspector:
         w = self.loaded
         image, sharpness = self._unmoved(w)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.drawn, w.truth, w.xy, w.xy, self._wrapped(w, self.knobs), image,
+            w.span, w.region, w.selected, w.events, w.truth, w.before, w.before, self._wrapped(w, self.knobs), image,
             image_after, sharpness, sharpness, is_beside=True,
         )  # fmt: skip
 
@@ -906,7 +887,7 @@ class Inspector:
         recording beside, if there is one.
         """
         w, knobs = self.loaded, knobs or self.knobs
-        xy = w.xy if against is None else self._moved(w, against)
+        xy = w.before if against is None else self._moved(w, against)
         (image_after, sharpness_after), other = self._measured(w, knobs), None
         if self.beside is not None and against is None:
             other = self.beside._beside(w.span, self.selection, image_after)
@@ -914,7 +895,7 @@ class Inspector:
         else:
             image, sharpness = self._unmoved(w) if against is None else self._measured(w, against)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), self._wrapped(w, knobs), image,
+            w.span, w.region, w.selected, w.events, w.truth, xy, self._moved(w, knobs), self._wrapped(w, knobs), image,
             image_after, sharpness, sharpness_after, other,
         )  # fmt: skip
 
@@ -946,7 +927,7 @@ class Inspector:
             rpm = 0.0 if self.has_encoder else given.rpm
             if rpm not in on_device:
                 on_device.clear()
-                on_device[rpm] = self._upload(w.events[:: max(1, -(-len(w.events) // CURVE_EVENTS))], rpm)
+                on_device[rpm] = self._upload(w.counted[:: max(1, -(-len(w.counted) // CURVE_EVENTS))], rpm)
             model, drift_us = self.model_of(given), self._drift_us(given)
             return imager.measure(model, on_device[rpm], drift_us, w.region)[1]
 
@@ -959,7 +940,7 @@ class Inspector:
         a pixel, over the logarithm of the interval [us]. Intervals between runs are not counted. Those under 1 us are
         in the first bin, those over 1 s in the last one.
         """
-        events, span, (left, top, right, bottom) = self.loaded.events, self.loaded.span, self.loaded.region
+        events, span, (left, top, right, bottom) = self.loaded.counted, self.loaded.span, self.loaded.region
         events = events[inside(events, self.loaded.region)]
         starts = span.events.t[np.cumsum([0, *(run.stop - run.start for run in span.runs)])[:-1]]
         run = np.searchsorted(starts, events.t, side="right")
@@ -1109,10 +1090,10 @@ class Inspector:
         """Return the prism angles of a window; those of the two last speeds are kept."""
         rpm = 0.0 if self.has_encoder else knobs.rpm
         if rpm not in w.angles:
-            encoder, t = self._encoder(rpm), w.drawn.t
+            encoder, t = self._encoder(rpm), w.events.t
             for old in list(w.angles)[:-1]:
                 del w.angles[old]
-            w.angles[rpm] = self._upload(w.events, rpm), encoder.angle_at(t), encoder.speed_at(t) * 1e-6
+            w.angles[rpm] = self._upload(w.counted, rpm), encoder.angle_at(t), encoder.speed_at(t) * 1e-6
         return w.angles[rpm]
 
     def _upload(self, events: Events, rpm: float) -> UploadedEvents:
@@ -1136,20 +1117,20 @@ class Inspector:
 
     def _moved(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float32]:
         """Return the compensated positions of the drawn events [px], shape ``(n, 2)``."""
-        encoder, (first, last) = self.encoder_of(knobs), w.drawn.t[[0, -1]].tolist()
-        if encoder.covers(first, last) and w.drawn.x.dtype == np.uint16:  # several times as fast
-            return np.asarray(compensate_events(w.drawn, self.model_of(knobs), encoder, device=self.device))
+        encoder, (first, last) = self.encoder_of(knobs), w.events.t[[0, -1]].tolist()
+        if encoder.covers(first, last) and w.events.x.dtype == np.uint16:  # several times as fast
+            return np.asarray(compensate_events(w.events, self.model_of(knobs), encoder, device=self.device))
         theta = self._theta(w, knobs).astype(np.float32)
-        return np.asarray(self.model_of(knobs).compensate_points(w.xy, theta), np.float32)
+        return np.asarray(self.model_of(knobs).compensate_points(w.before, theta), np.float32)
 
     def counts(self, w: LoadedWindow, knobs: Knobs | None, *, per_polarity: bool = False) -> NDArray[np.float32]:
-        """Return the number of a window's events at each pixel, see :func:`recorded_counts`.
+        """Return the number of a window's events at each pixel, shape ``(height, width)``, or two such images.
 
         Compensated events count at the pixel in which they lie; ``knobs`` None counts the events as recorded.
         """
         size = self.recording.events.size
         if knobs is None:
-            return recorded_counts(w.events, size, per_polarity=per_polarity)
+            return iwe(w.counted, *size, per_polarity=per_polarity, vote=Vote.NEAREST)
         with self.lock:
             if per_polarity not in self._votes:
                 canvas = CanvasShape(*size, per_polarity=per_polarity, vote=Vote.NEAREST)

@@ -304,18 +304,6 @@ SLIDERS: dict[str, tuple[str, str, tuple[float, float, float]]] = {
     **{name: slider for name, slider in _OF_MODELS.items() if name not in size_names()},
 }
 """Sliders by parameter, in their order: label, unit, and (minimum, maximum, step). That of the apex may be longer."""
-FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, **HAND_LIMITS}
-"""Smallest and largest value of the fields of the prism and the camera, in the page's units."""
-_OF_MODELS = {name: (p.label, {"rad": "°", "1": ""}.get(p.unit, p.unit), p.slider) for name, p in SLIDING.items()}
-SLIDERS: dict[str, tuple[str, str, tuple[float, float, float]]] = {
-    "apex": ("apex angle", "°", (0.0, 3.0, 0.005)),
-    **{name: slider for name, slider in _OF_MODELS.items() if name in size_names()},
-    "phase": ("phase", "°", (-180.0, 180.0, 0.25)),
-    "clock_offset": ("clock offset", "µs", (-20000.0, 20000.0, 10.0)),
-    "rpm": ("speed of the prism", "rpm", (-3000.0, 3000.0, 0.5)),
-    **{name: slider for name, slider in _OF_MODELS.items() if name not in size_names()},
-}
-"""Sliders by parameter, in their order: label, unit, and (minimum, maximum, step). That of the apex may be longer."""
 GIVEN = {"fov_deg": ("field of view", "°"), "prism_index": ("refractive index", "")}
 """Properties of camera and prism that a recording may lack: label and unit."""
 SCOPES = ("selection", "whole recording")

@@ -20,15 +20,16 @@ from typing import Any
 import numpy as np
 
 from amiwarp.calib import Calibration
-from amiwarp.choices import Axis, Colour, View
+from amiwarp.choices import Axis, Colour, View, Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
+from amiwarp.imaging.iwe import iwe
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
-from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection, recorded_counts
+from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
 from amiwarp.viewer.serve import FOLDER, finite, serve, use_page
 
@@ -766,7 +767,7 @@ class Panel(layout.Actions):
             orbit, column = map(drawing.float_bytes, lines)
             values |= {"orbit": orbit, "column": column, "has_orbit": True} if s.orbit_shown else {}
         if before is None or shown.span is not before.span:
-            counts = recorded_counts(shown.span.events, self.inspector.recording.events.size)
+            counts = iwe(shown.span.events, *self.inspector.recording.events.size, vote=Vote.NEAREST)
             values["overview"] = drawing.picture_state(counts, drawing.count_scale([counts]))
         left = "recorded" if against is None else s.against
         titles = drawing.cloud_titles(self.inspector, left)
