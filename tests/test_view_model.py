@@ -35,6 +35,7 @@ from amiwarp import (
 )
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.imaging import regions
+from amiwarp.imaging.export import save_values
 from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.metrics import random_variance, relative_variance
 from amiwarp.imaging.regions import suggest_region
@@ -58,7 +59,6 @@ from amiwarp.viewer.jobs import (
     estimate_phase,
     find_calibration,
     write_events,
-    write_image,
 )
 from amiwarp.viewer.layout import (
     SLIDERS,
@@ -988,17 +988,17 @@ def test_images_are_downloaded(inspector: Inspector, tmp_path: Path) -> None:
     inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
     for kind in (ImageKind.COUNT, ImageKind.POLARITY, ImageKind.TIME_SURFACE):
         images = make_images(inspector, kind)
-        write_image(images, tmp_path / f"{kind}.tif")
+        save_values(tmp_path / f"{kind}.tif", images.after)
         with Image.open(tmp_path / f"{kind}.tif") as picture:
             assert picture.n_frames == (2 if kind is ImageKind.POLARITY else 1)
             for page, values in enumerate(images.after if kind is ImageKind.POLARITY else [images.after]):
                 picture.seek(page)
                 np.testing.assert_array_equal(np.asarray(picture), values)
     with pytest.raises(AmiwarpError, match=r"as \.tif, not"):
-        write_image(images, tmp_path / "image.jpg")
-    write_image(images, tmp_path / "image.tif")
+        save_values(tmp_path / "image.jpg", images.after)
+    save_values(tmp_path / "image.tif", images.after)
     with pytest.raises(AmiwarpError, match="exists"):
-        write_image(images, tmp_path / "image.tif")
+        save_values(tmp_path / "image.tif", images.after)
 
 
 def test_the_events_shown_are_downloaded_as_tables(

@@ -66,6 +66,16 @@ def save_png(path: Path, picture: Any, *, overwrite: bool = False) -> None:
         encode_png(new.part, picture)
 
 
+def save_values(path: Path, image: NDArray[np.float32]) -> None:
+    """Write the values of an image as float32 to a new .tif file; of several layers, each to a page."""
+    from PIL import Image
+
+    check_ending(path, "values of images are written", [".tif"])
+    with NewFile(path) as new:
+        first, *more = (Image.fromarray(np.asarray(page, np.float32)) for page in image.reshape(-1, *image.shape[-2:]))
+        encode_image(new.part, first, "TIFF", save_all=bool(more), append_images=more)
+
+
 def encode_png(path: Path, picture: Any) -> None:
     """Write an 8-bit picture (an array or a Pillow image) as PNG to a temporary file, which the caller renames."""
     from PIL import Image

@@ -21,17 +21,16 @@ from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, rpm_between
 from amiwarp.events.recording import Events, Recording
-from amiwarp.imaging.export import encode_image
 from amiwarp.imaging.regions import MOST_SEARCHED, busiest
 from amiwarp.io import RecordingWriter
 from amiwarp.io.file_scan import FileEvents
-from amiwarp.io.files import NewFile
 from amiwarp.io.formats import check_ending
+from amiwarp.io.plain_files import save_map, save_rows
 from amiwarp.live.stream.session import RecentEvents
 from amiwarp.optics.models import ExactModel, alternatives
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.tasks import Progress, silent
-from amiwarp.viewer.drawing import Look, Scale, Scene, ShownImages, caption, picture_state, select_part, shown_lines
+from amiwarp.viewer.drawing import Look, Scale, Scene, caption, picture_state, select_part, shown_lines
 from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, Inspector, Knobs, Source, size_name
 from amiwarp.viewer.layout import EXPORTS, SLIDERS, UNITS, orbit_text
 
@@ -303,7 +302,6 @@ def write_table(inspector: Inspector, path: Path) -> None:
 
     Raises :class:`AmiwarpError` for another suffix, or if the file exists.
     """
-    ending = check_ending(path, "tables are written", (".csv", ".npz"))
     encoder, knobs = inspector.encoder_of(inspector.knobs), inspector.knobs
 
     def table(e: Events) -> tuple[NDArray[Any], ...]:
@@ -311,31 +309,12 @@ def write_table(inspector: Inspector, path: Path) -> None:
         return e.t, e.x, e.y, e.p, theta, moved[:, 0], moved[:, 1]
 
     tables = map(table, _selected_blocks(inspector))
-    with NewFile(path) as new, open(new.part, "wb") as file:
-        if ending == ".npz":
-            columns: dict[str, Any] = {
-                name: np.concatenate(parts) for name, *parts in zip(COLUMNS, *tables, strict=True)
-            }
-            width, height = inspector.recording.events.size
-            np.savez_compressed(file, width=width, height=height, **columns)
-            return
-        file.write((",".join(COLUMNS) + "\n").encode())
-        for each in tables:
-            np.savetxt(file, np.column_stack(each), fmt="%d,%d,%d,%d,%.6f,%.3f,%.3f")
-
-
-def write_image(images: ShownImages, path: Path) -> None:
-    """Write the values of the second image to a new .tif file, float32; two polarities on two pages, OFF and ON.
-
-    Raises :class:`AmiwarpError` for another suffix, or if the file exists.
-    """
-    from PIL import Image
-
-    check_ending(path, "values of images are written", (".tif",))
-    with NewFile(path) as new:
-        pages = images.after if images.after.ndim == 3 else images.after[None]
-        first, *more = (Image.fromarray(np.asarray(page, np.float32)) for page in pages)
-        encode_image(new.part, first, "TIFF", save_all=bool(more), append_images=more)
+    if check_ending(path, "tables are written", (".csv", ".npz")) == ".csv":
+        save_rows(path, COLUMNS, tables, "%d,%d,%d,%d,%.6f,%.3f,%.3f")
+        return
+    columns = {name: np.concatenate(parts) for name, *parts in zip(COLUMNS, *tables, strict=True)}
+    width, height = map(np.array, inspector.recording.events.size)
+    save_map(path, "table", {**columns, "width": width, "height": height}, overwrite=False)
 
 
 def _selected_blocks(inspector: Inspector) -> Iterator[Events]:

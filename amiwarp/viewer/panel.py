@@ -23,6 +23,7 @@ from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View, Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
+from amiwarp.imaging.export import save_values
 from amiwarp.imaging.iwe import iwe
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.tasks import Progress
@@ -594,7 +595,7 @@ class Panel(layout.Actions):
     async def _write(self, what: str) -> None:
         inspector = self.inspector
         write: dict[str, Callable[[Path], object]] = {
-            "values": lambda path: jobs.write_image(self._pair(), path),
+            "values": lambda path: save_values(path, self._pair().after),
             **dict.fromkeys(("csv", "npz"), partial(jobs.write_table, inspector)),
             "events": partial(jobs.write_events, inspector, compensated=False),
             "compensated": partial(jobs.write_events, inspector, compensated=True),
