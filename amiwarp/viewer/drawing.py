@@ -32,7 +32,6 @@ from amiwarp.plotting.clouds import check_opengl
 from amiwarp.plotting.figures import SKY, instance_colours
 from amiwarp.plotting.meshes import Box
 from amiwarp.reconstruction.picture import Picture, Reconstruction
-from amiwarp.validation import choice
 from amiwarp.viewer.inspector import (
     STORES,
     DisplayedWindow,
@@ -667,10 +666,6 @@ class Look:
     titles: tuple[str, ...] = ("as recorded", "compensated")
     """Titles of the clouds. With a single title, only the second cloud is drawn."""
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "colour", choice(Colour, self.colour, "colour"))
-        object.__setattr__(self, "axis", choice(Axis, self.axis, "axis"))
-
     def for_clouds(self, titles: Sequence[str]) -> Look:
         """Return the look for clouds with these titles. A single cloud gets the whole picture."""
         return replace(self, titles=tuple(titles), overlaid=self.overlaid or len(titles) == 1)
@@ -759,7 +754,7 @@ class Scene:
 
     def look_from(self, view: View, look: Look) -> None:
         """Move the camera to a view direction from which both clouds fit into the picture."""
-        self.view = view = choice(View, view, "view")
+        self.view = view
         self._draw_frame(look)
         b = self.box
         away, up = (np.array(v) for v in CAMERA_DIRECTIONS[view])
@@ -896,18 +891,13 @@ class Scene:
             self._frame += [(k, actor) for actor in self._axes(k, look, ink, title)]
 
     def _draw_lines(self, lines: Sequence[NDArray[Any]], look: Look) -> None:
-        """Draw a line in each cloud, instead of those drawn before, which are moved if there are as many."""
+        """Draw a line in each cloud, instead of those drawn before."""
         import pyvista
 
-        places = [self.box.positions(line[:, :2], line[:, 2]) for line in lines]
-        homes = [0 if look.overlaid else number for number in range(len(lines))]
-        if homes == [k for k, _ in self._lines]:
-            for (_, actor), points in zip(self._lines, places, strict=True):
-                actor.mapper.dataset.points = points
-            return
         for k, actor in self._lines:
             self.plotter.renderers[k].remove_actor(actor, render=False)
-        curves = [pyvista.lines_from_points(points) for points in places]
+        curves = [pyvista.lines_from_points(self.box.positions(line[:, :2], line[:, 2])) for line in lines]
+        homes = [0 if look.overlaid else number for number in range(len(lines))]
         self._lines = [(k, self._add(k, curve, color=ORBIT_COLOUR, line_width=2.5))
                        for k, curve in zip(homes, curves, strict=True)]  # fmt: skip
 
@@ -1158,10 +1148,6 @@ def shown_lines(
         return ()
     orbit, column = orbit_lines(inspector, shown, picked)
     return (orbit if against is None and shown.beside is None else column, column)
-
-
-NO_ORBIT = {"orbit": b"", "column": b"", "has_orbit": False}
-"""State variables without an orbit."""
 
 
 def event_text(shown: DisplayedWindow, k: int) -> str:

@@ -2,16 +2,18 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from operator import attrgetter
+from typing import Any, TypeAlias
 from urllib.parse import parse_qsl, urlencode
 
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS, alternatives, size_names
-from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look
+from amiwarp.viewer.drawing import AGAINST, ImageKind, Look
 from amiwarp.viewer.inspector import (
     OTHERS,
     SLIDING,
@@ -167,9 +169,9 @@ UNITS = {
 """Conversion from the units of page and address (angles in degrees) to the parameters' units (radians): factors."""
 HAND_LIMITS = {"fov_deg": (1.0, 170.0), "prism_index": (1.01, 3.5)}
 """Smallest and largest value of the properties of camera and prism that can be set by hand."""
-CHOICES: dict[str, Any] = {"image": ImageKind, "colour": Colour, "axis": Axis, "view": View}
-POLARITIES = {"both": None, "on": 1, "off": 0}
-FLAGS = {"0": False, "1": True}
+
+
+_Field: TypeAlias = tuple[str, Callable[[Any], str], Callable[[str], Any]]
 
 
 def encode_state(state: ViewState, default: ViewState) -> str:
@@ -188,86 +190,76 @@ def decode_state(
     """
     if len(query) > LONGEST_QUERY:
         return default, (f"the address has {len(query):,} characters after '?'; give at most {LONGEST_QUERY:,}",)
-    state, wrong = default, []
-    for key, value in parse_qsl(query.removeprefix("?"), keep_blank_values=True, errors="replace"):
+    state, wrong, fields = default, [], _fields(size, duration_us)
+    for key, text in parse_qsl(query.removeprefix("?"), keep_blank_values=True, errors="replace"):
         try:
-            state = _with_value(state, key, value, size, duration_us)
+            if key in fields and not (key in HAND_LIMITS and getattr(state, key) is None):
+                place, _, read = fields[key]
+                state = _replaced(state, place, read(text))
+            elif key == "sources":
+                state = replace(state, sources=_sources(text, state.sources))
+            else:
+                place, name = ("against", key[2:]) if key.startswith("b_") else ("knobs", key)
+                state = _replaced(state, place, _with_knob(getattr(state, place) or state.knobs, name, text))
         except (ValueError, KeyError, OverflowError):
-            wrong.append(f"the address gives {key[:20]!r} = {value[:40]!r}, which this recording cannot show")
+            wrong.append(f"the address gives {key[:20]!r} = {text[:40]!r}, which this recording cannot show")
     return state, tuple(wrong)
+
+
+def _fields(size: tuple[int, int], duration_us: int) -> dict[str, _Field]:
+    """Return for each key of an address where the state holds its value, and how it becomes text and comes back."""
+
+    def one_of(place: str, known: Mapping[str, Any]) -> _Field:
+        return place, {value: text for text, value in known.items()}.__getitem__, known.__getitem__
+
+    def milliseconds(text: str, low: int, high: int) -> int:
+        return int(_within(round(float(text) * 1e3), low, high))
+
+    def region(text: str) -> tuple[int, ...] | None:
+        if text == "all":
+            return None
+        left, top, right, bottom = (_whole(each, 0, max(size)) for each in text.split(","))
+        return left, top, int(_within(right, left + 1, size[0])), int(_within(bottom, top + 1, size[1]))
+
+    flags, choices = {"0": False, "1": True}, {"image": ImageKind, "colour": Colour, "axis": Axis, "view": View}
+    return {
+        "start_ms": ("start_us", lambda us: f"{us * 1e-3:.3f}", lambda text: milliseconds(text, 0, duration_us - 1)),
+        "length_ms": ("length_us", lambda us: f"{us * 1e-3:.3f}", lambda text: milliseconds(text, 1, duration_us)),
+        "polarity": one_of("selection.polarity", {"both": None, "on": 1, "off": 0}),
+        "region": ("selection.region", lambda sides: "all" if sides is None else ",".join(map(str, sides)), region),
+        "hide_hot": one_of("selection.hide_hot", flags),
+        "noise_us": ("selection.noise_us", lambda us: str(us or 0), lambda us: _whole(us, 0, LONGEST_NOISE_US) or None),
+        "overlaid": one_of("overlaid", flags),
+        **{name: one_of(name, {each.value: each for each in kind}) for name, kind in choices.items()},
+        **{name: (name, "{:.10g}".format, partial(_number, ends)) for name, ends in HAND_LIMITS.items()},
+    }  # fmt: skip
 
 
 def _texts(state: ViewState) -> dict[str, str]:
     """Return all values of a state as texts."""
-    s, polarities = state.selection, {value: text for text, value in POLARITIES.items()}
-    out = {
-        "start_ms": f"{state.start_us * 1e-3:.3f}", "length_ms": f"{state.length_us * 1e-3:.3f}",
-        "polarity": polarities[s.polarity], "region": "all" if s.region is None else ",".join(map(str, s.region)),
-        "hide_hot": str(int(s.hide_hot)), "noise_us": "0" if s.noise_us is None else str(s.noise_us),
-        "overlaid": str(int(state.overlaid)), **{name: getattr(state, name).value for name in CHOICES},
-        **{name: f"{value:.10g}" for name in HAND_LIMITS if (value := getattr(state, name)) is not None},
-        **_knob_texts(state.knobs, ""),
-    }  # fmt: skip
-    if state.against is not None:
-        out |= _knob_texts(state.against, "b_")
+    fields = {key: (attrgetter(place)(state), write) for key, (place, write, _) in _fields((0, 0), 0).items()}
+    out = {key: write(value) for key, (value, write) in fields.items() if key not in HAND_LIMITS or value is not None}
+    for before, knobs in (("", state.knobs), ("b_", state.against)):
+        if knobs is not None:
+            known = {name: knobs.value(name) for name in LIMITS if name not in foreign_names(knobs.model)}
+            out[f"{before}model"] = knobs.model
+            out |= {before + n: f"{value / UNITS[n]:.10g}" for n, value in known.items() if value is not None}
     foreign = foreign_names(state.knobs.model)
     shown = [(name, source) for name, source in state.sources if name not in foreign]
-    letters = ",".join(f"{name}:{source.name.lower()}" for name, source in shown)
-    return {**out, "sources": letters}
+    return {**out, "sources": ",".join(f"{name}:{source.name.lower()}" for name, source in shown)}
 
 
-def _knob_texts(knobs: Knobs, before: str) -> dict[str, str]:
-    """Return the values of parameters as texts, with ``before`` in front of their names."""
-    out = {f"{before}model": knobs.model}
-    foreign = foreign_names(knobs.model)
-    for name in (each for each in LIMITS if each not in foreign):
-        if (value := knobs.value(name)) is not None:
-            out[before + name] = f"{value / UNITS[name]:.10g}"
-    return out
-
-
-def _with_value(state: ViewState, key: str, text: str, size: tuple[int, int], duration_us: int) -> ViewState:
-    """Return a state with one value of an address. Raises ValueError, KeyError or OverflowError for a wrong value."""
-    plain: dict[str, Callable[[], ViewState]] = {
-        "start_ms": lambda: replace(state, start_us=int(_within(round(float(text) * 1e3), 0, duration_us - 1))),
-        "length_ms": lambda: replace(state, length_us=int(_within(round(float(text) * 1e3), 1, duration_us))),
-        "polarity": lambda: _selected(state, polarity=POLARITIES[text]),
-        "region": lambda: _selected(state, region=_region(text, size)),
-        "hide_hot": lambda: _selected(state, hide_hot=FLAGS[text]),
-        "noise_us": lambda: _selected(state, noise_us=_whole(text, 0, LONGEST_NOISE_US) or None),
-        "overlaid": lambda: replace(state, overlaid=FLAGS[text]),
-        "sources": lambda: replace(state, sources=_sources(text, state.sources)),
-    }
-    if key in plain:
-        return plain[key]()
-    change: dict[str, Any] = {}
-    if key in CHOICES:
-        change[key] = CHOICES[key](text)
-    elif key in HAND_LIMITS and getattr(state, key) is not None:
-        change[key] = _within(float(text), *HAND_LIMITS[key])
-    if change:
-        return replace(state, **change)
-    if key.startswith("b_"):
-        return replace(state, against=_with_knob(state.against or state.knobs, key.removeprefix("b_"), text))
-    return replace(state, knobs=_with_knob(state.knobs, key, text))
+def _replaced(state: Any, place: str, value: Any) -> Any:
+    """Return a state with another value of a field, or of a field of a field, such as ``selection.region``."""
+    name, _, inner = place.partition(".")
+    return replace(state, **{name: _replaced(getattr(state, name), inner, value) if inner else value})
 
 
 def _with_knob(knobs: Knobs, name: str, text: str) -> Knobs:
     """Return parameters with one value of an address."""
     if name == "model" and text in MODELS:
         return replace(knobs, model=text)
-    return knobs.with_values({name: _within(float(text), *LIMITS[name]) * UNITS[name]})
-
-
-def _selected(state: ViewState, **changes: Any) -> ViewState:
-    return replace(state, selection=replace(state.selection, **changes))
-
-
-def _region(text: str, size: tuple[int, int]) -> tuple[int, int, int, int] | None:
-    if text == "all":
-        return None
-    left, top, right, bottom = (_whole(each, 0, max(size)) for each in text.split(","))
-    return left, top, int(_within(right, left + 1, size[0])), int(_within(bottom, top + 1, size[1]))
+    return knobs.with_values({name: _number(LIMITS[name], text) * UNITS[name]})
 
 
 def _sources(text: str, known: tuple[tuple[str, Source], ...]) -> tuple[tuple[str, Source], ...]:
@@ -281,6 +273,10 @@ def _whole(text: str, low: int, high: int) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 12):
         raise ValueError(text)
     return int(_within(int(text), low, high))
+
+
+def _number(ends: tuple[float, float], text: str) -> float:
+    return _within(float(text), *ends)
 
 
 def _within(value: float, low: float, high: float) -> float:
@@ -365,7 +361,8 @@ CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice")
 EMPTY: tuple[tuple[Any, str], ...] = (
     ("", "trame_error_report_msg stream_note hover measured address events sharpness message rate_note picked_text "
          "image_note against_title b_text busy found"),
-    (b"", "cloud_before cloud_after cloud_third third_before colours_before colours_after rate_on rate_off"),
+    (b"", "cloud_before cloud_after cloud_third third_before colours_before colours_after rate_on rate_off orbit "
+          "column"),
     (False, "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "
             "difference has_b calibrating"),
     (None, "overview before after surface"), ((), "live_rows updating titles against_choices"),
@@ -553,7 +550,6 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
     size = recording.events.size
     return {
         **source_state(inspector), **knob_state(inspector), **prism_state(inspector),
-        **NO_ORBIT,
         "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "truth": truth_text(recording.truth),
         "size": list(size), "live": inspector.latest is not None,
         "models": list(alternatives(inspector.knobs.model)),

@@ -32,7 +32,7 @@ from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
 from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
-from amiwarp.viewer.serve import FOLDER, finite, serve, use_page
+from amiwarp.viewer.serve import finite, serve, use_page
 
 CARD_POINTS = 1_000_000
 """Largest number of points in each cloud of a browser that draws with a graphics card."""
@@ -89,7 +89,7 @@ class Panel(layout.Actions):
         self._wanted: dict[str, Any] = {}  # values that were set on the page, and that the inspector has not taken yet
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
         self._downloads = 0
-        use_page(server, (FOLDER / "page.html").read_text(encoding="utf-8"), self._folder.name)
+        use_page(server, self._folder.name)
         self.state.client_only(*layout.CLIENT_ONLY)
         self._listen()
         self.start(inspector)
@@ -138,7 +138,7 @@ class Panel(layout.Actions):
     def look(self) -> Look:
         """Style of the clouds."""
         s = self.state
-        return Look(s.colour, s.axis, s.point_size, s.opacity, s.dark, s.overlaid)
+        return Look(Colour(s.colour), Axis(s.axis), s.point_size, s.opacity, s.dark, s.overlaid)
 
     @look.setter
     def look(self, look: Look) -> None:
@@ -761,12 +761,12 @@ class Panel(layout.Actions):
         s, before, against = self.state, self.shown, self.against
         shown = self.inspector.show(against=against)
         values = drawing.cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
-        values |= {"image_slow": self.image is ImageKind.LOG_INTENSITY, **drawing.NO_ORBIT}
+        values["image_slow"] = self.image is ImageKind.LOG_INTENSITY
         if not values["image_slow"]:
             values |= self._images(shown)
-        if lines := drawing.shown_lines(self.inspector, shown, self.look.axis, against, self._picked):
-            orbit, column = map(drawing.float_bytes, lines)
-            values |= {"orbit": orbit, "column": column, "has_orbit": True} if s.orbit_shown else {}
+        found = drawing.shown_lines(self.inspector, shown, self.look.axis, against, self._picked)
+        lines = found if found and s.orbit_shown else (np.zeros(0),) * 2
+        values["orbit"], values["column"] = map(drawing.float_bytes, lines)
         if before is None or shown.span is not before.span:
             counts = iwe(shown.span.events, *self.inspector.recording.events.size, vote=Vote.NEAREST)
             values["overview"] = drawing.picture_state(counts, drawing.count_scale([counts]))

@@ -259,8 +259,9 @@ def first_page(path: Path) -> str:
                   flags=re.DOTALL)  # fmt: skip
 
 
-def use_page(server: Any, template: str, downloads: str) -> None:
+def use_page(server: Any, downloads: str) -> None:
     """Give a trame server the page's style and scripts, its template, and the folder ``downloads`` below its name."""
+    template = (FOLDER / "page.html").read_text(encoding="utf-8")
     server.enable_module({
         "serve": {ROUTE: str(FOLDER), server.name: downloads}, "styles": [f"{ROUTE}/page.css"],
         "module_scripts": [f"{ROUTE}/page.js"], "vue_use": ["amiwarp_page"],
