@@ -39,13 +39,13 @@ from amiwarp.imaging.export import save_values
 from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.metrics import random_variance, relative_variance
 from amiwarp.imaging.regions import suggest_region
+from amiwarp.io import event_rates, spans
+from amiwarp.io.event_rates import EventRates
 from amiwarp.optics.models import MODELS, Model, size_names
 from amiwarp.viewer import drawing, jobs
-from amiwarp.viewer import inspector as timeline
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer.drawing import ImageKind, Scale, events_text, make_images
 from amiwarp.viewer.inspector import (
-    EventRates,
     Inspector,
     Knobs,
     Selection,
@@ -666,7 +666,7 @@ def expected_rates(events: Events, edges: np.ndarray) -> np.ndarray:
 
 
 def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(timeline, "MOST_BINS", 4096)
+    monkeypatch.setattr(event_rates, "MOST_BINS", 4096)
     events = random_events(50_000, 16, 16)
     rates = EventRates(MemoryEvents(events, 16, 16))
     assert rates.share == 0.0
@@ -686,7 +686,7 @@ def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
     edges, exact = rates.curve(40_000, 41_000, 200)
     assert exact.shape == (2, 200)
     np.testing.assert_array_equal(exact, expected_rates(events, edges))
-    monkeypatch.setattr(timeline, "MOST_EXACT", 10)
+    monkeypatch.setattr(event_rates, "MOST_EXACT", 10)
     edges, coarse = rates.curve(40_000, 41_000, 200)
     assert 30 < coarse.shape[1] < 60
     np.testing.assert_allclose(coarse[0, 1:-1], expected_rates(events, edges)[0, 1:-1])
@@ -946,7 +946,7 @@ def test_the_events_of_the_window_are_downloaded(
     inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, compensated: bool, most_events: int
 ) -> None:
     monkeypatch.setattr(viewer, "MOST_EVENTS", most_events)
-    monkeypatch.setattr(jobs, "BLOCK", 10_000)
+    monkeypatch.setattr(spans, "BLOCK", 10_000)
     region, (start, length) = (20, 10, 140, 110), inspector.first_window()
     inspector.open(start, length, Selection(1, region))
     path = tmp_path / "events.h5"
@@ -977,7 +977,7 @@ def test_the_noise_filter_of_a_download_does_not_restart_at_its_blocks(
     expected = inspector.loaded.counted
     assert 0.2 * inspector.loaded.span.count < len(expected) < 0.95 * inspector.loaded.span.count
     monkeypatch.setattr(viewer, "MOST_EVENTS", 6400)
-    monkeypatch.setattr(jobs, "BLOCK", 500)
+    monkeypatch.setattr(spans, "BLOCK", 500)
     thinned = Inspector(inspector.recording)
     thinned.open(*window, Selection(noise_us=300))
     assert write_events(thinned, tmp_path / "events.h5", compensated=False) == len(expected)
@@ -1004,7 +1004,7 @@ def test_images_are_downloaded(inspector: Inspector, tmp_path: Path) -> None:
 def test_the_events_shown_are_downloaded_as_tables(
     inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(jobs, "BLOCK", 10_000)
+    monkeypatch.setattr(spans, "BLOCK", 10_000)
     inspector.open(*inspector.first_window(), Selection(region=(20, 10, 140, 110), polarity=1))
     jobs.write_table(inspector, tmp_path / "events.csv")
     jobs.write_table(inspector, tmp_path / "events.npz")
@@ -1059,7 +1059,7 @@ def test_intervals_between_two_runs_are_not_counted(monkeypatch: pytest.MonkeyPa
     made.open(0, 100_000)
     found = made.statistics()
     assert found["rows"][0] == ["rate", "64,000 events/s"]  # 3,200 in 50 ms
-    counts = np.array(found["y"]) / 100.0 * (3200 - 2 * viewer.RUNS)
+    counts = np.array(found["y"]) / 100.0 * (3200 - 2 * spans.RUNS)
     np.testing.assert_allclose(counts, np.rint(counts), rtol=0, atol=1e-6)
 
 

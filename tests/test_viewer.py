@@ -28,9 +28,10 @@ from amiwarp import (
 from amiwarp.calib.bad_pixels import MaskedEventSource
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.imaging.residuals import WIDEST_PX, residual
+from amiwarp.io.spans import read_span
 from amiwarp.optics.models import build_model, rungs
 from amiwarp.viewer.drawing import Look, Scene, axis_range, colours_of, orbit_lines, third_axis
-from amiwarp.viewer.inspector import Inspector, Knobs, Selection, read_span
+from amiwarp.viewer.inspector import Inspector, Knobs, Selection
 from reference.calibration_sample import exact_calibration
 
 TRUE = Prism(math.radians(1.0))

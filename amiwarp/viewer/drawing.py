@@ -28,6 +28,7 @@ from amiwarp.imaging.regions import SMOOTHING_PX, Region, inside
 from amiwarp.imaging.residuals import WIDEST_PX, at_pixels, residual
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import check_output, interrupts_later
+from amiwarp.io.spans import read_span
 from amiwarp.plotting.clouds import check_opengl
 from amiwarp.plotting.figures import SKY, instance_colours
 from amiwarp.plotting.meshes import Box
@@ -40,7 +41,6 @@ from amiwarp.viewer.inspector import (
     Knobs,
     LoadedWindow,
     colours_on_offer,
-    read_span,
 )
 
 if TYPE_CHECKING:

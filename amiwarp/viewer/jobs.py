@@ -23,9 +23,9 @@ from amiwarp.events.encoder import Encoder, rpm_between
 from amiwarp.events.recording import Events, Recording
 from amiwarp.imaging.regions import MOST_SEARCHED, busiest
 from amiwarp.io import RecordingWriter
-from amiwarp.io.file_scan import FileEvents
 from amiwarp.io.formats import check_ending
 from amiwarp.io.plain_files import save_map, save_rows
+from amiwarp.io.spans import span_blocks
 from amiwarp.live.stream.session import RecentEvents
 from amiwarp.optics.models import ExactModel, alternatives
 from amiwarp.reconstruction.picture import save_film
@@ -265,8 +265,6 @@ class LiveSource:
 
 # Files that the page offers as downloads: images, events and films.
 
-BLOCK = 1 << 20
-"""Number of events that are written at a time."""
 COLUMNS = ("t", "x", "y", "p", "theta", "x_compensated", "y_compensated")
 """Columns of a table of events: time [us], pixel, polarity, prism angle [rad] and compensated place [px]."""
 
@@ -323,29 +321,11 @@ def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
     The noise filter of a block sees the last events of the block before it.
     """
     noise_us, last = inspector.selection.noise_us or 0, None
-    for block in filter(len, _blocks(inspector)):
+    for block in filter(len, span_blocks(inspector.recording.events, inspector.loaded.span)):
         events = block if last is None else Events.concatenate([last, block])
         chosen = inspector.kept(events, inspector.selection, inspector.loaded.region)[-len(block) :]
         yield block if chosen.all() else block[chosen]
         last = events[int(np.searchsorted(events.t, block.t[-1] - noise_us)) :] if noise_us else None
-
-
-def _blocks(inspector: Inspector) -> Iterator[Events]:
-    """Yield all events of the window, in blocks."""
-    source, span = inspector.recording.events, inspector.loaded.span
-    end_us = span.start_us + span.length_us
-    if span.count == len(span.events):
-        yield span.events
-    elif isinstance(source, FileEvents):  # can only be read from its start
-        for block in source.blocks():
-            first, stop = np.searchsorted(block.t, (span.start_us, end_us))
-            yield block[first:stop]
-            if stop < len(block):
-                return
-    else:
-        stop = source.find(end_us)
-        for start in range(source.find(span.start_us), stop, BLOCK):
-            yield source.slice(start, min(start + BLOCK, stop))
 
 
 def _cut(encoder: Encoder, first_us: int, last_us: int) -> Encoder:

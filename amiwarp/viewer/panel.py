@@ -26,11 +26,12 @@ from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import save_values
 from amiwarp.imaging.iwe import iwe
 from amiwarp.io.depth_map import DepthMap
+from amiwarp.io.event_rates import EventRates
 from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
-from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection
+from amiwarp.viewer.inspector import DisplayedWindow, Inspector, Knobs, Library, Selection
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
 from amiwarp.viewer.serve import finite, serve, use_page
 
