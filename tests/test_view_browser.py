@@ -41,6 +41,7 @@ from amiwarp import (
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
 from amiwarp.live.stream.session import RecentEvents, followed
 from amiwarp.live.stream.sources import open_source, reopen_source
+from amiwarp.plotting.colours import depth_image, table_of
 from amiwarp.viewer import drawing, jobs
 from amiwarp.viewer import inspector as inspector_module
 from amiwarp.viewer.drawing import FOOT_PX, ImageKind, make_images, strip_share
@@ -690,7 +691,7 @@ def test_pictures_have_legend_colour_bar_and_caption_and_images_the_difference(
     ready(page)
     height = page.locator(".clouds canvas").bounding_box()["height"]
     below = picture("picture")[int(height) :]
-    assert colours_in(below, drawing.table_of("cividis")[10:-10:10]) > 0.95
+    assert colours_in(below, table_of("cividis")[10:-10:10]) > 0.95
     words = drawing.caption(inspector, inspector.show())
     left, top, right, bottom = region(page)
     assert f"x {left} to {right - 1}, y {top} to {bottom - 1} px" in words
@@ -710,7 +711,7 @@ def test_pictures_have_legend_colour_bar_and_caption_and_images_the_difference(
         image = found[32 : 32 + tall : size, x : x + wide : size]
         assert np.abs(image.astype(np.int16) - scale.rgb(values)).max() <= 1
         bar = found[32 + tall + 8, x : x + wide]
-        assert colours_in(bar[None], drawing.table_of(scale.colours)[10:-10:10]) > 0.95
+        assert colours_in(bar[None], table_of(scale.colours)[10:-10:10]) > 0.95
     with Image.open(download(page, "values", tmp_path)) as image:
         np.testing.assert_array_equal(np.asarray(image), pair.after)
     assert len(np.genfromtxt(download(page, "csv", tmp_path), delimiter=",", names=True)) == inspector.loaded.selected
@@ -887,7 +888,7 @@ def test_a_depth_map_is_an_image_in_metres_with_unknown_pixels_marked(opened: Op
     page.mouse.move(2, 2)
     picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), np.int16)
     seen = [picture[int(y), int(x)] for x, y in (pixel(page, "#image-after", *at) for at in ((10, 10), (50, 10)))]
-    _, scale = drawing.depth_image(depth)
+    _, scale = depth_image(depth)
     for colour, metres in zip(seen, (0.5, math.nan), strict=True):
         assert np.abs(colour - scale.rgb(np.array([metres]))[0].astype(int)).max() <= 1
     with Image.open(download(page, "values", tmp_path)) as values:

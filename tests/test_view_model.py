@@ -42,9 +42,10 @@ from amiwarp.imaging.regions import suggest_region
 from amiwarp.io import event_rates, spans
 from amiwarp.io.event_rates import EventRates
 from amiwarp.optics.models import MODELS, Model, size_names
+from amiwarp.plotting.colours import Scale, table_of
 from amiwarp.viewer import drawing, jobs
 from amiwarp.viewer import inspector as viewer
-from amiwarp.viewer.drawing import ImageKind, Scale, events_text, make_images
+from amiwarp.viewer.drawing import ImageKind, events_text, make_images
 from amiwarp.viewer.inspector import (
     Inspector,
     Knobs,
@@ -236,7 +237,7 @@ def test_a_depth_map_is_shown_in_metres_with_unknown_pixels_in_a_colour_of_their
     scale = images.after_scale
     assert scale is not None
     assert (scale.low, scale.high, scale.label) == (pytest.approx(0.5), pytest.approx(0.8), "depth [m]; blue: unknown")
-    rgb, table = scale.rgb(images.after), drawing.table_of(scale.colours).astype(int)
+    rgb, table = scale.rgb(images.after), table_of(scale.colours).astype(int)
     missing = rgb[np.isnan(images.after)].astype(int)
     assert len(np.unique(missing, axis=0)) == 1
     assert np.abs(table - missing[0]).max(axis=1).min() > 60  # no colour of the scale is near

@@ -30,6 +30,7 @@ from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import MODELS
 from amiwarp.plotting import clouds
 from amiwarp.plotting.clouds import Renderer
+from amiwarp.plotting.colours import DEPTH_MAP, SKY, depth_ends
 from amiwarp.reconstruction.picture import Picture, limits, tones
 
 EVENTS = 2_000_000
@@ -399,8 +400,6 @@ GAMMA = 2.2
 """Exponent (gamma) by which linear luminance is converted to grey."""
 GOLDEN = 0.618034
 """Golden ratio, the step of the hue between successive instances, so that neighbouring numbers differ in colour."""
-SKY = (0.85, 0.92, 1.0)
-"""Colour of pixels that see the sky, in the pictures of depth and instances."""
 WHEEL = 0.2
 """Diameter of the colour wheel of flow directions, as a share of the picture's height."""
 LEAST_SPEED = 1e-3
@@ -454,15 +453,12 @@ def _draw_depth(figure: Any, ax: Any, depth: NDArray[np.float32]) -> None:
     """Draw the depth on a logarithmic scale, with a colour bar."""
     from matplotlib.colors import LogNorm
 
-    seen = depth[np.isfinite(depth)]
     ax.set_title("depth [m]")
-    if not seen.size:
+    if not np.isfinite(depth).any():
         ax.imshow(np.broadcast_to(np.array(SKY), (*depth.shape, 3)))
         return
-    low, high = float(seen.min()), float(np.percentile(seen, PREVIEW_PERCENTILE))
-    low = max(low, 1e-4)
-    high = max(high, 1.1 * low)
-    drawn = ax.imshow(np.ma.masked_invalid(depth), cmap="viridis_r", norm=LogNorm(low, high))
+    low, high = depth_ends(depth)
+    drawn = ax.imshow(np.ma.masked_invalid(depth), cmap=DEPTH_MAP, norm=LogNorm(low, high))
     ax.imshow(np.where(np.isfinite(depth)[..., None], 0.0, (*SKY, 1.0)))
     bar = figure.colorbar(drawn, ax=ax, shrink=0.85)
     ticks = np.geomspace(low, high, 5)

@@ -11,7 +11,6 @@ from contextlib import closing, suppress
 from ctypes import CDLL, c_void_p
 from ctypes.util import find_library
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -21,16 +20,28 @@ from numpy.typing import NDArray
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, MemoryEvents, Recording
-from amiwarp.imaging.export import GAMMA, PERCENTILE, save_png
+from amiwarp.imaging.export import GAMMA, save_png
 from amiwarp.imaging.metrics import random_variance
-from amiwarp.imaging.palette import BLUE, OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK, ORANGE, PINK, VERMILION
+from amiwarp.imaging.palette import OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK
 from amiwarp.imaging.regions import SMOOTHING_PX, Region, inside
 from amiwarp.imaging.residuals import WIDEST_PX, at_pixels, residual
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import check_output, interrupts_later
 from amiwarp.io.spans import read_span
 from amiwarp.plotting.clouds import check_opengl
-from amiwarp.plotting.figures import SKY, instance_colours
+from amiwarp.plotting.colours import (
+    GREY,
+    Scale,
+    as_bytes,
+    cause_colours,
+    count_scale,
+    depth_colours,
+    depth_ends,
+    depth_image,
+    table_of,
+    ticks,
+)
+from amiwarp.plotting.figures import instance_colours
 from amiwarp.plotting.meshes import Box
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.viewer.inspector import (
@@ -178,89 +189,6 @@ class ImageKind(enum.StrEnum):
     """Depth of what each pixel sees, of a depth map."""
 
 
-@dataclass(frozen=True)
-class Scale:
-    """How values become colours."""
-
-    title: str
-    """Name of the quantity."""
-    unit: str
-    """Unit of the values; empty for numbers without unit."""
-    low: float
-    """Value at the start of the colour bar. Lower values have the same colour."""
-    high: float
-    """Value at the end of the colour bar. Higher values have the same colour."""
-    colours: str
-    """Colours, as :func:`table_of` knows them, or "polarity" for OFF and ON in two colours on black."""
-    gamma: float = 1.0
-    """Exponent of the tone curve: a colour's place on the bar is the share of the range to this power."""
-    missing: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Red, green and blue of pixels without a value, 0 to 1."""
-    missing_text: str = "no event"
-    """What a pixel without a value means."""
-
-    def __post_init__(self) -> None:
-        assert self.low < self.high
-
-    def places(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the places of values on the colour bar, 0 to 1; NaN stays NaN."""
-        share = (np.asarray(values, np.float64) - self.low) / (self.high - self.low)
-        return np.asarray(np.clip(share, 0.0, 1.0) ** self.gamma, np.float64)
-
-    def rgb(self, values: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """Return the colours of an image, shape ``(height, width, 3)``.
-
-        ``values``: shape ``(height, width)`` or ``(n,)``, or ``(2, height, width)`` for OFF and ON.
-        """
-        places = self.places(values)
-        if self.colours == "polarity":
-            both = places[0][..., None] * np.array(OFF_ON_BLACK) + places[1][..., None] * np.array(ON_ON_BLACK)
-            return np.asarray(np.rint(255.0 * np.clip(both, 0.0, 1.0)), np.uint8)
-        known = ~np.isnan(places)
-        rgb = table_of(self.colours)[(255.0 * np.where(known, places, 0.0)).astype(np.uint8)]
-        return np.where(known[..., None], rgb, _bytes(self.missing))
-
-    @property
-    def counts(self) -> bool:
-        """Whether the values are numbers of events, or their differences."""
-        return self.unit == "per pixel"
-
-    @property
-    def label(self) -> str:
-        """Name and unit of the quantity, and what a colour means that is not on the bar."""
-        label = f"{self.title} {self.unit}" if self.counts else f"{self.title} [{self.unit}]"
-        return f"{label}; blue: {self.missing_text}" if self.missing == SKY else label
-
-    def ticks(self) -> tuple[tuple[float, str], ...]:
-        """Return the marks of the colour bar: their places, 0 to 1, and their texts."""
-        values = ticks(self.low, self.high, 4, whole=self.counts)
-        return tuple((float(place), f"{v:g}") for place, v in zip(self.places(values), values, strict=True))
-
-
-def _bytes(rgb: Sequence[float]) -> NDArray[np.uint8]:
-    """Return red, green and blue as 0 to 255, shape ``(3,)``."""
-    return np.rint(255.0 * np.asarray(rgb)).astype(np.uint8)
-
-
-@cache
-def table_of(colours: str) -> NDArray[np.uint8]:
-    """Return the 256 colours of a bar, shape ``(256, 3)``: of a colour map of Matplotlib, or "difference".
-
-    The suffix " on light" or " on dark" keeps white or black apart from the background.
-    """
-    from matplotlib import colormaps
-    from matplotlib.colors import LinearSegmentedColormap
-
-    shares, (name, _, paper) = np.linspace(0.0, 1.0, 256), colours.partition(" on ")
-    if name == "difference":
-        table = LinearSegmentedColormap.from_list(name, (OFF_COLOUR, "white", ON_COLOUR))(shares)[:, :3]
-    else:
-        table = colormaps[name](shares)[:, :3]
-    if paper:
-        table = 1.0 - 0.8 * (1.0 - table) if paper == "dark" else 0.8 * table
-    return np.asarray(np.rint(255.0 * table), np.uint8)
-
-
 @dataclass(frozen=True, eq=False)
 class ShownImages:
     """Images of the shown region, before and after compensation, with one scale for both."""
@@ -324,13 +252,6 @@ def make_images(
     return ShownImages(kind, before, after - before, scale, after_scale=own)
 
 
-def count_scale(images: Sequence[NDArray[np.float32]], colours: str = "gray") -> Scale:
-    """Return one scale of counts for images."""
-    positive = [image[image > 0.0] for image in images]
-    top = max([1.0, *(float(np.percentile(each, PERCENTILE)) for each in positive if each.size)])
-    return Scale("events", "per pixel", 0.0, math.ceil(top), colours, GAMMA)
-
-
 def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:
     """Return the time of the latest event of each pixel from the start of the window on [ms]; NaN without events."""
     events, (width, height) = window.counted, inspector.recording.events.size
@@ -344,28 +265,24 @@ def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | Non
     return surface[:-1].reshape(height, width)
 
 
-def depth_image(depth: DepthMap) -> tuple[NDArray[np.float32], Scale]:
-    """Return the depths of a map [m], shape ``(height, width)``, NaN where they are unknown, and their scale."""
-    with np.errstate(divide="ignore"):
-        metres = 1.0 / depth.inverse_depth
-    return metres, Scale("depth", "m", *_scale(metres), DEPTH_MAP, missing=SKY, missing_text="unknown")
-
-
 # Colours for events by cause, instance and depth, and the legend of these colours.
 
-CAUSE_COLOURS = (BLUE, ORANGE, PINK, VERMILION)
-"""Colour of each cause of events, in the order of the codes of :class:`amiwarp.Cause`."""
-GREY = "#808080"
-"""Colour of the sky, and of unknown causes."""
-DEPTH_MAP = "viridis_r"
-"""Matplotlib colour map of depth. Near points are light."""
-DEPTH_PERCENTILES = (2.0, 98.0)
-"""Percentiles of the depths of drawn events at which the colour scale begins and ends."""
 Legend: TypeAlias = tuple[tuple[str, str], ...]
 """Rows of a legend: a colour in hexadecimal notation, and the meaning of the colour.
 
 The colour of the title row is empty.
 """
+
+
+def _truth_colours(colour: Colour, values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the colours (0 to 1) of causes, instances or depths, shape ``(n, 3)``. The sky is grey."""
+    from matplotlib.colors import to_rgb
+
+    if colour is Colour.DEPTH:
+        return depth_colours(values, depth_ends(values))
+    if colour is Colour.CAUSE:
+        return cause_colours(values)
+    return np.asarray(np.where((values == 0)[:, None], to_rgb(GREY), instance_colours(values)))
 
 
 def legend_of(truth: DrawnTruth, colour: Colour, most: int) -> Legend:
@@ -382,46 +299,17 @@ def legend_of(truth: DrawnTruth, colour: Colour, most: int) -> Legend:
         return ()
     values, title, more = truth.values(colour), colour.value, []
     if colour is Colour.DEPTH:
-        steps, title = np.geomspace(*_scale(values), most), "depth [m]"  # in equal ratios
-        rgb, texts = _depths(steps, _scale(values)), [f"{step:#.3g}".rstrip(".") for step in steps]
+        steps, title = np.geomspace(*depth_ends(values), most), "depth [m]"  # in equal ratios
+        rgb, texts = depth_colours(steps, depth_ends(values)), [f"{step:#.3g}".rstrip(".") for step in steps]
         more = [(GREY, "sky")] if np.isinf(values).any() else []
     else:
         counts = np.bincount(values)
         found = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
         shares, others = 100.0 * counts / counts.sum(), found[most:]
         texts = [f"{truth.name(colour, k)} {shares[k]:.3g} %" for k in found[:most].tolist()]
-        rgb = _names(colour, found[:most])
+        rgb = _truth_colours(colour, found[:most])
         more = [("", f"{len(others)} more {shares[others].sum():.3g} %")] if len(others) else []
     return (("", title), *zip(map(to_hex, rgb), texts, strict=True), *more)
-
-
-def _names(colour: Colour, values: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the colours (0 to 1) of cause codes or instance numbers, shape ``(n, 3)``."""
-    from matplotlib.colors import to_rgb
-
-    if colour is Colour.CAUSE:
-        table = np.array([to_rgb(each) for each in (*CAUSE_COLOURS, GREY)])
-        return np.asarray(table[np.minimum(values, len(CAUSE_COLOURS))])
-    return np.asarray(np.where((values == 0)[:, None], to_rgb(GREY), instance_colours(values)))
-
-
-def _depths(depth: NDArray[Any], scale: tuple[float, float]) -> NDArray[np.float64]:
-    """Return the colours (0 to 1) of depths [m] on a logarithmic scale, shape ``(n, 3)``. The sky is grey.
-
-    ``scale``: depths at both ends of the scale [m].
-    """
-    from matplotlib import colormaps, colors
-
-    rgb = colormaps[DEPTH_MAP](colors.LogNorm(*scale, clip=True)(depth))[:, :3]
-    return np.asarray(np.where(np.isfinite(depth)[:, None], rgb, colors.to_rgb(GREY)))
-
-
-def _scale(depth: NDArray[Any]) -> tuple[float, float]:
-    """Return the lowest and the highest depth of the colour scale [m]."""
-    seen = depth[np.isfinite(depth)]
-    low, high = np.percentile(seen, DEPTH_PERCENTILES).tolist() if len(seen) else (1.0, 10.0)
-    low = max(low, 1e-3)
-    return low, max(high, 1.1 * low)
 
 
 # Colours of the points in the event clouds, and the quantities that the colours show.
@@ -452,9 +340,7 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
         two = np.array([to_rgb(OFF_COLOUR), to_rgb(ON_COLOUR)])
         return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
     if look.colour in STORES:
-        values = shown.truth.values(look.colour)
-        rgb = _depths(values, _scale(values)) if look.colour is Colour.DEPTH else _names(look.colour, values)
-        return np.asarray(np.rint(255.0 * rgb), np.uint8)
+        return as_bytes(_truth_colours(look.colour, shown.truth.values(look.colour)))
     scale = scale_of(shown, look.colour, dark=look.dark)
     assert scale is not None
     return scale.rgb(_measure(shown, look.colour, after=after))
@@ -1030,18 +916,6 @@ def save_screenshot(
         save_png(path, scene.picture())
 
 
-def ticks(low: float, high: float, most: int = 5, *, whole: bool = False) -> NDArray[np.float64]:
-    """Return at most about ``most`` round numbers from ``low`` to ``high``; for angles, divisors of a full turn.
-
-    ``whole``: only whole numbers.
-    """
-    from matplotlib.ticker import MaxNLocator
-
-    steps = [1, 2, 3, 4.5, 6, 9, 10] if high == 360.0 else [1, 2, 2.5, 5, 10]
-    values = np.asarray(MaxNLocator(most, steps=steps, integer=whole).tick_values(low, high), np.float64)
-    return values[(values >= low) & (values <= high)]
-
-
 # What the browser draws of a window: points and colours as bytes, legends, and images as addresses.
 
 LEGEND_ROWS = 8
@@ -1122,7 +996,7 @@ def picture_state(values: NDArray[Any], scale: Scale) -> dict[str, Any]:
         "low": scale.low, "high": scale.high, "gamma": scale.gamma, "step": step,
         "unit": unit if step == 1 else f"{unit} at most in {step}×{step} px",
         "pair": [list(OFF_ON_BLACK), list(ON_ON_BLACK)] if two else None,
-        "missing": [*_bytes(scale.missing).tolist(), scale.missing_text],
+        "missing": [*as_bytes(scale.missing).tolist(), scale.missing_text],
         "table": b"" if two else _pixels(table_of(scale.colours)),
     }  # fmt: skip
 

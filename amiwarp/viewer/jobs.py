@@ -28,9 +28,10 @@ from amiwarp.io.plain_files import save_map, save_rows
 from amiwarp.io.spans import span_blocks
 from amiwarp.live.stream.session import RecentEvents
 from amiwarp.optics.models import ExactModel, alternatives
+from amiwarp.plotting.colours import Scale
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.tasks import Progress, silent
-from amiwarp.viewer.drawing import Look, Scale, Scene, caption, picture_state, select_part, shown_lines
+from amiwarp.viewer.drawing import Look, Scene, caption, picture_state, select_part, shown_lines
 from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, Inspector, Knobs, Source, size_name
 from amiwarp.viewer.layout import EXPORTS, SLIDERS, UNITS, orbit_text
 

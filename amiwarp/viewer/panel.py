@@ -27,6 +27,7 @@ from amiwarp.imaging.export import save_values
 from amiwarp.imaging.iwe import iwe
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.event_rates import EventRates
+from amiwarp.plotting.colours import count_scale
 from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
@@ -770,7 +771,7 @@ class Panel(layout.Actions):
         values["orbit"], values["column"] = map(drawing.float_bytes, lines)
         if before is None or shown.span is not before.span:
             counts = iwe(shown.span.events, *self.inspector.recording.events.size, vote=Vote.NEAREST)
-            values["overview"] = drawing.picture_state(counts, drawing.count_scale([counts]))
+            values["overview"] = drawing.picture_state(counts, count_scale([counts]))
         left = "recorded" if against is None else s.against
         titles = drawing.cloud_titles(self.inspector, left)
         return shown, {
