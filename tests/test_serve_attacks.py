@@ -24,11 +24,12 @@ import numpy as np
 import pytest
 
 from amiwarp import AmiwarpError, Camera, Prism, Recording, simulate
+from amiwarp.cli.view import warning
 from amiwarp.viewer import serve as server_module
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.layout import CALLS, SETTABLE
 from amiwarp.viewer.panel import MOST_IN_FLIGHT
-from amiwarp.viewer.serve import MOST_BYTES, HostNames, MessageFilter, address, is_local, reachable, serve, warning
+from amiwarp.viewer.serve import MOST_BYTES, HostNames, MessageFilter, address, is_local, reachable, serve
 from tests.test_serve import COUNT, TOKEN, WAIT_S, Counters, get, origin_of, served, until
 
 pytest.importorskip("trame_client")

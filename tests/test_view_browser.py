@@ -39,14 +39,14 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.live.stream.packets import encode_encoder, encode_events, encode_hello
-from amiwarp.live.stream.session import RecentEvents, followed
+from amiwarp.live.stream.session import LiveSource, RecentEvents, followed
 from amiwarp.live.stream.sources import open_source, reopen_source
 from amiwarp.plotting.colours import depth_image, table_of
 from amiwarp.viewer import drawing, jobs
 from amiwarp.viewer import inspector as inspector_module
 from amiwarp.viewer.drawing import FOOT_PX, ImageKind, make_images, strip_share
 from amiwarp.viewer.inspector import Inspector, Library, Source
-from amiwarp.viewer.jobs import JobCancelled, LiveSource, estimate_phase
+from amiwarp.viewer.jobs import JobCancelled, estimate_phase
 from amiwarp.viewer.layout import KEYS, SETTABLE
 from tests.test_serve import WAIT_S, served, until
 from tests.test_stream_returning import sender

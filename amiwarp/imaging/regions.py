@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.choices import Sharpness
 from amiwarp.events.recording import Events
 from amiwarp.imaging.export import PERCENTILE
-from amiwarp.imaging.metrics import random_variance
+from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes
+from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_variance
+from amiwarp.optics.models import Model
 
 Region = tuple[int, int, int, int]
 """Part of the image: left, top, right and bottom [px]; right and bottom are exclusive."""
@@ -41,6 +45,35 @@ def inside(events: Events, region: Region) -> NDArray[np.bool_]:
     """Return whether each event lies in a region, shape ``(n,)``."""
     left, top, right, bottom = region
     return (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
+
+
+class RegionSharpness:
+    """Measures the sharpness of a region of warped events, as calibration does: bilinear votes at dithered places.
+
+    It owns its buffers, so only one thread may use it.
+    """
+
+    def __init__(self, size: tuple[int, int], device: Any) -> None:
+        self._votes, self._device = Votes(CanvasShape(*size, dither=True), device), device
+        self._meter: SharpnessMeter | None = None
+
+    def measure(self, model: Model, events: UploadedEvents, offset_us: float, region: Region) -> tuple[float, float]:
+        """Return variance and sharpness of the smoothed region.
+
+        The variance over mean, as :attr:`amiwarp.Sharpness.VARIANCE`, grows with the number of events. The sharpness,
+        see :func:`amiwarp.imaging.metrics.relative_variance`, does not depend on it. ``offset_us`` is added to the
+        encoder's clock offset [us].
+        """
+        self._votes.add_events(model, events, drift=offset_us)
+        left, top, right, bottom = region
+        canvas, meter = CanvasShape(right - left, bottom - top, dither=True), self._meter
+        if meter is None or meter.image.shape != canvas.shape:
+            meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
+            self._meter = meter
+        part = self._votes.take()[0][top:bottom, left:right]
+        meter.image.write(part[None])
+        variance, mean = meter.measure(), float(part.mean())
+        return variance, relative_variance(variance, mean, SMOOTHING_PX) if mean > 0.0 else 0.0
 
 
 def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32], *, margin: int = 0) -> Region:

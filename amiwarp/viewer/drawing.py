@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import enum
 import math
-import os
-import sys
 from collections.abc import Sequence
 from contextlib import closing, suppress
-from ctypes import CDLL, c_void_p
-from ctypes.util import find_library
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -193,7 +189,6 @@ class ImageKind(enum.StrEnum):
 class ShownImages:
     """Images of the shown region, before and after compensation, with one scale for both."""
 
-    kind: ImageKind
     before: NDArray[np.float32] | None
     """Image of the events as recorded, or of the parameters compared with, shape ``(height, width)``, or
     ``(2, height, width)`` for OFF and ON. NaN marks pixels without a value. None for a log intensity, which needs
@@ -225,13 +220,13 @@ def make_images(
         known = np.concatenate([log[where] for log, where, _ in found])
         low, high = (float(np.percentile(known, share)) for share in (0.5, 99.5)) if known.size else (0.0, 1.0)
         scale = Scale("log intensity", "ON thresholds", low, max(high, low + 1e-3), "gray")
-        return ShownImages(kind, None if against is None else found[0][0], found[-1][0], scale, found[-1][2])
+        return ShownImages(None if against is None else found[0][0], found[-1][0], scale, found[-1][2])
     if kind is ImageKind.DEPTH:
         if inspector.depth is None:
             raise AmiwarpError("there is no depth map; start 'amiwarp view' with --depth")
         counts = make_images(inspector, ImageKind.COUNT, against=against, shown=shown)
         metres, scale = depth_image(inspector.depth)
-        return replace(counts, kind=kind, after=metres[top:bottom, left:right], after_scale=scale)
+        return replace(counts, after=metres[top:bottom, left:right], after_scale=scale)
     first = inspector.beside if against is None and inspector.beside is not None else inspector
     pair = (first, first.loaded, against), (inspector, window, knobs)
     if kind is ImageKind.TIME_SURFACE:
@@ -246,10 +241,10 @@ def make_images(
     else:
         scale = count_scale((before, after), "polarity" if kind is ImageKind.POLARITY else "gray")
     if not (difference and kind is ImageKind.COUNT):
-        return ShownImages(kind, before, after, scale)
+        return ShownImages(before, after, scale)
     most = max(float(np.abs(after - before).max()), 1.0)
     own = Scale("difference of events", "per pixel", -most, most, "difference")
-    return ShownImages(kind, before, after - before, scale, after_scale=own)
+    return ShownImages(before, after - before, scale, after_scale=own)
 
 
 def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:
@@ -343,7 +338,13 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
         return as_bytes(_truth_colours(look.colour, shown.truth.values(look.colour)))
     scale = scale_of(shown, look.colour, dark=look.dark)
     assert scale is not None
-    return scale.rgb(_measure(shown, look.colour, after=after))
+    if look.colour in (Colour.ANGLE, Colour.TIME):
+        return scale.rgb(third_axis(shown, Axis(look.colour.value)))
+    image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
+    if look.colour is Colour.DENSITY:
+        return scale.rgb(at_pixels(image, xy))
+    left, top, right, bottom = shown.region
+    return scale.rgb(residual(image, xy, (slice(top, bottom), slice(left, right))))
 
 
 def scale_of(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> Scale | None:
@@ -361,17 +362,6 @@ def scale_of(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> Scale | N
         top = math.ceil(np.percentile(image[image > 0], 99.0)) if (image > 0).any() else 1.0
         return Scale("events", "per pixel", 0.0, float(top), "cividis", GAMMA)
     return Scale("residual σ", "px", 0.0, WIDEST_PX, "cividis") if colour is Colour.RESIDUAL else None
-
-
-def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> NDArray[np.float64]:
-    """Return the displayed quantity of each point, in the unit of its scale, shape ``(n,)``."""
-    if colour in (Colour.ANGLE, Colour.TIME):
-        return third_axis(shown, Axis(colour.value))
-    image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
-    if colour is Colour.DENSITY:
-        return at_pixels(image, xy)
-    left, top, right, bottom = shown.region
-    return residual(image, xy, (slice(top, bottom), slice(left, right)))
 
 
 # Legend of the inspector's picture as VTK actors: rows of a coloured mark and the meaning of the colour, or a scale.
@@ -557,27 +547,6 @@ class Look:
         return replace(self, titles=tuple(titles), overlaid=self.overlaid or len(titles) == 1)
 
 
-def check_display() -> None:
-    """Raise :class:`AmiwarpError` if no window can be opened, where VTK would end the process."""
-    if not sys.platform.startswith("linux"):
-        return
-    remedy = "run with --web to serve the page for a browser, or with --screenshot to write a picture"
-    libraries = find_library("X11"), find_library("GL")
-    if None in libraries:
-        raise AmiwarpError(
-            f"a window needs libX11 and libGL; on Debian run: apt-get install libx11-6 libgl1; or {remedy}"
-        )
-    x11 = CDLL(libraries[0])
-    x11.XOpenDisplay.restype, x11.XCloseDisplay.argtypes = c_void_p, [c_void_p]
-    display = x11.XOpenDisplay(None)
-    if display is None:
-        given = os.environ.get("DISPLAY")
-        found = f"the display {given!r} cannot be opened" if given else "there is no display to open a window on"
-        raise AmiwarpError(f"{found}; {remedy}")
-    x11.XCloseDisplay(display)
-    os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkXOpenGLRenderWindow"
-
-
 def font() -> Path:
     """Return a font with Greek letters, which VTK's own font lacks."""
     from matplotlib import get_data_path
@@ -598,7 +567,8 @@ class Scene:
         number of renderers for other parts; they follow the :data:`OWN_RENDERERS` of the scene. Without ``off_screen``,
         a window shows the scene. Raises :class:`AmiwarpError` if VTK cannot draw on this machine.
         """
-        check_opengl() if off_screen else check_display()
+        if off_screen:
+            check_opengl()
         import pyvista
 
         parts = 1, OWN_RENDERERS + more

@@ -27,8 +27,7 @@ from amiwarp.events.recording import Events, Recording
 from amiwarp.events.truth import Cause, Truth
 from amiwarp.imaging.corners import find_background_activity
 from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, iwe, upload_events
-from amiwarp.imaging.metrics import SharpnessMeter, relative_variance
-from amiwarp.imaging.regions import SMOOTHING_PX, Region, inside, suggest_region
+from amiwarp.imaging.regions import Region, RegionSharpness, inside, suggest_region
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.spans import Span, read_span
 from amiwarp.optics.camera import Camera
@@ -114,38 +113,6 @@ class DrawnTruth:
             f"depth {self.values(c)[k]:.3f} m" if c is Colour.DEPTH else f"{c.value} {self.name(c, self.values(c)[k])}"
             for c in known
         )
-
-
-# Images of warped events and their sharpness for the inspector, on the device.
-
-
-class WindowImager:
-    """Measures the sharpness of images of warped events, as calibration does: bilinear votes at dithered places.
-
-    An imager owns its buffers, so only one thread may use it.
-    """
-
-    def __init__(self, size: tuple[int, int], device: Any) -> None:
-        self._votes, self._device = Votes(CanvasShape(*size, dither=True), device), device
-        self._meter: SharpnessMeter | None = None
-
-    def measure(self, model: Model, events: UploadedEvents, offset_us: float, region: Region) -> tuple[float, float]:
-        """Return variance and sharpness of the smoothed region.
-
-        The variance over mean, as :attr:`amiwarp.Sharpness.VARIANCE`, grows with the number of events. The sharpness,
-        see :func:`amiwarp.imaging.metrics.relative_variance`, does not depend on it. ``offset_us`` is added to the
-        encoder's clock offset [us].
-        """
-        self._votes.add_events(model, events, drift=offset_us)
-        left, top, right, bottom = region
-        canvas, meter = CanvasShape(right - left, bottom - top, dither=True), self._meter
-        if meter is None or meter.image.shape != canvas.shape:
-            meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
-            self._meter = meter
-        part = self._votes.take()[0][top:bottom, left:right]
-        meter.image.write(part[None])
-        variance, mean = meter.measure(), float(part.mean())
-        return variance, relative_variance(variance, mean, SMOOTHING_PX) if mean > 0.0 else 0.0
 
 
 # Parameters of the prism and selection of events under which the inspector shows a recording.
@@ -416,7 +383,7 @@ class Inspector:
         """Whether nobody looks any more: measuring the sharpness then raises :class:`AmiwarpError`."""
         self.lock = Lock()
         """Lock for the events on the device and the buffers of their images."""
-        self._imager, self._curve_imager = (WindowImager(source.size, device) for _ in range(2))
+        self._imager, self._curve_imager = (RegionSharpness(source.size, device) for _ in range(2))
         self._votes: dict[bool, Votes] = {}
         if calibration is not None:
             self.accept(calibration)
@@ -425,7 +392,7 @@ class Inspector:
         """Return an inspector that shows the same, with buffers of its own, for another thread."""
         made, size = copy(self), self.recording.events.size
         made.lock, made._votes, made.sources = Lock(), {}, dict(self.sources)
-        made._imager, made._curve_imager = (WindowImager(size, self.device) for _ in range(2))
+        made._imager, made._curve_imager = (RegionSharpness(size, self.device) for _ in range(2))
         made._window = made._span = None
         made.beside = None if self.beside is None else self.beside.copy()
         return made
@@ -761,13 +728,13 @@ class Inspector:
         for value in values[values >= 0.0].tolist() if name == size_name(knobs.model) else values.tolist():
             yield value, sharpness(knobs.with_values({name: value}))
 
-    def sharpness_meter(self, imager: WindowImager | None = None) -> Callable[[Knobs | None], float]:
+    def sharpness_meter(self, imager: RegionSharpness | None = None) -> Callable[[Knobs | None], float]:
         """Return a function that measures the sharpness of part of the window's events with given parameters.
 
         Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and belongs to the
         thread that uses the imager; by default, it has an imager of its own.
         """
-        w, imager = self.loaded, imager or WindowImager(self.recording.events.size, self.device)
+        w, imager = self.loaded, imager or RegionSharpness(self.recording.events.size, self.device)
         on_device: dict[float, UploadedEvents] = {}
 
         def sharpness(knobs: Knobs | None) -> float:

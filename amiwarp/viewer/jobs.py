@@ -5,7 +5,7 @@ import contextlib
 import math
 import re
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -19,14 +19,13 @@ from amiwarp.calib.settings import AUTO
 from amiwarp.choices import View
 from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder, rpm_between
+from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
 from amiwarp.imaging.regions import MOST_SEARCHED, busiest
 from amiwarp.io import RecordingWriter
 from amiwarp.io.formats import check_ending
 from amiwarp.io.plain_files import save_map, save_rows
 from amiwarp.io.spans import span_blocks
-from amiwarp.live.stream.session import RecentEvents
 from amiwarp.optics.models import ExactModel, alternatives
 from amiwarp.plotting.colours import Scale
 from amiwarp.reconstruction.picture import save_film
@@ -208,60 +207,6 @@ def cost_surface(
     scale = Scale("sharpness", "1", float(out.min()), max(float(out.max()), float(out.min()) + 1e-9), "cividis")
     return {"x": (sizes / scales[0]).tolist(), "y": (others / scales[1]).tolist(), "marks": marks, "x_title": x_title,
             "y_title": y_title, "picture": picture_state(out[::-1], scale)}  # fmt: skip
-
-
-# Live stream as the inspector sees it: its last seconds as a recording, and figures about it.
-
-
-class LiveSource:
-    """Function that returns the last seconds of a stream as a recording, with figures about the stream."""
-
-    def __init__(self, recent: RecentEvents, messages: Sequence[str]) -> None:
-        """Start with events of at least one turn. ``messages`` grows while the stream is followed.
-
-        Raises :class:`AmiwarpError` if there are fewer events.
-        """
-        first = recent.recording()
-        if first is None:
-            raise AmiwarpError("the stream has delivered less than one full turn; wait for one")
-        self._recent, self._messages, self._last = recent, messages, first
-
-    def __call__(self) -> Recording:
-        """Return the latest events of at least one turn."""
-        self._last = self._recent.recording() or self._last
-        return self._last
-
-    def state(self) -> dict[str, Any]:
-        """Return figures of this moment for page and window: rows of name, value and "bad", and what is wrong.
-
-        The speed is that of the last turn of the shown events; the latency is their age if they are shown now.
-        """
-        recent, problem, status = self._recent, self._recent.silence, self._recent.status
-        last, encoder = self._last.events.t_last, self._last.encoder
-        no_angles = "" if problem else recent.encoder_silence
-        turn_us = 2e6 if encoder is None else min(2e6, 60e6 / max(abs(encoder.rpm), 1.0))
-        rpm = None if encoder is None else rpm_between(encoder, round(last - turn_us), last)
-        said, speed = self._messages[-1] if self._messages else "", "unknown" if rpm is None else f"{rpm:.1f} rpm"
-        angles, rate = not (problem or no_angles), 0.0 if problem else status.rate_mev_s
-        fresh, latency_ms = angles and recent.turn_share >= 1.0, 1e3 * recent.age_s
-        rows = [
-            ("events", "interrupted, last ones shown" if problem else "receiving", problem),
-            ("prism angles", "receiving" if angles else "interrupted, last turn shown", not angles),
-            ("rate", f"{rate:.2f} million events/s", False),
-            ("latency", "–" if problem else f"{latency_ms:.0f} ms", not problem and latency_ms > 1e3),
-            ("turn covered", f"{100.0 * recent.turn_share:.0f} %", recent.turn_share < 1.0),
-            ("speed of the prism", speed if fresh else f"{speed}, last measured", rpm is None or not fresh),
-            ("lost events", f"{status.dropped:,}", status.dropped), ("out of order", f"{status.late:,}", status.late),
-        ]  # fmt: skip
-        if recent.segment > 1:
-            rows.append(("segment", f"{recent.segment}, since the source came back", False))
-        if said and not problem:
-            rows.append(("last message", said, False))
-        message = "" if said == problem else said
-        note = f"The stream is interrupted: {problem}. {message}".strip() if problem else ""
-        if no_angles:
-            note = f"No prism angles arrive: {no_angles}. The last turn before it is shown, until they return."
-        return {"live_rows": [[name, text, "bad" if bad else ""] for name, text, bad in rows], "stream_note": note}
 
 
 # Files that the page offers as downloads: images, events and films.

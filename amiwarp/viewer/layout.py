@@ -365,11 +365,9 @@ EMPTY: tuple[tuple[Any, str], ...] = (
           "column"),
     (False, "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "
             "difference has_b calibrating"),
-    (None, "overview before after surface"), ((), "live_rows updating titles against_choices"),
+    (None, "overview before after surface image_scale after_scale"), ((), "live_rows updating titles against_choices"),
 )  # fmt: skip
 """Values of state variables before the first update, and their names."""
-NO_SCALE: dict[str, Any] = {"bar": "", "ticks": [], "title": "", "square": None}
-"""Scale of an image before the first update."""
 
 
 class Actions:
@@ -549,7 +547,7 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
     recording = inspector.recording
     size = recording.events.size
     return {
-        **source_state(inspector), **knob_state(inspector), **prism_state(inspector),
+        **source_state(inspector), **knob_state(inspector), "turn_ms": turn_ms(inspector),
         "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "truth": truth_text(recording.truth),
         "size": list(size), "live": inspector.latest is not None,
         "models": list(alternatives(inspector.knobs.model)),
@@ -558,13 +556,13 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
         "keys": [[key, words] for key, _, words in KEYS], "scope": SCOPES[0], "scopes": list(SCOPES),
         "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
-        "kind": ImageKind.COUNT.value, "has_depth": inspector.depth is not None,
+        "kind": ImageKind.COUNT.value,
         "kinds": [each.value for each in ImageKind if each is not ImageKind.DEPTH or inspector.depth is not None],
         "speed": 0.1, "polarity": "both", "noise_ms": 2.0, "region_kind": "whole", "region_wanted": [0, 0, *size],
         "region": [0, 0, *size], "knob": inspector.orbit_names[0], "point_size": 2, "opacity": 1.0, "orbit_shown": True,
         "view": [View.FREE.value, 0], "tool": "region", "late": 0, "slice": [0.0, 1.0], "severity": "info",
         "picked": -1, "against": "recorded", "progress": 0, "calibrate_on": ["", ""], "curve_mark": 0.0,
-        "image_scale": NO_SCALE, "after_scale": NO_SCALE, "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
+        "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
         "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
         "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
         "statistics": {"rows": [], "x": [], "y": [], "median": None},
@@ -590,11 +588,9 @@ def knob_state(inspector: Inspector) -> dict[str, Any]:
             "notes": notes(inspector)}  # fmt: skip
 
 
-def prism_state(inspector: Inspector) -> dict[str, Any]:
-    """Return the state variables that depend on whether the prism rotates, so that there is a motion to compensate."""
-    turns = math.isfinite(inspector.turn_us)
-    return {"turn_ms": inspector.turn_us * 1e-3 if turns else 0.0, "has_model": turns,
-            "step_name": "turn" if turns else "window"}  # fmt: skip
+def turn_ms(inspector: Inspector) -> float:
+    """Return the duration of a turn [ms]; 0 if the prism does not rotate, so that there is no motion to compensate."""
+    return inspector.turn_us * 1e-3 if math.isfinite(inspector.turn_us) else 0.0
 
 
 def sliders(inspector: Inspector) -> list[dict[str, Any]]:

@@ -27,6 +27,7 @@ from amiwarp.imaging.export import save_values
 from amiwarp.imaging.iwe import iwe
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.event_rates import EventRates
+from amiwarp.live.stream.session import LiveSource
 from amiwarp.plotting.colours import count_scale
 from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
@@ -114,7 +115,7 @@ class Panel(layout.Actions):
         self.request_slow("preparation")
         if inspector.latest is not None:
             self.play()
-        if isinstance(inspector.latest, jobs.LiveSource):
+        if isinstance(inspector.latest, LiveSource):
             self.start_job(self._watch(inspector.latest))
 
     def close(self) -> None:
@@ -406,20 +407,11 @@ class Panel(layout.Actions):
     def play(self) -> None:
         """Play the recording from the current window, or follow a live stream; stop if already playing."""
         state = self.state
-        state.playing = not state.playing
-        if not state.playing or self.plays:
-            return
-        if not self.can_play():
-            state.playing = False
-            return
-        self.plays = True
-        self.start_job(self._play())
-
-    async def _play(self) -> None:
-        try:
-            await (self._run() if self.inspector.latest is None else self._follow())
-        finally:
-            self.plays = False
+        state.playing = not state.playing and (self.plays or self.can_play())
+        if state.playing and not self.plays:
+            self.plays = True
+            work = self._run() if self.inspector.latest is None else self._follow()
+            self.start_job(work).add_done_callback(lambda _: setattr(self, "plays", False))
 
     async def _run(self) -> None:
         state, loop, elapsed_s = self.state, asyncio.get_running_loop(), PLAY_S
@@ -450,11 +442,11 @@ class Panel(layout.Actions):
             await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
 
-    async def _watch(self, source: jobs.LiveSource) -> None:
+    async def _watch(self, source: LiveSource) -> None:
         """Show the figures of a live stream, also while it is not followed, until the page is closed."""
         while True:
             with self.state as state:
-                state.update(source.state())
+                state.live_rows, state.stream_note = source.figures()
             await asyncio.sleep(FOLLOW_S)
 
     def _clock_us(self, time_ms: float) -> int:
@@ -715,11 +707,11 @@ class Panel(layout.Actions):
                 self.inspector.knobs, self.inspector.sources = good
                 self.show_knobs()
                 raise
-            if self.compensates != state.has_model:  # the speed of a prism was set, or set to 0
+            if self.compensates != bool(state.turn_ms):  # the speed of a prism was set, or set to 0
                 state.axis = (Axis.ANGLE if self.compensates else Axis.TIME).value
                 self.request("look")
             mark = layout.knob_values(self.inspector)[state.knob]
-            state.update({**values, **layout.prism_state(self.inspector), "curve_mark": mark})
+            state.update({**values, "turn_ms": layout.turn_ms(self.inspector), "curve_mark": mark})
             if not state.playing:
                 self.remember("" if todo & {"suggestion", "state"} else self._change)
 

@@ -75,17 +75,6 @@ def address(host: str, port: int, token: str) -> str:
     return str(URL.build(scheme="http", host=reachable(host), port=port) / token / "")
 
 
-def warning(host: str) -> str | None:
-    """Return a warning for the user if other machines can connect to ``host``, else None."""
-    if is_local(host):
-        return None
-    return (
-        f"warning: served on {host} without encryption: everybody on the network who has the address can see the "
-        "recording, control the inspector and open the recordings in its folder; if you are the only user, use an SSH "
-        "tunnel"
-    )
-
-
 class HostNames:
     """Host names under which the server may be called.
 

@@ -19,6 +19,7 @@ from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.io.files import interrupts_later
+from amiwarp.live.stream.session import LiveSource
 from amiwarp.optics.models import alternatives
 from amiwarp.tasks import no_garbage_collection
 from amiwarp.viewer import drawing, jobs, layout
@@ -379,9 +380,9 @@ class Window(layout.Actions):
         if now - self._played_s < FOLLOW_S:
             return
         self._played_s = now
-        if isinstance(latest, jobs.LiveSource):
-            state = latest.state()
-            self._stream = [*(f"{name}: {text}" for name, text, _ in state["live_rows"]), state["stream_note"]]
+        if isinstance(latest, LiveSource):
+            rows, note = latest.figures()
+            self._stream = [*(f"{name}: {text}" for name, text, _ in rows), note]
         if self.plays:
             with self.errors_shown("window"):
                 self.inspector.renew()
