@@ -21,6 +21,7 @@ from amiwarp.imaging.metrics import random_variance
 from amiwarp.imaging.palette import OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK
 from amiwarp.imaging.regions import SMOOTHING_PX, Region, inside
 from amiwarp.imaging.residuals import WIDEST_PX, at_pixels, residual
+from amiwarp.imaging.tensors import latest_times
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import check_output, interrupts_later
 from amiwarp.io.spans import read_span
@@ -249,15 +250,11 @@ def make_images(
 
 def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:
     """Return the time of the latest event of each pixel from the start of the window on [ms]; NaN without events."""
-    events, (width, height) = window.counted, inspector.recording.events.size
-    x, y = (events.x, events.y) if knobs is None else np.rint(inspector.positions(events, knobs)).T
-    within = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    with np.errstate(invalid="ignore"):
-        pixel = np.where(within, y.astype(np.int64) * width + x.astype(np.int64), width * height)
-    surface = np.full(width * height + 1, np.nan, np.float32)  # the last element takes the events outside of the image
-    # events are in order of time; of several values for one pixel, NumPy keeps the last
-    surface[pixel] = (events.t - window.span.start_us) * 1e-3
-    return surface[:-1].reshape(height, width)
+    encoder = None if knobs is None else inspector.encoder_of(knobs)
+    model = None if knobs is None else inspector.model_of(knobs)
+    latest = latest_times(window.counted, *inspector.recording.events.size, per_polarity=False, model=model,
+                          encoder=encoder, device=inspector.device)  # fmt: skip
+    return np.where(latest < window.span.start_us, np.nan, (latest - window.span.start_us) * 1e-3).astype(np.float32)
 
 
 # Colours for events by cause, instance and depth, and the legend of these colours.

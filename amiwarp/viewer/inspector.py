@@ -360,9 +360,11 @@ class Inspector:
         """Nominal glass of the recording; a prism with an assumed apex if it is unknown."""
         self.zero_us = (source.t_first + source.t_last) // 2
         """Time at which the prism angle is 0 if there is no encoder [us]."""
-        best = self._best_model
+        best, ratio, second = self._best_model, None if recording.encoder is None else recording.encoder.ratio, {}
+        if ratio is not None:  # of a pair of prisms
+            second = {"second_apex": (as_wedge(self.prism).second or as_wedge(self.prism)).apex, "ratio": ratio}
         self.knobs = Knobs.given(
-            self._second_prism | self._typical_size(best), model=best, apex=self.nominal_apex,
+            second | self._typical_size(best), model=best, apex=self.nominal_apex,
             clock_offset=self._recorded_offset_us,
         )  # fmt: skip
         self.window: tuple[int, int] | None = None
@@ -473,15 +475,6 @@ class Inspector:
     def _best_model(self) -> str:
         """Name of the best model of the recording's optic; a pair of prisms if two angles may be theirs."""
         return best_model(self.recording) or RisleyModel.NAME
-
-    @property
-    def _second_prism(self) -> dict[str, float]:
-        """Values of the second prism of a pair as the recording gives them; none for one prism."""
-        ratio = None if self.recording.encoder is None else self.recording.encoder.ratio
-        if ratio is None:
-            return {}
-        wedge = as_wedge(self.prism)
-        return {"second_apex": (wedge.second or wedge).apex, "ratio": ratio}
 
     def _typical_size(self, model: str) -> dict[str, float]:
         """Return the size with which a model of another optic than a wedge starts; none for a wedge."""

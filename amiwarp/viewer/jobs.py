@@ -91,7 +91,13 @@ def estimate_phase(inspector: Inspector) -> bool:
     """
     if inspector.sources["phase"] is not Source.ASSUMED or not math.isfinite(inspector.turn_us):
         return False
-    measure = _searched(inspector).sharpness_meter()
+    searched, window, size = inspector, inspector.loaded, inspector.recording.events.size
+    if math.prod(size) > MOST_SEARCHED:  # of a large sensor, the part with most events, so that the search stays short
+        part, *times, _ = select_part(inspector, window, busiest(inspector.counts(window, None)))
+        searched = Inspector(part, device=inspector.device)
+        searched.set(inspector.knobs)
+        searched.window = times[0], times[1]
+    measure = searched.sharpness_meter()
 
     @cache
     def sharpness(phase: float) -> float:
@@ -107,19 +113,6 @@ def estimate_phase(inspector: Inspector) -> bool:
     inspector.set(replace(inspector.knobs, phase=found))
     inspector.sources["phase"] = Source.ESTIMATED
     return True
-
-
-def _searched(inspector: Inspector) -> Inspector:
-    """Return the inspector, or one of the part of a large sensor with most events, so that the search stays short."""
-    width, height = inspector.recording.events.size
-    if width * height <= MOST_SEARCHED:
-        return inspector
-    window = inspector.loaded
-    part, *times, _ = select_part(inspector, window, busiest(inspector.counts(window, None)))
-    small = Inspector(part, device=inspector.device)
-    small.set(inspector.knobs)
-    small.window = times[0], times[1]
-    return small
 
 
 # Calibration on what the inspector shows, and the sharpness over two parameters.

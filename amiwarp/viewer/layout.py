@@ -90,9 +90,8 @@ def apply_state(inspector: Inspector, state: ViewState) -> None:
         inspector.open(*window, state.selection)
     set_given(inspector, state.fov_deg, state.prism_index)
     inspector.set(state.knobs)
-    known = {name: source for name, source in inspector.sources.items() if name in ("camera", "prism")}
-    held = {name: source for name, source in known.items() if source is Source.FILE}
-    inspector.sources = dict(state.sources) | held
+    held = {name for name in ("camera", "prism") if inspector.sources[name] is Source.FILE}
+    inspector.sources = dict(state.sources) | dict.fromkeys(held, Source.FILE)
 
 
 def set_given(inspector: Inspector, fov_deg: float | None, index: float | None) -> None:

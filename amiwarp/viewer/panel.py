@@ -271,8 +271,8 @@ class Panel(layout.Actions):
 
         follow(("polarity", "hide_hot", "noise_filter"), self.request, "window")
         follow(("colour", "axis", "dark", "orbit_shown"), self.request, "look")
-        follow(("against", "kind", "difference"), self.request, "knobs")
-        follow(("model",), self._choose_model)
+        follow(("model",), lambda: self._wanted.update(model=self.state.model))
+        follow(("model", "against", "kind", "difference"), self.request, "knobs")
         follow(("model", "kind", "polarity", "hide_hot", "noise_filter"), self.released)
         for name in layout.CALLS:
             self.server.trigger(name)(getattr(self, name))
@@ -320,10 +320,6 @@ class Panel(layout.Actions):
             self.state.knob = name
         self.show_knobs()
         self.request("knobs", change=name)
-
-    def _choose_model(self) -> None:
-        self._wanted["model"] = self.state.model
-        self.request("knobs")
 
     def use_card(self, found: bool) -> None:
         """Show more points if the browser has a graphics card to draw them."""

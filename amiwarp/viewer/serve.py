@@ -242,8 +242,8 @@ def first_page(path: Path) -> str:
     """
     page = path.read_text(encoding="utf-8")
     page = re.sub(r'<meta\s+name="viewport"[^>]*>', '<meta name="viewport" content="width=device-width">', page)
-    page = re.sub(r"<title>.*?</title>", "<title>amiwarp inspector</title>", page)
-    page = page.replace("<title>", f'<script src="{ROUTE}/socket.js"></script><title>')
+    head = f'<script src="{ROUTE}/socket.js"></script><title>amiwarp inspector</title>'
+    page = re.sub(r"<title>.*?</title>", head, page)
     return re.sub(r'<div id="app"></div>\s*<script>.*?</script>', '<div id="app">opening the inspector …</div>', page,
                   flags=re.DOTALL)  # fmt: skip
 
