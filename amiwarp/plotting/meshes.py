@@ -68,7 +68,8 @@ def event_clouds(
     Raises
     ------
     AmiwarpError
-        If there are no events in window and region, or the calibration belongs to a camera of another size.
+        If there are no events in window and region, the calibration belongs to a camera of another size, or neither
+        recording nor calibration know how the prism turns.
 
     Notes
     -----

@@ -114,11 +114,12 @@ _prepared: set[str] = set()
 
 
 def prepare(inspector: Inspector) -> None:
-    """Compile and load what a log intensity needs, once per device, so that the first one takes no longer."""
+    """Compile and load what time surface and log intensity need, once per device, so that the first take no longer."""
     if str(inspector.device) in _prepared:
         return
     with suppress(AmiwarpError):
         window = replace(inspector.loaded, chosen=[])
+        _time_surface(inspector, window, inspector.knobs)
         log_intensity(inspector, window, inspector.knobs, share=PREPARING_SHARE)
         _prepared.add(str(inspector.device))
 
