@@ -239,7 +239,7 @@ OPENED_OTHERWISE = {
     "amiwarp.studies.cluster: info.read_text(encoding='utf-8')": "system",
     "amiwarp.live.stream.sources: open(0, 'rb', buffering=0, closefd=False)": "standard input",
     "amiwarp.viewer.serve: path.read_text(encoding='utf-8')": "file of the package",
-    "amiwarp.viewer.layout: (FOLDER / 'page.html').read_text(encoding='utf-8')": "file of the package",
+    "amiwarp.viewer.serve: (FOLDER / 'page.html').read_text(encoding='utf-8')": "file of the package",
     # Unfinished files of this process, or of a child of it.
     "amiwarp.imaging.export: open(part, 'r+b')": "own file",
     "amiwarp.io.files: open(path, 'r+b')": "lock file",

@@ -14,8 +14,9 @@ import pytest
 from amiwarp import AmiwarpError, Camera, DepthMap, Encoder, Events, MemoryEvents, Plate, Prism, Recording, simulate
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
+from amiwarp.plotting.colours import depth_image
 from amiwarp.viewer import jobs, layout
-from amiwarp.viewer.drawing import RECORDED, Look, depth_image, orbit_lines
+from amiwarp.viewer.drawing import RECORDED, Look, orbit_lines
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector
 from amiwarp.viewer.window import HELP_PAPER, MORE_KEYS, Window
 

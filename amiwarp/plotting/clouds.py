@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from ctypes.util import find_library
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 
 MISSING = "VTK found no OpenGL, so Matplotlib drew the point clouds; on Debian install libegl1 and libgl1-mesa-dri"
@@ -33,7 +35,7 @@ _CAMERA = ((2.75, -2.75, 1.55), (0.0, 0.0, -0.03), (0.0, 0.0, 1.0))
 """Position, focal point and upward direction of the camera."""
 
 
-__all__ = ["HALF", "MISSING", "Cloud", "Renderer", "draw_plain"]
+__all__ = ["HALF", "MISSING", "Cloud", "Renderer", "check_opengl", "draw_plain"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +54,11 @@ class Renderer:
 
     def __init__(self) -> None:
         """Start the process. If it fails, :meth:`render` returns None."""
-        environment = dict(os.environ)
-        if sys.platform.startswith("linux"):
-            # By default VTK tries X first, and crashes if libX11 is missing; EGL needs no display.
-            environment["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"
         quiet = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         command = [sys.executable, "-m", "amiwarp.plotting.clouds"]
         self._process: subprocess.Popen[bytes] | None = None
         with contextlib.suppress(OSError):
-            self._process = subprocess.Popen(command, env=environment, **quiet)  # type: ignore[call-overload]
+            self._process = subprocess.Popen(command, **quiet)  # type: ignore[call-overload]
 
     def __enter__(self) -> Renderer:
         return self
@@ -102,6 +100,16 @@ def draw_plain(axes: Any, cloud: Cloud) -> None:
     axes.text2D(0.03, 0.9, "angle", transform=axes.transAxes)
 
 
+def check_opengl() -> None:
+    """Select EGL for VTK on Linux. Raises :class:`AmiwarpError` without EGL, where VTK would end the process."""
+    if not sys.platform.startswith("linux"):
+        return
+    if find_library("EGL") is None:
+        raise AmiwarpError("VTK needs OpenGL (EGL) to draw; on Debian run: apt-get install libegl1 libgl1-mesa-dri")
+    # by default VTK tries X first, and crashes if libX11 is missing; EGL needs no display
+    os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"
+
+
 def _render_here(points: Path, picture: Path) -> None:
     """Draw one stored cloud with VTK in this process, and store the picture."""
     import pyvista
@@ -132,6 +140,7 @@ def _cropped(picture: NDArray[np.uint8], border: int = 8) -> NDArray[np.uint8]:
 
 def _main() -> None:
     """Load VTK, then draw all clouds in the folder whose name comes from the standard input."""
+    check_opengl()
     with tempfile.TemporaryDirectory() as folder:  # a first picture loads all that VTK needs
         points = Path(folder) / "points.npz"
         np.savez(points, xyz=np.zeros((2, 3), np.float32), on=np.array([False, True]))
