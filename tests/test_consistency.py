@@ -86,6 +86,18 @@ def test_the_flat_side_is_found(wide: Recording) -> None:
     assert any("flat face of the prism points to the scene" in w for w in found.warnings)
 
 
+def test_the_index_is_found(texture: np.ndarray) -> None:
+    """Without it, a wobble, a focal length and a distortion would share the error."""
+    prism = Prism(math.radians(4.0))
+    recording = simulate(texture, CAMERA, prism, duration_s=0.17, seed=6)
+    found = calibrated(replace(recording, prism=replace(prism, index=prism.index - 0.06)))
+    assert found.parameters["index"] == pytest.approx(prism.index, abs=0.01)
+    assert found.parameters["apex"] == pytest.approx(prism.apex, rel=0.02)
+    assert found.camera == CAMERA
+    assert error_px(recording, found) < 0.01
+    assert any("contradict index = 1.4568" in w and "give that of the glass" in w for w in found.warnings)
+
+
 def test_a_drifting_phase_is_reported(wide: Recording) -> None:
     assert wide.encoder is not None
     slipping = replace(wide, encoder=Encoder(wide.encoder.t, wide.encoder.angle * 1.008))

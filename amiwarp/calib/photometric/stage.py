@@ -1338,11 +1338,11 @@ def _corrections(given: ParameterSpace, space: ParameterSpace, answer: Answer) -
         )
     for name in space.names:
         if name not in given.names:
-            scale, unit = 1.0, "" if name in ("k1", "fy_over_fx") else " px"
+            scale, unit = 1.0, "" if name in ("k1", "fy_over_fx", "index") else " px"
             if units().get(name) == "rad":
                 scale, unit = math.degrees(1.0), " deg"
             was, now, by = (scale * x for x in (space.start[name], found[name], std[name]))
-            remedy = "; calibrate the lens" if name in LENS else ""
+            remedy = "; calibrate the lens" if name in LENS else "; give that of the glass" if name == "index" else ""
             if abs(now - was) >= CONTRADICTING * by:
                 said = f"the events contradict {name} = {was:.5g}{unit}: it was corrected to"
             else:  # the other one of two, or what a later correction explains
