@@ -4,6 +4,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -235,6 +236,16 @@ def test_a_camera_that_shakes_with_the_prism_is_refused(texture: np.ndarray) -> 
     recording = simulate(texture, CAMERA, PRISM, duration_s=0.17, camera_motion=motion, seed=6)
     with pytest.raises(AmiwarpError, match="the camera shakes with the prism, by 0"):
         calibrated(recording)
+
+
+def test_two_explanations_are_named_with_what_to_free() -> None:
+    side, seat, faces = (SimpleNamespace(cause=CAUSES[k]) for k in (2, -2, -1))
+    said = stage.rival_in_words(seat, faces, 0.09)  # type: ignore[arg-type]
+    assert "seat in its mount" in said
+    assert "evenness of the prism's faces" in said
+    assert "0.09 px" in said
+    assert "--free apex,phase,wobble_x,wobble_y or --free apex,phase,cylinder_x,cylinder_y" in said
+    assert "flat_side" not in stage.rival_in_words(side, seat, 0.09)  # type: ignore[arg-type]
 
 
 def test_linear_fit() -> None:
