@@ -4,6 +4,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -85,6 +86,18 @@ def test_the_flat_side_is_found(wide: Recording) -> None:
     assert found.prism.flat_side is FlatSide.SCENE
     assert error_px(wide, found) < 0.02
     assert any("flat face of the prism points to the scene" in w for w in found.warnings)
+
+
+def test_the_index_is_found(texture: np.ndarray) -> None:
+    """Without it, a wobble, a focal length and a distortion would share the error."""
+    prism = Prism(math.radians(4.0))
+    recording = simulate(texture, CAMERA, prism, duration_s=0.17, seed=6)
+    found = calibrated(replace(recording, prism=replace(prism, index=prism.index - 0.06)))
+    assert found.parameters["index"] == pytest.approx(prism.index, abs=0.01)
+    assert found.parameters["apex"] == pytest.approx(prism.apex, rel=0.02)
+    assert found.camera == CAMERA
+    assert error_px(recording, found) < 0.01
+    assert any("contradict index = 1.4568" in w and "give that of the glass" in w for w in found.warnings)
 
 
 def test_a_drifting_phase_is_reported(wide: Recording) -> None:
@@ -224,6 +237,16 @@ def test_a_camera_that_shakes_with_the_prism_is_refused(texture: np.ndarray) -> 
     recording = simulate(texture, CAMERA, PRISM, duration_s=0.17, camera_motion=motion, seed=6)
     with pytest.raises(AmiwarpError, match="the camera shakes with the prism, by 0"):
         calibrated(recording)
+
+
+def test_two_explanations_are_named_with_what_to_free() -> None:
+    side, seat, faces = (SimpleNamespace(cause=CAUSES[k]) for k in (2, -2, -1))
+    said = stage.rival_in_words(seat, faces, 0.09)  # type: ignore[arg-type]
+    assert "seat in its mount" in said
+    assert "evenness of the prism's faces" in said
+    assert "0.09 px" in said
+    assert "--free apex,phase,wobble_x,wobble_y or --free apex,phase,cylinder_x,cylinder_y" in said
+    assert "flat_side" not in stage.rival_in_words(side, seat, 0.09)  # type: ignore[arg-type]
 
 
 def test_linear_fit() -> None:
