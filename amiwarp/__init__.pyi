@@ -117,6 +117,7 @@ from .optics.prism import UnsizedPrism as UnsizedPrism
 from .optics.prism import apex_from_deflection as apex_from_deflection
 from .optics.prism import deflection_from_apex as deflection_from_apex
 from .optics.vibration import VibrationModel as VibrationModel
+from .plotting.meshes import event_clouds as event_clouds
 from .reconstruction.depth_at_rest import depth as depth
 from .reconstruction.picture import Picture as Picture
 from .reconstruction.picture import Reconstruction as Reconstruction
@@ -163,6 +164,5 @@ from .tasks import Progress as Progress
 from .translation.sources import DataSet as DataSet
 from .translation.sources import Interpolation as Interpolation
 from .translation.translator import translate as translate
-from .viewer.drawing import event_clouds as event_clouds
 from .viewer.panel import NotebookPage as NotebookPage
 from .viewer.panel import view as view

@@ -210,7 +210,7 @@ def opening(path: Path, device: str, n: int, length_us: int) -> dict[str, Any]:
 def rates(path: Path, n: int) -> dict[str, Any]:
     """Measure the count of all events over time, and a curve of 1,000 bins at four zooms."""
     from amiwarp.io import open_recording
-    from amiwarp.viewer.inspector import EventRates
+    from amiwarp.io.event_rates import EventRates
 
     source = open_recording(path).events
     counted, began, cpu = EventRates(source), time.perf_counter(), time.process_time()

@@ -49,7 +49,7 @@ CHANGE = """async (apex) => {
     document.querySelector('.clouds canvas').dataset.frames, document.querySelector('#image-after').dataset.images,
   ];
   const [before, begin] = [shown(), performance.now()];
-  trame.state.set('apex', apex);
+  trame.trigger('slide', ['apex', apex]);
   while (shown().some((each, k) => each === before[k])) await new Promise(requestAnimationFrame);
   return performance.now() - begin;
 }"""

@@ -1,18 +1,18 @@
 """A small network against the solver: log intensity from the compensated events of a quarter turn.
 
     python -m benchmarks.network --out NETWORK.pt [--device cuda:0] train [--seconds 400] [--cameras 256] [--side 128]
-    python -m benchmarks.network --out FILE.json [--device cuda:0] evaluate PICTURES --network NETWORK.pt
-        [--figure FILE.png] [--seeds 20]
+    python -m benchmarks.network --out FILE.json [--device cuda:0] evaluate PICTURES [--figure FILE.png] [--seeds 20]
 
 ``train`` simulates worlds of textured leaves, half of them with moving bodies, behind a turning prism, by
 :class:`amiwarp.EventSensor`, and trains on them for a time. No picture is used. ``evaluate`` shows the pictures of a
-folder to both methods, at rest and as backgrounds and bodies that move, and writes for each row the SSIM of either
-method, and the time that it took, events on the device.
+folder to the network in the package and to the solver, at rest and as backgrounds and bodies that move. It writes for
+each row the SSIM of either method, and the time that it took, events on the device; of the network also the time for a
+picture of a video.
 
 The network in the package was trained for 380 s, then for 250 s with ``--start`` and ``--first 100000 --rate 1e-3
 --cameras 96 --side 224 --pool 6144 --batch 24 --repeats 12``.
 
-The inputs are those of :func:`amiwarp.imaging.networks.quarter_turn_sums`.
+The inputs are those of :func:`amiwarp.imaging.networks.sums_of_parts`.
 """
 
 from __future__ import annotations
@@ -52,9 +52,10 @@ from amiwarp import (
     Simulation,
     Windows,
     polarity_histogram,
+    windows,
 )
 from amiwarp.imaging.metrics import TRUTH_PERCENTILES, picture_quality
-from amiwarp.imaging.networks import BINS, INPUTS, chords_of, quarter_turn_sums, sums_of_parts
+from amiwarp.imaging.networks import BINS, INPUTS, chords_of, sums_of_parts
 from benchmarks.reconstruct import CAMERA, PHASE, PRISM, textured
 
 STEPS = 4
@@ -397,6 +398,14 @@ def compared(
                        ("solver", lambda: by_solver(recording, model, device))):  # fmt: skip
         pictures[name], seconds = timed(work)
         row[name] = judged(pictures[name], true, areas) | {"seconds": seconds}
+    cut = windows(recording.events[:], encoder=recording.encoder, turns=0.25)
+
+    def video() -> Tensor:
+        found = network.over(recording, cut, model=model, encoder=recording.encoder)
+        return torch.stack([torch.from_dlpack(picture) for picture in found])
+
+    _, seconds = timed(video)
+    row["network"]["seconds_in_a_video"] = seconds / len(cut)
     return row, pictures
 
 
@@ -436,7 +445,7 @@ def in_motion(pictures: Tensor, seed: int, device: str) -> tuple[Recording, Mode
 def evaluate(options: argparse.Namespace) -> None:
     """Compare the network with the solver, and write the rows."""
     device, rows, shown = options.device, [], []
-    network = Network(options.network, input=quarter_turn_sums, multiple=2**LEVELS, device=device)
+    network = Network.quarter_turn(device=device)
     files = sorted(p for p in options.pictures.iterdir() if p.suffix in (".jpg", ".png"))
     for path in files:
         for contrast, noise_hz in CASES:
@@ -500,7 +509,6 @@ def main() -> None:
     training.add_argument("--repeats", type=int, default=16)
     comparing = commands.add_parser("evaluate")
     comparing.add_argument("pictures", type=Path)
-    comparing.add_argument("--network", type=Path, required=True)
     comparing.add_argument("--figure", type=Path)
     comparing.add_argument("--seeds", type=int, default=20)
     options = parser.parse_args()

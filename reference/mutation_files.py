@@ -64,7 +64,7 @@ from amiwarp.simulation.worlds.world_files import load_mesh
 from amiwarp.studies.dataset.making import JOURNAL, Journal, Made, list_items
 from amiwarp.studies.dataset.specification import load_specification
 from amiwarp.studies.evaluate.edges import THRESHOLDS
-from amiwarp.studies.evaluate.evaluation import CHANCE, Store, section
+from amiwarp.studies.evaluate.evaluation import Store, section
 from amiwarp.studies.evaluate.study import QUICK, CellResult, Condition, Stream, encode_picture
 from amiwarp.studies.stability import cells as stability
 from amiwarp.studies.stability.report import aggregate
@@ -193,10 +193,13 @@ def stored_edges() -> CellResult:
     """Return a cell of the edges with one row, of small pictures."""
     picture = encode_picture(np.zeros((3, 4), np.uint8))
     counts = [1] * len(THRESHOLDS)
-    names = (Stream.PLAIN.value, CHANCE)
+    names = (Stream.PLAIN.value, Stream.CALIBRATED.value)
     values: dict[str, Any] = {
         "images": [{"stream": name, "found": counts, "entropy": [0.5] * len(counts)} for name in names],
-        "rows": [{"stream": n, "truth": "Canny", "tolerance": 1.5, "matched": counts, "true": 9} for n in names],
+        "rows": [
+            {"stream": n, "truth": "Canny", "tolerance": 1.5, "matched": counts, "chance": counts, "true": 9}
+            for n in names
+        ],
         "sectors": [{"stream": names[0], "angle": 7.5, "recall": 0.5}],
         "pictures": {"Canny": picture, "geometry": picture},
     }
@@ -208,7 +211,7 @@ def stored_fading() -> CellResult:
     tiles = {"part_ms": 1.0, "columns": 2, "rate": [[1.0, 2.0]], "speed": [[1.0, 2.0]], "camera_speed": [[0.0, 1.0]]}
     film = [encode_picture(np.zeros((3, 4, 3), np.uint8))] * 2
     rows = [{"speed": speed, "rate": 1.0, "tiles": 5} for speed in (0.25, 1.0)]
-    return CellResult("fading", Condition(), {"rows": rows, "film": film, "tiles": tiles}, "", 1.0)
+    return CellResult("fading", Condition(), {"rows": rows, "whole": [], "film": film, "tiles": tiles}, "", 1.0)
 
 
 def stored_texture() -> CellResult:

@@ -1,8 +1,10 @@
 """Shared fixtures: devices, a headless browser, the folder of real recordings, a picture and a simulated recording."""
 
 import gc
+import importlib
 import math
 import os
+import pkgutil
 import shutil
 import sys
 from collections.abc import Iterator
@@ -13,8 +15,19 @@ import numpy as np
 import pytest
 import warp as wp
 
-from amiwarp import Calibration, Camera, PhotometricSettings, Prism, PrismMotion, Recording, calibrate, simulate
-from amiwarp.tasks import limited_cpu_threads
+from amiwarp import (
+    Calibration,
+    Camera,
+    PhotometricSettings,
+    Prism,
+    PrismMotion,
+    Recording,
+    calibrate,
+    kernels,
+    simulate,
+)
+from amiwarp.kernels.launch import load_all
+from amiwarp.tasks import cores, limited_cpu_threads
 from tests import SHARE
 
 wp.init()
@@ -23,24 +36,39 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 LONGEST_FIRST = (
-    "test_vibration", "test_mirror", "test_firmware", "test_photometric", "test_lens", "test_consistency",
-    "test_sensor_timing", "test_moving", "test_world_truth",
-    "test_prism_path", "test_stability", "test_view_browser", "test_live_writer", "test_named_worlds", "test_window",
-    "test_io_mutation", "test_public_values", "test_reconstruct", "test_chart", "test_refusals", "test_cli",
-    "test_dataset", "test_examples", "test_pixels", "test_compensate", "test_structure", "test_link", "test_demo",
-    "test_sparse", "test_translate", "test_session", "test_stream_cli", "test_view_cli", "test_design",
-    "test_optics_comparison",
-    "test_evaluate", "test_output", "test_optics_properties", "test_evaluate_motion", "test_stream_returning",
-    "test_calibrate", "test_optics", "test_auto", "test_benchmarks_gpu", "test_adaptive", "test_pixel_map",
-    "test_io_writers", "test_new_model",
+    "test_photometric", "test_moving", "test_consistency", "test_view_browser", "test_lens", "test_stream_cli",
+    "test_stability", "test_cli", "test_dataset", "test_examples", "test_rig", "test_demo", "test_design",
+    "test_named_worlds", "test_io_mutation", "test_refusals", "test_calibrate", "test_evaluate", "test_session",
+    "test_public_values", "test_chart", "test_optics_comparison", "test_evaluate_motion", "test_mirror",
+    "test_vibration", "test_firmware", "test_window", "test_live_writer", "test_world_truth", "test_sensor_timing",
+    "test_output", "test_benchmarks_gpu", "test_sparse", "test_benchmarks", "test_reconstruct", "test_io_hdf5",
+    "test_prism_path", "test_plate", "test_pixels", "test_serve_attacks", "test_io_writers", "test_link",
+    "test_chunk_file", "test_stream_cameras", "test_structure", "test_risley", "test_compensate", "test_small_orbits",
+    "test_worlds", "test_optics_properties", "test_auto", "test_arrays", "test_evaluate_paper", "test_view_cli",
+    "test_docstrings", "test_stream_returning", "test_io_formats", "test_cli_printable", "test_optics",
+    "test_conformance", "test_translate",
 )  # fmt: skip
 """Files whose tests take longest, in this order. They are run first, so that no process works alone at the end."""
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """With ``-n auto``, start one process more than there are cores: tests also wait, for clocks and browsers."""
+    return cores() + 1
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    """Let xdist keep the order of the files. By itself it begins with the files that have most tests."""
+    """Let xdist keep the order of the files. By itself it begins with the files that have most tests.
+
+    Kernels are compiled before its processes start, or each of them would compile them.
+    """
     if hasattr(config.option, "loadscopereorder"):
         config.option.loadscopereorder = False
+    if (getattr(config.option, "numprocesses", None) or 0) > 1 and not hasattr(config, "workerinput"):
+        for module in pkgutil.iter_modules(kernels.__path__, f"{kernels.__name__}."):
+            importlib.import_module(module.name)
+        for device in wp.get_devices():
+            load_all(device)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -4,6 +4,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -46,9 +47,10 @@ def wide(texture: np.ndarray) -> Recording:
     return simulate(texture, CAMERA, PRISM, duration_s=0.17, seed=6)
 
 
-def calibrated(recording: Recording, **settings: Any) -> Calibration:
+def calibrated(recording: Recording, density: float = 2.0, **settings: Any) -> Calibration:
+    """Return a calibration from few events. One node per pixel is a third faster, and the orbit 0.01 px too large."""
     given = {"model": "exact", "events": 60_000, "global_evaluations": 60, **settings}
-    return calibrate(recording, photometric=PhotometricSettings(pairs=60_000), **given)
+    return calibrate(recording, photometric=PhotometricSettings(pairs=60_000, density=density), **given)
 
 
 def error_px(recording: Recording, found: Calibration, camera: Camera = CAMERA) -> float:
@@ -69,7 +71,7 @@ def test_a_right_camera_is_left_alone(wide: Recording) -> None:
 def test_a_distortion_that_was_not_given_is_found(texture: np.ndarray) -> None:
     camera = replace(CAMERA, distortion=RadialTangential(k1=-0.1))
     recording = simulate(texture, camera, PRISM, duration_s=0.17, seed=6)
-    found = calibrated(replace(recording, camera=CAMERA))
+    found = calibrated(replace(recording, camera=CAMERA), density=1.0)
     assert error_px(recording, found, camera) < 0.03
     assert isinstance(found.camera.distortion, RadialTangential)
     assert found.camera.distortion.k1 == pytest.approx(-0.1, abs=0.01)
@@ -84,6 +86,18 @@ def test_the_flat_side_is_found(wide: Recording) -> None:
     assert found.prism.flat_side is FlatSide.SCENE
     assert error_px(wide, found) < 0.02
     assert any("flat face of the prism points to the scene" in w for w in found.warnings)
+
+
+def test_the_index_is_found(texture: np.ndarray) -> None:
+    """Without it, a wobble, a focal length and a distortion would share the error."""
+    prism = Prism(math.radians(4.0))
+    recording = simulate(texture, CAMERA, prism, duration_s=0.17, seed=6)
+    found = calibrated(replace(recording, prism=replace(prism, index=prism.index - 0.06)))
+    assert found.parameters["index"] == pytest.approx(prism.index, abs=0.01)
+    assert found.parameters["apex"] == pytest.approx(prism.apex, rel=0.02)
+    assert found.camera == CAMERA
+    assert error_px(recording, found) < 0.01
+    assert any("contradict index = 1.4568" in w and "give that of the glass" in w for w in found.warnings)
 
 
 def test_a_drifting_phase_is_reported(wide: Recording) -> None:
@@ -145,7 +159,7 @@ def read_by_column(recording: Recording, delay_us: int) -> Recording:
 
 def test_pixels_that_are_read_one_after_another_are_named(wide: Recording) -> None:
     with pytest.raises(AmiwarpError, match=r"events come late by .* us more from column to column") as refused:
-        calibrated(read_by_column(wide, 6))
+        calibrated(read_by_column(wide, 6), density=1.0)
     found = re.search(r"late by (\S+) us more", str(refused.value))
     assert found is not None
     assert float(found[1]) == pytest.approx(6.0, abs=1.0)
@@ -155,7 +169,7 @@ def test_an_accepted_delay_of_the_read_out_is_reported_and_no_error_of_the_encod
     wide: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stage, "LARGEST_SKEW_PX", 0.1)
-    found = calibrated(read_by_column(wide, 6))
+    found = calibrated(read_by_column(wide, 6), density=1.0)
     assert any(re.search(r"late by [56]\.?\d* us more from column to column", said) for said in found.warnings)
     assert found.harmonics is None
     assert found.parameters["apex"] == pytest.approx(PRISM.apex, rel=0.01)
@@ -165,7 +179,7 @@ def test_a_very_wrong_camera_is_no_error_of_the_encoder(wide: Recording, monkeyp
     """A false error of the angle is found first; the camera is corrected with it and without it."""
     errors = iter([np.array([0.004, 0.002, 0.0, 0.006, 0.0, 0.0])])
     monkeypatch.setattr(stage, "find_angle_error", lambda *_: next(errors, None))
-    found = calibrated(replace(wide, camera=replace(wide.camera, cx=wide.camera.cx + 3.0)))
+    found = calibrated(replace(wide, camera=replace(wide.camera, cx=wide.camera.cx + 3.0)), density=1.0)
     assert next(errors, None) is None
     assert found.harmonics is None
     assert found.camera.cx == pytest.approx(wide.camera.cx, abs=0.3)
@@ -174,7 +188,7 @@ def test_a_very_wrong_camera_is_no_error_of_the_encoder(wide: Recording, monkeyp
 def test_a_wrong_ratio_of_the_focal_lengths_is_found(texture: np.ndarray) -> None:
     camera = replace(CAMERA, fy=1.05 * CAMERA.fx)
     recording = simulate(texture, camera, PRISM, duration_s=0.17, seed=6)
-    found = calibrated(replace(recording, camera=CAMERA))
+    found = calibrated(replace(recording, camera=CAMERA), density=1.0)
     assert found.camera.fy / found.camera.fx == pytest.approx(1.05, abs=0.01)
     assert found.harmonics is None
     assert error_px(recording, found, camera) < 0.02
@@ -186,7 +200,7 @@ def test_a_wrong_ratio_of_the_focal_lengths_is_found(texture: np.ndarray) -> Non
 def test_an_uneven_or_wobbling_prism_is_found(texture: np.ndarray, name: str, shape: tuple[float, float]) -> None:
     motion = PrismMotion(720.0, **{name: shape})
     recording = simulate(texture, CAMERA, PRISM, duration_s=0.17, motion=motion, seed=6)
-    found = calibrated(recording)
+    found = calibrated(recording, density=1.0)
     assert {"cylinder_x", "wobble_x"} & found.parameters.keys()
     assert error_px(recording, found) < 0.04  # the other one explains the events nearly as well
 
@@ -223,6 +237,16 @@ def test_a_camera_that_shakes_with_the_prism_is_refused(texture: np.ndarray) -> 
     recording = simulate(texture, CAMERA, PRISM, duration_s=0.17, camera_motion=motion, seed=6)
     with pytest.raises(AmiwarpError, match="the camera shakes with the prism, by 0"):
         calibrated(recording)
+
+
+def test_two_explanations_are_named_with_what_to_free() -> None:
+    side, seat, faces = (SimpleNamespace(cause=CAUSES[k]) for k in (2, -2, -1))
+    said = stage.rival_in_words(seat, faces, 0.09)  # type: ignore[arg-type]
+    assert "seat in its mount" in said
+    assert "evenness of the prism's faces" in said
+    assert "0.09 px" in said
+    assert "--free apex,phase,wobble_x,wobble_y or --free apex,phase,cylinder_x,cylinder_y" in said
+    assert "flat_side" not in stage.rival_in_words(side, seat, 0.09)  # type: ignore[arg-type]
 
 
 def test_linear_fit() -> None:

@@ -5,7 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from amiwarp.studies.evaluate.claims import PAPER, Interval, Verdict, differences, judge, ranges, untestable
+from amiwarp.studies.evaluate.claims import (
+    PAPER,
+    Interval,
+    Verdict,
+    differences,
+    judge,
+    judge_number,
+    ranges,
+    untestable,
+)
 
 T_975 = {1: 12.7062, 2: 4.30265, 4: 2.77645, 9: 2.26216}
 """Quantiles of Student's t for a two-sided interval of 95 %, by degrees of freedom, as printed tables have them."""
@@ -63,7 +72,8 @@ def test_pairs_are_those_of_one_seed_and_case() -> None:
     claim = judge(1, "More.", found, "the score", above=0.0)
     means = [0.2, 0.2, 0.2, 0.3]  # the mean over the cases that a seed has
     half = 3.18245 * np.std(means, ddof=1) / 2.0
-    assert claim.ours == f"{np.mean(means):.3g} [{np.mean(means) - half:.3g}, {np.mean(means) + half:.3g}], 4 seeds"
+    ends = f"[{np.mean(means) - half:.3g}, {np.mean(means) + half:.3g}]"
+    assert claim.ours == f"{np.mean(means):.3g} {ends}, 4 seeds; seeds that lack a case: 2"
     assert claim.verdict is Verdict.REPRODUCED
     assert claim.rule == "the 95 % interval over the seeds of the score lies above 0"
     assert claim.paper == PAPER[1].value
@@ -98,6 +108,8 @@ def test_claims_without_results() -> None:
     assert judge(None, "", {"room": {}}, "the score", above=0.0).verdict is Verdict.NOT_TESTABLE
     assert judge(None, "", {"room": {1: 9.0}}, "the score", above=0.0).verdict is Verdict.UNDECIDED
     assert judge(None, "", {}, "the score", above=0.0).paper == "not in the paper"
+    assert judge_number(12, "", 1.9, "the error", below=2.0, unit="px").verdict is Verdict.REPRODUCED
+    assert judge_number(12, "", 2.1, "the error", below=2.0, unit="px").ours == "2.1 px, computed"
     assert untestable(9, "Pose.", "no network").verdict is Verdict.NOT_TESTABLE
 
 

@@ -675,7 +675,7 @@ def header_is_missing(compiler: tuple[str, ...], header: str) -> bool:
     return shutil.which(compiler[0]) is None or subprocess.run(make, capture_output=True, check=False).returncode != 0
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def avr(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
     """Start the simulator on an image for the ATmega2560."""
     if header_is_missing(("avr-gcc", "-mmcu=atmega2560"), "avr/io.h"):

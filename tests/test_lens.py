@@ -351,6 +351,15 @@ def recordings() -> list[amiwarp.Recording]:
     return [simulated(pose, seed) for seed, pose in enumerate(poses)]
 
 
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stop after two passes, with a third of the pairs: the images are small."""
+    monkeypatch.setattr(calibration, "MOST_PASSES", 2)
+    monkeypatch.setattr(calibration, "PAIRS", calibration.PAIRS // 3)
+    monkeypatch.setattr(calibration, "FINE_PAIRS", calibration.FINE_PAIRS // 3)
+
+
+@pytest.mark.usefixtures("quick")
 def test_recordings_of_a_still_board_give_lens_and_prism(recordings: list[amiwarp.Recording], tmp_path: Path) -> None:
     encoder = recordings[0].encoder
     assert encoder is not None
@@ -580,14 +589,13 @@ def stream(recordings: list[amiwarp.Recording], tmp_path_factory: pytest.TempPat
     return path
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_stream_gives_a_lens_once_its_poses_are_enough(
     stream: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lens_live, "GOOD_POSES", 4)
     monkeypatch.setattr(corner_fit, "LARGEST_FOCAL_DEVIATION", 0.02)
     monkeypatch.setattr(calibration, "MOST_PASSES", 1)
-    monkeypatch.setattr(calibration, "PAIRS", calibration.PAIRS // 3)
-    monkeypatch.setattr(calibration, "FINE_PAIRS", calibration.FINE_PAIRS // 3)
     result = CliRunner().invoke(app, ["lens", str(stream), str(tmp_path / "camera.json"), "--fast", *LIVE])
     assert result.exit_code == 0, result.output
     data = json.loads(result.stdout)

@@ -530,6 +530,25 @@ def test_own_network_shows_the_scene(quarter: Any, device: str) -> None:
         Network.quarter_turn(device=device)(events, 160, 120, **window)
 
 
+def test_own_network_makes_several_pictures_at_a_time(quarter: Any, device: str, monkeypatch: Any) -> None:
+    """They are those of single calls, also of windows that do not follow one another."""
+    torch = pytest.importorskip("torch")
+    if device != "cpu" and not torch.cuda.is_available():
+        pytest.skip("PyTorch without CUDA")
+    simulation, _, optic, _ = quarter
+    recording, network = simulation.run(), Network.quarter_turn(device=device)
+    cut = windows(recording.events[:], encoder=optic["encoder"], turns=0.25)[np.array([0, 1, 2, 4])]
+    sizes: list[int] = []
+    run = Network._run_grids
+    monkeypatch.setattr(Network, "_run_grids", lambda self, z, states: (sizes.append(len(z)), run(self, z, states))[1])
+    found = list(network.over(recording, cut, **optic))
+    assert sizes == [3, 1]
+    for picture, first, last, t0, t1 in zip(found, cut.start, cut.stop, cut.t_start, cut.t_end, strict=True):
+        window = {"t_start": int(t0), "t_end": int(t1)}
+        one = network(recording.events[int(first) : int(last)], *recording.events.size, **window, **optic)
+        np.testing.assert_allclose(picture, one, atol=1e-4)
+
+
 def test_the_command_uses_the_own_network(quarter: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("torch")
     simulation, _, optic, window = quarter

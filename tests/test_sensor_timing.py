@@ -9,6 +9,7 @@ import warp as wp
 
 from amiwarp import Calibration, ExactModel, PhotometricSettings, Settings, calibrate, model_error
 from amiwarp.brightness.solver import THRESHOLD, BrightnessMap, EventTable, Tiles, darkness, set_lags
+from amiwarp.calib.photometric.stage import judge_lag
 from amiwarp.studies.stability.cells import Condition, make
 
 SMALL = Condition(width=160, height=120, turns=3.0, latency_us=0.0)
@@ -25,12 +26,22 @@ def calibrated(condition: Condition) -> tuple[Calibration, float]:
 
 
 def test_slow_photoreceptors_are_found() -> None:
-    """Without the correction the error is 0.074 px."""
-    found, error = calibrated(replace(SMALL, cutoff_hz=100.0))
+    """Without the correction the answer is refused; on a sensor of 160 × 120 px it is 0.07 px off."""
+    found, error = calibrated(replace(SMALL, cutoff_hz=100.0, width=128, height=96))
     assert error < 0.05
     assert found.photometric is not None
     assert 1000.0 < found.photometric.time_constant_us < 6000.0  # 1592 us at white, 3470 us at the middle level
     assert any("the pixels are slow" in w for w in found.warnings)
+
+
+def test_pixels_too_slow_are_refused() -> None:
+    """About a tenth of a correction remains, and slow pixels turn the path by more than a small angle."""
+    assert judge_lag(0.2, 0.1) == (True, "")
+    for turn, moved_px, words in ((0.4, 0.1, "turns by 23 deg"), (0.2, 0.38, "by 0.38 px rms")):
+        accepted, reason = judge_lag(turn, moved_px)
+        assert not accepted
+        assert words in reason
+        assert "slower prism" in reason
 
 
 def test_an_unknown_refractory_period_is_found() -> None:

@@ -24,11 +24,12 @@ import numpy as np
 import pytest
 
 from amiwarp import AmiwarpError, Camera, Prism, Recording, simulate
+from amiwarp.cli.view import warning
 from amiwarp.viewer import serve as server_module
 from amiwarp.viewer.inspector import Inspector
 from amiwarp.viewer.layout import CALLS, SETTABLE
 from amiwarp.viewer.panel import MOST_IN_FLIGHT
-from amiwarp.viewer.serve import MOST_BYTES, HostNames, MessageFilter, address, is_local, reachable, serve, warning
+from amiwarp.viewer.serve import MOST_BYTES, HostNames, MessageFilter, address, is_local, reachable, serve
 from tests.test_serve import COUNT, TOKEN, WAIT_S, Counters, get, origin_of, served, until
 
 pytest.importorskip("trame_client")
@@ -186,7 +187,7 @@ def test_junk_changes_nothing_and_the_page_goes_on(
             assert after.keys() == first.keys()
             changed = {name for name in first if first[name] != after[name]}
             assert changed <= {"curve", "curve_mark", "updating", "knob", "message", "severity"}  # "a is no number"
-            await page.send("trame.state.update", [{"key": "apex", "value": 0.5}])
+            await page.send("trame.trigger", "slide", ["apex", 0.5], {})
             sharpness = after["sharpness"]
             while sharpness == after["sharpness"]:
                 sharpness = (await page.state())["sharpness"]
@@ -247,7 +248,7 @@ def check_values(state: dict[str, Any], name: str) -> list[Any]:
 def test_numbers_that_are_none_do_not_pass() -> None:
     for name, check in SETTABLE.items():
         assert not any(check(value) for value in (math.nan, math.inf, None, b"x", {}, "\ud800" * 300)), name
-        assert SETTABLE["apex"](1) and not SETTABLE["apex"](True)  # noqa: PT018
+        assert SETTABLE["point_size"](1) and not SETTABLE["point_size"](True)  # noqa: PT018
 
 
 # sizes

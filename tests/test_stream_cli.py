@@ -136,11 +136,13 @@ def test_a_replay_of_two_encoders_is_compensated_and_recorded_again(
     with subprocess.Popen(
         [*words, *map(str, args)], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as live:
-        subprocess.run([*words, "record", "-", str(tmp_path / "h.h5")], env=environment, stdin=live.stdout, check=True)
+        record = [*words, "record", "-", str(tmp_path / "h.h5"), "--json"]
+        done = subprocess.run(record, env=environment, stdin=live.stdout, capture_output=True, check=True)
         assert live.stderr is not None
         error = live.stderr.read().decode()
     assert live.returncode == 0, error
     assert f"{PAIR_SENT:,} events" in error
+    assert json.loads(done.stdout)["events"] == PAIR_SENT
     for copy in ("r.h5", "h.h5"):
         assert_same_recording(tmp_path / copy, source)
     compensate(open_recording(source), Calibration.load(calibration), tmp_path / "offline.h5")
@@ -433,24 +435,6 @@ def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path, monke
     assert 119.0 < motor.target_rpm(0) < 715.0
     said = json.loads(done.stdout)
     assert said["events"] == said["compensated"] == SENT
-
-
-def test_packets_go_through_pipes(folder: Path, tmp_path: Path) -> None:
-    """Pipe ``live --raw-to -`` into ``record -``."""
-    args = ["live", folder / "recording.h5", "--fast", "--calibration", folder / "c.json", "--raw-to", "-"]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
-    words = [sys.executable, "-c", "from amiwarp.__main__ import main; main()"]
-    with subprocess.Popen(
-        [*words, *map(str, args), "--device", "cpu"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as live:
-        out = subprocess.run(
-            [*words, "record", "-", str(tmp_path / "r.h5"), "--json"], env=environment, stdin=live.stdout,
-            capture_output=True, check=True,
-        )  # fmt: skip
-        assert live.stderr is not None
-        assert b"400,000 events" in live.stderr.read()
-    assert json.loads(out.stdout)["events"] == SENT
-    np.testing.assert_array_equal(times(tmp_path / "r.h5"), times(folder / "recording.h5"))
 
 
 @pytest.mark.parametrize(

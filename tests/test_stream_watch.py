@@ -34,11 +34,10 @@ from amiwarp import (
 from amiwarp.live.stream import session as ring_module
 from amiwarp.live.stream.adaptive import WINDOW_US, SpeedController, SpeedKeeper, prism_orbit
 from amiwarp.live.stream.packets import EncoderSamples, Packet, PacketDecoder
-from amiwarp.live.stream.session import SECONDS, PhaseCheck, RecentEvents, followed
+from amiwarp.live.stream.session import SECONDS, LiveSource, PhaseCheck, RecentEvents, followed
 from amiwarp.live.stream.sockets import Forward
 from amiwarp.live.stream.sources import FileSource, open_source
 from amiwarp.viewer.inspector import Inspector
-from amiwarp.viewer.jobs import LiveSource
 from reference.calibration_sample import exact_calibration
 
 CAMERA, PRISM = Camera.from_fov(120, 90, math.radians(50)), Prism(math.radians(2.0))
@@ -53,8 +52,8 @@ def recording(texture: np.ndarray) -> Recording:
 
 def said(live: LiveSource) -> dict[str, str]:
     """Return what the inspector says of a stream: its rows by name, and as "note" what is wrong."""
-    state = live.state()
-    return {**{name: text for name, text, _ in state["live_rows"]}, "note": state["stream_note"]}
+    rows, note = live.figures()
+    return {**{name: text for name, text, _ in rows}, "note": note}
 
 
 def rpm(rows: dict[str, str]) -> float:

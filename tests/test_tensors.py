@@ -265,6 +265,27 @@ def test_no_events(device: str) -> None:
     assert host(amiwarp.event_count(none, 4, 3, windows=amiwarp.windows(none, count=3))).shape == (0, 3, 4)
 
 
+@pytest.mark.parametrize("burst", [0, 300, 3000])
+def test_intervals_in_parts(burst: int, device: str, every_core: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full interval is cut into parts; with more events at one time than a part may hold, it cannot be."""
+    monkeypatch.setattr(tensors, "CAPACITY", 2000)
+    monkeypatch.setattr(tensors, "LEAST_BITS", 20)
+    events = some_events()
+    t = events.t.copy()
+    t[5000 : 5000 + burst] = t[5000]
+    events = Events(events.x, events.y, t, events.p)
+    there = put(events, device)
+    one, (t0, t1) = tensors._batch(there, None, None, None, None, None, device), (int(t[0]), int(t[-1]))
+    parts, fullest = tensors._parts(one, tensors._grid(WIDTH, HEIGHT, steps=BINS - 1, rate=BINS - 1))
+    assert (parts > 1) == (fullest < tensors.CAPACITY) == (burst < tensors.CAPACITY)
+    found = host(amiwarp.voxel_grid(there, WIDTH, HEIGHT, BINS))
+    assert np.abs(found - linear_grid(events, BINS, BINS - 1, t0, t1)).max() < EXACT
+    ranges = [(0, 9000), (9000, len(t))]
+    cut = amiwarp.windows(events, ranges=ranges)
+    each = [linear_grid(events[a:b], BINS, BINS - 1, int(t[a]), int(t[b - 1])) for a, b in ranges]
+    assert np.abs(host(amiwarp.voxel_grid(there, WIDTH, HEIGHT, BINS, windows=cut)) - np.stack(each)).max() < EXACT
+
+
 def test_a_cell_with_very_many_events(device: str) -> None:
     """More events in one pixel and interval than a packed word holds: nothing overflows."""
     n = tensors.CAPACITY + 1000

@@ -170,13 +170,13 @@ def distance(found: amiwarp.Calibration, shake: amiwarp.Vibration) -> float:
 
 @pytest.fixture(scope="module")
 def calibrated(shaken: amiwarp.Recording) -> amiwarp.Calibration:
-    prompt = amiwarp.PhotometricSettings(pairs=50_000, sensor=amiwarp.SensorTiming(refractory_us=1.0))
+    prompt = amiwarp.PhotometricSettings(pairs=25_000, sensor=amiwarp.SensorTiming(refractory_us=1.0))
     return amiwarp.calibrate(shaken, model="vibration", events=50_000, photometric=prompt)
 
 
 def test_an_unknown_refractory_period_is_refused_with_the_remedy(shaken: amiwarp.Recording) -> None:
     with pytest.raises(amiwarp.AmiwarpError, match=r"within 0\.0\d+ px only.*give the sensor's refractory period"):
-        amiwarp.calibrate(shaken, model="vibration", events=50_000, photometric=replace(COARSE, pairs=20_000))
+        amiwarp.calibrate(shaken, model="vibration", events=25_000, photometric=replace(COARSE, pairs=10_000))
 
 
 def test_it_is_calibrated_without_start_values(calibrated: amiwarp.Calibration) -> None:

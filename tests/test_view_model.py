@@ -1,14 +1,11 @@
 """The inspector's values for its page: suggested region, sharpness, residuals, event rates and state."""
 
-import asyncio
-import contextlib
 import json
 import math
 import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -37,22 +34,25 @@ from amiwarp import (
     simulate,
 )
 from amiwarp.choices import Axis, Colour, View
+from amiwarp.imaging import regions
+from amiwarp.imaging.export import save_values
 from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.metrics import random_variance, relative_variance
-from amiwarp.optics.models import MODELS, Model
+from amiwarp.imaging.regions import suggest_region
+from amiwarp.io import event_rates, spans
+from amiwarp.io.event_rates import EventRates
+from amiwarp.optics.models import MODELS, Model, size_names
+from amiwarp.plotting.colours import Scale, table_of
 from amiwarp.viewer import drawing, jobs
-from amiwarp.viewer import inspector as timeline
 from amiwarp.viewer import inspector as viewer
-from amiwarp.viewer.drawing import ImageKind, Scale, events_text, make_images
+from amiwarp.viewer.drawing import ImageKind, events_text, make_images
 from amiwarp.viewer.inspector import (
-    EventRates,
     Inspector,
     Knobs,
     Selection,
     Source,
     foreign_names,
     size_name,
-    suggest_region,
 )
 from amiwarp.viewer.jobs import (
     calibrated_events,
@@ -60,7 +60,6 @@ from amiwarp.viewer.jobs import (
     estimate_phase,
     find_calibration,
     write_events,
-    write_image,
 )
 from amiwarp.viewer.layout import (
     SLIDERS,
@@ -74,8 +73,8 @@ from amiwarp.viewer.layout import (
     initial_state,
     knob_values,
     orbit_text,
+    sliders,
 )
-from amiwarp.viewer.panel import Panel
 
 TRUE = Prism(math.radians(1.0))
 
@@ -139,7 +138,7 @@ def test_the_slider_of_the_size_has_name_and_unit_of_the_optic_s_own(
     inspector.use_model(model)
     assert size_name(model) == name
     assert SLIDERS[name][:2] == label
-    sizes = [each for each in ("apex", "amplitude", "inverse_depth") if f"model === '{model}'" in SLIDERS[each][3]]
+    sizes = [each["name"] for each in sliders(inspector) if each["name"] in size_names()]
     assert sizes == [name]  # the others are not shown
     assert size_of(inspector.model) > 0.0  # a typical value, at first
     assert inspector.sources[name] is not Source.HAND
@@ -238,7 +237,7 @@ def test_a_depth_map_is_shown_in_metres_with_unknown_pixels_in_a_colour_of_their
     scale = images.after_scale
     assert scale is not None
     assert (scale.low, scale.high, scale.label) == (pytest.approx(0.5), pytest.approx(0.8), "depth [m]; blue: unknown")
-    rgb, table = scale.rgb(images.after), drawing.table_of(scale.colours).astype(int)
+    rgb, table = scale.rgb(images.after), table_of(scale.colours).astype(int)
     missing = rgb[np.isnan(images.after)].astype(int)
     assert len(np.unique(missing, axis=0)) == 1
     assert np.abs(table - missing[0]).max(axis=1).min() > 60  # no colour of the scale is near
@@ -493,8 +492,8 @@ def test_of_a_large_image_the_square_with_most_events_is_searched(monkeypatch: p
     before[320:640, 512:832] += 3.0
     after = before.copy()
     after[450:540, 600:700] = np.where(np.arange(100) % 10 < 2, 20.0, 0.0)
-    monkeypatch.setattr(viewer, "MOST_SEARCHED", 330**2)
-    assert viewer.busiest(before) == (512, 320, 832, 640)
+    monkeypatch.setattr(regions, "MOST_SEARCHED", 330**2)
+    assert regions.busiest(before) == (512, 320, 832, 640)
     left, top, right, bottom = suggest_region(before, after)
     assert 590 < left < right < 720
     assert 440 < top < bottom < 560
@@ -555,7 +554,7 @@ def test_counts_and_polarities_are_those_of_the_window(inspector: Inspector) -> 
         np.testing.assert_array_equal(one, of_window[top:bottom, left:right])
         np.testing.assert_array_equal(both.sum(axis=0), one)
         np.testing.assert_array_equal(one, np.rint(one))
-    events = inspector.loaded.events
+    events = inspector.loaded.counted
     expected = np.zeros((inspector.camera.height, inspector.camera.width))
     np.add.at(expected, (events.y, events.x), 1)
     np.testing.assert_array_equal(counts.before, expected[top:bottom, left:right])
@@ -572,7 +571,7 @@ def test_a_time_surface_holds_the_latest_times(inspector: Inspector) -> None:
     found = make_images(inspector, ImageKind.TIME_SURFACE)
     window = inspector.loaded
     expected = np.full(found.after.shape, np.nan)
-    for x, y, t in zip(window.events.x, window.events.y, window.events.t, strict=True):
+    for x, y, t in zip(window.counted.x, window.counted.y, window.counted.t, strict=True):
         expected[y, x] = (t - window.span.start_us) * 1e-3
     assert found.before is not None
     np.testing.assert_allclose(found.before, expected, atol=1e-4)
@@ -668,7 +667,7 @@ def expected_rates(events: Events, edges: np.ndarray) -> np.ndarray:
 
 
 def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(timeline, "MOST_BINS", 4096)
+    monkeypatch.setattr(event_rates, "MOST_BINS", 4096)
     events = random_events(50_000, 16, 16)
     rates = EventRates(MemoryEvents(events, 16, 16))
     assert rates.share == 0.0
@@ -688,7 +687,7 @@ def test_rates_are_counted_at_any_zoom(monkeypatch: pytest.MonkeyPatch) -> None:
     edges, exact = rates.curve(40_000, 41_000, 200)
     assert exact.shape == (2, 200)
     np.testing.assert_array_equal(exact, expected_rates(events, edges))
-    monkeypatch.setattr(timeline, "MOST_EXACT", 10)
+    monkeypatch.setattr(event_rates, "MOST_EXACT", 10)
     edges, coarse = rates.curve(40_000, 41_000, 200)
     assert 30 < coarse.shape[1] < 60
     np.testing.assert_allclose(coarse[0, 1:-1], expected_rates(events, edges)[0, 1:-1])
@@ -948,7 +947,7 @@ def test_the_events_of_the_window_are_downloaded(
     inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, compensated: bool, most_events: int
 ) -> None:
     monkeypatch.setattr(viewer, "MOST_EVENTS", most_events)
-    monkeypatch.setattr(jobs, "BLOCK", 10_000)
+    monkeypatch.setattr(spans, "BLOCK", 10_000)
     region, (start, length) = (20, 10, 140, 110), inspector.first_window()
     inspector.open(start, length, Selection(1, region))
     path = tmp_path / "events.h5"
@@ -976,10 +975,10 @@ def test_the_noise_filter_of_a_download_does_not_restart_at_its_blocks(
 ) -> None:
     window = inspector.first_window()
     inspector.open(*window, Selection(noise_us=300))
-    expected = inspector.loaded.events
+    expected = inspector.loaded.counted
     assert 0.2 * inspector.loaded.span.count < len(expected) < 0.95 * inspector.loaded.span.count
     monkeypatch.setattr(viewer, "MOST_EVENTS", 6400)
-    monkeypatch.setattr(jobs, "BLOCK", 500)
+    monkeypatch.setattr(spans, "BLOCK", 500)
     thinned = Inspector(inspector.recording)
     thinned.open(*window, Selection(noise_us=300))
     assert write_events(thinned, tmp_path / "events.h5", compensated=False) == len(expected)
@@ -990,23 +989,23 @@ def test_images_are_downloaded(inspector: Inspector, tmp_path: Path) -> None:
     inspector.open(*inspector.first_window(), Selection(region=(30, 20, 110, 80)))
     for kind in (ImageKind.COUNT, ImageKind.POLARITY, ImageKind.TIME_SURFACE):
         images = make_images(inspector, kind)
-        write_image(images, tmp_path / f"{kind}.tif")
+        save_values(tmp_path / f"{kind}.tif", images.after)
         with Image.open(tmp_path / f"{kind}.tif") as picture:
             assert picture.n_frames == (2 if kind is ImageKind.POLARITY else 1)
             for page, values in enumerate(images.after if kind is ImageKind.POLARITY else [images.after]):
                 picture.seek(page)
                 np.testing.assert_array_equal(np.asarray(picture), values)
     with pytest.raises(AmiwarpError, match=r"as \.tif, not"):
-        write_image(images, tmp_path / "image.jpg")
-    write_image(images, tmp_path / "image.tif")
+        save_values(tmp_path / "image.jpg", images.after)
+    save_values(tmp_path / "image.tif", images.after)
     with pytest.raises(AmiwarpError, match="exists"):
-        write_image(images, tmp_path / "image.tif")
+        save_values(tmp_path / "image.tif", images.after)
 
 
 def test_the_events_shown_are_downloaded_as_tables(
     inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(jobs, "BLOCK", 10_000)
+    monkeypatch.setattr(spans, "BLOCK", 10_000)
     inspector.open(*inspector.first_window(), Selection(region=(20, 10, 140, 110), polarity=1))
     jobs.write_table(inspector, tmp_path / "events.csv")
     jobs.write_table(inspector, tmp_path / "events.npz")
@@ -1030,32 +1029,6 @@ def test_a_calibration_is_downloaded(inspector: Inspector, tmp_path: Path) -> No
     inspector.as_calibration().save(tmp_path / "calibration.json")
     data = json.loads((tmp_path / "calibration.json").read_text())
     assert data["parameters"]["apex"]["value"] == TRUE.apex
-
-
-class PageState(dict[str, Any]):
-    """State variables of a page, as attributes and by name."""
-
-    __getattr__ = dict.__getitem__
-    __setattr__ = dict.__setitem__
-
-
-def test_a_number_that_is_typed_during_an_update_stays() -> None:
-    """The page sets the variable while an update is computed in a thread; the end of the update once reset it."""
-    state = PageState(apex=1.0, knob="apex", playing=True, has_model=False)
-
-    async def compute_while_the_user_types(work: Any) -> tuple[None, dict[str, Any]]:
-        state.apex = 2.5
-        return None, {}
-
-    inspector = SimpleNamespace(turn_us=math.inf, knobs=Knobs(), sources={})
-    panel = SimpleNamespace(
-        errors_shown=lambda what: contextlib.nullcontext(), in_thread=compute_while_the_user_types, state=state,
-        inspector=inspector, compensates=False, shown=None, set_knobs=lambda: None,
-        show_knobs=lambda: state.update(apex=1.0), remember=lambda change: None, _compute=None,
-    )  # fmt: skip
-    asyncio.run(Panel.make(panel, {"knobs"}))  # type: ignore[arg-type]
-    assert state.apex == 2.5
-    assert state.curve_mark == 2.5
 
 
 @pytest.mark.parametrize("polarity", [None, 1])
@@ -1087,7 +1060,7 @@ def test_intervals_between_two_runs_are_not_counted(monkeypatch: pytest.MonkeyPa
     made.open(0, 100_000)
     found = made.statistics()
     assert found["rows"][0] == ["rate", "64,000 events/s"]  # 3,200 in 50 ms
-    counts = np.array(found["y"]) / 100.0 * (3200 - 2 * viewer.RUNS)
+    counts = np.array(found["y"]) / 100.0 * (3200 - 2 * spans.RUNS)
     np.testing.assert_allclose(counts, np.rint(counts), rtol=0, atol=1e-6)
 
 

@@ -25,9 +25,10 @@ from amiwarp import (
 )
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.cli.app import app
+from amiwarp.plotting.colours import CAUSE_COLOURS, GREY
 from amiwarp.viewer import inspector as viewer
 from amiwarp.viewer import inspector as window
-from amiwarp.viewer.drawing import CAUSE_COLOURS, GREY, Look, Scene, colours_of, event_text, legend_of
+from amiwarp.viewer.drawing import Look, Scene, colours_of, event_text, legend_of
 from amiwarp.viewer.inspector import Inspector, Selection, colours_on_offer, truth_text
 from amiwarp.viewer.layout import initial_state
 

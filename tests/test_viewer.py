@@ -27,9 +27,11 @@ from amiwarp import (
 )
 from amiwarp.calib.bad_pixels import MaskedEventSource
 from amiwarp.choices import Axis, Colour, View
+from amiwarp.imaging.residuals import WIDEST_PX, residual
+from amiwarp.io.spans import read_span
 from amiwarp.optics.models import build_model, rungs
-from amiwarp.viewer.drawing import WIDEST_PX, Look, Scene, axis_range, colours_of, orbit_lines, residual, third_axis
-from amiwarp.viewer.inspector import Inspector, Knobs, Selection, read_span, recorded_counts
+from amiwarp.viewer.drawing import Look, Scene, axis_range, colours_of, orbit_lines, third_axis
+from amiwarp.viewer.inspector import Inspector, Knobs, Selection
 from reference.calibration_sample import exact_calibration
 
 TRUE = Prism(math.radians(1.0))
@@ -420,7 +422,7 @@ def test_a_residual_is_the_standard_deviation_across_an_edge(width: float, toler
     y = rng.uniform(0.0, 79.0, n)
     x, y = (np.rint(each).astype(np.int64) for each in (x, y))
     none = np.zeros(n, np.int64)
-    image = recorded_counts(Events.from_arrays(x, y, none, none), (100, 80))
+    image = iwe(Events.from_arrays(x, y, none, none), 100, 80)
     xy = np.stack([x, y], axis=1).astype(np.float32)[(y > 12) & (y < 68)]
     found = residual(image, xy)
     assert found.mean() == pytest.approx(width, abs=tolerance)

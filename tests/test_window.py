@@ -14,8 +14,9 @@ import pytest
 from amiwarp import AmiwarpError, Camera, DepthMap, Encoder, Events, MemoryEvents, Plate, Prism, Recording, simulate
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.optics.models import MODELS
+from amiwarp.plotting.colours import depth_image
 from amiwarp.viewer import jobs, layout
-from amiwarp.viewer.drawing import RECORDED, Look, depth_image, orbit_lines
+from amiwarp.viewer.drawing import RECORDED, Look, orbit_lines
 from amiwarp.viewer.inspector import DisplayedWindow, Inspector
 from amiwarp.viewer.window import HELP_PAPER, MORE_KEYS, Window
 
@@ -27,6 +28,13 @@ TRUE = Prism(math.radians(1.0))
 def recording(texture: np.ndarray) -> Recording:
     camera = Camera.from_fov(120, 90, math.radians(50))
     return simulate(texture, camera, TRUE, duration_s=0.25, seed=1, nominal_prism=Prism(math.radians(1.2)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def only_new_garbage() -> None:
+    """Leave what earlier tests loaded out of the garbage collections here, which would take ten times as long."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

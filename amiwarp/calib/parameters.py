@@ -34,7 +34,7 @@ from amiwarp.optics.models import (
     size_names,
     wrap_angle,
 )
-from amiwarp.optics.prism import NominalPrism, Plate, Prism, UnsizedPrism
+from amiwarp.optics.prism import NominalPrism, Plate, Prism, UnsizedPrism, as_wedge
 from amiwarp.validation import guarded, instance, one_of, real, shown, vector
 
 NOMINAL_APEX = math.radians(2.0)
@@ -488,7 +488,7 @@ def widened(space: ParameterSpace, names: tuple[str, ...]) -> ParameterSpace:
     They start at their present values. Raises :class:`AmiwarpError` if one of them moves no event.
     """
     camera = space.camera
-    given = given_lens(camera)
+    given = {**given_lens(camera), "index": as_wedge(space.prism).index}
     values = {**{n: given.get(n, 0.0) for n in names}, **space.start}
     half = {"focal_length": 0.6 * values.get("focal_length", 0.0), "k1": 0.5, "fy_over_fx": 0.3}
     half |= dict.fromkeys(("center_x", "center_y"), 0.2 * camera.width)

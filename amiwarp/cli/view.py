@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
+import sys
 from collections.abc import Callable, Iterator
+from ctypes import CDLL, c_void_p
+from ctypes.util import find_library
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,7 +34,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.io import open_recording
 from amiwarp.io.formats import check_ending
-from amiwarp.viewer.serve import warning
+from amiwarp.viewer.serve import is_local
 
 if TYPE_CHECKING:
     from amiwarp.viewer.drawing import Look
@@ -136,9 +140,8 @@ class StreamOptions:
         if not self.live:
             yield None
             return
-        from amiwarp.live.stream.session import RecentEvents, followed
+        from amiwarp.live.stream.session import LiveSource, RecentEvents, followed
         from amiwarp.live.stream.sources import open_source, reopen_source
-        from amiwarp.viewer.jobs import LiveSource
 
         messages: list[str] = []
 
@@ -284,6 +287,7 @@ def run_view(
         if not page.web:
             from amiwarp.viewer import window
 
+            check_display()
             window.Window(waiting[0], look=look.look(waiting[0]), view=look.view, size=look.pixels(window.SIZE)).run()
             return
 
@@ -296,6 +300,38 @@ def run_view(
             return waiting.pop() if waiting else new_inspector()
 
         page.serve(inspector_of_tab, library, name=recording.name, common=common)
+
+
+def warning(host: str) -> str | None:
+    """Return a warning for the user if other machines can connect to ``host``, else None."""
+    if is_local(host):
+        return None
+    return (
+        f"warning: served on {host} without encryption: everybody on the network who has the address can see the "
+        "recording, control the inspector and open the recordings in its folder; if you are the only user, use an SSH "
+        "tunnel"
+    )
+
+
+def check_display() -> None:
+    """Raise :class:`AmiwarpError` if no window can be opened, where VTK would end the process."""
+    if not sys.platform.startswith("linux"):
+        return
+    remedy = "run with --web to serve the page for a browser, or with --screenshot to write a picture"
+    libraries = find_library("X11"), find_library("GL")
+    if None in libraries:
+        raise AmiwarpError(
+            f"a window needs libX11 and libGL; on Debian run: apt-get install libx11-6 libgl1; or {remedy}"
+        )
+    x11 = CDLL(libraries[0])
+    x11.XOpenDisplay.restype, x11.XCloseDisplay.argtypes = c_void_p, [c_void_p]
+    display = x11.XOpenDisplay(None)
+    if display is None:
+        given = os.environ.get("DISPLAY")
+        found = f"the display {given!r} cannot be opened" if given else "there is no display to open a window on"
+        raise AmiwarpError(f"{found}; {remedy}")
+    x11.XCloseDisplay(display)
+    os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkXOpenGLRenderWindow"
 
 
 def _lines(d: dict[str, Any]) -> list[str]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import bisect
+import contextlib
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from amiwarp.events import recording as checks
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, described, regroup, slice_bounds
 from amiwarp.kernels import events as kernels
+from amiwarp.kernels.launch import launch
 from amiwarp.kernels.prism_angle import EncoderParams
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import TIME_LIMIT, as_times, guarded, instance, on_gpu, one_of, whole
@@ -400,7 +402,8 @@ def join(arrays: Sequence[wp.array]) -> wp.array:
 def limits(events: DeviceEvents) -> list[int]:
     """Return first and last time [us], largest x and y [px], largest p, and 1 if times decrease anywhere.
 
-    Largest x and y are 0 for compensated events. Found once. Raises :class:`AmiwarpError` if there are no events.
+    Largest x and y are 0 for compensated events. Found once; those of a part of :class:`DeviceMemoryEvents` are limits
+    of all its events. Raises :class:`AmiwarpError` if there are no events.
     """
     if not len(events):
         raise AmiwarpError("there are no events, so there is no first or last time; check len() first")
@@ -434,6 +437,52 @@ def time_span(events: Events | DeviceEvents) -> tuple[int, int]:
     return int(events.t[0]), int(events.t[-1])
 
 
+def times_at(events: Events | DeviceEvents, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the times of a few events [us]."""
+    if isinstance(events, Events) or events.device.is_cpu:
+        return (events.t if isinstance(events, Events) else events.t.numpy())[indices]
+    return _look_up(kernels.take_times, events.t, indices)
+
+
+def find_indices(events: Events | DeviceEvents, times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the index of the first event at or after each time."""
+    if isinstance(events, Events) or events.device.is_cpu:
+        return np.searchsorted(events.t if isinstance(events, Events) else events.t.numpy(), times).astype(np.int64)
+    return _look_up(kernels.find_times, events.t, times)
+
+
+def _look_up(kernel: Any, t: wp.array, given: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return what a kernel finds in the times of events on a device for each given number."""
+    if not len(given):
+        return given.copy()
+    shared = host_numbers(len(given), wp.int64, t.device)
+    shared.numpy()[: len(given)] = given
+    launch(kernel, len(given), [t, shared], [shared], device=t.device)
+    wait(t.device)
+    found = shared.numpy()[: len(given)].copy()
+    idle_numbers[t.device.is_cpu, wp.int64].append(shared)
+    return found
+
+
+idle_numbers: defaultdict[tuple[bool, Any], list[wp.array]] = defaultdict(list)
+"""Memory of the host that a later call uses again, by whether it is for a CPU, and type. GPUs read it and write to it,
+so it is page-locked for them. Locking takes longer than many calls. What is not used is 0 in arrays of int32."""
+
+
+def host_numbers(n: int, dtype: Any, device: Any) -> wp.array:
+    """Return at least ``n`` numbers in memory of the host that the device, too, reads and writes.
+
+    A caller that has waited for the device puts it back to ``idle_numbers``.
+    """
+    idle = idle_numbers[device.is_cpu, dtype]
+    while idle:
+        with contextlib.suppress(IndexError):  # another thread took it
+            found = idle.pop()
+            if len(found) >= n:
+                return found
+    return wp.zeros(max(n, 64), dtype=dtype, device="cpu", pinned=device.is_cuda)
+
+
 def device_for(events: Events | DeviceEvents, device: Any) -> Any:
     """Return the device to compute on: that of events on a device, else ``device``, "cpu" if it is None.
 
@@ -454,7 +503,19 @@ def wait(device: Any) -> None:
     arrays, and read the results on any stream, also with libraries that ignore streams.
     """
     if device.is_cuda:
+        _keep_memory(device.alias)
         wp.synchronize_stream(device)
+
+
+@cache
+def _keep_memory(name: str) -> None:
+    """Let Warp keep memory that a call gave back, unless a limit is set: at most a GiB, or a sixteenth of the GPU's.
+
+    Otherwise each wait returns it to the driver, and the next call takes up to a millisecond to get it again.
+    """
+    device = wp.get_device(name)
+    if device.is_mempool_enabled and not wp.get_mempool_release_threshold(device):
+        wp.set_mempool_release_threshold(device, min(1 << 30, device.total_memory // 16))
 
 
 # A source of events that are held on a device.
@@ -520,7 +581,11 @@ class DeviceMemoryEvents(EventSource):
 
     def __getitem__(self, which: slice) -> DeviceEvents:  # type: ignore[override]
         """Return the events of a slice without steps where they are: as views on the device."""
-        return self._events[which]
+        found = self._events[which]
+        if len(found):
+            ends = times_at(found, np.array([0, len(found) - 1])).tolist()
+            found._limits.extend([*ends, *limits(self._events)[2:]])
+        return found
 
     def slice(self, start: int, stop: int) -> Events:
         return self.slice_on_device(start, stop).to_host()
@@ -538,11 +603,10 @@ class DeviceMemoryEvents(EventSource):
         DeviceEvents
             The events.
         """
-        return self._events[max(start, 0) : max(stop, 0)]
+        return self[max(start, 0) : max(stop, 0)]
 
     def find(self, t: int) -> int:
-        times = self._events.t
-        return bisect.bisect_left(range(len(self)), t, key=lambda index: int(times[index : index + 1].numpy()[0]))
+        return int(find_indices(self._events, np.array([t]))[0])
 
     def between(self, t_start: int, t_end: int) -> Events:
         return self.between_on_device(t_start, t_end).to_host()
@@ -560,7 +624,8 @@ class DeviceMemoryEvents(EventSource):
         DeviceEvents
             The events.
         """
-        return self._events[self.find(t_start) : self.find(t_end)]
+        start, stop = find_indices(self._events, np.array([t_start, t_end])).tolist()
+        return self[start:stop]
 
     def blocks(self, *, count: int | None = None, duration_us: int | None = None) -> Iterator[Events]:
         chunks = (self.slice(start, start + DEFAULT_BLOCK) for start in range(0, len(self), DEFAULT_BLOCK))

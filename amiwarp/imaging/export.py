@@ -41,6 +41,11 @@ def tone(counts: NDArray[Any]) -> NDArray[np.float32]:
     return np.asarray(np.clip(counts / top, 0.0, 1.0) ** GAMMA, np.float32)
 
 
+def in_two_colours(off: NDArray[Any], on: NDArray[Any]) -> NDArray[Any]:
+    """Return the brightness of OFF and ON events as colours on black, at most 2, shape ``(height, width, 3)``."""
+    return off[..., None] * np.array(OFF_ON_BLACK) + on[..., None] * np.array(ON_ON_BLACK)
+
+
 def to_picture(image: NDArray[np.float32], layers: Layers) -> NDArray[np.uint8]:
     """Return an image of events as an 8-bit picture, shape ``(height, width)``; with polarities ``(height, width, 3)``.
 
@@ -54,8 +59,7 @@ def to_picture(image: NDArray[np.float32], layers: Layers) -> NDArray[np.uint8]:
     elif layers is Layers.SIGNED:
         shown = 0.5 + 0.5 * np.sign(image) * tone(np.abs(image))
     else:
-        bright = tone(image)
-        shown = bright[0][..., None] * np.array(OFF_ON_BLACK) + bright[1][..., None] * np.array(ON_ON_BLACK)
+        shown = in_two_colours(*tone(image))
     return np.asarray(np.rint(np.clip(shown, 0.0, 1.0) * 255.0), np.uint8)
 
 
@@ -64,6 +68,16 @@ def save_png(path: Path, picture: Any, *, overwrite: bool = False) -> None:
     check_ending(path, "pictures are written", [".png"])
     with NewFile(path, overwrite=overwrite) as new:
         encode_png(new.part, picture)
+
+
+def save_values(path: Path, image: NDArray[np.float32]) -> None:
+    """Write the values of an image as float32 to a new .tif file; of several layers, each to a page."""
+    from PIL import Image
+
+    check_ending(path, "values of images are written", [".tif"])
+    with NewFile(path) as new:
+        first, *more = (Image.fromarray(np.asarray(page, np.float32)) for page in image.reshape(-1, *image.shape[-2:]))
+        encode_image(new.part, first, "TIFF", save_all=bool(more), append_images=more)
 
 
 def encode_png(path: Path, picture: Any) -> None:

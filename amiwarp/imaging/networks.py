@@ -14,10 +14,10 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import DeviceEvents, device_for, wait
+from amiwarp.events.device_events import DeviceEvents, device_for, find_indices, time_span, wait
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
-from amiwarp.imaging.tensors import ToTensor, Windows, find_indices, on_device, polarity_histogram, voxel_grid
+from amiwarp.imaging.tensors import ToTensor, Windows, on_device, polarity_histogram, voxel_grid
 from amiwarp.io.files import input_path
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import Model
@@ -145,7 +145,7 @@ class Network:
         >>> next(network.over(recording, turns, **optic)).shape
         (1, 48, 64)
         """
-        return cls(OWN, input=quarter_turn_sums, multiple=OWN_MULTIPLE, device=device)
+        return _QuarterTurn(OWN, input=quarter_turn_sums, multiple=OWN_MULTIPLE, device=device)
 
     def __call__(
         self,
@@ -232,10 +232,9 @@ class Network:
 
     def _iterate(self, recording: Recording, windows: Windows, optic: dict[str, Any]) -> Iterator[Any]:
         states = None
-        rows = (windows.start, windows.stop, windows.t_start, windows.t_end)
-        for start, stop, t_start, t_end in zip(*(row.tolist() for row in rows), strict=True):
-            options = {"t_start": t_start, "t_end": t_end, **optic}
-            out, states = self._run(recording.events[start:stop], *recording.events.size, states, options)
+        for events, some in _in_lots(recording, windows, 1):
+            options = {"t_start": int(some.t_start[0]), "t_end": int(some.t_end[0]), **optic}
+            out, states = self._run(events, *recording.events.size, states, options)
             yield out
 
     def _run(self, events: Any, width: int, height: int, states: Any, options: dict[str, Any]) -> tuple[Any, Any]:
@@ -248,10 +247,16 @@ class Network:
             raise AmiwarpError(
                 f"the input function gives shape {grid.shape}; expected (channels, {height}, {width}), one window"
             )
+        out, states = self._run_grids(grid.reshape((1, *grid.shape)), states)
+        return out[0] if isinstance(events, DeviceEvents) else out[0].numpy(), states
+
+    def _run_grids(self, grids: wp.array, states: Any) -> tuple[wp.array, Any]:
+        """Return the results for inputs of windows, shape (n, channels, height, width), and the states after them."""
+        n, channels, height, width = grids.shape
         rows, columns = (-(-size // self._multiple) * self._multiple for size in (height, width))
         top, left = (rows - height + 1) // 2, (columns - width + 1) // 2  # as E2VID pads
-        padded = wp.zeros((1, grid.shape[0], rows, columns), dtype=self._file.dtype, device=self._device)
-        wp.utils.array_cast(grid, padded[0, :, top : top + height, left : left + width])
+        padded = wp.zeros((n, channels, rows, columns), dtype=self._file.dtype, device=self._device)
+        wp.utils.array_cast(grids, padded[:, :, top : top + height, left : left + width])
         if states is None:
             states = self._file.start(self._first)
         wait(self._device)
@@ -262,14 +267,42 @@ class Network:
         except Exception as error:  # both libraries raise many kinds of errors
             hint = "check the bins of the input and multiple, and call reset() before images of another size"
             raise AmiwarpError(f"{self._file.path}: fails for input {padded.shape}: {_cause(error)}; {hint}") from error
-        if out.ndim != 4 or out.shape[0] != 1 or out.shape[2:] != (rows, columns):
+        if out.ndim != 4 or out.shape[0] != n or out.shape[2:] != (rows, columns):
             raise AmiwarpError(
                 f"{self._file.path}: its first output has shape {out.shape}; expected "
-                f"(1, channels, {rows}, {columns}), the size of the input"
+                f"({n}, channels, {rows}, {columns}), the size of the input"
             )
-        result = wp.clone(out[0, :, top : top + height, left : left + width])
+        result = wp.clone(out[:, :, top : top + height, left : left + width])
         wait(self._device)
-        return result if isinstance(events, DeviceEvents) else result.numpy(), states
+        return result, states
+
+
+class _QuarterTurn(Network):
+    """amiwarp's own network, which makes the pictures of several windows at a time."""
+
+    def _iterate(self, recording: Recording, windows: Windows, optic: dict[str, Any]) -> Iterator[Any]:
+        size = recording.events.size
+        for events, some in _in_lots(recording, windows, MOST_AT_ONCE):
+            sums = sums_of_windows(on_device(events, self._device), *size, some, optic["model"], optic["encoder"])
+            out, _ = self._run_grids(_as_array(sums, self._device, "the sums"), None)
+            pictures = out if isinstance(events, DeviceEvents) else out.numpy()
+            yield from (pictures[k] for k in range(len(some)))
+
+
+def _in_lots(recording: Recording, windows: Windows, most: int) -> Iterator[tuple[Any, Windows]]:
+    """Yield the events of at most ``most`` windows at a time, and these windows of them.
+
+    Windows that follow one another are read together; others come one by one.
+    """
+    first = 0
+    while first < len(windows):
+        last = first + 1
+        while last < min(first + most, len(windows)) and windows.start[last] == windows.stop[last - 1]:
+            last += 1
+        some = windows[first:last]
+        start, stop = int(some.start[0]), int(some.stop[-1])
+        yield recording.events[start:stop], Windows(some.start - start, some.stop - start, some.t_start, some.t_end)
+        first = last
 
 
 # amiwarp's own network.
@@ -278,6 +311,8 @@ OWN, OWN_MULTIPLE = Path(__file__).with_name("quarter_turn.pt"), 32
 """File of amiwarp's own network, and the number whose multiples its sizes are [px]."""
 BINS, INPUTS = 6, 8
 """Equal parts of the quarter turn in which events are counted, and sums of these counts."""
+MOST_AT_ONCE = 8
+"""Most windows whose pictures are made at the same time, which takes less time per picture."""
 LEAST_TURNS, MOST_TURNS = 0.2, 0.3
 """Turns of the first angle in a window that amiwarp's own network takes."""
 
@@ -296,44 +331,58 @@ def quarter_turn_sums(
 
     Raises :class:`AmiwarpError` without an optic, or if it does not turn by about a quarter in the window.
     """
+    first, last = time_span(events) if len(events) else (0, 0)
+    times = (first if t_start is None else t_start), (last if t_end is None else t_end)
+    one = Windows(*(np.array([value], np.int64) for value in (0, len(events), *times)))
+    return sums_of_windows(events, width, height, one, model, encoder)[0]
+
+
+def sums_of_windows(
+    events: DeviceEvents, width: int, height: int, windows: Windows, model: Model | None, encoder: Encoder | None
+) -> Any:
+    """Return the inputs of amiwarp's own network for windows, in order of time: shape (n, INPUTS, height, width)."""
     import torch
 
     if model is None or encoder is None:
         raise AmiwarpError("amiwarp's own network compensates events: give model and encoder")
-    t = torch.from_dlpack(events.t)
-    if not len(t):
-        return torch.zeros(INPUTS, height, width, device=t.device)
-    first, last = (int(t[k]) if given is None else given for k, given in ((0, t_start), (-1, t_end)))
-    ends = first + np.arange(BINS + 1) * (last - first) // BINS
-    begin, end = encoder.angle_at(ends[[0, -1]]).tolist()
-    turns = abs(end - begin) / math.tau
-    if not LEAST_TURNS <= turns <= MOST_TURNS:
+    if not len(events):
+        return torch.zeros(len(windows), INPUTS, height, width, device=torch.from_dlpack(events.t).device)
+    lengths = windows.t_end - windows.t_start
+    ends = windows.t_start[:, None] + np.arange(BINS + 1) * lengths[:, None] // BINS
+    begin, end = encoder.angle_at(ends[:, [0, -1]].ravel()).reshape(-1, 2).T
+    turns = np.abs(end - begin) / math.tau
+    wrong = (turns < LEAST_TURNS) | (turns > MOST_TURNS)
+    if wrong.any():
+        k = int(np.argmax(wrong))
         raise AmiwarpError(
-            f"the optic turns by {turns:.2g} of a turn in the window of {last - first} us; amiwarp's own network takes "
-            "a quarter turn: cut the events by windows(events, encoder=encoder, turns=0.25)"
+            f"the optic turns by {turns[k]:.2g} of a turn in the window of {lengths[k]} us; amiwarp's own network "
+            "takes a quarter turn: cut the events by windows(events, encoder=encoder, turns=0.25)"
         )
-    index = find_indices(events, ends)
-    index[-1] = len(events)  # the last event may be at the end
-    parts = Windows(index[:-1], index[1:], ends[:-1], ends[1:])
-    counts = torch.from_dlpack(
-        polarity_histogram(events, width, height, windows=parts, model=model, encoder=encoder, device=events.device)
-    )
-    return sums_of_parts(counts[None], chords_of(model, encoder, ends))[0]
+    index = find_indices(events, ends.ravel()).reshape(ends.shape)
+    index = np.clip(index, windows.start[:, None], windows.stop[:, None])
+    index[:, -1] = windows.stop  # the last event may be at the end
+    parts = Windows(*(part.ravel() for part in (index[:, :-1], index[:, 1:], ends[:, :-1], ends[:, 1:])))
+    found = polarity_histogram(events, width, height, windows=parts, model=model, encoder=encoder, device=events.device)
+    counts = torch.from_dlpack(found).reshape(len(windows), BINS, 2, height, width)
+    return sums_of_parts(counts, chords_of(model, encoder, ends))
 
 
 def chords_of(model: Model, encoder: Encoder, times: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Return how far the middle of the compensated view moves between successive times [px], shape (n, 2)."""
+    """Return how far the middle of the compensated view moves between successive times [px].
+
+    Times have the shape (..., n), chords (..., n - 1, 2).
+    """
     camera = model.camera
     middle = np.array([[0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]])
-    path = model.compensate_points(np.repeat(middle, len(times), axis=0), encoder.angles_at(times))
-    return np.diff(np.asarray(path), axis=0).astype(np.float32)
+    path = model.compensate_points(np.repeat(middle, times.size, axis=0), encoder.angles_at(times.ravel()))
+    return np.diff(np.asarray(path).reshape(*times.shape, 2), axis=-2).astype(np.float32)
 
 
 def sums_of_parts(counts: Any, chords: NDArray[np.float32]) -> Any:
     """Return sums over the counts of the parts of a quarter turn, shape (n, INPUTS, height, width).
 
     ``counts``: tensor of OFF and ON events in each part, shape (n, BINS, 2, height, width). ``chords``: how far the
-    view moves in each part [px], shape (BINS, 2).
+    view moves in each part [px], shape (n, BINS, 2), or (BINS, 2) for all.
 
     Where the view moves along a chord, ON minus OFF events add up to the gradient times the chord, in units of the
     threshold. So the first two sums are the least-squares gradient of all parts. The next two are its change over
@@ -342,14 +391,15 @@ def sums_of_parts(counts: Any, chords: NDArray[np.float32]) -> Any:
     """
     import torch
 
-    late, twice = np.linspace(-1.0, 1.0, len(chords)), 2.0 * np.arctan2(chords[:, 1], chords[:, 0])
+    late, twice = np.linspace(-1.0, 1.0, chords.shape[-2]), 2.0 * np.arctan2(chords[..., 1], chords[..., 0])
     towards = np.linalg.pinv(chords)
-    signed = np.concatenate([towards, towards * late])
-    length = np.hypot(chords[:, 0], chords[:, 1]).sum()
-    unsigned = np.stack([np.ones_like(late), np.cos(twice), np.sin(twice), late]) / length
-    weights = np.concatenate([signed[:, :, None] * [-1.0, 1.0], unsigned[:, :, None] * [1.0, 1.0]])
+    signed = np.concatenate([towards, towards * late], axis=-2)
+    length = np.hypot(chords[..., 0], chords[..., 1]).sum(-1)[..., None, None]
+    ones = np.ones_like(twice)
+    unsigned = np.stack([ones, np.cos(twice), np.sin(twice), late * ones], axis=-2) / length
+    weights = np.concatenate([signed[..., None] * [-1.0, 1.0], unsigned[..., None] * [1.0, 1.0]], axis=-3)
     given = torch.tensor(weights.astype(np.float32), device=counts.device)
-    return torch.einsum("cbp,nbphw->nchw", given, counts)
+    return torch.einsum("cbp,nbphw->nchw" if given.ndim == 3 else "ncbp,nbphw->nchw", given, counts)
 
 
 def _as_array(values: Any, device: Any, what: str) -> wp.array:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -17,14 +15,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import device_events
-from amiwarp.events.device_events import DeviceEvents, check_sensor, device_for, encoder_params, limits, wait
+from amiwarp.events.device_events import (
+    DeviceEvents,
+    check_sensor,
+    device_for,
+    encoder_params,
+    find_indices,
+    host_numbers,
+    idle_numbers,
+    limits,
+    times_at,
+    wait,
+)
 from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, Recording, check_order
 from amiwarp.imaging.positions import LaunchPlan
 from amiwarp.kernels import tensors as kernels
-from amiwarp.kernels.events import NEVER, find_times, take_times
+from amiwarp.kernels.events import NEVER
 from amiwarp.kernels.launch import launch, load, run_together, slices
-from amiwarp.kernels.tensors import BLOCK
+from amiwarp.kernels.tensors import BLOCK, RUN
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.optics.models import Model
 from amiwarp.tasks import cpu_threads
@@ -153,7 +162,7 @@ def windows(
         return _at_indices(events, edges[:-1], np.minimum(edges[1:], n))
     if not n:
         return _at_indices(events, np.zeros(0, np.int64), np.zeros(0, np.int64))
-    first, last = _times_at(events, np.array([0, n - 1]))
+    first, last = times_at(events, np.array([0, n - 1]))
     if duration_us is not None:
         duration_us = whole(duration_us, "duration_us", 1, 1 << 62, " us in a window")
         number = (last - first) // duration_us + (1 if incomplete else 0)
@@ -182,55 +191,9 @@ def _at_indices(events: Events | DeviceEvents, start: NDArray[np.int64], stop: N
     """Return windows at indices, which start and end at the times of their first and last events."""
     filled = stop > start
     t_start, t_end = np.zeros(len(start), np.int64), np.zeros(len(start), np.int64)
-    times = _times_at(events, np.concatenate([start[filled], stop[filled] - 1]))
+    times = times_at(events, np.concatenate([start[filled], stop[filled] - 1]))
     t_start[filled], t_end[filled] = np.split(times, 2)
     return Windows(start, stop, t_start, t_end)
-
-
-def _times_at(events: Events | DeviceEvents, indices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the times of a few events [us]."""
-    if isinstance(events, Events) or events.device.is_cpu:
-        return (events.t if isinstance(events, Events) else events.t.numpy())[indices]
-    return _look_up(take_times, events.t, indices)
-
-
-def find_indices(events: Events | DeviceEvents, times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index of the first event at or after each time."""
-    if isinstance(events, Events) or events.device.is_cpu:
-        return np.searchsorted(events.t if isinstance(events, Events) else events.t.numpy(), times).astype(np.int64)
-    return _look_up(find_times, events.t, times)
-
-
-def _look_up(kernel: Any, t: wp.array, given: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return what a kernel finds in the times of events on a device for each given number."""
-    if not len(given):
-        return given.copy()
-    shared = _shared(len(given), wp.int64, t.device)
-    shared.numpy()[: len(given)] = given
-    launch(kernel, len(given), [t, shared], [shared], device=t.device)
-    wait(t.device)
-    found = shared.numpy()[: len(given)].copy()
-    _idle[t.device.is_cpu, wp.int64].append(shared)
-    return found
-
-
-_idle: defaultdict[tuple[bool, Any], list[wp.array]] = defaultdict(list)
-"""Memory of the host that a later call uses again, by whether it is for a CPU, and type. GPUs read it and write to it,
-so it is page-locked for them. Locking takes longer than many calls. What is not used is 0 in arrays of int32."""
-
-
-def _shared(n: int, dtype: Any, device: Any) -> wp.array:
-    """Return at least ``n`` numbers in memory of the host that the device, too, reads and writes.
-
-    A caller that has waited for the device puts it back to ``_idle``.
-    """
-    idle = _idle[device.is_cpu, dtype]
-    while idle:
-        with contextlib.suppress(IndexError):  # another thread took it
-            found = idle.pop()
-            if len(found) >= n:
-                return found
-    return wp.zeros(max(n, 64), dtype=dtype, device="cpu", pinned=device.is_cuda)
 
 
 # Batches of recordings.
@@ -333,7 +296,7 @@ class _Batch:
             for start, stop in zip(self.windows.start.tolist(), self.windows.stop.tolist(), strict=True):
                 check_order(host[start:stop], where="events", first_index=start)
         else:
-            _idle[self.device.is_cpu, wp.int32].append(self.unsorted)
+            idle_numbers[self.device.is_cpu, wp.int32].append(self.unsorted)
         found = out.numpy() if self.on_host else out
         return found[0] if self.single else found
 
@@ -362,7 +325,7 @@ def _batch(
     found = on_device(events, there)
     if model is not None and encoder is not None:
         found = _compensated(found, model, encoder)
-    return _Batch(found, cut, single, on_host, _shared(1, wp.int32, there))
+    return _Batch(found, cut, single, on_host, host_numbers(1, wp.int32, there))
 
 
 def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | None) -> Windows:
@@ -371,7 +334,7 @@ def _window(events: Events | DeviceEvents, t_start: int | None, t_end: int | Non
     if limits and not limits[5]:  # known, and the times ascend
         first, last = limits[:2]
     else:
-        first, last = _times_at(events, np.array([0, len(events) - 1])).tolist() if len(events) else (0, 0)
+        first, last = times_at(events, np.array([0, len(events) - 1])).tolist() if len(events) else (0, 0)
     low, high = first if t_start is None else t_start, last if t_end is None else t_end
     if high < low:
         if t_start is not None and t_end is not None:
@@ -412,6 +375,7 @@ class _Grid(NamedTuple):
     layers: int = 1
     low: int = 0
     off: int = 1
+    parts: int = 1
 
 
 def _grid(width: int, height: int, **values: int) -> _Grid:
@@ -455,15 +419,16 @@ def _images(
     span = cut.t_end - cut.t_start
     if grid.rate and len(cut) and int(span.max()) >= (1 << 53) // grid.rate:
         raise AmiwarpError(f"a window lasts {int(span.max())} us; give one below {(1 << 53) // grid.rate} us")
-    bytes_each = grid.steps * group * sums * wp.types.type_size_in_bytes(dtype)
+    groups = grid.steps * grid.parts
+    bytes_each = groups * group * sums * wp.types.type_size_in_bytes(dtype)
     most = min(max(MOST_BYTES["cpu" if device.is_cpu else "cuda"] // bytes_each, 1), len(cut))
     # behind the images there are the spare groups of the slices, and places for the events outside the image
     threads = cpu_threads() if device.is_cpu else 1
-    spare = most * grid.steps
+    spare = most * groups
     trash = (spare + threads - 1) * group
     size = (trash + threads * 2 * (grid.width + 16)) * sums
     if size > MOST_EVENTS:
-        raise AmiwarpError(f"a window has {grid.steps * group} pixels in all its images; give fewer bins")
+        raise AmiwarpError(f"a window has {groups * group} pixels in all its images; give fewer bins")
     in_words = device.is_cpu and on_cpu is kernels.add_event_word_blocks
     images = _take_zeros(size) if in_words else wp.empty(size, dtype=dtype, device=device)
     for first in range(0, len(cut), most or 1):
@@ -480,7 +445,7 @@ def _images(
         yield first, number, images
     if in_words:
         images.numpy()[trash:size] = 0
-        if images.size * 8 <= 2 * MOST_BYTES["cpu"]:
+        if images.size * 8 <= 6 * MOST_BYTES["cpu"]:
             _zeros[:] = [images]
 
 
@@ -506,8 +471,9 @@ def _add_on_cpu(
         return
     parts = []
     for k, (first, stop) in enumerate(slices(blocks, cpu_threads(), SMALLEST)):
-        part = first, spare + k - 1 if k else -1, trash + k * 2 * (grid.width + 16)
-        parts.append((_struct(kernels.Part, *part), stop - first))
+        part = first, spare + k - 1 if k else -1, trash + k * 2 * (grid.width + 16), stop
+        run_of = int(RUN) if kernel is kernels.add_event_word_blocks else 1
+        parts.append((_struct(kernels.Part, *part), -(-(stop - first) // run_of)))
 
     def run(part: Any, n: int) -> None:
         wp.launch(kernel, n, [*inputs, part], outputs, device=images.device)
@@ -549,9 +515,10 @@ def _latest(batch: _Batch, grid: _Grid, *, carry: bool) -> Iterator[tuple[int, i
 def _shares(batch: _Batch, grid: _Grid, bins: int) -> wp.array:
     """Return the bins of all windows, shape (windows, layers * bins, height, width)."""
     out = batch.empty((grid.layers * bins, grid.height, grid.width), wp.float32)
-    fullest = _fullest(batch, grid)
-    in_words = batch.events.whole_pixels and fullest < CAPACITY
-    grid = grid._replace(border=int(not in_words), low=63 - max(fullest.bit_length(), LEAST_BITS))
+    parts, fullest = _parts(batch, grid) if batch.events.whole_pixels else (1, CAPACITY)
+    in_words = fullest < CAPACITY
+    border, low = int(not in_words), 63 - max(fullest.bit_length(), LEAST_BITS)
+    grid = grid._replace(border=border, low=low, parts=parts)
     kernel, on_cpu, read, sums = kernels.share_events, kernels.share_event_blocks, kernels.read_shares, 2
     if in_words:
         kernel, on_cpu, read, sums = kernels.add_event_words, kernels.add_event_word_blocks, kernels.read_bins, 1
@@ -564,22 +531,36 @@ def _shares(batch: _Batch, grid: _Grid, bins: int) -> wp.array:
     return out
 
 
-CAPACITY, LEAST_BITS = 1 << 20, 16
-"""Number of events in a time interval from which words are not used. Fewer events leave more bits for their shares: 22
-bits just below the capacity, and 30 bits below ``2**LEAST_BITS`` events. With 22 bits, the sum of a thousand shares is
-exact to 1e-5."""
+CAPACITY, LEAST_BITS = 1 << 19, 16
+"""Number of events in a part of a time interval from which words are not used. Fewer events leave more bits for their
+shares: 24 bits just below the capacity, and 30 bits below ``2**LEAST_BITS`` events. With 24 bits, the sum of ten
+thousand shares is exact to 1e-5."""
+MOST_IMAGES = 52
+"""Largest memory of a window's images for each of its events, if its time intervals are cut into parts [bytes]."""
 
 
-def _fullest(batch: _Batch, grid: _Grid) -> int:
-    """Return an upper bound for the number of events in a time interval of a window; exact if there are many."""
+def _parts(batch: _Batch, grid: _Grid) -> tuple[int, int]:
+    """Return into how many parts each time interval is cut so that words can be used, and the most events in a part.
+
+    The second number is an upper bound, exact if there are many events. From CAPACITY on, words cannot be used.
+    """
     cut = batch.windows
     most = int((cut.stop - cut.start).max(initial=0))
     if most < CAPACITY or not grid.rate:
-        return most
-    edges = [-(-k * (cut.t_end - cut.t_start) // grid.rate) for k in range(1, grid.rate)]
-    inside = np.clip(find_indices(batch.events, (cut.t_start + np.reshape(edges, (-1, len(cut)))).ravel()), 0, None)
-    found = np.stack([cut.start, *np.clip(inside.reshape(-1, len(cut)), cut.start, cut.stop), cut.stop])
-    return int(np.diff(found, axis=0).max())
+        return 1, most
+    span = cut.t_end - cut.t_start
+    parts = 1 << (most // (grid.rate * CAPACITY)).bit_length()
+    image = 8 * grid.layers * grid.width * grid.height
+    while grid.steps * parts * image <= MOST_IMAGES * most and int(span.max()) * grid.rate * parts < 1 << 53:
+        number = grid.rate * parts
+        edges = cut.t_start - -np.arange(1, number)[:, None] * span // number
+        inside = find_indices(batch.events, edges.ravel()).reshape(edges.shape)
+        found = np.stack([cut.start, *np.clip(inside, cut.start, cut.stop), cut.stop])
+        fullest = int(np.diff(found, axis=0).max())
+        if fullest < CAPACITY:
+            return parts, fullest
+        parts *= 2
+    return 1, most
 
 
 def _normalise(values: wp.array) -> None:

@@ -4,7 +4,7 @@ import contextlib
 import math
 import shutil
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, BinaryIO, TypeAlias
@@ -285,6 +285,14 @@ def save_map(path: Path, what: str, arrays: Mapping[str, NDArray[Any]], *, overw
     check_ending(path, f"{what}s are written", [".npz"])
     with NewFile(path, overwrite=overwrite) as new, open(new.part, "wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def save_rows(path: Path, names: Sequence[str], blocks: Iterable[tuple[NDArray[Any], ...]], form: str) -> None:
+    """Write blocks of columns to a new text file, under a line with their names; ``form``: format of a row."""
+    with NewFile(path) as new, open(new.part, "wb") as file:
+        file.write((",".join(names) + "\n").encode())
+        for block in blocks:
+            np.savetxt(file, np.column_stack(block), fmt=form)
 
 
 @contextlib.contextmanager

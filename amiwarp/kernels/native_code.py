@@ -141,46 +141,67 @@ def add_word_pairs(
 
 
 @wp.func_native("""
-    const int* place = (const int*)places.data;
-    const uint64_t* word = (const uint64_t*)words.data;
-    uint64_t* sum = (uint64_t*)sums.data;
 #ifndef __CUDACC__
-    for (int k = 0; k < n; ++k) __builtin_prefetch(sum + place[k], 1);
+    for (int k = 0; k < n; ++k) __builtin_prefetch((uint64_t*)sums.data + ((const int*)places.data)[first + k], 1);
 #endif
-#pragma clang loop unroll(disable)
-    for (int k = 0; k < n; ++k) sum[place[k]] += word[k];
 """)
-def add_words(sums: wp.array(dtype=wp.int64), places: wp.array(dtype=int), words: wp.array(dtype=wp.int64), n: int):
-    """Add a word to the sum at each of ``n`` places, modulo 2**64. For CPUs, if no other thread adds there."""
+def prefetch_words(sums: wp.array(dtype=wp.int64), places: wp.array(dtype=int), first: int, n: int):
+    """Fetch the words at ``places[first : first + n]`` into a core's cache, while it goes on."""
 
 
 @wp.func_native("""
+    const int* place = (const int*)places.data + first;
+    const uint64_t* word = (const uint64_t*)words.data + first;
+    uint64_t* sum = (uint64_t*)sums.data;
+#pragma clang loop unroll(disable)
+    for (int k = 0; k < n; ++k) sum[place[k]] += word[k];
+""")
+def add_words(
+    sums: wp.array(dtype=wp.int64), places: wp.array(dtype=int), words: wp.array(dtype=wp.int64), first: int, n: int
+):
+    """Add ``words[first : first + n]`` at their places, modulo 2**64. For CPUs, if no other thread adds there."""
+
+
+@wp.func_native("""
+#ifdef __CUDACC__
+    const int most = 1;
+#else
+    const int most = 64;
+#endif
     const int above = 64 - low, fraction = 2 * low - 64;
     const double unit = 1.0 / (double)(1 << fraction);
+    int64_t total[most];
     for (int bin = bins - 1; bin >= 0; --bin) {
-        uint64_t* first = (uint64_t*)words.data + start + bin * size;
-        const uint64_t* second = first - size;
-        float* to = (float*)out.data + at + bin * size;
-        const bool starts = bin < steps, ends = bin > 0;
-        for (int k = 0; k < n; ++k) {
-            const uint64_t a = starts ? first[k] : 0, b = ends ? second[k] : 0;
-            const int64_t shares = (int64_t)(a << above) >> above, signs = (int64_t)(a - (uint64_t)shares) >> low;
-            const int64_t total = signs * (1 << fraction) - shares + ((int64_t)(b << above) >> above);
-            to[k] = (float)((double)total * unit);
+        uint64_t* starts = (uint64_t*)words.data + start + bin * parts * size;
+        const uint64_t* ends = starts - parts * size;
+        for (int first = 0; first < n; first += most) {
+            const int m = n - first < most ? n - first : most;
+            float* to = (float*)out.data + at + bin * size + first;
+            for (int k = 0; k < m; ++k) total[k] = 0;
+            for (int part = 0; part < (bin < steps ? parts : 0); ++part)
+                for (int k = 0; k < m; ++k) {
+                    const uint64_t word = starts[part * size + first + k];
+                    const int64_t shares = (int64_t)(word << above) >> above;
+                    total[k] += ((int64_t)(word - (uint64_t)shares) >> low) * (1 << fraction) - shares;
+                }
+            for (int part = 0; part < (bin > 0 ? parts : 0); ++part)
+                for (int k = 0; k < m; ++k)
+                    total[k] += (int64_t)(ends[part * size + first + k] << above) >> above;
+            for (int k = 0; k < m; ++k) to[k] = (float)((double)total[k] * unit);
         }
 #ifndef __CUDACC__
-        if (starts) memset(first, 0, 8 * n);
+        for (int part = 0; part < (bin < steps ? parts : 0); ++part) memset(starts + part * size, 0, 8 * n);
 #endif
     }
 """)
 def read_words(
     out: wp.array(dtype=float), at: int, words: wp.array(dtype=wp.int64), low: int, start: int, size: int, steps: int,
-    bins: int, n: int,
+    parts: int, bins: int, n: int,
 ):  # fmt: skip
     """Compute all bins of ``n`` pixels of a voxel grid from the words of :mod:`amiwarp.kernels.tensors`.
 
-    ``low`` is the number of bits of the lower field, ``size`` the number of pixels of an image. On CPUs, the words are
-    cleared.
+    ``low`` is the number of bits of the lower field, ``size`` the number of pixels of an image, ``parts`` the number of
+    images of a time interval. On CPUs, the words are cleared.
     """
 
 

@@ -1,18 +1,19 @@
 """Event representations for networks: voxel grids, histograms, and latest times.
 
-A launch adds the events of many windows. A window has a group of images for each of its time intervals: one image, or
-one for OFF and one for ON events. Sums are integers, so that they depend neither on the order of events nor on the
-number of threads.
+A launch adds the events of many windows. A window has a group of images for each of its time intervals, or for each
+part of them: one image, or one for OFF and one for ON events. Sums are integers, so that they depend neither on the
+order of events nor on the number of threads.
 
 A voxel grid shares each event between the bins at both ends of its time interval, so a pixel of an image holds two
 sums. At whole pixels, one 64-bit word holds both: the sum of the events' signs, and in its lower ``low`` bits the sum
 of the shares of the interval's end, in units of 2**(64 - 2 * low) event. The addition is modulo 2**64. No field
-overflows if fewer than 2**(63 - low) events lie in an interval. Otherwise, and at positions between pixels, a pixel has
-two 64-bit sums in units of 2**-30 event: the shares of the interval's start, and those of its end.
+overflows if fewer than 2**(63 - low) events are added to an image, so an interval with more events is cut into parts
+with an image each. If that is not possible, and at positions between pixels, a pixel has two 64-bit sums in units of
+2**-30 event: the shares of the interval's start, and those of its end.
 
-A block is 64 events of one window. A CPU thread processes a block, a GPU thread one event. On a CPU, each slice of the
-blocks adds to groups that no other slice adds to. Times ascend, so a slice can share only its first group with the
-slice before. A spare group replaces it, and is added to it later.
+A block is 64 events of one window. A GPU thread processes one event, a CPU thread a block, or a run of blocks for
+words. On a CPU, each slice of the blocks adds to groups that no other slice adds to. Times ascend, so a slice can share
+only its first group with the slice before. A spare group replaces it, and is added to it later.
 """
 
 from typing import Any
@@ -32,6 +33,7 @@ from amiwarp.kernels.native_code import (
     load_int64,
     load_uint8,
     load_uint16,
+    prefetch_words,
     read_words,
     store_float,
     store_int,
@@ -42,6 +44,7 @@ from amiwarp.kernels.native_code import (
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 BLOCK = wp.constant(64)  # number of events of a block
+RUN = wp.constant(8)  # number of blocks whose words a CPU thread adds
 WHOLE = wp.constant(1 << 30)  # share of a whole event
 EARLIEST = wp.constant(wp.int64(-(2**62)))  # limit of the times of events [us]; without events, a pixel holds less
 LONGEST = wp.constant(wp.int64(1 << 31))  # time of a block from which it is not processed at once [us]
@@ -66,6 +69,7 @@ class Grid:
     layers: int  # images of a time interval: 2 to separate OFF (first) and ON events, else 1
     low: int  # bits of the lower field of a word, 43 to 47
     off: int  # what an OFF event counts: -1 or 1; an ON event counts 1
+    parts: int  # groups of a time interval, a power of 2; 1 except for words
 
 
 @wp.struct
@@ -75,6 +79,7 @@ class Part:
     block: int  # first block
     spare: int  # group that replaces the first one, or -1
     trash: int  # number of a pixel after all images, for the events outside of them
+    stop: int  # after the last block
 
 
 # Window, time interval and pixel of an event.
@@ -195,7 +200,15 @@ def event_of(
 @wp.func
 def group_of(grid: Grid, windows: wp.array2d(dtype=wp.int64), window: int, t: wp.int64) -> int:
     """Return the number of the group of images for a time."""
-    return window * grid.steps + interval_of(grid, time_at(grid, windows[window, T_START], windows[window, SPAN], t))
+    return group_at(grid, window, time_at(grid, windows[window, T_START], windows[window, SPAN], t))
+
+
+@wp.func
+def group_at(grid: Grid, window: int, time: wp.float64) -> int:
+    """Return the number of the group of images for a time in units of the window's intervals."""
+    interval = interval_of(grid, time)
+    part = int((time - wp.float64(interval)) * wp.float64(grid.parts))
+    return (window * grid.steps + interval) * grid.parts + wp.min(part, grid.parts - 1)
 
 
 @wp.func
@@ -258,10 +271,9 @@ def add_event_word(
     col, row = int(x[i]), int(y[i])
     if is_pixel(grid, col, row) == 1:
         time = time_at(grid, windows[window, T_START], windows[window, SPAN], t[i])
-        interval = interval_of(grid, time)
-        group = window * grid.steps + interval
+        group = group_at(grid, window, time)
         place = place_of(grid, wp.where(group == own, part.spare, group), p[i], col, row)
-        wp.atomic_add(words, place, word_of(grid, weight_of(grid, p[i]), end_share(time, interval)))
+        wp.atomic_add(words, place, word_of(grid, weight_of(grid, p[i]), end_share(time, interval_of(grid, time))))
 
 
 @wp.kernel
@@ -392,13 +404,13 @@ def time_block(
 @wp.func
 def place_interval(
     grid: Grid, part: Part, group: int, first: int, x: wp.array(dtype=Any), y: wp.array(dtype=Any),
-    p: wp.array(dtype=wp.uint8), places: wp.array(dtype=int),
+    p: wp.array(dtype=wp.uint8), places: wp.array(dtype=int), at: int,
 ):  # fmt: skip
-    """Compute the nearest pixel of each event of a whole block in one time interval."""
+    """Compute the nearest pixel of each event of a whole block in one time interval, from ``places[at]`` on."""
     for k in range(BLOCK):
         col, row = load_nearest(x, first + k), load_nearest(y, first + k)
         place = place_of(grid, group, load_uint8(p, first + k), col, row)
-        store_int(places, k, wp.where(is_pixel(grid, col, row) == 1, place, part.trash))
+        store_int(places, at + k, wp.where(is_pixel(grid, col, row) == 1, place, part.trash))
 
 
 @wp.func
@@ -441,7 +453,7 @@ def count_event_blocks(
     own, group = own_group(grid, windows, t, part), group_of(grid, windows, window, t[first])
     if n == BLOCK and group == group_of(grid, windows, window, t[first + n - 1]):
         places = wp.zeros(shape=(64,), dtype=int)
-        place_interval(grid, part, wp.where(group == own, part.spare, group), first, x, y, p, places)
+        place_interval(grid, part, wp.where(group == own, part.spare, group), first, x, y, p, places, 0)
         count_places(counts, places, n)
     else:
         for k in range(n):
@@ -465,26 +477,23 @@ def keep_latest_blocks(
 
 
 @wp.func
-def add_interval_words(
+def store_interval_words(
     grid: Grid, part: Part, own: int, windows: wp.array2d(dtype=wp.int64), window: int, group: int, first: int,
     x: wp.array(dtype=wp.uint16), y: wp.array(dtype=wp.uint16), t: wp.array(dtype=wp.int64),
-    p: wp.array(dtype=wp.uint8), words: wp.array(dtype=wp.int64),
+    p: wp.array(dtype=wp.uint8), places: wp.array(dtype=int), words: wp.array(dtype=wp.int64), at: int,
 ):  # fmt: skip
-    """Add the words of a whole block's events in one time interval, as most are. Times are from the first event on.
+    """Store the places and words of a whole block's events in one group, as most are. Times are from the first event.
 
     The sums and products are whole numbers below 2**53, so that a share is the same as from :func:`time_at`.
     """
-    places = wp.zeros(shape=(64,), dtype=int)
-    own_words = wp.zeros(shape=(64,), dtype=wp.int64)
     used = wp.where(group == own, part.spare, group)
-    interval, t_first = group - window * grid.steps, t[first]
+    interval, t_first = group / grid.parts - window * grid.steps, t[first]
     start, span = wp.float64((t_first - windows[window, T_START]) * wp.int64(grid.rate)), windows[window, SPAN]
-    place_interval(grid, part, used, first, x, y, p, places)
+    place_interval(grid, part, used, first, x, y, p, places, at)
     for k in range(BLOCK):
         elapsed = wp.float64(int(load_int64(t, first + k) - t_first)) * wp.float64(grid.rate)
         end = end_share(in_intervals(grid, start + elapsed, wp.float64(span)), interval)
-        store_int64(own_words, k, word_of(grid, weight_of(grid, load_uint8(p, first + k)), end))
-    add_words(words, places, own_words, BLOCK)
+        store_int64(words, at + k, word_of(grid, weight_of(grid, load_uint8(p, first + k)), end))
 
 
 @wp.kernel
@@ -493,16 +502,30 @@ def add_event_word_blocks(
     p: wp.array(dtype=wp.uint8), windows: wp.array2d(dtype=wp.int64), grid: Grid, part: Part,
     unsorted: wp.array(dtype=int), words: wp.array(dtype=wp.int64),
 ):  # fmt: skip
-    """Add the words of the events of each thread's block."""
-    window, first, n = start_block(t, windows, part.block + wp.tid(), unsorted)
+    """Add the words of the events of each thread's blocks. Those of a block are added after the next one's are known.
+
+    Meanwhile, the pixels are fetched from memory: an image is larger than a core's cache.
+    """
+    places = wp.zeros(shape=(128,), dtype=int)
+    waiting = wp.zeros(shape=(128,), dtype=wp.int64)
     own = own_group(grid, windows, t, part)
-    group = group_of(grid, windows, window, t[first])
-    t_last = t[first + n - 1]
-    if n == BLOCK and group == group_of(grid, windows, window, t_last) and t_last - t[first] < LONGEST:
-        add_interval_words(grid, part, own, windows, window, group, first, x, y, t, p, words)
-    else:
-        for k in range(n):
-            add_event_word(grid, part, own, windows, window, first + k, x, y, t, p, words)
+    at, before = int(0), int(0)
+    first_block = part.block + wp.tid() * RUN
+    for block in range(first_block, wp.min(first_block + RUN, part.stop)):
+        window, first, n = start_block(t, windows, block, unsorted)
+        group = group_of(grid, windows, window, t[first])
+        t_last = t[first + n - 1]
+        if n == BLOCK and group == group_of(grid, windows, window, t_last) and t_last - t[first] < LONGEST:
+            store_interval_words(
+                grid, part, own, windows, window, group, first, x, y, t, p, places, waiting, at)  # fmt: skip
+            prefetch_words(words, places, at, BLOCK)
+            at = BLOCK - at
+            add_words(words, places, waiting, at, before)
+            before = BLOCK
+        else:
+            for k in range(n):
+                add_event_word(grid, part, own, windows, window, first + k, x, y, t, p, words)
+    add_words(words, places, waiting, BLOCK - at, before)
 
 
 @wp.kernel
@@ -575,8 +598,8 @@ def read_bins(
     first = (start + wp.tid()) * length
     size = grid.width * grid.height
     window, pixel = first / size, first % size
-    start_of = window * grid.steps * size + pixel
-    read_words(out, window * bins * size + pixel, words, grid.low, start_of, size, grid.steps, bins, length)
+    start_of = window * grid.steps * grid.parts * size + pixel
+    read_words(out, window * bins * size + pixel, words, grid.low, start_of, size, grid.steps, grid.parts, bins, length)
 
 
 @wp.kernel

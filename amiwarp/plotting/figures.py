@@ -23,11 +23,13 @@ from amiwarp.imaging.export import PERCENTILE, save_png
 from amiwarp.imaging.iwe import iwe
 from amiwarp.imaging.metrics import PictureQuality
 from amiwarp.imaging.palette import BLACK, ORANGE, VERMILION
+from amiwarp.imaging.regions import best_box
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import write_text
 from amiwarp.io.formats import check_ending
 from amiwarp.optics.models import MODELS
 from amiwarp.plotting.clouds import Cloud, draw_cloud
+from amiwarp.plotting.colours import DEPTH_MAP, SKY, depth_ends
 from amiwarp.reconstruction.picture import Picture, limits, tones
 
 EVENTS = 2_000_000
@@ -36,6 +38,8 @@ POINTS = 60_000
 """Largest number of points in an event cloud."""
 REGION = (64, 80)
 """Width and height of the part of the image that is enlarged and drawn as clouds [px]."""
+BORDER = 8
+"""Distance of the enlarged part from the border of the image, if the image is large enough [px]."""
 WIDTH, TITLE = 15.0, 14.0
 """Width of the demo's figure [inch], and size of its titles [point]."""
 GREYS, FAINT = 128, 8
@@ -164,7 +168,7 @@ class EventViews:
     def of(cls, recording: Recording, calibration: Calibration, device: Any) -> EventViews:
         """Compute the images and the clouds."""
         pair = images(thin(recording, EVENTS), recording, calibration, device=device)
-        corner = busiest(pair.after)
+        corner = best_box(pair.after, pair.after, *REGION, BORDER)
         return cls(pair, corner, region_clouds(recording, calibration, corner, device))
 
 
@@ -266,23 +270,6 @@ def show_grey(ax: Any, image: NDArray[np.float32], title: str) -> None:
     ax.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
     ax.set(xticks=(), yticks=())
     ax.set_title(title)
-
-
-def busiest(image: NDArray[np.float32]) -> tuple[int, int]:
-    """Return the top left pixel of the region with the highest contrast, away from the image's border.
-
-    Pixels brighter than the display's white are clipped, so that single hot pixels do not decide.
-    """
-    from scipy.ndimage import uniform_filter
-
-    width, height = REGION
-    clipped = np.minimum(image, Images(image, image).top).astype(np.float64)
-    mean, square = (uniform_filter(power, (height, width)) for power in (clipped, clipped**2))
-    contrast = square - mean**2
-    margin_y, margin_x = min(height // 2 + 8, image.shape[0] // 2 - 1), min(width // 2 + 8, image.shape[1] // 2 - 1)
-    inner = contrast[margin_y:-margin_y, margin_x:-margin_x]
-    row, column = np.unravel_index(int(np.argmax(inner)), inner.shape)
-    return max(0, int(column) + margin_x - width // 2), max(0, int(row) + margin_y - height // 2)
 
 
 def region_clouds(
@@ -393,8 +380,6 @@ GAMMA = 2.2
 """Exponent (gamma) by which linear luminance is converted to grey."""
 GOLDEN = 0.618034
 """Golden ratio, the step of the hue between successive instances, so that neighbouring numbers differ in colour."""
-SKY = (0.85, 0.92, 1.0)
-"""Colour of pixels that see the sky, in the pictures of depth and instances."""
 WHEEL = 0.2
 """Diameter of the colour wheel of flow directions, as a share of the picture's height."""
 LEAST_SPEED = 1e-3
@@ -448,15 +433,12 @@ def _draw_depth(figure: Any, ax: Any, depth: NDArray[np.float32]) -> None:
     """Draw the depth on a logarithmic scale, with a colour bar."""
     from matplotlib.colors import LogNorm
 
-    seen = depth[np.isfinite(depth)]
     ax.set_title("depth [m]")
-    if not seen.size:
+    if not np.isfinite(depth).any():
         ax.imshow(np.broadcast_to(np.array(SKY), (*depth.shape, 3)))
         return
-    low, high = float(seen.min()), float(np.percentile(seen, PREVIEW_PERCENTILE))
-    low = max(low, 1e-4)
-    high = max(high, 1.1 * low)
-    drawn = ax.imshow(np.ma.masked_invalid(depth), cmap="viridis_r", norm=LogNorm(low, high))
+    low, high = depth_ends(depth)
+    drawn = ax.imshow(np.ma.masked_invalid(depth), cmap=DEPTH_MAP, norm=LogNorm(low, high))
     ax.imshow(np.where(np.isfinite(depth)[..., None], 0.0, (*SKY, 1.0)))
     bar = figure.colorbar(drawn, ax=ax, shrink=0.85)
     ticks = np.geomspace(low, high, 5)

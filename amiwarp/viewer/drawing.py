@@ -8,41 +8,49 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import closing, suppress
-from ctypes import CDLL, c_void_p
 from ctypes.util import find_library
 from dataclasses import dataclass, replace
-from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, MemoryEvents, Recording
-from amiwarp.imaging.export import GAMMA, PERCENTILE, save_png
+from amiwarp.imaging.export import GAMMA, save_png
 from amiwarp.imaging.metrics import random_variance
-from amiwarp.imaging.palette import BLUE, OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK, ORANGE, PINK, VERMILION
+from amiwarp.imaging.palette import OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK
+from amiwarp.imaging.regions import SMOOTHING_PX, Region, inside
+from amiwarp.imaging.residuals import WIDEST_PX, at_pixels, residual
+from amiwarp.imaging.tensors import latest_times
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import check_output, interrupts_later
-from amiwarp.plotting.figures import SKY, instance_colours
+from amiwarp.io.spans import read_span
+from amiwarp.plotting.colours import (
+    GREY,
+    Scale,
+    as_bytes,
+    cause_colours,
+    count_scale,
+    depth_colours,
+    depth_ends,
+    depth_image,
+    table_of,
+    ticks,
+)
+from amiwarp.plotting.figures import instance_colours
+from amiwarp.plotting.meshes import Box
 from amiwarp.reconstruction.picture import Picture, Reconstruction
-from amiwarp.validation import choice, guarded, vector, whole
 from amiwarp.viewer.inspector import (
-    SMOOTHING_PX,
     STORES,
     DisplayedWindow,
     DrawnTruth,
     Inspector,
     Knobs,
     LoadedWindow,
-    Region,
-    Selection,
     colours_on_offer,
-    inside,
-    read_span,
 )
 
 if TYPE_CHECKING:
@@ -66,13 +74,13 @@ def select_part(
     is used. ``longest_us``: longest duration [us]; of a longer window, and of one with too many events, the middle is
     used.
     """
-    span, events = window.span, window.events
+    span, events = window.span, window.counted
     share = min(1.0, longest_us / span.length_us, MOST_EVENTS / max(span.count, 1))
     length_us = max(1, math.ceil(share * span.length_us))
     start_us = span.start_us + (span.length_us - length_us) // 2
     if span.count > len(span.events):  # the window was read in runs with gaps
         span = read_span(inspector.recording.events, start_us, length_us, most_events=span.count)
-        events = inspector.select(span, inspector.selection).events
+        events = inspector.select(span, inspector.selection).counted
     first, stop = np.searchsorted(events.t, (start_us, start_us + length_us))
     events = events[first:stop]
     left, top, right, bottom = part
@@ -108,11 +116,12 @@ _prepared: set[str] = set()
 
 
 def prepare(inspector: Inspector) -> None:
-    """Compile and load what a log intensity needs, once per device, so that the first one takes no longer."""
+    """Compile and load what time surface and log intensity need, once per device, so that the first take no longer."""
     if str(inspector.device) in _prepared:
         return
     with suppress(AmiwarpError):
         window = replace(inspector.loaded, chosen=[])
+        _time_surface(inspector, window, inspector.knobs)
         log_intensity(inspector, window, inspector.knobs, share=PREPARING_SHARE)
         _prepared.add(str(inspector.device))
 
@@ -180,94 +189,10 @@ class ImageKind(enum.StrEnum):
     """Depth of what each pixel sees, of a depth map."""
 
 
-@dataclass(frozen=True)
-class Scale:
-    """How values become colours."""
-
-    title: str
-    """Name of the quantity."""
-    unit: str
-    """Unit of the values; empty for numbers without unit."""
-    low: float
-    """Value at the start of the colour bar. Lower values have the same colour."""
-    high: float
-    """Value at the end of the colour bar. Higher values have the same colour."""
-    colours: str
-    """Colours, as :func:`table_of` knows them, or "polarity" for OFF and ON in two colours on black."""
-    gamma: float = 1.0
-    """Exponent of the tone curve: a colour's place on the bar is the share of the range to this power."""
-    missing: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Red, green and blue of pixels without a value, 0 to 1."""
-    missing_text: str = "no event"
-    """What a pixel without a value means."""
-
-    def __post_init__(self) -> None:
-        assert self.low < self.high
-
-    def places(self, values: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the places of values on the colour bar, 0 to 1; NaN stays NaN."""
-        share = (np.asarray(values, np.float64) - self.low) / (self.high - self.low)
-        return np.asarray(np.clip(share, 0.0, 1.0) ** self.gamma, np.float64)
-
-    def rgb(self, values: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """Return the colours of an image, shape ``(height, width, 3)``.
-
-        ``values``: shape ``(height, width)`` or ``(n,)``, or ``(2, height, width)`` for OFF and ON.
-        """
-        places = self.places(values)
-        if self.colours == "polarity":
-            both = places[0][..., None] * np.array(OFF_ON_BLACK) + places[1][..., None] * np.array(ON_ON_BLACK)
-            return np.asarray(np.rint(255.0 * np.clip(both, 0.0, 1.0)), np.uint8)
-        known = ~np.isnan(places)
-        rgb = table_of(self.colours)[(255.0 * np.where(known, places, 0.0)).astype(np.uint8)]
-        return np.where(known[..., None], rgb, _bytes(self.missing))
-
-    @property
-    def counts(self) -> bool:
-        """Whether the values are numbers of events, or their differences."""
-        return self.unit == "per pixel"
-
-    @property
-    def label(self) -> str:
-        """Name and unit of the quantity, and what a colour means that is not on the bar."""
-        label = f"{self.title} {self.unit}" if self.counts else f"{self.title} [{self.unit}]"
-        return f"{label}; blue: {self.missing_text}" if self.missing == SKY else label
-
-    def ticks(self) -> tuple[tuple[float, str], ...]:
-        """Return the marks of the colour bar: their places, 0 to 1, and their texts."""
-        values = ticks(self.low, self.high, 4, whole=self.counts)
-        return tuple((float(place), f"{v:g}") for place, v in zip(self.places(values), values, strict=True))
-
-
-def _bytes(rgb: Sequence[float]) -> NDArray[np.uint8]:
-    """Return red, green and blue as 0 to 255, shape ``(3,)``."""
-    return np.rint(255.0 * np.asarray(rgb)).astype(np.uint8)
-
-
-@cache
-def table_of(colours: str) -> NDArray[np.uint8]:
-    """Return the 256 colours of a bar, shape ``(256, 3)``: of a colour map of Matplotlib, or "difference".
-
-    The suffix " on light" or " on dark" keeps white or black apart from the background.
-    """
-    from matplotlib import colormaps
-    from matplotlib.colors import LinearSegmentedColormap
-
-    shares, (name, _, paper) = np.linspace(0.0, 1.0, 256), colours.partition(" on ")
-    if name == "difference":
-        table = LinearSegmentedColormap.from_list(name, (OFF_COLOUR, "white", ON_COLOUR))(shares)[:, :3]
-    else:
-        table = colormaps[name](shares)[:, :3]
-    if paper:
-        table = 1.0 - 0.8 * (1.0 - table) if paper == "dark" else 0.8 * table
-    return np.asarray(np.rint(255.0 * table), np.uint8)
-
-
 @dataclass(frozen=True, eq=False)
 class ShownImages:
     """Images of the shown region, before and after compensation, with one scale for both."""
 
-    kind: ImageKind
     before: NDArray[np.float32] | None
     """Image of the events as recorded, or of the parameters compared with, shape ``(height, width)``, or
     ``(2, height, width)`` for OFF and ON. NaN marks pixels without a value. None for a log intensity, which needs
@@ -299,13 +224,13 @@ def make_images(
         known = np.concatenate([log[where] for log, where, _ in found])
         low, high = (float(np.percentile(known, share)) for share in (0.5, 99.5)) if known.size else (0.0, 1.0)
         scale = Scale("log intensity", "ON thresholds", low, max(high, low + 1e-3), "gray")
-        return ShownImages(kind, None if against is None else found[0][0], found[-1][0], scale, found[-1][2])
+        return ShownImages(None if against is None else found[0][0], found[-1][0], scale, found[-1][2])
     if kind is ImageKind.DEPTH:
         if inspector.depth is None:
             raise AmiwarpError("there is no depth map; start 'amiwarp view' with --depth")
         counts = make_images(inspector, ImageKind.COUNT, against=against, shown=shown)
         metres, scale = depth_image(inspector.depth)
-        return replace(counts, kind=kind, after=metres[top:bottom, left:right], after_scale=scale)
+        return replace(counts, after=metres[top:bottom, left:right], after_scale=scale)
     first = inspector.beside if against is None and inspector.beside is not None else inspector
     pair = (first, first.loaded, against), (inspector, window, knobs)
     if kind is ImageKind.TIME_SURFACE:
@@ -320,54 +245,39 @@ def make_images(
     else:
         scale = count_scale((before, after), "polarity" if kind is ImageKind.POLARITY else "gray")
     if not (difference and kind is ImageKind.COUNT):
-        return ShownImages(kind, before, after, scale)
+        return ShownImages(before, after, scale)
     most = max(float(np.abs(after - before).max()), 1.0)
     own = Scale("difference of events", "per pixel", -most, most, "difference")
-    return ShownImages(kind, before, after - before, scale, after_scale=own)
-
-
-def count_scale(images: Sequence[NDArray[np.float32]], colours: str = "gray") -> Scale:
-    """Return one scale of counts for images."""
-    positive = [image[image > 0.0] for image in images]
-    top = max([1.0, *(float(np.percentile(each, PERCENTILE)) for each in positive if each.size)])
-    return Scale("events", "per pixel", 0.0, math.ceil(top), colours, GAMMA)
+    return ShownImages(before, after - before, scale, after_scale=own)
 
 
 def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | None) -> NDArray[np.float32]:
     """Return the time of the latest event of each pixel from the start of the window on [ms]; NaN without events."""
-    events, (width, height) = window.events, inspector.recording.events.size
-    x, y = (events.x, events.y) if knobs is None else np.rint(inspector.positions(events, knobs)).T
-    within = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    with np.errstate(invalid="ignore"):
-        pixel = np.where(within, y.astype(np.int64) * width + x.astype(np.int64), width * height)
-    surface = np.full(width * height + 1, np.nan, np.float32)  # the last element takes the events outside of the image
-    # events are in order of time; of several values for one pixel, NumPy keeps the last
-    surface[pixel] = (events.t - window.span.start_us) * 1e-3
-    return surface[:-1].reshape(height, width)
-
-
-def depth_image(depth: DepthMap) -> tuple[NDArray[np.float32], Scale]:
-    """Return the depths of a map [m], shape ``(height, width)``, NaN where they are unknown, and their scale."""
-    with np.errstate(divide="ignore"):
-        metres = 1.0 / depth.inverse_depth
-    return metres, Scale("depth", "m", *_scale(metres), DEPTH_MAP, missing=SKY, missing_text="unknown")
+    encoder = None if knobs is None else inspector.encoder_of(knobs)
+    model = None if knobs is None else inspector.model_of(knobs)
+    latest = latest_times(window.counted, *inspector.recording.events.size, per_polarity=False, model=model,
+                          encoder=encoder, device=inspector.device)  # fmt: skip
+    return np.where(latest < window.span.start_us, np.nan, (latest - window.span.start_us) * 1e-3).astype(np.float32)
 
 
 # Colours for events by cause, instance and depth, and the legend of these colours.
 
-CAUSE_COLOURS = (BLUE, ORANGE, PINK, VERMILION)
-"""Colour of each cause of events, in the order of the codes of :class:`amiwarp.Cause`."""
-GREY = "#808080"
-"""Colour of the sky, and of unknown causes."""
-DEPTH_MAP = "viridis_r"
-"""Matplotlib colour map of depth. Near points are light."""
-DEPTH_PERCENTILES = (2.0, 98.0)
-"""Percentiles of the depths of drawn events at which the colour scale begins and ends."""
 Legend: TypeAlias = tuple[tuple[str, str], ...]
 """Rows of a legend: a colour in hexadecimal notation, and the meaning of the colour.
 
 The colour of the title row is empty.
 """
+
+
+def _truth_colours(colour: Colour, values: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the colours (0 to 1) of causes, instances or depths, shape ``(n, 3)``. The sky is grey."""
+    from matplotlib.colors import to_rgb
+
+    if colour is Colour.DEPTH:
+        return depth_colours(values, depth_ends(values))
+    if colour is Colour.CAUSE:
+        return cause_colours(values)
+    return np.asarray(np.where((values == 0)[:, None], to_rgb(GREY), instance_colours(values)))
 
 
 def legend_of(truth: DrawnTruth, colour: Colour, most: int) -> Legend:
@@ -384,58 +294,20 @@ def legend_of(truth: DrawnTruth, colour: Colour, most: int) -> Legend:
         return ()
     values, title, more = truth.values(colour), colour.value, []
     if colour is Colour.DEPTH:
-        steps, title = np.geomspace(*_scale(values), most), "depth [m]"  # in equal ratios
-        rgb, texts = _depths(steps, _scale(values)), [f"{step:#.3g}".rstrip(".") for step in steps]
+        steps, title = np.geomspace(*depth_ends(values), most), "depth [m]"  # in equal ratios
+        rgb, texts = depth_colours(steps, depth_ends(values)), [f"{step:#.3g}".rstrip(".") for step in steps]
         more = [(GREY, "sky")] if np.isinf(values).any() else []
     else:
         counts = np.bincount(values)
         found = np.argsort(-counts, kind="stable")[: np.count_nonzero(counts)]
         shares, others = 100.0 * counts / counts.sum(), found[most:]
         texts = [f"{truth.name(colour, k)} {shares[k]:.3g} %" for k in found[:most].tolist()]
-        rgb = _names(colour, found[:most])
+        rgb = _truth_colours(colour, found[:most])
         more = [("", f"{len(others)} more {shares[others].sum():.3g} %")] if len(others) else []
     return (("", title), *zip(map(to_hex, rgb), texts, strict=True), *more)
 
 
-def _names(colour: Colour, values: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the colours (0 to 1) of cause codes or instance numbers, shape ``(n, 3)``."""
-    from matplotlib.colors import to_rgb
-
-    if colour is Colour.CAUSE:
-        table = np.array([to_rgb(each) for each in (*CAUSE_COLOURS, GREY)])
-        return np.asarray(table[np.minimum(values, len(CAUSE_COLOURS))])
-    return np.asarray(np.where((values == 0)[:, None], to_rgb(GREY), instance_colours(values)))
-
-
-def _depths(depth: NDArray[Any], scale: tuple[float, float]) -> NDArray[np.float64]:
-    """Return the colours (0 to 1) of depths [m] on a logarithmic scale, shape ``(n, 3)``. The sky is grey.
-
-    ``scale``: depths at both ends of the scale [m].
-    """
-    from matplotlib import colormaps, colors
-
-    rgb = colormaps[DEPTH_MAP](colors.LogNorm(*scale, clip=True)(depth))[:, :3]
-    return np.asarray(np.where(np.isfinite(depth)[:, None], rgb, colors.to_rgb(GREY)))
-
-
-def _scale(depth: NDArray[Any]) -> tuple[float, float]:
-    """Return the lowest and the highest depth of the colour scale [m]."""
-    seen = depth[np.isfinite(depth)]
-    low, high = np.percentile(seen, DEPTH_PERCENTILES).tolist() if len(seen) else (1.0, 10.0)
-    low = max(low, 1e-3)
-    return low, max(high, 1.1 * low)
-
-
 # Colours of the points in the event clouds, and the quantities that the colours show.
-
-NEAR_PX = 2.0
-"""Standard deviation of the Gaussian weights of the events near an event [px]."""
-WIDEST_PX = 3.0 * NEAR_PX
-"""Largest residual [px]. Wider edges look the same as spread events."""
-ROUNDING_VARIANCE = 1.0 / 12.0
-"""Variance that rounding to a pixel adds to the place of an event in an image [px²]."""
-WIDE_EVENTS = 2.0
-"""Number of spread events that are assumed near each event, so that a lone event has a large residual."""
 
 
 def third_axis(shown: DisplayedWindow, axis: Axis) -> NDArray[np.float64]:
@@ -463,12 +335,16 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
         two = np.array([to_rgb(OFF_COLOUR), to_rgb(ON_COLOUR)])
         return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
     if look.colour in STORES:
-        values = shown.truth.values(look.colour)
-        rgb = _depths(values, _scale(values)) if look.colour is Colour.DEPTH else _names(look.colour, values)
-        return np.asarray(np.rint(255.0 * rgb), np.uint8)
+        return as_bytes(_truth_colours(look.colour, shown.truth.values(look.colour)))
     scale = scale_of(shown, look.colour, dark=look.dark)
     assert scale is not None
-    return scale.rgb(_measure(shown, look.colour, after=after))
+    if look.colour in (Colour.ANGLE, Colour.TIME):
+        return scale.rgb(third_axis(shown, Axis(look.colour.value)))
+    image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
+    if look.colour is Colour.DENSITY:
+        return scale.rgb(at_pixels(image, xy))
+    left, top, right, bottom = shown.region
+    return scale.rgb(residual(image, xy, (slice(top, bottom), slice(left, right))))
 
 
 def scale_of(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> Scale | None:
@@ -486,70 +362,6 @@ def scale_of(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> Scale | N
         top = math.ceil(np.percentile(image[image > 0], 99.0)) if (image > 0).any() else 1.0
         return Scale("events", "per pixel", 0.0, float(top), "cividis", GAMMA)
     return Scale("residual σ", "px", 0.0, WIDEST_PX, "cividis") if colour is Colour.RESIDUAL else None
-
-
-def _measure(shown: DisplayedWindow, colour: Colour, *, after: bool) -> NDArray[np.float64]:
-    """Return the displayed quantity of each point, in the unit of its scale, shape ``(n,)``."""
-    if colour in (Colour.ANGLE, Colour.TIME):
-        return third_axis(shown, Axis(colour.value))
-    image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
-    if colour is Colour.DENSITY:
-        return at_pixels(image, xy)
-    left, top, right, bottom = shown.region
-    return residual(image, xy, (slice(top, bottom), slice(left, right)))
-
-
-def at_pixels(image: NDArray[Any], xy: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the image's value at each point, 0 outside the image, shape ``(n,)``."""
-    x, y = (np.nan_to_num(xy[:, k], nan=-9.0) for k in (0, 1))
-    column, row = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
-    inside = (column >= 0) & (column < image.shape[1]) & (row >= 0) & (row < image.shape[0])
-    out = np.zeros(len(xy))
-    out[inside] = image[row[inside], column[inside]]
-    return out
-
-
-def residual(
-    image: NDArray[np.float32], xy: NDArray[np.float32], where: tuple[slice, slice] = (slice(None), slice(None))
-) -> NDArray[np.float64]:
-    """Return the width of the edge at each point, or what is left of the prism's motion [px], shape ``(n,)``.
-
-    It is the standard deviation across the edge of the events near the point: near 0 on a sharp edge, and
-    :data:`WIDEST_PX` among spread events and outside the rows and columns ``where``, in which it is computed. The event
-    itself does not count.
-    """
-    wide = np.full(image.shape, WIDEST_PX)
-    spread = _spread_across_edges(image, where)
-    # Gaussian weights of variance n² and an edge of variance w² give a spread of 1 / (1 / n² + 1 / w²).
-    width = spread * NEAR_PX**2 / np.maximum(NEAR_PX**2 - spread, 1e-6) - ROUNDING_VARIANCE
-    wide[where] = np.sqrt(np.clip(width, 1e-6, WIDEST_PX**2))
-    found = at_pixels(wide, xy)
-    return np.where(found > 0.0, found, WIDEST_PX)
-
-
-def _spread_across_edges(image: NDArray[np.float32], where: tuple[slice, slice]) -> NDArray[np.float64]:
-    """Return the smallest variance, over all directions, of the weighted events about each pixel [px²].
-
-    The variance is about the mean of these events, so that it is the same on both sides of an edge and on its middle.
-    Sums with weights G of variance s are s G' for the places, and s G + s² G'' for their squares, so they follow from
-    derivatives of the smoothed image.
-    """
-    from scipy.ndimage import gaussian_filter
-
-    reach, near = 4 * math.ceil(NEAR_PX), NEAR_PX**2
-    rows, columns = (range(size)[axis] for size, axis in zip(image.shape, where, strict=True))
-    top, left = max(rows.start - reach, 0), max(columns.start - reach, 0)
-    part = image[top : rows.stop + reach, left : columns.stop + reach].astype(np.float64)
-    orders = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))
-    smooth, y, x, yy, xy, xx = (gaussian_filter(part, NEAR_PX, order=order, mode="constant") for order in orders)
-    own = 1.0 / (math.tau * near)
-    density = np.maximum(smooth - own, 0.0) + WIDE_EVENTS * own
-    mean_y, mean_x = near * y / density, near * x / density
-    yy, xx = (near + near**2 * (second + own / near) / density for second in (yy, xx))
-    yy, xx = yy - mean_y**2, xx - mean_x**2
-    xy = near**2 * xy / density - mean_x * mean_y
-    spread = np.clip(0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy), 0.0, near)
-    return np.asarray(spread[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left])
 
 
 # Legend of the inspector's picture as VTK actors: rows of a coloured mark and the meaning of the colour, or a scale.
@@ -690,8 +502,6 @@ def events_text(shown: DisplayedWindow) -> str:
 
 # VTK scene with the event clouds before and after compensation, drawn off screen without a user interface.
 
-AXIS_HEIGHT = 0.75
-"""Length of the drawn third axis, as a multiple of the region's width."""
 BACKGROUND_AND_INK = {False: ("white", "#333333"), True: ("#15181c", "#d8d8d8")}
 """Colours of background and lines, for light (False) and dark (True) mode."""
 CAMERA_DIRECTIONS = {
@@ -732,46 +542,16 @@ class Look:
     titles: tuple[str, ...] = ("as recorded", "compensated")
     """Titles of the clouds. With a single title, only the second cloud is drawn."""
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "colour", choice(Colour, self.colour, "colour"))
-        object.__setattr__(self, "axis", choice(Axis, self.axis, "axis"))
-
     def for_clouds(self, titles: Sequence[str]) -> Look:
         """Return the look for clouds with these titles. A single cloud gets the whole picture."""
         return replace(self, titles=tuple(titles), overlaid=self.overlaid or len(titles) == 1)
 
 
-@dataclass(frozen=True)
-class Box:
-    """Frame of both clouds: a region of the image [px], and the range of the third axis."""
+def font() -> Path:
+    """Return a font with Greek letters, which VTK's own font lacks."""
+    from matplotlib import get_data_path
 
-    left: int
-    top: int
-    right: int
-    bottom: int
-    low: float
-    """Start of the third axis [deg or ms]."""
-    high: float
-    """End of the third axis [deg or ms]."""
-
-    @property
-    def width(self) -> int:
-        """Width of the shown region of the image [px]."""
-        return self.right - self.left
-
-    @property
-    def axis_height(self) -> float:
-        """Length of the third axis in the scene [px]."""
-        return AXIS_HEIGHT * self.width
-
-    @property
-    def stretch(self) -> float:
-        """Scale of the third axis [px per deg or ms]. The scale of x and y is 1."""
-        return self.axis_height / (self.high - self.low)
-
-    def positions(self, xy: NDArray[Any], third: NDArray[Any]) -> NDArray[np.float32]:
-        """Return points in the scene, shape ``(n, 3)``; y is negated, because the scene's y axis points up."""
-        return np.stack([xy[:, 0], -xy[:, 1], (third - self.low) * self.stretch], axis=1).astype(np.float32)
+    return Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
 
 
 def check_opengl() -> None:
@@ -782,34 +562,6 @@ def check_opengl() -> None:
         raise AmiwarpError("VTK needs OpenGL (EGL) to draw; on Debian run: apt-get install libegl1 libgl1-mesa-dri")
     # by default VTK tries X first, and crashes if libX11 is missing; EGL needs no display
     os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"
-
-
-def check_display() -> None:
-    """Raise :class:`AmiwarpError` if no window can be opened, where VTK would end the process."""
-    if not sys.platform.startswith("linux"):
-        return
-    remedy = "run with --web to serve the page for a browser, or with --screenshot to write a picture"
-    libraries = find_library("X11"), find_library("GL")
-    if None in libraries:
-        raise AmiwarpError(
-            f"a window needs libX11 and libGL; on Debian run: apt-get install libx11-6 libgl1; or {remedy}"
-        )
-    x11 = CDLL(libraries[0])
-    x11.XOpenDisplay.restype, x11.XCloseDisplay.argtypes = c_void_p, [c_void_p]
-    display = x11.XOpenDisplay(None)
-    if display is None:
-        given = os.environ.get("DISPLAY")
-        found = f"the display {given!r} cannot be opened" if given else "there is no display to open a window on"
-        raise AmiwarpError(f"{found}; {remedy}")
-    x11.XCloseDisplay(display)
-    os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkXOpenGLRenderWindow"
-
-
-def font() -> Path:
-    """Return a font with Greek letters, which VTK's own font lacks."""
-    from matplotlib import get_data_path
-
-    return Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
 
 
 class Scene:
@@ -825,7 +577,8 @@ class Scene:
         number of renderers for other parts; they follow the :data:`OWN_RENDERERS` of the scene. Without ``off_screen``,
         a window shows the scene. Raises :class:`AmiwarpError` if VTK cannot draw on this machine.
         """
-        check_opengl() if off_screen else check_display()
+        if off_screen:
+            check_opengl()
         import pyvista
 
         parts = 1, OWN_RENDERERS + more
@@ -867,7 +620,7 @@ class Scene:
 
     def look_from(self, view: View, look: Look) -> None:
         """Move the camera to a view direction from which both clouds fit into the picture."""
-        self.view = view = choice(View, view, "view")
+        self.view = view
         self._draw_frame(look)
         b = self.box
         away, up = (np.array(v) for v in CAMERA_DIRECTIONS[view])
@@ -1004,18 +757,13 @@ class Scene:
             self._frame += [(k, actor) for actor in self._axes(k, look, ink, title)]
 
     def _draw_lines(self, lines: Sequence[NDArray[Any]], look: Look) -> None:
-        """Draw a line in each cloud, instead of those drawn before, which are moved if there are as many."""
+        """Draw a line in each cloud, instead of those drawn before."""
         import pyvista
 
-        places = [self.box.positions(line[:, :2], line[:, 2]) for line in lines]
-        homes = [0 if look.overlaid else number for number in range(len(lines))]
-        if homes == [k for k, _ in self._lines]:
-            for (_, actor), points in zip(self._lines, places, strict=True):
-                actor.mapper.dataset.points = points
-            return
         for k, actor in self._lines:
             self.plotter.renderers[k].remove_actor(actor, render=False)
-        curves = [pyvista.lines_from_points(points) for points in places]
+        curves = [pyvista.lines_from_points(self.box.positions(line[:, :2], line[:, 2])) for line in lines]
+        homes = [0 if look.overlaid else number for number in range(len(lines))]
         self._lines = [(k, self._add(k, curve, color=ORBIT_COLOUR, line_width=2.5))
                        for k, curve in zip(homes, curves, strict=True)]  # fmt: skip
 
@@ -1148,18 +896,6 @@ def save_screenshot(
         save_png(path, scene.picture())
 
 
-def ticks(low: float, high: float, most: int = 5, *, whole: bool = False) -> NDArray[np.float64]:
-    """Return at most about ``most`` round numbers from ``low`` to ``high``; for angles, divisors of a full turn.
-
-    ``whole``: only whole numbers.
-    """
-    from matplotlib.ticker import MaxNLocator
-
-    steps = [1, 2, 3, 4.5, 6, 9, 10] if high == 360.0 else [1, 2, 2.5, 5, 10]
-    values = np.asarray(MaxNLocator(most, steps=steps, integer=whole).tick_values(low, high), np.float64)
-    return values[(values >= low) & (values <= high)]
-
-
 # What the browser draws of a window: points and colours as bytes, legends, and images as addresses.
 
 LEGEND_ROWS = 8
@@ -1240,7 +976,7 @@ def picture_state(values: NDArray[Any], scale: Scale) -> dict[str, Any]:
         "low": scale.low, "high": scale.high, "gamma": scale.gamma, "step": step,
         "unit": unit if step == 1 else f"{unit} at most in {step}×{step} px",
         "pair": [list(OFF_ON_BLACK), list(ON_ON_BLACK)] if two else None,
-        "missing": [*_bytes(scale.missing).tolist(), scale.missing_text],
+        "missing": [*as_bytes(scale.missing).tolist(), scale.missing_text],
         "table": b"" if two else _pixels(table_of(scale.colours)),
     }  # fmt: skip
 
@@ -1268,10 +1004,6 @@ def shown_lines(
     return (orbit if against is None and shown.beside is None else column, column)
 
 
-NO_ORBIT = {"orbit": b"", "column": b"", "has_orbit": False}
-"""State variables without an orbit."""
-
-
 def event_text(shown: DisplayedWindow, k: int) -> str:
     """Return the description of point ``k``: pixel, time, angle, polarity, compensated position and ground truth."""
     e, (x, y), truth = shown.events, shown.after[k], shown.truth.text(k)
@@ -1290,123 +1022,3 @@ def float_bytes(values: NDArray[Any]) -> bytes:
 def _pixels(colours: NDArray[np.uint8]) -> bytes:
     """Return colours, shape ``(n, 3)``, as opaque pixels of an image in the browser."""
     return np.column_stack([colours, np.full(len(colours), 255, np.uint8)]).tobytes()
-
-
-# Event clouds before and after compensation as PyVista meshes, for scenes and files of other programs.
-
-TRUTHS = {
-    "cause": "stored_causes", "instance": "stored_instances", "depth_m": "stored_depths", "place_m": "stored_places",
-}  # fmt: skip
-"""Arrays of the clouds by name, and the ground truth that they hold."""
-
-
-@guarded
-def event_clouds(
-    recording: Recording,
-    calibration: Calibration,
-    *,
-    window: tuple[int, int] | None = None,
-    region: tuple[int, int, int, int] | None = None,
-    axis: str = "angle",
-    device: Any = "cpu",
-) -> tuple[pyvista.PolyData, pyvista.PolyData]:
-    """Return the events as recorded and compensated as point clouds, to plot, slice and save with PyVista.
-
-    Parameters
-    ----------
-    recording : Recording
-        Events to show.
-    calibration : Calibration
-        Calibration of the recording.
-    window : tuple of int, optional
-        Start and end of the time window on the events' clock [us]; the end is exclusive. Default: the whole recording.
-    region : tuple of int, optional
-        Left, top, right and bottom of a part of the image [px]; right and bottom are exclusive. The clouds hold the
-        events that were recorded in it. Default: the whole image.
-    axis : str
-        Third axis: "angle" or "time".
-    device : str or warp.Device
-        Device that compensates the events.
-
-    Returns
-    -------
-    tuple of pyvista.PolyData
-        Clouds before and after compensation, with one vertex per event.
-
-    Raises
-    ------
-    AmiwarpError
-        If there are no events in window and region, or the calibration belongs to a camera of another size.
-
-    Notes
-    -----
-    A point lies at x [px], -y [px], as VTK's y axis points up, and the prism angle or the time times a scale: the whole
-    third axis is 0.75 times as long as the region is wide. Both clouds have these arrays:
-
-    - ``t_us`` (int64): time after the first event of the recording [us],
-    - ``theta_rad`` (float64): prism angle, from 0 to 2π [rad],
-    - ``polarity`` (uint8): 1 for ON, 0 for OFF,
-    - ``index`` (int64): index of the event in the recording,
-    - ``residual_px`` (float32): standard deviation across the edge on which the event lies [px], up to 6,
-    - of a simulation: ``cause``, ``instance``, ``depth_m`` [m] and ``place_m`` (point in the world that the event saw
-      [m], shape ``(n, 3)``), as far as the recording holds them.
-
-    The field data hold ``axes`` (names and units of the coordinates), ``z_scale`` (length of one unit of the third axis
-    [px]), ``z_start`` (its value at z = 0) and ``t_first_us`` (time of the first event on its clock [us], int64). All
-    events of the window are in the first cloud, but those outside of the encoder's record. Events for which the model
-    has no solution are not in the second cloud.
-
-    Examples
-    --------
-    >>> camera, prism = amiwarp.Camera.from_fov(32, 24, 1.0), amiwarp.Prism(0.02)
-    >>> events = amiwarp.Events.from_arrays([10, 20], [12, 14], [0, 1000], [0, 1])
-    >>> encoder = amiwarp.Encoder.constant_speed(720.0, 0, 2000)
-    >>> recording = amiwarp.Recording(amiwarp.MemoryEvents(events, 32, 24), camera, encoder, prism)
-    >>> calibration = amiwarp.Calibration(
-    ...     model_name="circle", camera=camera, prism=prism, parameters={"deflection": 0.01, "phase": 0.3},
-    ...     uncertainty={}, free=(), sharpness_name="variance", sharpness_before=1.0, sharpness_after=2.0,
-    ...     stages=(), events=2, seconds=0.0)
-    >>> before, after = amiwarp.event_clouds(recording, calibration)
-    >>> after.n_points, after["t_us"].tolist()
-    (2, [0, 1000])
-    """
-    third, source = choice(Axis, axis, "axis"), recording.events
-    inspector = Inspector(
-        recording, calibration, device=device, most_events=max(len(source), 1), most_points=max(len(source), 1)
-    )
-    integer = partial(whole, low=-(2**62), high=2**62)
-    start, stop = vector((source.t_first, source.t_last + 1) if window is None else window, 2, "window", integer)
-    if stop <= start:
-        raise AmiwarpError(f"window is {window}; give start and end [us], the end after the start")
-    width, height = source.size
-    left, top, right, bottom = vector((0, 0, *source.size) if region is None else region, 4, "region", integer)
-    if not (0 <= left < right <= width and 0 <= top < bottom <= height):
-        raise AmiwarpError(f"region is {region}; give left, top, right and bottom in an image of {width}x{height} px")
-    inspector.open(start, stop - start, Selection(region=None if region is None else (left, top, right, bottom)))
-    shown = inspector.show()
-    before, after = (_cloud(shown, third, after=after) for after in (False, True))
-    return before, after
-
-
-def _cloud(shown: DisplayedWindow, axis: Axis, *, after: bool) -> pyvista.PolyData:
-    """Return one of the clouds."""
-    import pyvista
-
-    box, xy = Box(*shown.region, *axis_range(shown, axis)), shown.after if after else shown.before
-    valid = np.isfinite(xy).all(axis=1)
-    arrays: dict[str, NDArray[Any]] = {
-        "t_us": shown.events.t - shown.span.first_us, "theta_rad": shown.theta, "polarity": shown.events.p,
-        "index": np.concatenate([np.arange(run.start, run.stop) for run in shown.span.runs])[shown.truth.positions],
-        "residual_px": _measure(shown, Colour.RESIDUAL, after=after).astype(np.float32),
-    }  # fmt: skip
-    for name, attribute in TRUTHS.items():
-        if (store := getattr(shown.truth.truth, attribute, None)) is not None:
-            arrays[name] = shown.span.rows(store)[shown.truth.positions]
-    cloud = pyvista.PolyData(box.positions(xy, third_axis(shown, axis))[valid])
-    for name, values in arrays.items():
-        cloud.point_data[name] = values[valid]
-    unit = "theta [deg]" if axis is Axis.ANGLE else "t [ms]"
-    cloud.field_data["axes"] = ["x [px]", "-y [px]", f"({unit} - z_start) * z_scale"]
-    cloud.field_data["z_scale"], cloud.field_data["z_start"] = [box.stretch], [box.low]
-    cloud.field_data["t_first_us"] = np.array([shown.span.first_us], np.int64)
-    return cloud

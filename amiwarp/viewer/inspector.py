@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -24,153 +23,17 @@ from amiwarp.choices import Colour, Sharpness, Vote
 from amiwarp.compensation.recordings import at_depths, compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, check_prisms, turn_between
-from amiwarp.events.recording import Events, EventSource, Recording
-from amiwarp.events.truth import Cause, EventValues, Truth
+from amiwarp.events.recording import Events, Recording
+from amiwarp.events.truth import Cause, Truth
 from amiwarp.imaging.corners import find_background_activity
-from amiwarp.imaging.export import PERCENTILE
-from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, upload_events
-from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_variance
+from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, iwe, upload_events
+from amiwarp.imaging.regions import Region, RegionSharpness, inside, suggest_region
 from amiwarp.io.depth_map import DepthMap
-from amiwarp.io.file_scan import FileEvents
+from amiwarp.io.spans import Span, read_span
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, PHASE, Model, PlateModel, RisleyModel, alternatives, build_model
 from amiwarp.optics.prism import NominalPrism, Plate, Prism, as_wedge
 from amiwarp.reconstruction.picture import Picture, border_displacements
-
-# Rates of ON and OFF events over a recording at any zoom, counted once in bounded memory.
-
-MOST_BINS = 1 << 19
-"""Largest number of time bins in which the events of the whole recording are counted."""
-MOST_EXACT = 1_000_000
-"""Largest number of events that are read to count them in bins finer than those of the whole recording."""
-
-
-class EventRates:
-    """Counts of a recording's events over time. Call :meth:`fill` until it returns True, in one thread.
-
-    Another thread may call :meth:`curve` meanwhile.
-    """
-
-    def __init__(self, source: EventSource) -> None:
-        self._source = source
-        self._first, self._stop = source.t_first, source.t_last + 1
-        bins = min(MOST_BINS, self._stop - self._first)
-        share = np.arange(bins + 1, dtype=np.float64) / bins
-        self._edges = self._first + np.rint(share * (self._stop - self._first)).astype(np.int64)
-        self._counts = np.zeros((2, bins), np.int64)
-        self._blocks: Iterator[Events] = iter(source.blocks())
-        self._read = (np.zeros((2, bins + 1), np.int64), self._first)  # number of events before each edge; time read
-
-    @property
-    def share(self) -> float:
-        """Share of the recording's duration that is counted, 0 to 1."""
-        return (self._read[1] - self._first) / (self._stop - self._first)
-
-    def fill(self, seconds: float) -> bool:
-        """Count events for about ``seconds`` [s], at least one block. Return whether all events are counted."""
-        until, read_us = time.perf_counter() + seconds, self._read[1]
-        for block in self._blocks:
-            if len(block):
-                low, high = np.searchsorted(self._edges, (block.t[0], block.t[-1]), side="right") - 1
-                self._counts[:, low : high + 1] += counted(block, self._edges[low : high + 2])
-                read_us = int(block.t[-1])
-            if time.perf_counter() >= until:
-                break
-        else:
-            read_us = self._stop
-        sums = np.zeros((2, len(self._edges)), np.int64)
-        np.cumsum(self._counts, axis=1, out=sums[:, 1:])
-        self._read = sums, read_us
-        return read_us == self._stop
-
-    def curve(self, start_us: int, end_us: int, bins: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the rates of OFF and ON events between two times in about ``bins`` bins of equal length, or nearly so.
-
-        Returns edges of the bins on the events' clock [us], shape ``(n + 1,)``, and rates [1/s], shape ``(2, n)``, NaN
-        where the recording is not read yet.
-        Bins finer than those of the whole recording are counted if the time between holds few events. Otherwise, the
-        curve has fewer bins. Times outside the recording have rate 0.
-        """
-        start_us, end_us = int(start_us), max(int(end_us), int(start_us) + 1)
-        edges = np.unique(start_us + (end_us - start_us) * np.arange(bins + 1, dtype=np.int64) // bins)
-        finest = (self._stop - self._first) / (len(self._edges) - 1)
-        fine = edges[1] - edges[0] < 4.0 * finest and finest > 1.0
-        counts = self._exact(edges) if fine else None
-        if fine and counts is None:
-            within = (self._edges > start_us) & (self._edges < end_us)
-            edges = np.concatenate([[start_us], self._edges[within], [end_us]])
-            edges = edges[np.unique(np.r_[0 : len(edges) - 1 : max(1, len(edges) // bins), len(edges) - 1])]
-        if counts is None:
-            sums, read_us = self._read
-            before = np.searchsorted(self._edges, edges)  # a bin of the recording belongs to where it begins
-            counts = np.diff(sums[:, np.minimum(before, sums.shape[1] - 1)], axis=1).astype(np.float64)
-            if read_us < self._stop:
-                counts[:, edges[1:] > read_us] = np.nan
-        return edges, counts / np.diff(edges) * 1e6
-
-    def _exact(self, edges: NDArray[np.int64]) -> NDArray[np.int64] | None:
-        """Return the numbers of OFF and ON events in bins, read from the source; None if there are too many."""
-        if isinstance(self._source, FileEvents):  # would be read from its start
-            return None
-        first, stop = (self._source.find(int(t)) for t in (edges[0], edges[-1]))
-        return None if stop - first > MOST_EXACT else counted(self._source.slice(first, stop), edges)
-
-
-def counted(events: Events, edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the numbers of OFF and ON events in time bins, shape ``(2, n)``."""
-    at = np.searchsorted(events.t, edges)
-    on = np.diff(np.concatenate([[0], np.cumsum(events.p, dtype=np.int64)])[at])
-    return np.array([np.diff(at) - on, on])
-
-
-# Events of a time window, read without loading the other events.
-
-RUNS = 64
-"""Number of evenly spaced runs of events that are read from a window with too many events."""
-
-
-@dataclass(frozen=True)
-class Span:
-    """Events of a time window."""
-
-    first_us: int
-    """Time of the recording's first event, from which all shown times count [us]."""
-    start_us: int
-    """Start of the time window on the events' clock [us]."""
-    length_us: int
-    """Length of the time window [us]."""
-    count: int
-    """Number of events in the time window, including those that are not read."""
-    events: Events
-    """All events of the window, or evenly spaced runs of them."""
-    runs: tuple[slice, ...]
-    """Indices of these events in the recording."""
-    places: NDArray[np.float32] | None = None
-    """Places of the events of a compensated recording [px], shape ``(n, 2)``; ``events`` has their pixels then."""
-
-    @property
-    def start_ms(self) -> float:
-        """Start of the time window after the recording's first event [ms]."""
-        return (self.start_us - self.first_us) * 1e-3
-
-    def rows(self, values: EventValues) -> NDArray[Any]:
-        """Return the rows of ``values`` for :attr:`events`; ``values`` has one row per event of the recording."""
-        return np.concatenate([values[run] for run in self.runs])
-
-
-def read_span(source: EventSource, start_us: int, length_us: int, *, most_events: int) -> Span:
-    """Read the events with ``start_us <= t < start_us + length_us``.
-
-    If the window holds more than ``most_events``, read about this number in evenly spaced runs.
-    """
-    first, stop = (source.find(t) for t in (start_us, start_us + length_us))
-    count = stop - first
-    if count <= most_events:
-        return Span(source.t_first, start_us, length_us, count, source.slice(first, stop), (slice(first, stop),))
-    starts, length = (first + np.arange(RUNS) * count // RUNS).tolist(), most_events // RUNS
-    runs = tuple(slice(k, k + length) for k in starts)
-    events = Events.concatenate(list(_runs(source, starts, length)))
-    return Span(source.t_first, start_us, length_us, count, events, runs)
 
 
 def _in_pixels(span: Span, size: tuple[int, int]) -> Span:
@@ -181,20 +44,6 @@ def _in_pixels(span: Span, size: tuple[int, int]) -> Span:
     x, y = (np.clip(np.rint(v), 0, n - 1).astype(np.uint16) for v, n in zip((e.x, e.y), size, strict=True))
     places = np.stack([e.x, e.y], axis=1).astype(np.float32)
     return replace(span, events=Events(x, y, e.t, e.p), places=places)
-
-
-def _runs(source: EventSource, starts: list[int], length: int) -> Iterator[Events]:
-    """Yield runs of ``length`` events. A file that can only be read from its start is read in one pass."""
-    if not isinstance(source, FileEvents):
-        yield from (source.slice(k, k + length) for k in starts)
-        return
-    seen = 0
-    for block in source.blocks():
-        yield from (block[max(k - seen, 0) : max(k + length - seen, 0)] for k in starts if k < seen + len(block))
-        seen += len(block)
-        starts = [k for k in starts if k + length > seen]
-        if not starts:
-            return
 
 
 # Ground truth of the events that the inspector draws, read from the recording on first use.
@@ -264,58 +113,6 @@ class DrawnTruth:
             f"depth {self.values(c)[k]:.3f} m" if c is Colour.DEPTH else f"{c.value} {self.name(c, self.values(c)[k])}"
             for c in known
         )
-
-
-# Images of warped events and their sharpness for the inspector, on the device.
-
-SMOOTHING_PX = 1.0
-"""Standard deviation of the Gaussian that smooths the image before its sharpness is measured, as in calibration [px].
-"""
-
-Region = tuple[int, int, int, int]
-"""Part of the image: left, top, right and bottom [px]; right and bottom are exclusive."""
-
-
-class WindowImager:
-    """Measures the sharpness of images of warped events, as calibration does: bilinear votes at dithered places.
-
-    An imager owns its buffers, so only one thread may use it.
-    """
-
-    def __init__(self, size: tuple[int, int], device: Any) -> None:
-        self._votes, self._device = Votes(CanvasShape(*size, dither=True), device), device
-        self._meter: SharpnessMeter | None = None
-
-    def measure(self, model: Model, events: UploadedEvents, offset_us: float, region: Region) -> tuple[float, float]:
-        """Return variance and sharpness of the smoothed region.
-
-        The variance over mean, as :attr:`amiwarp.Sharpness.VARIANCE`, grows with the number of events. The sharpness,
-        see :func:`amiwarp.imaging.metrics.relative_variance`, does not depend on it. ``offset_us`` is added to the
-        encoder's clock offset [us].
-        """
-        self._votes.clear()
-        self._votes.add_events(model, events, drift=offset_us)
-        left, top, right, bottom = region
-        canvas, meter = CanvasShape(right - left, bottom - top, dither=True), self._meter
-        if meter is None or meter.image.shape != canvas.shape:
-            meter = SharpnessMeter(canvas, Sharpness.VARIANCE, smoothing=SMOOTHING_PX, device=self._device)
-            self._meter = meter
-        if meter.image.shape == self._votes.canvas.shape:
-            self._votes.read(meter.image)
-            part = meter.image.numpy()[0]
-        else:
-            part = self._votes.take()[0][top:bottom, left:right]
-            meter.image.write(part[None])
-        variance, mean = meter.measure(), float(part.mean())
-        return variance, relative_variance(variance, mean, SMOOTHING_PX) if mean > 0.0 else 0.0
-
-
-def recorded_counts(events: Events, size: tuple[int, int], *, per_polarity: bool = False) -> NDArray[np.float32]:
-    """Return the number of events at each pixel, shape ``(height, width)``; with polarities ``(2, height, width)``."""
-    shape, pixel = (*(2,) * per_polarity, *size[::-1]), events.y.astype(np.int64) * size[0] + events.x
-    if per_polarity:
-        pixel += events.p.astype(np.int64) * math.prod(size)
-    return np.bincount(pixel, minlength=math.prod(shape)).astype(np.float32).reshape(shape)
 
 
 # Parameters of the prism and selection of events under which the inspector shows a recording.
@@ -420,22 +217,28 @@ class Selection:
 
 
 @dataclass(frozen=True, eq=False)
-class LoadedWindow:
-    """Selected events of a window, in memory and on the device, and their image without compensation."""
+class DrawnWindow:
+    """Selected events of a time window that are drawn as points."""
 
     span: Span
     """Time window, with all events that were read from it."""
     region: Region
     """Part of the image that is shown."""
     selected: int
-    """Number of events of the selection."""
-    drawn: Events
-    """Selected events that are drawn as points."""
-    truth: DrawnTruth
-    """Ground truth of the drawn events."""
-    xy: NDArray[np.float32]
-    """Pixels of the drawn events [px], shape ``(n, 2)``."""
+    """Number of selected events, which are all in the images."""
     events: Events
+    """Events that are drawn as points."""
+    truth: DrawnTruth
+    """Ground truth of these events."""
+    before: NDArray[np.float32]
+    """Pixels of the drawn events as recorded [px], shape ``(n, 2)``."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedWindow(DrawnWindow):
+    """Selected events of a window, in memory and on the device, and their image without compensation."""
+
+    counted: Events
     """Events of the images: the selected events, and those near the region that compensation may move into it."""
     angles: dict[float, tuple[UploadedEvents, NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
     """Events on the device, prism angles [rad] and speeds [rad/us] of the drawn events, without the clock offset set on
@@ -450,21 +253,9 @@ class LoadedWindow:
 
 
 @dataclass(frozen=True, eq=False)
-class DisplayedWindow:
+class DisplayedWindow(DrawnWindow):
     """Time window shown with the current parameters: images of all events, and points of evenly spaced events."""
 
-    span: Span
-    """Time window, with all events that were read from it."""
-    region: Region
-    """Part of the image that is shown: left, top, right and bottom [px]; right and bottom are exclusive."""
-    selected: int
-    """Number of selected events, which are all in the images."""
-    events: Events
-    """Events that are drawn as points."""
-    truth: DrawnTruth
-    """Ground truth of these events."""
-    before: NDArray[np.float32]
-    """Pixels of the drawn events as recorded [px], shape ``(n, 2)``."""
     after: NDArray[np.float32]
     """Compensated positions of the drawn events [px], shape ``(n, 2)``; NaN if the model has no solution."""
     theta: NDArray[np.float64]
@@ -512,114 +303,6 @@ CURVE_EVENTS = 200_000
 """Largest number of events that a sharpness curve uses."""
 
 
-def inside(events: Events, region: Region) -> NDArray[np.bool_]:
-    """Return whether each event lies in a region, shape ``(n,)``."""
-    left, top, right, bottom = region
-    return (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
-
-
-# Region of the image that the inspector shows first: where compensation gains most sharpness.
-
-WIDEST, NARROWEST = 120, 60
-"""Largest width of a suggested region, and its width on a small sensor or if there are very many events [px]."""
-CLEAR_EVENTS = 50_000
-"""Number of events above which a narrower region is suggested, because so many points hide each other in the cloud."""
-LEAST_SIGMA = 5.0
-"""Smallest gain of variance over mean, in standard deviations of that of random events, that shows an effect."""
-NEARLY_BEST = 0.5
-"""Share of the largest gain of variance from which a region is a candidate. The candidate whose sharpness gains the
-largest factor is chosen.
-
-The variance grows with the square of the number of events, so that nearly empty regions are no candidates.
-"""
-MOST_SEARCHED, BLOCK_PX = 1 << 22, 64
-"""Largest number of pixels that are searched; of a larger image, the square with most events, in steps of
-:data:`BLOCK_PX` [px]."""
-LEAST_SHARE = 0.8
-"""Smallest ratio of the number of recorded events to that of compensated events in a candidate: its edges do not come
-from outside."""
-
-
-def suggest_region(before: NDArray[np.float32], after: NDArray[np.float32], *, margin: int = 0) -> Region:
-    """Return the region in which compensation gains most sharpness.
-
-    If it gains nothing anywhere, return the region of the recorded image that has most structure. ``before`` and
-    ``after`` are images of the same events as recorded and compensated [events per pixel], shape ``(height, width)``.
-    ``margin``: distance that the region keeps from the border of the image if it can [px]. If it is the radius of the
-    orbit, no events of the region were outside of the image during a part of the turn.
-    """
-    rows, columns = before.shape
-    if before.size > MOST_SEARCHED:
-        left, top, right, bottom = busiest(before)
-        part = np.s_[top:bottom, left:right]
-        x0, y0, x1, y1 = suggest_region(before[part], after[part], margin=margin)
-        return left + x0, top + y0, left + x1, top + y1
-    width = min(columns, WIDEST, max(columns // 3, NARROWEST))
-    while True:
-        height = min(rows, max(1, round(width * min(rows / columns, 1.0))))
-        left, top = _best_box(before, after, width, height, margin)
-        events = float(before[top : top + height, left : left + width].sum())
-        if events <= CLEAR_EVENTS or width <= NARROWEST:
-            return left, top, left + width, top + height
-        width = max(NARROWEST, min(width - 1, int(width * (CLEAR_EVENTS / events) ** 0.5)))
-
-
-def busiest(image: NDArray[np.float32]) -> Region:
-    """Return the part of a large image, of at most :data:`MOST_SEARCHED` pixels, that has most events."""
-    side = math.isqrt(MOST_SEARCHED) // BLOCK_PX
-    rows, columns = (-(-size // BLOCK_PX) for size in image.shape)
-    blocks = np.add.reduceat(np.add.reduceat(image, range(0, image.shape[0], BLOCK_PX), axis=0),
-                             range(0, image.shape[1], BLOCK_PX), axis=1).astype(np.float64)  # fmt: skip
-    height, width = min(side, rows), min(side, columns)
-    means = _box_means(blocks, width, height)
-    top, left = (BLOCK_PX * int(k) for k in np.unravel_index(int(np.argmax(means)), means.shape))
-    right, bottom = min(left + BLOCK_PX * width, image.shape[1]), min(top + BLOCK_PX * height, image.shape[0])
-    return left, top, right, bottom
-
-
-def _best_box(
-    before: NDArray[np.float32], after: NDArray[np.float32], width: int, height: int, margin: int
-) -> tuple[int, int]:
-    """Return left and top of the best box of a size: without a gain, of that with most structure."""
-    mean, over_mean = _of_boxes(before, width, height)
-    mean_after, over_mean_after = _of_boxes(after, width, height)
-    noise = random_variance(SMOOTHING_PX)
-    # the variance of random events stays in the divisor, so that a region without structure has no arbitrary factor
-    factor = (over_mean_after - noise) / mean_after / (np.maximum(over_mean, noise) / mean)
-    variance = mean_after * over_mean_after - mean * over_mean
-    variance = np.where(mean >= LEAST_SHARE * mean_after, variance, 0.0)
-    margins = (min(margin, (n - 1) // 2) for n in variance.shape)  # at least the middle is searched
-    inner = tuple(slice(m, n - m) for m, n in zip(margins, variance.shape, strict=True))
-    if (over_mean_after - over_mean)[inner].max() <= LEAST_SIGMA * noise * (2.0 / (width * height)) ** 0.5:
-        variance = factor = mean * over_mean
-    candidates = np.full(variance.shape, -np.inf)
-    candidates[inner] = np.where(variance[inner] >= NEARLY_BEST * variance[inner].max(), factor[inner], -np.inf)
-    top, left = np.unravel_index(int(np.argmax(candidates)), candidates.shape)
-    return int(left), int(top)
-
-
-def _of_boxes(image: NDArray[np.float32], width: int, height: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mean, and variance over mean, of all boxes in a smoothed image, indexed by top and left.
-
-    Counts are limited, so that hot pixels are not taken for structure.
-    """
-    from scipy.ndimage import gaussian_filter
-
-    positive = image[image > 0.0]
-    limit = float(np.percentile(positive, PERCENTILE)) if positive.size else 1.0
-    smoothed = gaussian_filter(np.minimum(image, limit).astype(np.float64), SMOOTHING_PX, mode="constant")
-    mean, square = (_box_means(values, width, height) for values in (smoothed, smoothed**2))
-    mean = np.maximum(mean, 1e-6)
-    return mean, np.maximum(square / mean - mean, 0.0)
-
-
-def _box_means(values: NDArray[np.float64], width: int, height: int) -> NDArray[np.float64]:
-    """Return the mean over each box that lies in the image, indexed by top and left."""
-    sums = np.pad(values, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
-    both = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
-    return np.asarray(both / (width * height), np.float64)
-
-
 MOST_EVENTS = 2_000_000
 """Largest number of events in the image of a window. Of a fuller window, evenly spaced runs are read."""
 FOV_DEG = 60.0
@@ -647,15 +330,13 @@ class Inspector:
         *,
         device: Any = "cpu",
         latest: Callable[[], Recording] | None = None,
-        most_events: int | None = None,
         most_points: int | None = None,
     ) -> None:
         """Start with a recording; a calibration sets the prism's parameters.
 
-        ``latest`` returns the current events of a live stream, see :meth:`renew`. ``most_events``: largest number of
-        events that are read from a window, by default :data:`MOST_EVENTS`. ``most_points``: largest number of points
-        in each cloud, by default :data:`MOST_POINTS`. Raises :class:`AmiwarpError` if there are no events, or if the
-        calibration belongs to another camera.
+        ``latest`` returns the current events of a live stream, see :meth:`renew`. ``most_points``: largest number of
+        points in each cloud, by default :data:`MOST_POINTS`. Raises :class:`AmiwarpError` if there are no events, or
+        if the calibration belongs to another camera.
         """
         source = recording.events
         if not len(source):
@@ -675,14 +356,15 @@ class Inspector:
         if recording.camera is None:
             recording = replace(recording, camera=Camera.from_fov(*source.size, math.radians(FOV_DEG)))
         self.recording, self.device, self.latest = recording, device, latest
-        self._most_events = most_events
         self.prism = nominal(recording.prism)
         """Nominal glass of the recording; a prism with an assumed apex if it is unknown."""
         self.zero_us = (source.t_first + source.t_last) // 2
         """Time at which the prism angle is 0 if there is no encoder [us]."""
-        best = self._best_model
+        best, ratio, second = self._best_model, None if recording.encoder is None else recording.encoder.ratio, {}
+        if ratio is not None:  # of a pair of prisms
+            second = {"second_apex": (as_wedge(self.prism).second or as_wedge(self.prism)).apex, "ratio": ratio}
         self.knobs = Knobs.given(
-            self._second_prism | self._typical_size(best), model=best, apex=self.nominal_apex,
+            second | self._typical_size(best), model=best, apex=self.nominal_apex,
             clock_offset=self._recorded_offset_us,
         )  # fmt: skip
         self.window: tuple[int, int] | None = None
@@ -703,7 +385,7 @@ class Inspector:
         """Whether nobody looks any more: measuring the sharpness then raises :class:`AmiwarpError`."""
         self.lock = Lock()
         """Lock for the events on the device and the buffers of their images."""
-        self._imager, self._curve_imager = (WindowImager(source.size, device) for _ in range(2))
+        self._imager, self._curve_imager = (RegionSharpness(source.size, device) for _ in range(2))
         self._votes: dict[bool, Votes] = {}
         if calibration is not None:
             self.accept(calibration)
@@ -712,7 +394,7 @@ class Inspector:
         """Return an inspector that shows the same, with buffers of its own, for another thread."""
         made, size = copy(self), self.recording.events.size
         made.lock, made._votes, made.sources = Lock(), {}, dict(self.sources)
-        made._imager, made._curve_imager = (WindowImager(size, self.device) for _ in range(2))
+        made._imager, made._curve_imager = (RegionSharpness(size, self.device) for _ in range(2))
         made._window = made._span = None
         made.beside = None if self.beside is None else self.beside.copy()
         return made
@@ -793,15 +475,6 @@ class Inspector:
     def _best_model(self) -> str:
         """Name of the best model of the recording's optic; a pair of prisms if two angles may be theirs."""
         return best_model(self.recording) or RisleyModel.NAME
-
-    @property
-    def _second_prism(self) -> dict[str, float]:
-        """Values of the second prism of a pair as the recording gives them; none for one prism."""
-        ratio = None if self.recording.encoder is None else self.recording.encoder.ratio
-        if ratio is None:
-            return {}
-        wedge = as_wedge(self.prism)
-        return {"second_apex": (wedge.second or wedge).apex, "ratio": ratio}
 
     def _typical_size(self, model: str) -> dict[str, float]:
         """Return the size with which a model of another optic than a wedge starts; none for a wedge."""
@@ -949,7 +622,7 @@ class Inspector:
         return Calibration(
             model_name=k.model, camera=self.camera, prism=nominal(self.prism, kind), parameters=kept, uncertainty={},
             free=(), sharpness_name=Sharpness.VARIANCE.value, sharpness_before=before, sharpness_after=after,
-            stages=(), events=len(w.events), seconds=0.0, warnings=("set by hand in the inspector",),
+            stages=(), events=len(w.counted), seconds=0.0, warnings=("set by hand in the inspector",),
             zero_us=None if self.has_encoder else self.zero_us, harmonics=self._harmonics,
         )  # fmt: skip
 
@@ -1012,7 +685,7 @@ class Inspector:
         w = self.loaded
         image, sharpness = self._unmoved(w)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.drawn, w.truth, w.xy, w.xy, self._wrapped(w, self.knobs), image,
+            w.span, w.region, w.selected, w.events, w.truth, w.before, w.before, self._wrapped(w, self.knobs), image,
             image_after, sharpness, sharpness, is_beside=True,
         )  # fmt: skip
 
@@ -1024,7 +697,7 @@ class Inspector:
         recording beside, if there is one.
         """
         w, knobs = self.loaded, knobs or self.knobs
-        xy = w.xy if against is None else self._moved(w, against)
+        xy = w.before if against is None else self._moved(w, against)
         (image_after, sharpness_after), other = self._measured(w, knobs), None
         if self.beside is not None and against is None:
             other = self.beside._beside(w.span, self.selection, image_after)
@@ -1032,7 +705,7 @@ class Inspector:
         else:
             image, sharpness = self._unmoved(w) if against is None else self._measured(w, against)
         return DisplayedWindow(
-            w.span, w.region, w.selected, w.drawn, w.truth, xy, self._moved(w, knobs), self._wrapped(w, knobs), image,
+            w.span, w.region, w.selected, w.events, w.truth, xy, self._moved(w, knobs), self._wrapped(w, knobs), image,
             image_after, sharpness, sharpness_after, other,
         )  # fmt: skip
 
@@ -1048,13 +721,13 @@ class Inspector:
         for value in values[values >= 0.0].tolist() if name == size_name(knobs.model) else values.tolist():
             yield value, sharpness(knobs.with_values({name: value}))
 
-    def sharpness_meter(self, imager: WindowImager | None = None) -> Callable[[Knobs | None], float]:
+    def sharpness_meter(self, imager: RegionSharpness | None = None) -> Callable[[Knobs | None], float]:
         """Return a function that measures the sharpness of part of the window's events with given parameters.
 
         Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and belongs to the
         thread that uses the imager; by default, it has an imager of its own.
         """
-        w, imager = self.loaded, imager or WindowImager(self.recording.events.size, self.device)
+        w, imager = self.loaded, imager or RegionSharpness(self.recording.events.size, self.device)
         on_device: dict[float, UploadedEvents] = {}
 
         def sharpness(knobs: Knobs | None) -> float:
@@ -1064,7 +737,7 @@ class Inspector:
             rpm = 0.0 if self.has_encoder else given.rpm
             if rpm not in on_device:
                 on_device.clear()
-                on_device[rpm] = self._upload(w.events[:: max(1, -(-len(w.events) // CURVE_EVENTS))], rpm)
+                on_device[rpm] = self._upload(w.counted[:: max(1, -(-len(w.counted) // CURVE_EVENTS))], rpm)
             model, drift_us = self.model_of(given), self._drift_us(given)
             return imager.measure(model, on_device[rpm], drift_us, w.region)[1]
 
@@ -1077,7 +750,7 @@ class Inspector:
         a pixel, over the logarithm of the interval [us]. Intervals between runs are not counted. Those under 1 us are
         in the first bin, those over 1 s in the last one.
         """
-        events, span, (left, top, right, bottom) = self.loaded.events, self.loaded.span, self.loaded.region
+        events, span, (left, top, right, bottom) = self.loaded.counted, self.loaded.span, self.loaded.region
         events = events[inside(events, self.loaded.region)]
         starts = span.events.t[np.cumsum([0, *(run.stop - run.start for run in span.runs)])[:-1]]
         run = np.searchsorted(starts, events.t, side="right")
@@ -1176,8 +849,7 @@ class Inspector:
     def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:
         """Read and select the events of a time window. The events of the last one are not read again."""
         if self._span is None or (self._span.start_us, self._span.length_us) != (start_us, length_us):
-            most = self._most_events or MOST_EVENTS
-            span = read_span(self.recording.events, start_us, length_us, most_events=most)
+            span = read_span(self.recording.events, start_us, length_us, most_events=MOST_EVENTS)
             self._span = _in_pixels(span, self.recording.events.size) if self._is_beside else span
         return self.select(self._span, selection)
 
@@ -1228,10 +900,10 @@ class Inspector:
         """Return the prism angles of a window; those of the two last speeds are kept."""
         rpm = 0.0 if self.has_encoder else knobs.rpm
         if rpm not in w.angles:
-            encoder, t = self._encoder(rpm), w.drawn.t
+            encoder, t = self._encoder(rpm), w.events.t
             for old in list(w.angles)[:-1]:
                 del w.angles[old]
-            w.angles[rpm] = self._upload(w.events, rpm), encoder.angle_at(t), encoder.speed_at(t) * 1e-6
+            w.angles[rpm] = self._upload(w.counted, rpm), encoder.angle_at(t), encoder.speed_at(t) * 1e-6
         return w.angles[rpm]
 
     def _upload(self, events: Events, rpm: float) -> UploadedEvents:
@@ -1255,20 +927,20 @@ class Inspector:
 
     def _moved(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float32]:
         """Return the compensated positions of the drawn events [px], shape ``(n, 2)``."""
-        encoder, (first, last) = self.encoder_of(knobs), w.drawn.t[[0, -1]].tolist()
-        if encoder.covers(first, last) and w.drawn.x.dtype == np.uint16:  # several times as fast
-            return np.asarray(compensate_events(w.drawn, self.model_of(knobs), encoder, device=self.device))
+        encoder, (first, last) = self.encoder_of(knobs), w.events.t[[0, -1]].tolist()
+        if encoder.covers(first, last) and w.events.x.dtype == np.uint16:  # several times as fast
+            return np.asarray(compensate_events(w.events, self.model_of(knobs), encoder, device=self.device))
         theta = self._theta(w, knobs).astype(np.float32)
-        return np.asarray(self.model_of(knobs).compensate_points(w.xy, theta), np.float32)
+        return np.asarray(self.model_of(knobs).compensate_points(w.before, theta), np.float32)
 
     def counts(self, w: LoadedWindow, knobs: Knobs | None, *, per_polarity: bool = False) -> NDArray[np.float32]:
-        """Return the number of a window's events at each pixel, see :func:`recorded_counts`.
+        """Return the number of a window's events at each pixel, shape ``(height, width)``, or two such images.
 
         Compensated events count at the pixel in which they lie; ``knobs`` None counts the events as recorded.
         """
         size = self.recording.events.size
         if knobs is None:
-            return recorded_counts(w.events, size, per_polarity=per_polarity)
+            return iwe(w.counted, *size, per_polarity=per_polarity, vote=Vote.NEAREST)
         with self.lock:
             if per_polarity not in self._votes:
                 canvas = CanvasShape(*size, per_polarity=per_polarity, vote=Vote.NEAREST)

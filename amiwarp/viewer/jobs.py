@@ -5,7 +5,7 @@ import contextlib
 import math
 import re
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -19,19 +19,19 @@ from amiwarp.calib.settings import AUTO
 from amiwarp.choices import View
 from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import Encoder, rpm_between
+from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
-from amiwarp.imaging.export import encode_image
+from amiwarp.imaging.regions import MOST_SEARCHED, busiest
 from amiwarp.io import RecordingWriter
-from amiwarp.io.file_scan import FileEvents
-from amiwarp.io.files import NewFile
 from amiwarp.io.formats import check_ending
-from amiwarp.live.stream.session import RecentEvents
+from amiwarp.io.plain_files import save_map, save_rows
+from amiwarp.io.spans import span_blocks
 from amiwarp.optics.models import ExactModel, alternatives
+from amiwarp.plotting.colours import Scale
 from amiwarp.reconstruction.picture import save_film
 from amiwarp.tasks import Progress, silent
-from amiwarp.viewer.drawing import Look, Scale, Scene, ShownImages, caption, picture_state, select_part, shown_lines
-from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, MOST_SEARCHED, Inspector, Knobs, Source, busiest, size_name
+from amiwarp.viewer.drawing import Look, Scene, caption, picture_state, select_part, shown_lines
+from amiwarp.viewer.inspector import CURVE_HALF_WIDTH, Inspector, Knobs, Source, size_name
 from amiwarp.viewer.layout import EXPORTS, SLIDERS, UNITS, orbit_text
 
 # Progress of long work in threads.
@@ -91,7 +91,13 @@ def estimate_phase(inspector: Inspector) -> bool:
     """
     if inspector.sources["phase"] is not Source.ASSUMED or not math.isfinite(inspector.turn_us):
         return False
-    measure = _searched(inspector).sharpness_meter()
+    searched, window, size = inspector, inspector.loaded, inspector.recording.events.size
+    if math.prod(size) > MOST_SEARCHED:  # of a large sensor, the part with most events, so that the search stays short
+        part, *times, _ = select_part(inspector, window, busiest(inspector.counts(window, None)))
+        searched = Inspector(part, device=inspector.device)
+        searched.set(inspector.knobs)
+        searched.window = times[0], times[1]
+    measure = searched.sharpness_meter()
 
     @cache
     def sharpness(phase: float) -> float:
@@ -107,19 +113,6 @@ def estimate_phase(inspector: Inspector) -> bool:
     inspector.set(replace(inspector.knobs, phase=found))
     inspector.sources["phase"] = Source.ESTIMATED
     return True
-
-
-def _searched(inspector: Inspector) -> Inspector:
-    """Return the inspector, or one of the part of a large sensor with most events, so that the search stays short."""
-    width, height = inspector.recording.events.size
-    if width * height <= MOST_SEARCHED:
-        return inspector
-    window = inspector.loaded
-    part, *times, _ = select_part(inspector, window, busiest(inspector.counts(window, None)))
-    small = Inspector(part, device=inspector.device)
-    small.set(inspector.knobs)
-    small.window = times[0], times[1]
-    return small
 
 
 # Calibration on what the inspector shows, and the sharpness over two parameters.
@@ -209,64 +202,8 @@ def cost_surface(
             "y_title": y_title, "picture": picture_state(out[::-1], scale)}  # fmt: skip
 
 
-# Live stream as the inspector sees it: its last seconds as a recording, and figures about it.
-
-
-class LiveSource:
-    """Function that returns the last seconds of a stream as a recording, with figures about the stream."""
-
-    def __init__(self, recent: RecentEvents, messages: Sequence[str]) -> None:
-        """Start with events of at least one turn. ``messages`` grows while the stream is followed.
-
-        Raises :class:`AmiwarpError` if there are fewer events.
-        """
-        first = recent.recording()
-        if first is None:
-            raise AmiwarpError("the stream has delivered less than one full turn; wait for one")
-        self._recent, self._messages, self._last = recent, messages, first
-
-    def __call__(self) -> Recording:
-        """Return the latest events of at least one turn."""
-        self._last = self._recent.recording() or self._last
-        return self._last
-
-    def state(self) -> dict[str, Any]:
-        """Return figures of this moment for page and window: rows of name, value and "bad", and what is wrong.
-
-        The speed is that of the last turn of the shown events; the latency is their age if they are shown now.
-        """
-        recent, problem, status = self._recent, self._recent.silence, self._recent.status
-        last, encoder = self._last.events.t_last, self._last.encoder
-        no_angles = "" if problem else recent.encoder_silence
-        turn_us = 2e6 if encoder is None else min(2e6, 60e6 / max(abs(encoder.rpm), 1.0))
-        rpm = None if encoder is None else rpm_between(encoder, round(last - turn_us), last)
-        said, speed = self._messages[-1] if self._messages else "", "unknown" if rpm is None else f"{rpm:.1f} rpm"
-        angles, rate = not (problem or no_angles), 0.0 if problem else status.rate_mev_s
-        fresh, latency_ms = angles and recent.turn_share >= 1.0, 1e3 * recent.age_s
-        rows = [
-            ("events", "interrupted, last ones shown" if problem else "receiving", problem),
-            ("prism angles", "receiving" if angles else "interrupted, last turn shown", not angles),
-            ("rate", f"{rate:.2f} million events/s", False),
-            ("latency", "–" if problem else f"{latency_ms:.0f} ms", not problem and latency_ms > 1e3),
-            ("turn covered", f"{100.0 * recent.turn_share:.0f} %", recent.turn_share < 1.0),
-            ("speed of the prism", speed if fresh else f"{speed}, last measured", rpm is None or not fresh),
-            ("lost events", f"{status.dropped:,}", status.dropped), ("out of order", f"{status.late:,}", status.late),
-        ]  # fmt: skip
-        if recent.segment > 1:
-            rows.append(("segment", f"{recent.segment}, since the source came back", False))
-        if said and not problem:
-            rows.append(("last message", said, False))
-        message = "" if said == problem else said
-        note = f"The stream is interrupted: {problem}. {message}".strip() if problem else ""
-        if no_angles:
-            note = f"No prism angles arrive: {no_angles}. The last turn before it is shown, until they return."
-        return {"live_rows": [[name, text, "bad" if bad else ""] for name, text, bad in rows], "stream_note": note}
-
-
 # Files that the page offers as downloads: images, events and films.
 
-BLOCK = 1 << 20
-"""Number of events that are written at a time."""
 COLUMNS = ("t", "x", "y", "p", "theta", "x_compensated", "y_compensated")
 """Columns of a table of events: time [us], pixel, polarity, prism angle [rad] and compensated place [px]."""
 
@@ -302,7 +239,6 @@ def write_table(inspector: Inspector, path: Path) -> None:
 
     Raises :class:`AmiwarpError` for another suffix, or if the file exists.
     """
-    ending = check_ending(path, "tables are written", (".csv", ".npz"))
     encoder, knobs = inspector.encoder_of(inspector.knobs), inspector.knobs
 
     def table(e: Events) -> tuple[NDArray[Any], ...]:
@@ -310,31 +246,12 @@ def write_table(inspector: Inspector, path: Path) -> None:
         return e.t, e.x, e.y, e.p, theta, moved[:, 0], moved[:, 1]
 
     tables = map(table, _selected_blocks(inspector))
-    with NewFile(path) as new, open(new.part, "wb") as file:
-        if ending == ".npz":
-            columns: dict[str, Any] = {
-                name: np.concatenate(parts) for name, *parts in zip(COLUMNS, *tables, strict=True)
-            }
-            width, height = inspector.recording.events.size
-            np.savez_compressed(file, width=width, height=height, **columns)
-            return
-        file.write((",".join(COLUMNS) + "\n").encode())
-        for each in tables:
-            np.savetxt(file, np.column_stack(each), fmt="%d,%d,%d,%d,%.6f,%.3f,%.3f")
-
-
-def write_image(images: ShownImages, path: Path) -> None:
-    """Write the values of the second image to a new .tif file, float32; two polarities on two pages, OFF and ON.
-
-    Raises :class:`AmiwarpError` for another suffix, or if the file exists.
-    """
-    from PIL import Image
-
-    check_ending(path, "values of images are written", (".tif",))
-    with NewFile(path) as new:
-        pages = images.after if images.after.ndim == 3 else images.after[None]
-        first, *more = (Image.fromarray(np.asarray(page, np.float32)) for page in pages)
-        encode_image(new.part, first, "TIFF", save_all=bool(more), append_images=more)
+    if check_ending(path, "tables are written", (".csv", ".npz")) == ".csv":
+        save_rows(path, COLUMNS, tables, "%d,%d,%d,%d,%.6f,%.3f,%.3f")
+        return
+    columns = {name: np.concatenate(parts) for name, *parts in zip(COLUMNS, *tables, strict=True)}
+    width, height = map(np.array, inspector.recording.events.size)
+    save_map(path, "table", {**columns, "width": width, "height": height}, overwrite=False)
 
 
 def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
@@ -343,29 +260,11 @@ def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
     The noise filter of a block sees the last events of the block before it.
     """
     noise_us, last = inspector.selection.noise_us or 0, None
-    for block in filter(len, _blocks(inspector)):
+    for block in filter(len, span_blocks(inspector.recording.events, inspector.loaded.span)):
         events = block if last is None else Events.concatenate([last, block])
         chosen = inspector.kept(events, inspector.selection, inspector.loaded.region)[-len(block) :]
         yield block if chosen.all() else block[chosen]
         last = events[int(np.searchsorted(events.t, block.t[-1] - noise_us)) :] if noise_us else None
-
-
-def _blocks(inspector: Inspector) -> Iterator[Events]:
-    """Yield all events of the window, in blocks."""
-    source, span = inspector.recording.events, inspector.loaded.span
-    end_us = span.start_us + span.length_us
-    if span.count == len(span.events):
-        yield span.events
-    elif isinstance(source, FileEvents):  # can only be read from its start
-        for block in source.blocks():
-            first, stop = np.searchsorted(block.t, (span.start_us, end_us))
-            yield block[first:stop]
-            if stop < len(block):
-                return
-    else:
-        stop = source.find(end_us)
-        for start in range(source.find(span.start_us), stop, BLOCK):
-            yield source.slice(start, min(start + BLOCK, stop))
 
 
 def _cut(encoder: Encoder, first_us: int, last_us: int) -> Encoder:

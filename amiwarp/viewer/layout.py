@@ -2,20 +2,21 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from operator import attrgetter
+from typing import Any, TypeAlias
 from urllib.parse import parse_qsl, urlencode
 
 from amiwarp.calib import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS, alternatives, size_names
-from amiwarp.viewer.drawing import AGAINST, NO_ORBIT, ImageKind, Look
+from amiwarp.viewer.drawing import AGAINST, ImageKind, Look
 from amiwarp.viewer.inspector import (
     OTHERS,
     SLIDING,
-    WEDGE_SIZES,
     Inspector,
     Knobs,
     Selection,
@@ -25,7 +26,7 @@ from amiwarp.viewer.inspector import (
     size_name,
     truth_text,
 )
-from amiwarp.viewer.serve import FOLDER, Check, flag, number, one_of
+from amiwarp.viewer.serve import Check, flag, number, one_of
 
 # State of the inspector's page: what it shows, with which parameters; its history, and its text in the address.
 
@@ -75,9 +76,7 @@ def current_state(inspector: Inspector, **look: Any) -> ViewState:
     first = inspector.recording.events.t_first
     axis = Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME
     sources = tuple(inspector.sources.items())
-    given = given_state(inspector)
-    of = {"axis": axis, "fov_deg": given["fov_deg"] if given["gives_camera"] else None,
-          "prism_index": given["index"] if given["gives_prism"] else None, **look}  # fmt: skip
+    of = {"axis": axis, **{field["name"]: field["value"] for field in given_fields(inspector)}, **look}
     return ViewState(start_us - first, length_us, inspector.selection, inspector.knobs, sources, **of)
 
 
@@ -91,17 +90,15 @@ def apply_state(inspector: Inspector, state: ViewState) -> None:
         inspector.open(*window, state.selection)
     set_given(inspector, state.fov_deg, state.prism_index)
     inspector.set(state.knobs)
-    known = {name: source for name, source in inspector.sources.items() if name in ("camera", "prism")}
-    held = {name: source for name, source in known.items() if source is Source.FILE}
-    inspector.sources = dict(state.sources) | held
+    held = {name for name in ("camera", "prism") if inspector.sources[name] is Source.FILE}
+    inspector.sources = dict(state.sources) | dict.fromkeys(held, Source.FILE)
 
 
 def set_given(inspector: Inspector, fov_deg: float | None, index: float | None) -> None:
     """Set the camera and the prism's index by hand where they differ from the inspector's; None keeps them."""
-    given = given_state(inspector)
-    if fov_deg is not None and fov_deg != given["fov_deg"]:
+    if fov_deg is not None and fov_deg != inspector.fov_deg:
         inspector.set_camera(fov_deg)
-    if index is not None and index != given["index"]:
+    if index is not None and index != round(inspector.prism.index, 4):
         inspector.set_index(index)
 
 
@@ -171,9 +168,9 @@ UNITS = {
 """Conversion from the units of page and address (angles in degrees) to the parameters' units (radians): factors."""
 HAND_LIMITS = {"fov_deg": (1.0, 170.0), "prism_index": (1.01, 3.5)}
 """Smallest and largest value of the properties of camera and prism that can be set by hand."""
-CHOICES: dict[str, Any] = {"image": ImageKind, "colour": Colour, "axis": Axis, "view": View}
-POLARITIES = {"both": None, "on": 1, "off": 0}
-FLAGS = {"0": False, "1": True}
+
+
+_Field: TypeAlias = tuple[str, Callable[[Any], str], Callable[[str], Any]]
 
 
 def encode_state(state: ViewState, default: ViewState) -> str:
@@ -192,86 +189,76 @@ def decode_state(
     """
     if len(query) > LONGEST_QUERY:
         return default, (f"the address has {len(query):,} characters after '?'; give at most {LONGEST_QUERY:,}",)
-    state, wrong = default, []
-    for key, value in parse_qsl(query.removeprefix("?"), keep_blank_values=True, errors="replace"):
+    state, wrong, fields = default, [], _fields(size, duration_us)
+    for key, text in parse_qsl(query.removeprefix("?"), keep_blank_values=True, errors="replace"):
         try:
-            state = _with_value(state, key, value, size, duration_us)
+            if key in fields and not (key in HAND_LIMITS and getattr(state, key) is None):
+                place, _, read = fields[key]
+                state = _replaced(state, place, read(text))
+            elif key == "sources":
+                state = replace(state, sources=_sources(text, state.sources))
+            else:
+                place, name = ("against", key[2:]) if key.startswith("b_") else ("knobs", key)
+                state = _replaced(state, place, _with_knob(getattr(state, place) or state.knobs, name, text))
         except (ValueError, KeyError, OverflowError):
-            wrong.append(f"the address gives {key[:20]!r} = {value[:40]!r}, which this recording cannot show")
+            wrong.append(f"the address gives {key[:20]!r} = {text[:40]!r}, which this recording cannot show")
     return state, tuple(wrong)
+
+
+def _fields(size: tuple[int, int], duration_us: int) -> dict[str, _Field]:
+    """Return for each key of an address where the state holds its value, and how it becomes text and comes back."""
+
+    def one_of(place: str, known: Mapping[str, Any]) -> _Field:
+        return place, {value: text for text, value in known.items()}.__getitem__, known.__getitem__
+
+    def milliseconds(text: str, low: int, high: int) -> int:
+        return int(_within(round(float(text) * 1e3), low, high))
+
+    def region(text: str) -> tuple[int, ...] | None:
+        if text == "all":
+            return None
+        left, top, right, bottom = (_whole(each, 0, max(size)) for each in text.split(","))
+        return left, top, int(_within(right, left + 1, size[0])), int(_within(bottom, top + 1, size[1]))
+
+    flags, choices = {"0": False, "1": True}, {"image": ImageKind, "colour": Colour, "axis": Axis, "view": View}
+    return {
+        "start_ms": ("start_us", lambda us: f"{us * 1e-3:.3f}", lambda text: milliseconds(text, 0, duration_us - 1)),
+        "length_ms": ("length_us", lambda us: f"{us * 1e-3:.3f}", lambda text: milliseconds(text, 1, duration_us)),
+        "polarity": one_of("selection.polarity", {"both": None, "on": 1, "off": 0}),
+        "region": ("selection.region", lambda sides: "all" if sides is None else ",".join(map(str, sides)), region),
+        "hide_hot": one_of("selection.hide_hot", flags),
+        "noise_us": ("selection.noise_us", lambda us: str(us or 0), lambda us: _whole(us, 0, LONGEST_NOISE_US) or None),
+        "overlaid": one_of("overlaid", flags),
+        **{name: one_of(name, {each.value: each for each in kind}) for name, kind in choices.items()},
+        **{name: (name, "{:.10g}".format, partial(_number, ends)) for name, ends in HAND_LIMITS.items()},
+    }  # fmt: skip
 
 
 def _texts(state: ViewState) -> dict[str, str]:
     """Return all values of a state as texts."""
-    s, polarities = state.selection, {value: text for text, value in POLARITIES.items()}
-    out = {
-        "start_ms": f"{state.start_us * 1e-3:.3f}", "length_ms": f"{state.length_us * 1e-3:.3f}",
-        "polarity": polarities[s.polarity], "region": "all" if s.region is None else ",".join(map(str, s.region)),
-        "hide_hot": str(int(s.hide_hot)), "noise_us": "0" if s.noise_us is None else str(s.noise_us),
-        "overlaid": str(int(state.overlaid)), **{name: getattr(state, name).value for name in CHOICES},
-        **{name: f"{value:.10g}" for name in HAND_LIMITS if (value := getattr(state, name)) is not None},
-        **_knob_texts(state.knobs, ""),
-    }  # fmt: skip
-    if state.against is not None:
-        out |= _knob_texts(state.against, "b_")
+    fields = {key: (attrgetter(place)(state), write) for key, (place, write, _) in _fields((0, 0), 0).items()}
+    out = {key: write(value) for key, (value, write) in fields.items() if key not in HAND_LIMITS or value is not None}
+    for before, knobs in (("", state.knobs), ("b_", state.against)):
+        if knobs is not None:
+            known = {name: knobs.value(name) for name in LIMITS if name not in foreign_names(knobs.model)}
+            out[f"{before}model"] = knobs.model
+            out |= {before + n: f"{value / UNITS[n]:.10g}" for n, value in known.items() if value is not None}
     foreign = foreign_names(state.knobs.model)
     shown = [(name, source) for name, source in state.sources if name not in foreign]
-    letters = ",".join(f"{name}:{source.name.lower()}" for name, source in shown)
-    return {**out, "sources": letters}
+    return {**out, "sources": ",".join(f"{name}:{source.name.lower()}" for name, source in shown)}
 
 
-def _knob_texts(knobs: Knobs, before: str) -> dict[str, str]:
-    """Return the values of parameters as texts, with ``before`` in front of their names."""
-    out = {f"{before}model": knobs.model}
-    foreign = foreign_names(knobs.model)
-    for name in (each for each in LIMITS if each not in foreign):
-        if (value := knobs.value(name)) is not None:
-            out[before + name] = f"{value / UNITS[name]:.10g}"
-    return out
-
-
-def _with_value(state: ViewState, key: str, text: str, size: tuple[int, int], duration_us: int) -> ViewState:
-    """Return a state with one value of an address. Raises ValueError, KeyError or OverflowError for a wrong value."""
-    plain: dict[str, Callable[[], ViewState]] = {
-        "start_ms": lambda: replace(state, start_us=int(_within(round(float(text) * 1e3), 0, duration_us - 1))),
-        "length_ms": lambda: replace(state, length_us=int(_within(round(float(text) * 1e3), 1, duration_us))),
-        "polarity": lambda: _selected(state, polarity=POLARITIES[text]),
-        "region": lambda: _selected(state, region=_region(text, size)),
-        "hide_hot": lambda: _selected(state, hide_hot=FLAGS[text]),
-        "noise_us": lambda: _selected(state, noise_us=_whole(text, 0, LONGEST_NOISE_US) or None),
-        "overlaid": lambda: replace(state, overlaid=FLAGS[text]),
-        "sources": lambda: replace(state, sources=_sources(text, state.sources)),
-    }
-    if key in plain:
-        return plain[key]()
-    change: dict[str, Any] = {}
-    if key in CHOICES:
-        change[key] = CHOICES[key](text)
-    elif key in HAND_LIMITS and getattr(state, key) is not None:
-        change[key] = _within(float(text), *HAND_LIMITS[key])
-    if change:
-        return replace(state, **change)
-    if key.startswith("b_"):
-        return replace(state, against=_with_knob(state.against or state.knobs, key.removeprefix("b_"), text))
-    return replace(state, knobs=_with_knob(state.knobs, key, text))
+def _replaced(state: Any, place: str, value: Any) -> Any:
+    """Return a state with another value of a field, or of a field of a field, such as ``selection.region``."""
+    name, _, inner = place.partition(".")
+    return replace(state, **{name: _replaced(getattr(state, name), inner, value) if inner else value})
 
 
 def _with_knob(knobs: Knobs, name: str, text: str) -> Knobs:
     """Return parameters with one value of an address."""
     if name == "model" and text in MODELS:
         return replace(knobs, model=text)
-    return knobs.with_values({name: _within(float(text), *LIMITS[name]) * UNITS[name]})
-
-
-def _selected(state: ViewState, **changes: Any) -> ViewState:
-    return replace(state, selection=replace(state.selection, **changes))
-
-
-def _region(text: str, size: tuple[int, int]) -> tuple[int, int, int, int] | None:
-    if text == "all":
-        return None
-    left, top, right, bottom = (_whole(each, 0, max(size)) for each in text.split(","))
-    return left, top, int(_within(right, left + 1, size[0])), int(_within(bottom, top + 1, size[1]))
+    return knobs.with_values({name: _number(LIMITS[name], text) * UNITS[name]})
 
 
 def _sources(text: str, known: tuple[tuple[str, Source], ...]) -> tuple[tuple[str, Source], ...]:
@@ -287,6 +274,10 @@ def _whole(text: str, low: int, high: int) -> int:
     return int(_within(int(text), low, high))
 
 
+def _number(ends: tuple[float, float], text: str) -> float:
+    return _within(float(text), *ends)
+
+
 def _within(value: float, low: float, high: float) -> float:
     """Return a value in a range. Raises ValueError for any other, such as NaN."""
     if not low <= value <= high:
@@ -296,36 +287,20 @@ def _within(value: float, low: float, high: float) -> float:
 
 NAMES = ("apex", "phase", "clock_offset", "rpm", *SLIDING)
 """Names of the prism parameters that have a slider."""
-GIVEN = {"fov_deg": ("field of view", "°", "gives_camera"), "index": ("refractive index", "", "gives_prism")}
-"""Properties of camera and prism that a recording may lack: label, unit, and the condition for showing the field."""
-FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, "fov_deg": HAND_LIMITS["fov_deg"],
-                "index": HAND_LIMITS["prism_index"]}  # fmt: skip
+FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, **HAND_LIMITS}
 """Smallest and largest value of the fields of the prism and the camera, in the page's units."""
-
-
-def _if_free(*names: str) -> str:
-    """Return the condition for showing a slider: that the model has one of the parameters."""
-    return " || ".join(f"model === '{kind.NAME}'" for kind in MODELS.values() if {*names} & {*kind.FREE})
-
-
-_OF_MODELS = {
-    name: (
-        p.label,
-        {"rad": "°", "1": ""}.get(p.unit, p.unit),
-        tuple(f"{x:g}" for x in p.slider),
-        f"({_if_free(name)}) && !has_depth" if name in size_names() else _if_free(name),
-    )
-    for name, p in SLIDING.items()
-}
-SLIDERS = {
-    "apex": ("apex angle", "°", ("0", "apex_most", "0.005"), _if_free(*WEDGE_SIZES)),
+_OF_MODELS = {name: (p.label, {"rad": "°", "1": ""}.get(p.unit, p.unit), p.slider) for name, p in SLIDING.items()}
+SLIDERS: dict[str, tuple[str, str, tuple[float, float, float]]] = {
+    "apex": ("apex angle", "°", (0.0, 3.0, 0.005)),
     **{name: slider for name, slider in _OF_MODELS.items() if name in size_names()},
-    "phase": ("phase", "°", ("-180", "180", "0.25"), "true"),
-    "clock_offset": ("clock offset", "µs", ("-20000", "20000", "10"), "has_encoder"),
-    "rpm": ("speed of the prism", "rpm", ("-3000", "3000", "0.5"), "!has_encoder"),
+    "phase": ("phase", "°", (-180.0, 180.0, 0.25)),
+    "clock_offset": ("clock offset", "µs", (-20000.0, 20000.0, 10.0)),
+    "rpm": ("speed of the prism", "rpm", (-3000.0, 3000.0, 0.5)),
     **{name: slider for name, slider in _OF_MODELS.items() if name not in size_names()},
 }
-"""Sliders of the page by parameter: label, unit, (minimum, maximum, step), and the condition for showing the slider."""
+"""Sliders by parameter, in their order: label, unit, and (minimum, maximum, step). That of the apex may be longer."""
+GIVEN = {"fov_deg": ("field of view", "°"), "prism_index": ("refractive index", "")}
+"""Properties of camera and prism that a recording may lack: label and unit."""
 SCOPES = ("selection", "whole recording")
 """Choices of the events that a calibration uses."""
 KEYS = (
@@ -363,13 +338,13 @@ EXPORTS = {
 FILMS = ("turntable", "film")
 """Downloads that take long."""
 CALLS = (
-    "key", "released", "choose", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
+    "key", "released", "choose", "slide", "typed", "draw", "whole", "suggest", "look_from", "step", "move_window",
     "resize_window", "pick", "play", "calibrate", "accept", "discard", "take_truth", "zoom_timeline", "undo", "redo",
     "reset", "restore", "answer", "keep_b", "swap_b", "export", "open_file", "use_card", "end_film",
 )  # fmt: skip
 """Methods of the panel that the page may call."""
 SETTABLE: dict[str, Check] = {
-    **dict.fromkeys(NAMES, number()), "point_size": number(1.0, 20.0), "opacity": number(0.0, 1.0),
+    "point_size": number(1.0, 20.0), "opacity": number(0.0, 1.0),
     "speed": number(0.001, 10.0), "polarity": one_of("both", "ON", "OFF"), "model": one_of(*MODELS),
     "colour": one_of(*(each.value for each in Colour)), "axis": one_of(*(each.value for each in Axis)),
     "kind": one_of(*(each.value for each in ImageKind)), "against": one_of(*AGAINST), "scope": one_of(*SCOPES),
@@ -385,14 +360,13 @@ CLIENT_ONLY = ("hover", "measured", "tool", "late", "slice")
 EMPTY: tuple[tuple[Any, str], ...] = (
     ("", "trame_error_report_msg stream_note hover measured address events sharpness message rate_note picked_text "
          "image_note against_title b_text busy found"),
-    (b"", "cloud_before cloud_after cloud_third third_before colours_before colours_after rate_on rate_off"),
+    (b"", "cloud_before cloud_after cloud_third third_before colours_before colours_after rate_on rate_off orbit "
+          "column"),
     (False, "help_shown open_shown playing loop hide_hot noise_filter dark overlaid can_undo can_redo image_slow "
             "difference has_b calibrating"),
-    (None, "overview before after surface"), ((), "live_rows updating titles against_choices"),
+    (None, "overview before after surface image_scale after_scale"), ((), "live_rows updating titles against_choices"),
 )  # fmt: skip
 """Values of state variables before the first update, and their names."""
-NO_SCALE: dict[str, Any] = {"bar": "", "ticks": [], "title": "", "square": None}
-"""Scale of an image before the first update."""
 
 
 class Actions:
@@ -564,34 +538,6 @@ class Actions:
         return self.history
 
 
-def template() -> str:
-    """Return the page's template with its sliders."""
-    fields = "\n".join(map(_given, GIVEN))
-    page = (FOLDER / "page.html").read_text(encoding="utf-8")
-    return page.replace("@KNOBS@", "\n".join(map(_knob, SLIDERS))).replace("@GIVEN@", fields)
-
-
-def _given(name: str) -> str:
-    (label, unit, where), (low, high) = GIVEN[name], FIELD_LIMITS[name]
-    return (
-        f'<label v-if="{where}">{label}{unit and f" ({unit})"}<NumberField id="field-{name}" :low="{low}" '
-        f':high="{high}" unit="{unit}" :value="{name}" '
-        f"@typed=\"trigger('typed', ['{name}', $event])\"></NumberField></label>"
-    )
-
-
-def _knob(name: str) -> str:
-    label, unit, (least, most, step), where = SLIDERS[name]
-    low, high = FIELD_LIMITS[name]
-    return (
-        f'<KnobField v-if="{where}" name="{name}" label="{label}" unit="{unit}" :value="{name}" :least="{least}" '
-        f':most="{most}" :step="{step}" :low="{low:g}" :high="{high:g}" :truth="truths.{name}" '
-        f':note="sources.{name}" @drag="{name} = $event" '
-        f"@typed=\"trigger('typed', ['{name}', $event])\" "
-        f"@chosen=\"trigger('choose', ['{name}'])\"></KnobField>"
-    )
-
-
 # State at the start, and the parts of it that follow from the recording and the inspector's parameters.
 
 
@@ -600,33 +546,27 @@ def initial_state(inspector: Inspector) -> dict[str, Any]:
     recording = inspector.recording
     size = recording.events.size
     return {
-        **source_state(inspector), **knob_state(inspector), **prism_state(inspector),
-        **NO_ORBIT,
+        **source_state(inspector), **knob_state(inspector), "turn_ms": turn_ms(inspector),
         "trame__title": f"amiwarp: {recording.name}", "name": recording.name, "truth": truth_text(recording.truth),
-        "size": list(size), "live": inspector.latest is not None, "has_encoder": inspector.has_encoder,
-        "models": list(alternatives(inspector.knobs.model)), "apex_most": apex_most(inspector),
-        "truths": truths(inspector), "has_truth": inspector.truth is not None, "beside": inspector.beside is not None,
+        "size": list(size), "live": inspector.latest is not None,
+        "models": list(alternatives(inspector.knobs.model)),
+        "has_truth": inspector.truth is not None, "beside": inspector.beside is not None,
         "exports": [[name, text, name in FILMS] for name, (text, _) in EXPORTS.items()],
         "keys": [[key, words] for key, _, words in KEYS], "scope": SCOPES[0], "scopes": list(SCOPES),
         "colour": Colour.POLARITY.value, "colours": [each.value for each in colours_on_offer(recording.truth)],
         "axis": (Axis.ANGLE if math.isfinite(inspector.turn_us) else Axis.TIME).value, "axes": [a.value for a in Axis],
-        "kind": ImageKind.COUNT.value, "has_depth": inspector.depth is not None,
+        "kind": ImageKind.COUNT.value,
         "kinds": [each.value for each in ImageKind if each is not ImageKind.DEPTH or inspector.depth is not None],
         "speed": 0.1, "polarity": "both", "noise_ms": 2.0, "region_kind": "whole", "region_wanted": [0, 0, *size],
         "region": [0, 0, *size], "knob": inspector.orbit_names[0], "point_size": 2, "opacity": 1.0, "orbit_shown": True,
         "view": [View.FREE.value, 0], "tool": "region", "late": 0, "slice": [0.0, 1.0], "severity": "info",
         "picked": -1, "against": "recorded", "progress": 0, "calibrate_on": ["", ""], "curve_mark": 0.0,
-        "image_scale": NO_SCALE, "after_scale": NO_SCALE, "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
+        "third_axis": {"low": 0.0, "high": 1.0, "title": ""},
         "legend": {"title": "", "rows": [], "bar": "", "low": "", "high": ""},
         "curve": {"name": "", "title": "", "text": "", "x": [], "y": [], "truth": None},
         "statistics": {"rows": [], "x": [], "y": [], "median": None},
         **{name: value for value, names in EMPTY for name in names.split()},
     }  # fmt: skip
-
-
-def apex_most(inspector: Inspector) -> float:
-    """Return the end of the slider of the apex angle [deg]."""
-    return max(3.0, round(2.0 * math.degrees(inspector.nominal_apex), 1))
 
 
 def source_state(inspector: Inspector) -> dict[str, Any]:
@@ -643,27 +583,42 @@ def knob_values(inspector: Inspector) -> dict[str, float]:
 
 def knob_state(inspector: Inspector) -> dict[str, Any]:
     """Return the state variables of the prism's parameters."""
-    sources = {name: str(source.value) for name, source in inspector.sources.items()}
-    return {**knob_values(inspector), **given_state(inspector), "model": inspector.knobs.model, "sources": sources,
+    return {"knobs": sliders(inspector), "given": given_fields(inspector), "model": inspector.knobs.model,
             "notes": notes(inspector)}  # fmt: skip
 
 
-def prism_state(inspector: Inspector) -> dict[str, Any]:
-    """Return the state variables that depend on whether the prism rotates, so that there is a motion to compensate."""
-    turns = math.isfinite(inspector.turn_us)
-    return {"turn_ms": inspector.turn_us * 1e-3 if turns else 0.0, "has_model": turns,
-            "step_name": "turn" if turns else "window"}  # fmt: skip
+def turn_ms(inspector: Inspector) -> float:
+    """Return the duration of a turn [ms]; 0 if the prism does not rotate, so that there is no motion to compensate."""
+    return inspector.turn_us * 1e-3 if math.isfinite(inspector.turn_us) else 0.0
 
 
-def given_state(inspector: Inspector) -> dict[str, Any]:
-    """Return the state variables of the camera and the prism that can be set if the recording lacks them."""
-    return {
-        "fov_deg": inspector.fov_deg, "index": round(inspector.prism.index, 4),
-        "gives_camera": inspector.sources["camera"] in (Source.ASSUMED, Source.HAND),
-        "gives_prism": (
-            inspector.sources["prism"] in (Source.ASSUMED, Source.HAND) and MODELS[inspector.knobs.model].PRISM
-        ),
-    }  # fmt: skip
+def sliders(inspector: Inspector) -> list[dict[str, Any]]:
+    """Return the sliders of the model's parameters: label, unit, ends, step, limits, value, true value and source."""
+    values, known = knob_values(inspector), truths(inspector)
+    shown = {*MODELS[inspector.knobs.model].FREE} - size_names()
+    shown |= {*inspector.orbit_names, "clock_offset" if inspector.has_encoder else "rpm"}
+    out = []
+    for name, (label, unit, (least, most, step)) in SLIDERS.items():
+        if name in shown:
+            end = max(most, round(2.0 * math.degrees(inspector.nominal_apex), 1)) if name == "apex" else most
+            low, high = FIELD_LIMITS[name]
+            out.append({
+                "name": name, "label": label, "unit": unit, "least": least, "most": end, "step": step, "low": low,
+                "high": high, "value": values[name], "truth": known[name], "note": str(inspector.sources[name].value),
+            })  # fmt: skip
+    return out
+
+
+def given_fields(inspector: Inspector) -> list[dict[str, Any]]:
+    """Return the properties of camera and prism that the recording lacks: name, label, unit, value and its limits."""
+    by_hand = {name for name, source in inspector.sources.items() if source in (Source.ASSUMED, Source.HAND)}
+    prism = "prism" in by_hand and MODELS[inspector.knobs.model].PRISM
+    found = {"fov_deg": ("camera" in by_hand, inspector.fov_deg), "prism_index": (prism, inspector.prism.index)}
+    return [
+        {"name": name, "label": label, "unit": unit, "value": round(found[name][1], 4), "low": low, "high": high}
+        for (name, (label, unit)), (low, high) in zip(GIVEN.items(), HAND_LIMITS.values(), strict=True)
+        if found[name][0]
+    ]
 
 
 def truths(inspector: Inspector) -> dict[str, float | None]:

@@ -20,15 +20,20 @@ from typing import Any
 import numpy as np
 
 from amiwarp.calib import Calibration
-from amiwarp.choices import Axis, Colour, View
+from amiwarp.choices import Axis, Colour, View, Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
+from amiwarp.imaging.export import save_values
+from amiwarp.imaging.iwe import iwe
 from amiwarp.io.depth_map import DepthMap
+from amiwarp.io.event_rates import EventRates
+from amiwarp.live.stream.session import LiveSource
+from amiwarp.plotting.colours import count_scale
 from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
-from amiwarp.viewer.inspector import DisplayedWindow, EventRates, Inspector, Knobs, Library, Selection, recorded_counts
+from amiwarp.viewer.inspector import DisplayedWindow, Inspector, Knobs, Library, Selection
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
 from amiwarp.viewer.serve import finite, serve, use_page
 
@@ -84,10 +89,10 @@ class Panel(layout.Actions):
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
         self._rates: EventRates
         self._progress: JobProgress | None = None
-        self._knobs_shown: dict[str, Any] = {}  # parameters and model that were last sent to the page
+        self._wanted: dict[str, Any] = {}  # values that were set on the page, and that the inspector has not taken yet
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
         self._downloads = 0
-        use_page(server, layout.template(), self._folder.name)
+        use_page(server, self._folder.name)
         self.state.client_only(*layout.CLIENT_ONLY)
         self._listen()
         self.start(inspector)
@@ -101,7 +106,7 @@ class Panel(layout.Actions):
         files = [] if self._library is None else self._library.files()
         folder = "" if self._library is None else str(self._library.folder)
         self.state.update({**layout.initial_state(inspector), "files": files, "folder": folder})
-        self._knobs_shown = {}
+        self._wanted = {}
         self.show_knobs()
         self.time_window = inspector.window or inspector.first_window()
         self.start_job(self._count_events())
@@ -110,7 +115,7 @@ class Panel(layout.Actions):
         self.request_slow("preparation")
         if inspector.latest is not None:
             self.play()
-        if isinstance(inspector.latest, jobs.LiveSource):
+        if isinstance(inspector.latest, LiveSource):
             self.start_job(self._watch(inspector.latest))
 
     def close(self) -> None:
@@ -136,7 +141,7 @@ class Panel(layout.Actions):
     def look(self) -> Look:
         """Style of the clouds."""
         s = self.state
-        return Look(s.colour, s.axis, s.point_size, s.opacity, s.dark, s.overlaid)
+        return Look(Colour(s.colour), Axis(s.axis), s.point_size, s.opacity, s.dark, s.overlaid)
 
     @look.setter
     def look(self, look: Look) -> None:
@@ -264,10 +269,9 @@ class Panel(layout.Actions):
         def follow(names: tuple[str, ...], call: Callable[..., None], *given: str) -> None:
             self.state.change(*names)(lambda **_: call(*given))  # trame gives the whole state
 
-        for name in layout.NAMES:
-            follow((name,), self._dragged, name)
         follow(("polarity", "hide_hot", "noise_filter"), self.request, "window")
         follow(("colour", "axis", "dark", "orbit_shown"), self.request, "look")
+        follow(("model",), lambda: self._wanted.update(model=self.state.model))
         follow(("model", "against", "kind", "difference"), self.request, "knobs")
         follow(("model", "kind", "polarity", "hide_hot", "noise_filter"), self.released)
         for name in layout.CALLS:
@@ -296,18 +300,26 @@ class Panel(layout.Actions):
             self.say(f"{text!r} is not a number; give a number such as 1.5", "error")
             return
         if name in layout.FIELD_LIMITS:
-            (low, high), (label, unit, *_) = layout.FIELD_LIMITS[name], {**layout.SLIDERS, **layout.GIVEN}[name]
-            if not low <= value <= high:
-                text = f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}"
-                self.say(text, "error")
-                return
-        if name == "turns":
-            name, value = "length_ms", value * float(self.state.turn_ms)
-        self.state[name] = round(value, 4)
+            self.slide(name, value)
+        else:
+            length = name == "turns"
+            self.state["length_ms" if length else name] = round(value * float(self.state.turn_ms if length else 1.0), 4)
+            self.request("window")
+        self.released()
+
+    def slide(self, name: str, value: float) -> None:
+        """Set a parameter of the prism or the camera, in the unit of its slider or field."""
+        if name not in layout.FIELD_LIMITS:
+            return
+        (low, high), (label, unit, *_) = layout.FIELD_LIMITS[name], {**layout.SLIDERS, **layout.GIVEN}[name]
+        if not low <= value <= high:
+            self.say(f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error")
+            return
+        self._wanted[name] = round(value, 4)
         if name in layout.NAMES:
             self.state.knob = name
-        self.request("knobs" if name in layout.FIELD_LIMITS else "window")
-        self.released()
+        self.show_knobs()
+        self.request("knobs", change=name)
 
     def use_card(self, found: bool) -> None:
         """Show more points if the browser has a graphics card to draw them."""
@@ -391,20 +403,11 @@ class Panel(layout.Actions):
     def play(self) -> None:
         """Play the recording from the current window, or follow a live stream; stop if already playing."""
         state = self.state
-        state.playing = not state.playing
-        if not state.playing or self.plays:
-            return
-        if not self.can_play():
-            state.playing = False
-            return
-        self.plays = True
-        self.start_job(self._play())
-
-    async def _play(self) -> None:
-        try:
-            await (self._run() if self.inspector.latest is None else self._follow())
-        finally:
-            self.plays = False
+        state.playing = not state.playing and (self.plays or self.can_play())
+        if state.playing and not self.plays:
+            self.plays = True
+            work = self._run() if self.inspector.latest is None else self._follow()
+            self.start_job(work).add_done_callback(lambda _: setattr(self, "plays", False))
 
     async def _run(self) -> None:
         state, loop, elapsed_s = self.state, asyncio.get_running_loop(), PLAY_S
@@ -435,11 +438,11 @@ class Panel(layout.Actions):
             await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
 
-    async def _watch(self, source: jobs.LiveSource) -> None:
+    async def _watch(self, source: LiveSource) -> None:
         """Show the figures of a live stream, also while it is not followed, until the page is closed."""
         while True:
             with self.state as state:
-                state.update(source.state())
+                state.live_rows, state.stream_note = source.figures()
             await asyncio.sleep(FOLLOW_S)
 
     def _clock_us(self, time_ms: float) -> int:
@@ -485,30 +488,24 @@ class Panel(layout.Actions):
         self.request("knobs")
 
     def set_knobs(self) -> None:
-        """Give the inspector the parameters that the page shows, where they differ from the inspector's."""
-        layout.set_given(self.inspector, self.state.fov_deg, self.state.index)
-        known, shown = layout.knob_values(self.inspector), self.state
-        values = {name: float(shown[name]) * layout.UNITS[name] for name in layout.NAMES if shown[name] != known[name]}
-        self._knobs_shown = {name: shown[name] for name in self._knobs_shown}
-        self.inspector.set(replace(self.inspector.knobs.with_values(values), model=shown.model))
+        """Give the inspector the values that were set on the page."""
+        inspector, wanted, self._wanted = self.inspector, self._wanted, {}
+        layout.set_given(inspector, wanted.pop("fov_deg", None), wanted.pop("prism_index", None))
+        model = wanted.pop("model", inspector.knobs.model)
+        values = {name: value * layout.UNITS[name] for name, value in wanted.items()}
+        inspector.set(replace(inspector.knobs.with_values(values), model=model))
 
     def show_knobs(self) -> None:
-        """Show the inspector's parameters on the page, but leave those that a user has changed since the last time."""
+        """Show the inspector's parameters on the page, or the values that it has not taken yet."""
         state = layout.knob_state(self.inspector)
-        was, names = self._knobs_shown, ("model", *layout.FIELD_LIMITS)
-        self._knobs_shown = {name: state[name] for name in names}
-        self.state.update({name: value for name, value in state.items() if value != was.get(name)})
+        for field in (*state["knobs"], *state["given"]):
+            field["value"] = self._wanted.get(field["name"], field["value"])
+        self.state.update({**state, "model": self._wanted.get("model", state["model"])})
 
     def knobs_taken(self) -> None:
         """Show parameters that the inspector has taken from elsewhere."""
         self.show_knobs()
         super().knobs_taken()
-
-    def _dragged(self, name: str) -> None:
-        """Follow a slider. Values that the server itself has set are ignored."""
-        if self.state[name] != layout.knob_values(self.inspector)[name]:
-            self.state.knob = name
-            self.request("knobs", change=name)
 
     @property
     def against(self) -> Knobs | None:
@@ -588,7 +585,7 @@ class Panel(layout.Actions):
     async def _write(self, what: str) -> None:
         inspector = self.inspector
         write: dict[str, Callable[[Path], object]] = {
-            "values": lambda path: jobs.write_image(self._pair(), path),
+            "values": lambda path: save_values(path, self._pair().after),
             **dict.fromkeys(("csv", "npz"), partial(jobs.write_table, inspector)),
             "events": partial(jobs.write_events, inspector, compensated=False),
             "compensated": partial(jobs.write_events, inspector, compensated=True),
@@ -706,10 +703,11 @@ class Panel(layout.Actions):
                 self.inspector.knobs, self.inspector.sources = good
                 self.show_knobs()
                 raise
-            if self.compensates != state.has_model:  # the speed of a prism was set, or set to 0
+            if self.compensates != bool(state.turn_ms):  # the speed of a prism was set, or set to 0
                 state.axis = (Axis.ANGLE if self.compensates else Axis.TIME).value
                 self.request("look")
-            state.update({**values, **layout.prism_state(self.inspector), "curve_mark": float(state[state.knob])})
+            mark = layout.knob_values(self.inspector)[state.knob]
+            state.update({**values, "turn_ms": layout.turn_ms(self.inspector), "curve_mark": mark})
             if not state.playing:
                 self.remember("" if todo & {"suggestion", "state"} else self._change)
 
@@ -753,15 +751,15 @@ class Panel(layout.Actions):
         s, before, against = self.state, self.shown, self.against
         shown = self.inspector.show(against=against)
         values = drawing.cloud_state(shown, Colour(s.colour), Axis(s.axis), dark=bool(s.dark))
-        values |= {"image_slow": self.image is ImageKind.LOG_INTENSITY, **drawing.NO_ORBIT}
+        values["image_slow"] = self.image is ImageKind.LOG_INTENSITY
         if not values["image_slow"]:
             values |= self._images(shown)
-        if lines := drawing.shown_lines(self.inspector, shown, self.look.axis, against, self._picked):
-            orbit, column = map(drawing.float_bytes, lines)
-            values |= {"orbit": orbit, "column": column, "has_orbit": True} if s.orbit_shown else {}
+        found = drawing.shown_lines(self.inspector, shown, self.look.axis, against, self._picked)
+        lines = found if found and s.orbit_shown else (np.zeros(0),) * 2
+        values["orbit"], values["column"] = map(drawing.float_bytes, lines)
         if before is None or shown.span is not before.span:
-            counts = recorded_counts(shown.span.events, self.inspector.recording.events.size)
-            values["overview"] = drawing.picture_state(counts, drawing.count_scale([counts]))
+            counts = iwe(shown.span.events, *self.inspector.recording.events.size, vote=Vote.NEAREST)
+            values["overview"] = drawing.picture_state(counts, count_scale([counts]))
         left = "recorded" if against is None else s.against
         titles = drawing.cloud_titles(self.inspector, left)
         return shown, {
@@ -802,9 +800,10 @@ class Panel(layout.Actions):
         label, unit, *_ = layout.SLIDERS[name]
         best = int(np.argmax(scores))
         peak = f"{'at the edge ' if best in (0, len(x) - 1) else ''}{x[best]:.4g}"
-        s.curve = {"name": label, "title": f"{label} ({unit})", "text": f"peak {peak}, now {s[name]:.4g}", "x": x,
+        now = layout.knob_values(self.inspector)[name]
+        s.curve = {"name": label, "title": f"{label} ({unit})", "text": f"peak {peak}, now {now:.4g}", "x": x,
                    "y": scores.tolist(), "truth": layout.truths(self.inspector)[name]}  # fmt: skip
-        s.curve_mark = float(s[name])
+        s.curve_mark = now
 
 
 def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progress: Progress) -> Any:

@@ -75,17 +75,6 @@ def address(host: str, port: int, token: str) -> str:
     return str(URL.build(scheme="http", host=reachable(host), port=port) / token / "")
 
 
-def warning(host: str) -> str | None:
-    """Return a warning for the user if other machines can connect to ``host``, else None."""
-    if is_local(host):
-        return None
-    return (
-        f"warning: served on {host} without encryption: everybody on the network who has the address can see the "
-        "recording, control the inspector and open the recordings in its folder; if you are the only user, use an SSH "
-        "tunnel"
-    )
-
-
 class HostNames:
     """Host names under which the server may be called.
 
@@ -254,14 +243,15 @@ def first_page(path: Path) -> str:
     """
     page = path.read_text(encoding="utf-8")
     page = re.sub(r'<meta\s+name="viewport"[^>]*>', '<meta name="viewport" content="width=device-width">', page)
-    page = re.sub(r"<title>.*?</title>", "<title>amiwarp inspector</title>", page)
-    page = page.replace("<title>", f'<script src="{ROUTE}/socket.js"></script><title>')
+    head = f'<script src="{ROUTE}/socket.js"></script><title>amiwarp inspector</title>'
+    page = re.sub(r"<title>.*?</title>", head, page)
     return re.sub(r'<div id="app"></div>\s*<script>.*?</script>', '<div id="app">opening the inspector …</div>', page,
                   flags=re.DOTALL)  # fmt: skip
 
 
-def use_page(server: Any, template: str, downloads: str) -> None:
+def use_page(server: Any, downloads: str) -> None:
     """Give a trame server the page's style and scripts, its template, and the folder ``downloads`` below its name."""
+    template = (FOLDER / "page.html").read_text(encoding="utf-8")
     server.enable_module({
         "serve": {ROUTE: str(FOLDER), server.name: downloads}, "styles": [f"{ROUTE}/page.css"],
         "module_scripts": [f"{ROUTE}/page.js"], "vue_use": ["amiwarp_page"],

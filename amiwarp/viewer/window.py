@@ -19,11 +19,12 @@ from amiwarp.events.recording import Recording
 from amiwarp.imaging.export import save_png
 from amiwarp.imaging.palette import OFF_COLOUR, ON_COLOUR
 from amiwarp.io.files import interrupts_later
-from amiwarp.optics.models import MODELS, alternatives
+from amiwarp.live.stream.session import LiveSource
+from amiwarp.optics.models import alternatives
 from amiwarp.tasks import no_garbage_collection
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import Look, Scene
-from amiwarp.viewer.inspector import SLIDING, DisplayedWindow, Inspector, colours_on_offer
+from amiwarp.viewer.inspector import DisplayedWindow, Inspector, colours_on_offer
 
 SIZE = (1500, 950)
 """Width and height of the window at the start [px]."""
@@ -235,8 +236,8 @@ class Window(layout.Actions):
 
     def nudge(self, steps: int) -> None:
         """Move the chosen parameter by steps of its slider."""
-        _, _, (_, _, step), _ = layout.SLIDERS[self.knob]
-        self.slide(self.knob, layout.knob_values(self.inspector)[self.knob] + steps * float(step))
+        step = layout.SLIDERS[self.knob][2][2]
+        self.slide(self.knob, layout.knob_values(self.inspector)[self.knob] + steps * step)
 
     def choose_next(self, what: str) -> None:
         """Choose the next parameter for the keys and the curve, or the next model, colour or polarity that is shown."""
@@ -379,9 +380,9 @@ class Window(layout.Actions):
         if now - self._played_s < FOLLOW_S:
             return
         self._played_s = now
-        if isinstance(latest, jobs.LiveSource):
-            state = latest.state()
-            self._stream = [*(f"{name}: {text}" for name, text, _ in state["live_rows"]), state["stream_note"]]
+        if isinstance(latest, LiveSource):
+            rows, note = latest.figures()
+            self._stream = [*(f"{name}: {text}" for name, text, _ in rows), note]
         if self.plays:
             with self.errors_shown("window"):
                 self.inspector.renew()
@@ -465,8 +466,8 @@ class Window(layout.Actions):
         """
         import pyvista
 
-        inspector, dark = self.inspector, self.look.dark
-        names = tuple(self._names())
+        dark, fields = self.look.dark, self._fields()
+        names = tuple(fields)
         self.knob = self.knob if self.knob in names else names[0]
         built, self._built = self._built, (names, dark, self.compensates, self.knob)
         if built[:1] != self._built[:1]:
@@ -475,43 +476,30 @@ class Window(layout.Actions):
             self._make_charts()
             self.scene.place((CORNER[0], CORNER[1] if self.compensates else 0.0), self._look)
             self._curves = self._curve_steps()
-        values = layout.knob_values(inspector)
-        values |= {"start_ms": (self.time_window[0] - inspector.recording.events.t_first) * 1e-3,
-                   "length_ms": self.time_window[1] * 1e-3}  # fmt: skip
         for name, slider in self.sliders.items():
-            shape, (low, high) = slider.GetRepresentation(), self._range(name)
+            shape, (value, low, high, title) = slider.GetRepresentation(), fields[name]
             shape.SetMinimumValue(low)
             shape.SetMaximumValue(high)
-            shape.SetValue(values[name])
-            shape.SetTitleText(self._slider_title(name, values[name]))
+            shape.SetValue(value)
+            shape.SetTitleText(title)
             ink = drawing.ORBIT_COLOUR if name == self.knob else drawing.BACKGROUND_AND_INK[dark][1]
             for part in ("Title", "Slider", "Tube", "Cap"):
                 getattr(shape, f"Get{part}Property")().SetColor(pyvista.Color(ink).float_rgb)
         self._show_texts()
 
-    def _names(self) -> list[str]:
-        """Return the names of the sliders: of the parameters that matter, and of the time window."""
-        knobs, model = self.inspector.knobs, MODELS[self.inspector.knobs.model]
-        time_name = "clock_offset" if self.inspector.has_encoder else "rpm"
-        names = [*self.inspector.orbit_names, time_name]
-        others = [n for n in SLIDING if n in model.FREE[2:] and (n.startswith("tilt") or knobs.value(n))]
-        return [*names, *others, *FINE]
-
-    def _slider_title(self, name: str, value: float) -> str:
-        """Return name, value and unit of a slider, and where the value comes from."""
-        if name in FINE:
-            return f"{'window from' if name == 'start_ms' else 'length'} {value:.3f} ms"
-        text = f"{layout.SLIDERS[name][0]} {layout.with_unit(name, value, 6)}"
-        return f"{text} ({self.inspector.sources[name].value})"
-
-    def _range(self, name: str) -> tuple[float, float]:
-        whole_ms = self.whole_us * 1e-3
-        if name in FINE:
-            return {"start_ms": (0.0, whole_ms), "length_ms": (min(0.1, 0.5 * whole_ms), whole_ms)}[name]
-        low, high, _ = layout.SLIDERS[name][2]
-        if high == "apex_most":
-            high = str(layout.apex_most(self.inspector))
-        return float(low), float(high)
+    def _fields(self) -> dict[str, tuple[float, float, float, str]]:
+        """Return value, ends and title of the sliders: of the parameters that matter, and of the time window."""
+        out, always = {}, (*self.inspector.orbit_names, "clock_offset", "rpm")
+        for slider in layout.sliders(self.inspector):
+            name, value = slider["name"], slider["value"]
+            if value or name in always or name.startswith("tilt"):
+                title = f"{slider['label']} {layout.with_unit(name, value, 6)} ({slider['note']})"
+                out[name] = value, slider["least"], slider["most"], title
+        whole_ms, length_ms = self.whole_us * 1e-3, self.time_window[1] * 1e-3
+        start_ms = (self.time_window[0] - self.inspector.recording.events.t_first) * 1e-3
+        out["start_ms"] = start_ms, 0.0, whole_ms, f"window from {start_ms:.3f} ms"
+        out["length_ms"] = length_ms, min(0.1, 0.5 * whole_ms), whole_ms, f"length {length_ms:.3f} ms"
+        return out
 
     def _make_sliders(self, names: tuple[str, ...]) -> None:
         self.plotter.clear_slider_widgets()
@@ -520,9 +508,8 @@ class Window(layout.Actions):
         for k, name in enumerate(names):
             y = 0.8 - 0.74 * k / max(len(names) - 1, 9)
             slider = self.plotter.add_slider_widget(
-                lambda value, name=name: self.slide(name, value), self._range(name), value=sum(self._range(name)) / 2,
-                pointa=(0.05, y), pointb=(0.95, y), interaction_event="always", title_height=0.014, tube_width=0.003,
-                slider_width=0.02,
+                lambda value, name=name: self.slide(name, value), (0.0, 1.0), value=0.5, pointa=(0.05, y),
+                pointb=(0.95, y), interaction_event="always", title_height=0.014, tube_width=0.003, slider_width=0.02,
             )  # fmt: skip
             slider.KeyPressActivationOff()  # VTK's key i would hide it
             slider.GetRepresentation().ShowSliderLabelOff()

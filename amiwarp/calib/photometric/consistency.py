@@ -62,10 +62,12 @@ class Cause:
 
 
 CENTER = Cause("the principal point", ("center_x", "center_y"))
+INDEX = Cause("the refractive index of the prism", ("index",))
 CAUSES = (
     Cause("the focal length", ("focal_length",)),
     CENTER,
     Cause("the flat side of the prism", (FLAT_SIDE,)),
+    INDEX,
     Cause("the lens distortion k1", ("k1",)),
     Cause("the ratio of the focal lengths fy / fx", ("fy_over_fx",)),
     Cause("the direction of the prism's axis", ("tilt_x", "tilt_y")),
@@ -73,8 +75,8 @@ CAUSES = (
     Cause("the evenness of the prism's faces", ("cylinder_x", "cylinder_y")),
 )
 """All causes that the photometric stage can name and correct, the likeliest first."""
-ASPECT, SHAPES = CAUSES[4], CAUSES[6:]
-GATED = (ASPECT, *SHAPES)
+ASPECT, SHAPES = CAUSES[5], CAUSES[7:]
+GATED = (INDEX, ASPECT, *SHAPES)
 """Causes whose effect is examined only if a first look, without the map's change, finds one."""
 SCREENED = (*CAUSES[:3], *GATED)
 """Causes that every answer is tested for. The effects of the others resemble those of the first two."""
@@ -300,7 +302,7 @@ SHAKE_SHARE = 0.75
 left 0.02 to 0.62 of it, shakes by 30 % of the prism's motion 0.84 to 1.7."""
 LEAST_SHAKE_GAIN = 0.0025
 """Smallest share of the squared residuals that a shake must explain beyond all causes together. An index that is wrong
-by 0.06, which no cause frees, leaves 0.0013 to it at most, shakes by 30 % of the prism's motion 0.0048 or more."""
+by 0.06 left 0.0013 to it at most while no cause freed it, shakes by 30 % of the prism's motion 0.0048 or more."""
 LEAST_FURTHER_GAIN = 0.0005
 """Smallest share that a further cause must remove once the given lens has turned out to be wrong."""
 LEAST_MOVE_PX = 0.005
@@ -428,14 +430,15 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
     for cause in screened:
         if cause not in GATED:
             columns |= _cause_columns(cost, best, cause)
-    # wobble has nearly the effect of cylinder power: where the first look finds none of that, it finds no wobble
-    wobble, cylinder = SHAPES
-    gates = [c for c in screened if c in GATED and (c is not wobble or cylinder not in screened)]
+    # wobble and index look like cylinder power: where the first look finds none of that, it finds none of them
+    cylinder = SHAPES[1]
+    alike = [c for c in screened if c in (INDEX, SHAPES[0])] if cylinder in screened else []
+    gates = [c for c in screened if c in GATED and c not in alike]
     least_gain = LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN
     for group in telling(cost, [_cause_columns(cost, best, cause) for cause in gates], least_gain):
         columns |= group
-    if set(cylinder.names) <= columns.keys() and wobble in screened:
-        columns |= _cause_columns(cost, best, wobble)
+    for cause in alike if set(cylinder.names) <= columns.keys() else ():
+        columns |= _cause_columns(cost, best, cause)
     fit, shake_px = linear_fit(cost, columns), 0.0
     findings = _findings(cost, best, fit, screened, least_gain)
     if findings and not doubtful:
@@ -747,7 +750,7 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> AngleFi
     others: dict[str, Any] = {}
     if not names:
         # cylinder power stands for wobble too, which has nearly the same effect
-        for cause in (c for c in testable(cost.space) if c in SCREENED and c is not SHAPES[0]):
+        for cause in (c for c in testable(cost.space) if c in SCREENED and c not in (INDEX, SHAPES[0])):
             others |= {n: x for n, x in _cause_columns(cost, best, cause).items() if n not in given}
     fit = linear_fit(cost, given | angles | others)
     if not names:

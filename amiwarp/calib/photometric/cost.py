@@ -418,6 +418,8 @@ MARGIN_PX, ROTATION_MARGIN_PX = 3, 8
 a rotating one."""
 LONGEST_GAP_US = 60_000
 """Longest time between the two events of a pair [us]. Noise makes longer gaps unreliable."""
+LONGEST_PATH_GAP_US = 200_000
+"""The same for pairs that tell the path of the prism's angle: while the prism starts from rest, events come slowly."""
 FEWEST_PAIRS = 1_500
 """Smallest number of pairs of events for the photometric stage."""
 PAIRS_PER_NODE = 1.5
@@ -459,6 +461,7 @@ class _PairCollector:
         self._found: list[PairSet] = []
         self._done = 0
         self._heard_us = self._read_us = 0
+        self.longest_gap_us = LONGEST_GAP_US
 
     @property
     def silent_share(self) -> float:
@@ -491,8 +494,8 @@ class _PairCollector:
             joined = None
         table = EventTable(parts, self._near, search.device, joined=joined)
         pairs = table.pairs(
-            calibration_events.encoder, longest_gap_us=LONGEST_GAP_US, shortest_gap_us=2.0 * self.sensor.refractory_us,
-            sensor=self.sensor, middle_us=space.middle_us,
+            calibration_events.encoder, longest_gap_us=self.longest_gap_us,
+            shortest_gap_us=2.0 * self.sensor.refractory_us, sensor=self.sensor, middle_us=space.middle_us,
         )  # fmt: skip
         if not len(pairs):
             return pairs
@@ -600,6 +603,7 @@ def collect_everywhere(
     share = most / max(1.0, len(source) * float(np.mean(tile_of >= 0)))
     near[np.random.default_rng(0).random(near.shape) >= share] = -1
     collector = _PairCollector(recording, search, tile_of, near, settings.sensor)
+    collector.longest_gap_us = LONGEST_PATH_GAP_US
     parts = -(-len(source) // EVENTS_AT_A_TIME)
     edges = np.linspace(source.t_first, source.t_last + 1, parts + 1).astype(np.int64).tolist()
     spans = [*itertools.pairwise(edges)]

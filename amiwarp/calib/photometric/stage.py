@@ -60,7 +60,7 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
             return found.finished(answer)
         if parts := moving_parts(found.answers.cost):
             return found.finished(replace(answer, result=replace(answer.result, moving=parts)).judged(*MOVING))
-    rpm, sensor, time_constant = search.calibration_events.encoder.rpm, given, 0.0
+    rpm, sensor, time_constant, slow_px = search.calibration_events.encoder.rpm, given, 0.0, 0.0
     rad_per_us, direction, delay = abs(rpm) * math.tau / 60e6, math.copysign(1.0, rpm), list[str]()
     examined = can_be_examined(answer, found.answers.cost) and bool(rpm)
     missing = missing_step(found.answers.cost) if examined else 0.0
@@ -78,8 +78,11 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
             answer = found.answers.search(found.start)
             _, lag = timing_steps(found.answers.cost, answer.stage.x, direction)
         if lag:
+            fast = answer.stage.x
             answer, turn = found.with_slow_pixels(answer, lag, direction)
             time_constant = turn / rad_per_us
+            space = found.answers.cost.space
+            slow_px = consistency.distance(*(space.build(space.to_values(at)) for at in (fast, answer.stage.x)))
         if len(v) == len(answer.stage.x):
             found.answers.timing = answer.stage.x - v
     kind, blind_px = MODELS[found.answers.cost.space.model], 0.0
@@ -93,14 +96,14 @@ def refine(recording: Recording, search: Search) -> tuple[PhotometricSummary, St
         blind_px = fastest_px_per_rad(found.answers.cost.space, answer.stage.x) * blind_rad
         answer = answer.judged(*judge_blindness(blind_px))
     answers = found.answers
-    answer = checked(answers, answer).judged(*judge_lag(time_constant * rad_per_us))
+    answer = checked(answers, answer).judged(*judge_lag(time_constant * rad_per_us, slow_px))
     doubt_px = answers.doubt_px(answer.stage.x)
     answer = answer.judged(doubt_px <= LARGEST_DOUBT_PX, doubt_in_words(doubt_px, sensor))
     answer = answer.judged(*judge_losses(missing)) if examined else answer
     if examined and search.angles_hold and answer.result.accepted:
         answer, delay = without_angle_error(answers, answer, direction * rad_per_us)
     notes = (
-        *timing_notes(sensor.refractory_us - given.refractory_us, time_constant),
+        *timing_notes(sensor.refractory_us - given.refractory_us, time_constant, slow_px),
         *loss_notes(found.silent_share, missing), *delay, *answer.result.warnings,
         *([doubt_in_words(doubt_px, sensor)] if doubt_px >= NOTABLE_DOUBT_PX else []),
         *([blindness_in_words(blind_px)] if blind_px >= NOTABLE_BLIND_PX else []),
@@ -546,16 +549,30 @@ def is_far(moved: float) -> bool:
 LARGEST_LAG_RAD = 0.35
 """Largest angle by which the prism may turn within the time constant of slow photoreceptors [rad]. At 0.2 an error of
 0.02 px remains, at 0.4 one of 0.14 px."""
+LARGEST_SLOW_PX = 0.2
+"""Largest correction for slow photoreceptors [px rms]. About a tenth of it remains: up to 0.06 px in weak and fine
+texture, where the correction is 0.3 to 0.4 px."""
 
 
-def judge_lag(turn: float) -> tuple[bool, str]:
-    """Return whether to accept an answer for pixels within whose time constant the prism turns by an angle [rad]."""
-    if turn <= LARGEST_LAG_RAD:
-        return True, ""
-    return False, (
-        f"the pixels are too slow: the prism turns by {math.degrees(turn):.0f} deg within their time constant; use "
-        "more light, a larger bandwidth or a slower prism"
-    )
+def judge_lag(turn: float, moved_px: float) -> tuple[bool, str]:
+    """Return whether to accept an answer for slow pixels, and the reason.
+
+    The prism turns by the angle ``turn`` [rad] within their time constant, and their correction moved the model by
+    ``moved_px``.
+    """
+    remedy = "use more light, a larger bandwidth or a slower prism"
+    if turn > LARGEST_LAG_RAD:
+        angle = math.degrees(turn)
+        return (
+            False,
+            f"the pixels are too slow: the prism turns by {angle:.0f} deg within their time constant; {remedy}",
+        )
+    if moved_px > LARGEST_SLOW_PX:
+        return False, (
+            f"the pixels are too slow for this texture: they change the size of the orbit by {moved_px:.2f} px rms, "
+            f"and the correction leaves about a tenth of that; {remedy}, or show a scene with stronger edges"
+        )
+    return True, ""
 
 
 def judge_consistency(error_px: float, cause: str) -> tuple[bool, str]:
@@ -1119,8 +1136,11 @@ def doubt_in_words(px: float, sensor: SensorTiming) -> str:
     )
 
 
-def timing_notes(refractory_us: float, time_constant_us: float) -> list[str]:
-    """Return a sentence for each time that was found [us]; 0 for none."""
+def timing_notes(refractory_us: float, time_constant_us: float, slow_px: float) -> list[str]:
+    """Return a sentence for each time that was found [us]; 0 for none.
+
+    The correction for slow pixels moved the model by ``slow_px``.
+    """
     notes = []
     if refractory_us:
         notes.append(
@@ -1130,7 +1150,8 @@ def timing_notes(refractory_us: float, time_constant_us: float) -> list[str]:
     if time_constant_us:
         notes.append(
             f"the pixels are slow: about {time_constant_us:.0f} us at the median brightness, more in the dark. The "
-            "size of the orbit was corrected. The lag is part of the phase, which holds at this speed of the prism only"
+            f"size of the orbit was corrected, by {slow_px:.2f} px rms, of which about a tenth may remain. The lag is "
+            "part of the phase, which holds at this speed of the prism only"
         )
     return notes
 
@@ -1153,6 +1174,8 @@ RIVAL_STD = 0.5
 """Systematic standard deviation of an answer with a rival explanation: a share of the difference of their answers."""
 LEAST_RIVAL_PX = 0.02
 """Distance of the models of two explanations from which on both are reported [px rms]."""
+LARGEST_RIVAL_PX = 0.06
+"""The same from which on the answer is refused. A wobble of 2 degrees and cylinder power are 0.05 px apart."""
 CONTRADICTING = 3.0
 """Number of standard deviations from which on a correction is said to contradict what was given."""
 SAME_COST = 1.05
@@ -1227,14 +1250,21 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
         if as_wedge(best.space.prism).flat_side is as_wedge(rival.space.prism).flat_side
     ]
     answer = _final(search, answer, check, apart)
-    notes = [
-        f"the events do not tell whether {best.cause.words} or {rival.cause.words} is wrong: both explain them as "
-        f"well, and differ by {px:.2f} px rms"
-        for best, rival, px in rivals
-        if px >= LEAST_RIVAL_PX
-    ]
+    notes = [rival_in_words(best, rival, px) for best, rival, px in rivals if px >= LEAST_RIVAL_PX]
+    for best, rival, px in rivals:
+        answer = answer.judged(px <= LARGEST_RIVAL_PX, rival_in_words(best, rival, px))
     notes = [*_corrections(given, search.cost.space, answer), *notes, *check.warnings()]
     return replace(answer, result=replace(answer.result, warnings=(*notes, *answer.result.warnings)))
+
+
+def rival_in_words(best: _Corrected, rival: _Corrected, px: float) -> str:
+    """Return that two explanations, ``px`` apart, explain the events equally well, and what to do."""
+    frees = [",".join(n for n in each.cause.names if n != consistency.FLAT_SIDE) for each in (best, rival)]
+    remedy = " or ".join(f"--free apex,phase,{names}" for names in frees if names)
+    return (
+        f"the events do not tell whether {best.cause.words} or {rival.cause.words} is wrong: both explain them as "
+        f"well, and differ by {px:.2f} px rms; choose the right one ({remedy})"
+    )
 
 
 def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Consistency) -> _Corrected | None:
@@ -1338,11 +1368,11 @@ def _corrections(given: ParameterSpace, space: ParameterSpace, answer: Answer) -
         )
     for name in space.names:
         if name not in given.names:
-            scale, unit = 1.0, "" if name in ("k1", "fy_over_fx") else " px"
+            scale, unit = 1.0, "" if name in ("k1", "fy_over_fx", "index") else " px"
             if units().get(name) == "rad":
                 scale, unit = math.degrees(1.0), " deg"
             was, now, by = (scale * x for x in (space.start[name], found[name], std[name]))
-            remedy = "; calibrate the lens" if name in LENS else ""
+            remedy = "; calibrate the lens" if name in LENS else "; give that of the glass" if name == "index" else ""
             if abs(now - was) >= CONTRADICTING * by:
                 said = f"the events contradict {name} = {was:.5g}{unit}: it was corrected to"
             else:  # the other one of two, or what a later correction explains

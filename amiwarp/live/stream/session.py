@@ -21,7 +21,7 @@ from amiwarp.calib.result import Calibration
 from amiwarp.choices import Sharpness
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder, EncoderStream, start_of_last_run
+from amiwarp.events.encoder import TWO_PI, Encoder, EncoderStream, rpm_between, start_of_last_run
 from amiwarp.events.recording import OVERHEAD, Events, MemoryEvents, Recording, held_bytes
 from amiwarp.imaging.iwe import CanvasShape
 from amiwarp.imaging.metrics import SharpnessMeter
@@ -854,6 +854,57 @@ def _last_run(samples: list[tuple[NDArray[np.int64], NDArray[np.float64]]], t_fi
 
 def _silence(what: str, seconds: float) -> str:
     return f"no {what} for {seconds:.0f} s" if seconds > SILENT_S else ""
+
+
+class LiveSource:
+    """Function that returns the last seconds of a stream as a recording, with figures about the stream."""
+
+    def __init__(self, recent: RecentEvents, messages: Sequence[str]) -> None:
+        """Start with events of at least one turn. ``messages`` grows while the stream is followed.
+
+        Raises :class:`AmiwarpError` if there are fewer events.
+        """
+        first = recent.recording()
+        if first is None:
+            raise AmiwarpError("the stream has delivered less than one full turn; wait for one")
+        self._recent, self._messages, self._last = recent, messages, first
+
+    def __call__(self) -> Recording:
+        """Return the latest events of at least one turn."""
+        self._last = self._recent.recording() or self._last
+        return self._last
+
+    def figures(self) -> tuple[list[list[str]], str]:
+        """Return figures of this moment, as rows of name, value and "bad", and what is wrong; empty if nothing is.
+
+        The speed is that of the last turn of the shown events; the latency is their age if they are shown now.
+        """
+        recent, problem, status = self._recent, self._recent.silence, self._recent.status
+        last, encoder = self._last.events.t_last, self._last.encoder
+        no_angles = "" if problem else recent.encoder_silence
+        turn_us = 2e6 if encoder is None else min(2e6, 60e6 / max(abs(encoder.rpm), 1.0))
+        rpm = None if encoder is None else rpm_between(encoder, round(last - turn_us), last)
+        said, speed = self._messages[-1] if self._messages else "", "unknown" if rpm is None else f"{rpm:.1f} rpm"
+        angles, rate = not (problem or no_angles), 0.0 if problem else status.rate_mev_s
+        fresh, latency_ms = angles and recent.turn_share >= 1.0, 1e3 * recent.age_s
+        rows = [
+            ("events", "interrupted, last ones shown" if problem else "receiving", problem),
+            ("prism angles", "receiving" if angles else "interrupted, last turn shown", not angles),
+            ("rate", f"{rate:.2f} million events/s", False),
+            ("latency", "–" if problem else f"{latency_ms:.0f} ms", not problem and latency_ms > 1e3),
+            ("turn covered", f"{100.0 * recent.turn_share:.0f} %", recent.turn_share < 1.0),
+            ("speed of the prism", speed if fresh else f"{speed}, last measured", rpm is None or not fresh),
+            ("lost events", f"{status.dropped:,}", status.dropped), ("out of order", f"{status.late:,}", status.late),
+        ]  # fmt: skip
+        if recent.segment > 1:
+            rows.append(("segment", f"{recent.segment}, since the source came back", False))
+        if said and not problem:
+            rows.append(("last message", said, False))
+        message = "" if said == problem else said
+        note = f"The stream is interrupted: {problem}. {message}".strip() if problem else ""
+        if no_angles:
+            note = f"No prism angles arrive: {no_angles}. The last turn before it is shown, until they return."
+        return [[name, text, "bad" if bad else ""] for name, text, bad in rows], note
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import CircleModel, ExactModel, Model, ModelError, predicted_error, rms
 from amiwarp.optics.prism import Prism
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.claims import Claim, differences, judge
+from amiwarp.studies.evaluate.claims import Claim, differences, judge, judge_number, untestable
 from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Settings, Stream, Streams, Table
 
 TITLE = "Apex angle and speed"
@@ -31,7 +31,9 @@ PROTOCOL = (
     "slow wander with knots every 20 ms, a constant offset that a calibration at 720 rpm has absorbed, and the offset "
     "that a clock's drift makes after the calibration (1 ms is 17 ppm of a minute). The displacement error is the rms "
     "distance of the compensated events from where the true model at the true angle puts them. It is also given for "
-    "the paper's circle, whose deflection fits the true model best."
+    "the paper's circle, whose deflection fits the true model best. An error surges above 720 rpm if its relative "
+    "growth from 720 to 1440 rpm is larger, by more than 10 percentage points, than that from 360 to 720 rpm: for an "
+    "error in proportion to the speed, both are 100 %."
 )
 DIFFERENCES = (
     "The paper measures one sensor, whose bandwidth and light it does not state, with events of real edges; a motor "
@@ -39,15 +41,17 @@ DIFFERENCES = (
     "other values are those of the DVXplorer's model. The paper's measure leaves out events over 3 px from an edge, so "
     "it saturates near 1 px."
 )
-VERSION = 3
+VERSION = 4
 NEEDS_TRUTH = True
 
 APEX_DEG = (0.5, 1.0, 2.0)
 """Apex angles [deg]."""
 SPEEDS, QUICK_SPEEDS = (180.0, 360.0, 720.0, 1440.0, 2880.0), (360.0, 720.0, 1440.0)
 """Speeds of the prism [turns/min]."""
-BANDWIDTHS, QUICK_BANDWIDTHS = (0.0, 1000.0, 300.0, 100.0), (0.0, 1000.0, 100.0)
+BANDWIDTHS, QUICK_BANDWIDTHS = (0.0, 1000.0, 300.0, 100.0), (1000.0, 100.0)
 """Bandwidths of the photoreceptors at white [Hz]; 0 for unlimited."""
+LIMITS, QUICK_LIMITS = (study.IDEAL, *study.LIMITS), (study.IDEAL, study.BANDWIDTH)
+"""Single limits of the sensors at the usual apex angle."""
 WHOLE = (640, 480)
 """Width and height of the whole sensor [px]."""
 USUAL_DEG, USUAL_HZ = 0.5, 1000.0
@@ -67,12 +71,17 @@ WANDER_US = 20_000.0
 """Time between the knots of a slow wander [us]."""
 EXACT, CIRCLE = "exact model", "circle"
 """Models that compensate: the true one, and the paper's."""
+CIRCLE_PX = 2.0
+"""Error of the circle in a field of view of 90° that the paper states [px]."""
 PRACTICAL_PX = 2.0
 """Largest compensation error that the paper states for its system [px]."""
 USUAL_RPM = 720.0
 """Speed above which the paper reports a surge [turns/min]."""
-SURGE = 1.25
-"""Smallest increase of the blur above :data:`USUAL_RPM` that counts as a surge."""
+SURGE = 0.1
+"""Least amount by which the relative growth of an error above :data:`USUAL_RPM`, per doubling, exceeds that below."""
+FIELDS = {"90° across the width": 90.0,
+          "90° across the diagonal": float(np.degrees(2.0 * np.arctan(WHOLE[0] / np.hypot(*WHOLE))))}  # fmt: skip
+"""Fields of view of 90° [deg, across the width]: the paper does not say across what."""
 
 
 class _Row(TypedDict):
@@ -114,10 +123,12 @@ def conditions(settings: Settings) -> list[Condition]:
 
     At the usual speed and bandwidth there is also the whole sensor, at whose border the circle is worst.
     """
-    speeds, bandwidths = (QUICK_SPEEDS, QUICK_BANDWIDTHS) if settings.quick else (SPEEDS, BANDWIDTHS)
+    speeds, bandwidths, limits = (
+        (QUICK_SPEEDS, QUICK_BANDWIDTHS, QUICK_LIMITS) if settings.quick else (SPEEDS, BANDWIDTHS, LIMITS)
+    )
     size = replace(settings, width=min(settings.width, 320), height=min(settings.height, 240))
     grid: list[dict[str, Any]] = [{"apex": a, "cutoff_hz": hz} for a in APEX_DEG for hz in bandwidths]
-    grid += [{"apex": USUAL_DEG, "only": limit} for limit in (study.IDEAL, *study.LIMITS)]
+    grid += [{"apex": USUAL_DEG, "only": limit} for limit in limits]
     grid.append({"apex": USUAL_DEG, "only": study.BANDWIDTH, "cutoff_hz": min(bandwidths[1:])})
     turns = [
         replace(condition, rpm=rpm, duration_s=60.0 / rpm)
@@ -297,6 +308,14 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
               study.grouped(sizes, ("apex_name", "size", "rpm"), ["displacement", "blur", "edge_blur"]),
               f"True model, {USUAL_HZ:g} Hz.",
               Chart("speed [rpm]", "blur [px]", "rms timing error", "std", panels=("apex",), log_x=True)),
+        Table("apex_speed_surge", "Surge of the error above 720 rpm over the timing error (slow wander)",
+              ("measure", "apex", "rms timing error [ms]", "seeds", "growth 360 to 720 rpm", "std of growth below",
+               "growth 720 to 1440 rpm", "std of growth above", "surge", "std"),
+              study.grouped([r | {"measure": measure.replace("_", " "), "ms": r["error_us"] * 1e-3}
+                             for measure in ("edge_blur", "blur") for r in surge_of(sizes, measure)],
+                            ("measure", "apex_name", "ms"), ["below", "above", "surge"]),
+              f"The error surges if the second growth is larger by more than {SURGE:g}.",
+              Chart("rms timing error [ms]", "surge", "apex", "std", panels=("measure",), marks={"surge": SURGE})),
         Table("apex_speed_models", "Error of the circle and of the exact model over the whole sensor",
               ("apex", "timing error", "model", "seeds", *measures),
               study.grouped(models, ("apex_name", "timing", "model"), ["displacement", "blur", "edge_blur"]),
@@ -305,10 +324,11 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
                     kind=study.ChartKind.BARS, marks={"the paper's system": PRACTICAL_PX})),
         Table("apex_speed_circle", "Distance of the best circle from exact refraction, computed",
               ("apex", "field of view", "rms [px]", "largest [px]"),
-              [(f"apex {degrees:g}°", f"{fov:g}°", error.rms, error.worst)
-               for degrees in (APEX_DEG if models else ()) for fov in (60.0, 90.0)
+              [(f"apex {degrees:g}°", f"{fov:.3g}°", error.rms, error.worst)
+               for degrees in (APEX_DEG if models else ()) for fov in (60.0, FIELDS["90° across the diagonal"], 90.0)
                for error in (circle_error(degrees, fov),)],
-              "Over 640x480 px and a turn. The paper states 2 px in 90°, without apex angle and focal length."),
+              "Over 640x480 px and a turn. The field of view is that across the width; 77.3° are 90° across the "
+              "diagonal. The paper states 2 px in 90°, without apex angle and focal length."),
         over_speed("apex_speed_delay", "Delay of the sensor over speed", "delay", "delay [us]",
                    "Delay at which the blur is smallest."),
         over_speed("apex_speed_rate", "Event rate over speed", "mev_per_s", "rate [Mev/s]",
@@ -357,27 +377,47 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
     apex = [r for r in rows if (r["degrees"], r["cutoff_hz"]) == (USUAL_DEG, USUAL_HZ)]
     fast, slow = {"rpm": 2 * USUAL_RPM}, {"rpm": USUAL_RPM}
     growth = [{"degrees": float(degrees), "seed": seed, "growth": value}
-              for degrees, values in differences(timed, "blur", fast, slow, by=("degrees",)).items()
+              for degrees, values in differences(timed, "edge_blur", fast, slow, by=("degrees",)).items()
               for seed, value in values.items()]  # fmt: skip
-    surge = "the blur at 1440 rpm relative to that at 720 rpm"
+    large = f"timing errors of {USUAL_US * 1e-3:g} ms"
 
-    def surges(rows: Sequence[dict[str, Any]], degrees: float) -> dict[str, dict[int, float]]:
-        chosen = [r for r in rows if r["degrees"] == degrees]
-        return differences(chosen, "blur", fast, slow, by=("apex_name",), relative=True)
+    def surges(number: int | None, text: str, rows: Sequence[dict[str, Any]], degrees: float, measure: str, *,
+               no: bool = False) -> Claim:  # fmt: skip
+        surge = surge_of([r for r in rows if r["degrees"] == degrees], measure)
+        found = differences(surge, "surge", {}, by=("apex_name",))
+        limit: Any = {"below" if no else "above": SURGE}
+        what = (
+            f"the relative growth of the {measure.replace('_', ' ')} from 720 to 1440 rpm less that from 360 to 720 rpm"
+        )
+        return judge(number, text, found, what, **limit)
 
     def of(degrees: float, model: str) -> dict[str, Any]:
         return {"degrees": degrees, "model": model}
 
     return [
-        *(judge(13, f"With timing errors of 1 ms rms, the error surges above 720 rpm (apex {degrees:g}°).",
-                surges(timed, degrees), surge, above=SURGE - 1.0) for degrees in (0.5, 1.0)),
-        *(judge(13, f"Without timing errors, the error does not surge above 720 rpm (apex {degrees:g}°).",
-                surges(none, degrees), surge, below=SURGE - 1.0) for degrees in (0.5, 1.0)),
-        judge(13, "With timing errors of 1 ms rms, the error grows more at 1° than at 0.5° (720 to 1440 rpm).",
+        *(surges(number, f"With {large} rms, the {measure.replace('_', ' ')} surges above 720 rpm (apex {degrees:g}°).",
+                 timed, degrees, measure)
+          for number, measure in ((13, "edge_blur"), (None, "blur")) for degrees in (0.5, 1.0)),
+        *(surges(number, f"Without timing errors, the {measure.replace('_', ' ')} does not surge above 720 rpm (apex "
+                 f"{degrees:g}°).", none, degrees, measure, no=True)
+          for number, measure in ((13, "edge_blur"), (None, "blur")) for degrees in (0.5, 1.0)),
+        judge(13, f"With {large} rms, the edge blur grows more at 1° than at 0.5° (720 to 1440 rpm).",
               differences(growth, "growth", {"degrees": 1.0}, {"degrees": 0.5}, by=()),
-              "the growth of the blur at 1° less that at 0.5°", above=0.0, unit="px"),
-        *(judge(None, f"The error surges above 720 rpm without timing errors (apex 0.5°, bandwidth {_name(hz)}).",
-                surges([r for r in rows if r["cutoff_hz"] == hz], 0.5), surge, above=SURGE - 1.0) for hz in bandwidths),
+              "the growth of the edge blur at 1° less that at 0.5°", above=0.0, unit="px"),
+        *(surges(None, f"The blur surges above 720 rpm without timing errors (apex 0.5°, bandwidth {_name(hz)}).",
+                 [r for r in rows if r["cutoff_hz"] == hz], 0.5, "blur") for hz in bandwidths),
+        *(judge(11, f"The error of a system as the paper's, with the circle and {large}, is at most {PRACTICAL_PX:g} "
+                f"px (rms, apex {degrees:g}°, 720 rpm, whole sensor).",
+                differences(_whole_sensor(errors, USUAL_US), "displacement", of(degrees, CIRCLE), by=()),
+                "the rms displacement error", below=PRACTICAL_PX, unit="px") for degrees in (0.5, 1.0)),
+        untestable(11, "Compensation runs in real time on an onboard computer.",
+                   "no onboard computer was at hand: the documentation states the rate on two cores of a server"),
+        *(judge_number(12, f"The circle's error is within {CIRCLE_PX:g} px {where} (apex {USUAL_DEG:g}°, {fov}).",
+                       getattr(circle_error(USUAL_DEG, FIELDS[fov]), name), f"the {what} over 640x480 px and a turn",
+                       below=CIRCLE_PX, unit="px")
+          for fov in (FIELDS if errors else ())
+          for where, name, what in (("in the rms", "rms", "rms error"),
+                                    ("everywhere in the image", "worst", "largest error"))),
         judge(14, "With the circle and timing errors of 1 ms, the error of 2° is above what the paper states for its "
               "system (720 rpm, whole sensor).",
               differences(_whole_sensor(errors, USUAL_US), "displacement", of(2.0, CIRCLE), by=()),
@@ -401,6 +441,22 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
               ("A larger apex (720 rpm)", usual, {"degrees": 1.0}, {"degrees": 0.5}, "at 1° less that at 0.5°"),
               ("A higher speed (apex 0.5°)", apex, fast, slow, "at 1440 rpm less that at 720 rpm"))),
     ]  # fmt: skip
+
+
+def surge_of(rows: Sequence[dict[str, Any]], measure: str) -> list[dict[str, Any]]:
+    """Return the surge of a measure above 720 rpm for each apex, timing error and seed: see :data:`SURGE`."""
+    found: dict[tuple[Any, ...], dict[float, dict[str, Any]]] = {}
+    for row in rows:
+        key = (row["apex_name"], row.get("timing"), row.get("error_us"), row["seed"])
+        if row[measure] is not None:
+            found.setdefault(key, {})[row["rpm"]] = row
+    out = []
+    for speeds in found.values():
+        if {USUAL_RPM / 2.0, USUAL_RPM, 2.0 * USUAL_RPM} <= set(speeds):
+            low, usual, high = (speeds[rpm][measure] for rpm in (USUAL_RPM / 2.0, USUAL_RPM, 2.0 * USUAL_RPM))
+            below, above = usual / low - 1.0, high / usual - 1.0
+            out.append(speeds[USUAL_RPM] | {"below": below, "above": above, "surge": above - below})
+    return out
 
 
 def _whole_sensor(rows: Sequence[dict[str, Any]], *sizes_us: float) -> list[dict[str, Any]]:

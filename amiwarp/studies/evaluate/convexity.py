@@ -128,6 +128,10 @@ SMALL = (160, 120)
 """Width and height of the image [px]."""
 LEAST_PHASE_DEG = 10.0
 """Half range of phases, a step of the grid, above which a cost counts as convex around its optimum [deg]."""
+LEAST_S, LONGER_S = 0.25, 4.0
+"""Lengths of the windows that are compared with the paper's 2 s [s]."""
+SOMETIMES, LITTLE_PX = 0.05, 0.5
+"""Least share of recordings that counts as some, and largest gain that counts as little, a step of the grid [px]."""
 FOUND_PX = 1.0
 """Largest error of an optimum that counts as found: what the grid and the sensor's delay leave [px]."""
 
@@ -292,14 +296,15 @@ def contours(surfaces: Sequence[dict[str, Any]]) -> NDArray[np.uint8]:
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the calibration from 2 s: its optimum, and the convexity of the cost around it."""
-    rows = [r | {"convex_deg": r["phase_half"] * r["found"]}
-            for r in _rows(results) if r["window"] == WINDOW_US * 1e-6]  # fmt: skip
+    every = _rows(results)
+    rows = [r | {"convex_deg": r["phase_half"] * r["found"]} for r in every if r["window"] == WINDOW_US * 1e-6]
     ideal = [r for r in rows if r["only"] is not None]
     noisy = [r for r in rows if r["only"] is None]
-    found = []
+    found = [c for number, cost, is_ideal in ((16, PIXELS, True), (None, OURS, False))
+             for c in _lengths(number, cost, [r for r in every if (r["only"] is not None) == is_ideal])]  # fmt: skip
     for number, cost, chosen, sensor in (
-        (16, PIXELS, ideal, "ideal sensor"), (16, PIXELS, noisy, "DVXplorer"), (16, PAPER, noisy, "DVXplorer"),
-        (None, OURS, noisy, "DVXplorer"),
+        (16, PAPER, ideal, "ideal sensor"), (16, PIXELS, ideal, "ideal sensor"), (16, PAPER, noisy, "DVXplorer"),
+        (16, PIXELS, noisy, "DVXplorer"), (None, OURS, noisy, "DVXplorer"),
     ):  # fmt: skip
         for text, value, what, limits in (
             ("the optimum is the true one", "error", "the error of the optimum", {"below": FOUND_PX, "unit": "px"}),
@@ -310,3 +315,17 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
             values = differences(chosen, value, {"cost": cost}, by=("scene",))
             found.append(judge(number, f"With '{cost}' and 2 s, {text} ({sensor}).", values, what, **limits))
     return found
+
+
+def _lengths(number: int | None, cost: str, rows: Sequence[dict[str, Any]]) -> list[Claim]:
+    """Return the verdicts on recordings that are shorter and longer than the paper's 2 s, by a cost."""
+    usual, less, more = ({"cost": cost, "window": seconds} for seconds in (WINDOW_US * 1e-6, LEAST_S, LONGER_S))
+    sensor = f"({'ideal sensor' if number else 'DVXplorer'})"
+    return [
+        judge(number, f"With '{cost}' and {LEAST_S:g} s, the true optimum is sometimes not found {sensor}.",
+              differences(rows, "found", less, usual, by=("scene",)),
+              f"the share of recordings in which it is found in {LEAST_S:g} s less that in 2 s", below=-SOMETIMES),
+        judge(number, f"With '{cost}', {LONGER_S:g} s gain little over 2 s {sensor}.",
+              differences(rows, "error", usual, more, by=("scene",)),
+              f"the error of the optimum in 2 s less that in {LONGER_S:g} s", below=LITTLE_PX, unit="px"),
+    ]  # fmt: skip

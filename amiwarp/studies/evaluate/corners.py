@@ -17,7 +17,8 @@ from amiwarp.kernels import corners, launch
 from amiwarp.optics.camera import Camera
 from amiwarp.simulation.worlds.world import Trajectory, WorldScene
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.claims import Claim, differences, judge, untestable
+from amiwarp.studies.evaluate.claims import Claim, differences, judge, ranges, untestable
+from amiwarp.studies.evaluate.evaluation import CHANCE
 from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Frames, Settings, Stream, Streams, Table
 
 # Tracks of corner events, and their lifetime, error and update rate against truth.
@@ -130,14 +131,19 @@ def track_frames(grey: Sequence[NDArray[np.uint8]], t_us: Sequence[int]) -> Trac
     return sorted_tracks(numbers, np.asarray(t_us, np.int64)[index], places, index)
 
 
-def seen_places(frame: FrameTruth, camera: Camera, trajectory: Trajectory, xy: NDArray[np.floating]) -> NDArray[Any]:
-    """Return what a camera without a prism sees at places [px], in the world [m], shape (n, 3); NaN for the sky."""
+def seen_places(
+    frame: FrameTruth, camera: Camera, trajectory: Trajectory, xy: NDArray[np.floating], t_us: ArrayLike
+) -> NDArray[Any]:
+    """Return what a camera without a prism sees at places [px], in the world [m], shape (n, 3); NaN for the sky.
+
+    ``t_us``: time of each place [us], shape (n,), at which the depth is about that of ``frame``.
+    """
     column, row = (np.clip(np.rint(v).astype(int), 0, n - 1)
                    for v, n in zip(xy.T, frame.depth.shape[::-1], strict=True))  # fmt: skip
-    (rotation,), (position,) = trajectory.poses([frame.t_us * 1e-6])
+    rotation, position = trajectory.poses(np.asarray(t_us, np.float64) * 1e-6)
     rays = np.asarray(camera.pixels_to_rays(xy.astype(np.float64)))
     depth = np.where(np.isfinite(frame.depth), frame.depth, np.nan)[row, column]
-    return np.asarray(position + (rays * (depth / rays[:, 2])[:, None]) @ rotation.T)
+    return np.asarray(position + np.einsum("nj,nij->ni", rays * (depth / rays[:, 2])[:, None], rotation))
 
 
 def project(
@@ -205,6 +211,8 @@ class TrackQuality:
     """Mean distance from the truth until the end, over all points after the first of each track [px]."""
     update_hz: float
     """Number of points after the first of each track, by the time that tracks live [1/s]."""
+    total_s: float
+    """Sum of the lifetimes [s]."""
 
 
 def lives(tracks: Tracks, truth: NDArray[np.float64], limit_px: float) -> NDArray[np.bool_]:
@@ -244,6 +252,7 @@ def track_quality(tracks: Tracks, truth: NDArray[np.float64], limit_px: float) -
         float(life.mean()) if len(life) else float("nan"),
         float(errors.mean()) if len(errors) else float("nan"),
         len(errors) / total if total > 0.0 else float("nan"),
+        total,
     )
 
 
@@ -261,15 +270,17 @@ PROTOCOL = (
     "eFAST and Arc* detect corners in the events as recorded. The events are then compensated, and corner events up to "
     f"3 px and {GAP_US / 1000:.0f} ms apart are joined to tracks. The truth of a track is the point of the world that "
     "its first event saw, projected to the image without the prism. A track ends where it is further from the truth "
-    "than a limit (5 px in the comparison), or where the point is hidden. Apex 1°. In frames of the standard camera, "
+    "than a limit (5 px in the comparison), or where the point is hidden. Tracks alive at a time are the sum of all "
+    "lifetimes over the duration. Chance are as many corners as those of the calibrated AMI-EV, at its times and at "
+    "random places: the tracker also joins these, within its 3 px. Apex 1°. In frames of the standard camera, "
     "corners are those of Shi and Tomasi, tracked by Lucas and Kanade (OpenCV). The error of the compensation is the "
-    "median distance of events from where a camera without a prism would see their points."
+    "distance of events from where a camera without a prism would see their points."
 )
 DIFFERENCES = (
     "The paper's main text gives neither the tracker nor the limit at which a track ends. The ranking depends on the "
     "limit: see the curves. Scenes are simulated."
 )
-VERSION = 3
+VERSION = 4
 NEEDS_TRUTH = True
 
 APEX = math.radians(1.0)
@@ -285,13 +296,14 @@ SOURCES = {
     Stream.RAW: (Stream.TRUE, Stream.CALIBRATED, Stream.SELF, Stream.RAW),
 }
 """Streams whose positions are those of the events of another stream, by that stream."""
-PAPER_ERROR_PX, SAME_PX = (1.0, 2.0), 0.5
-"""Range of an error of about 1.5 px, and change of the error that counts as none [px]."""
+PAPER_ERROR_PX, SLIGHT_PX, SAME_PX = (1.0, 2.0), 1.0, 0.5
+"""Range of an error of about 1.5 px, and changes of the error that count as slight and as none [px]."""
+FAR = 1.0
+"""Relative difference of an update rate that is far above another one."""
 SUBSTANTIAL = 0.25
 """Increase of the lifetime that counts as substantial, relative to the S-EV's."""
-VALUES = ("number", "lifetime_ms", "error_px", "update_hz")
+VALUES = ("number", "alive", "lifetime_ms", "error_px", "update_hz")
 """Names of the values of each row."""
-
 
 FRAME_CORNERS = "frames"
 """Detector of the corners of a standard camera, among those of events."""
@@ -299,10 +311,11 @@ FRAME_CORNERS = "frames"
 
 class _Row(TypedDict):
     detector: Literal["frames", *CornerMethod]  # type: ignore[valid-type]
-    stream: study.Compared
+    stream: Literal["chance", *Stream, *Frames]  # type: ignore[valid-type]
     limit: study.Amount
     gap: study.Amount
     number: study.Amount | None
+    alive: study.Amount | None
     lifetime_ms: study.Amount | None
     error_px: study.Amount | None
     update_hz: study.Amount | None
@@ -311,6 +324,7 @@ class _Row(TypedDict):
 class _Error(TypedDict):
     stream: Stream
     median_px: study.Amount | None
+    rms_px: study.Amount | None
 
 
 class Values(TypedDict):
@@ -322,8 +336,8 @@ class Values(TypedDict):
 
 
 def conditions(settings: Settings) -> list[Condition]:
-    """Return the room at rest and moving, in full also the desk, with the apex angle of the paper's features."""
-    scenes = [c for c in settings.scenes() if c.world != "street" and c.trajectory != "fast"]
+    """Return the scenes without the street, with the apex angle of the paper's features."""
+    scenes = [c for c in settings.scenes() if c.world != "street"]
     return [replace(condition, apex=APEX) for condition in scenes]
 
 
@@ -344,6 +358,8 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
             for stream in (s for s in members if s in names):
                 known = {"detector": detector.value, "stream": stream.value}
                 t, xy, which = _corners(streams, stream, found, indices)
+                if stream is Stream.CALIBRATED:
+                    rows += [known | {"stream": CHANCE} | row for row in _chance_quality(streams, t, frames)]
                 for gap_us in GAPS_US:
                     curve = [known | row for row in _quality(streams, t, xy, place[which], frames, gap_us)]
                     rows += curve if gap_us == GAP_US else []
@@ -351,9 +367,7 @@ def measure(streams: Streams, settings: Settings) -> dict[str, Any]:
     for kind in Frames:
         seen = {"detector": FRAME_CORNERS, "stream": kind.value, "gap": kind.interval_us / 1e3}
         rows += [seen | row for row in _frame_quality(streams, kind, frames)]
-    errors = [
-        {"stream": s.value, "median_px": _compensation_error(streams, s)} for s in SOURCES[Stream.RAW] if s in names
-    ]
+    errors = [{"stream": s.value, **_compensation_error(streams, s)} for s in SOURCES[Stream.RAW] if s in names]
     return {"rows": rows, "gaps": gaps, "errors": errors}
 
 
@@ -362,24 +376,41 @@ def _frame_quality(streams: Streams, kind: Frames, frames: Sequence[FrameTruth])
     scene, times = streams.simulation.scene, streams.exposures(kind).tolist()
     assert isinstance(scene, WorldScene)
     tracks = track_frames([streams.grey_frame(t) for t in times], times)
-    begin = tracks.first
-    places = np.full((len(begin), 3), np.nan)
-    for k in np.unique(tracks.index[begin]).tolist():
-        of = np.flatnonzero(tracks.index[begin] == k)
-        seen = streams.frame(times[k] if scene.trajectory.moves else streams.start_us)
-        places[of] = seen_places(seen, streams.camera, scene.trajectory, tracks.xy[begin[of]])
-    truth = true_paths(tracks, places, streams.camera, scene.trajectory, frames)
-    return [_values(q) for q in quality_curve(tracks, truth, LIMITS_PX)]
+    seen = [streams.frame(t) for t in (times if scene.trajectory.moves else [streams.start_us])]
+    return _curve(streams, tracks, _begun_on(streams, tracks, seen), frames)
 
 
-def _compensation_error(streams: Streams, stream: Stream) -> float | None:
-    """Return the median distance of a stream's events from the true places of what they saw [px]."""
+def _chance_quality(streams: Streams, t: NDArray[np.int64], frames: Sequence[FrameTruth]) -> list[dict[str, Any]]:
+    """Return the quality of the tracks of corners at random places, for each limit. ``t``: their times [us]."""
+    places = np.random.default_rng(streams.condition.seed).uniform(-0.5, np.array(streams.size) - 0.5, (len(t), 2))
+    tracks = link_corners(t, places)
+    found = _curve(streams, tracks, _begun_on(streams, tracks, frames), frames)
+    return [row | {"gap": GAP_US / 1e3} for row in found]
+
+
+def _begun_on(streams: Streams, tracks: Tracks, frames: Sequence[FrameTruth]) -> NDArray[np.float64]:
+    """Return the point of the world at the first place of each track [m], shape (tracks, 3), by the nearest frame."""
+    scene = streams.simulation.scene
+    assert isinstance(scene, WorldScene)
+    t, xy = tracks.t[tracks.first], tracks.xy[tracks.first]
+    nearest = np.abs(t[:, None] - np.array([frame.t_us for frame in frames])).argmin(axis=1)
+    places = np.full((len(t), 3), np.nan)
+    for k in np.unique(nearest).tolist():
+        of = nearest == k
+        places[of] = seen_places(frames[k], streams.camera, scene.trajectory, xy[of], t[of])
+    return places
+
+
+def _compensation_error(streams: Streams, stream: Stream) -> dict[str, float | None]:
+    """Return median and rms of the distance of a stream's events from the true places of what they saw [px]."""
     span = streams.start_us, streams.end_us
     events, truth = streams.window(stream, *span), streams.event_truth(stream, *span)
     assert truth.points is not None
     assert truth.cause is not None
     apart = np.hypot(events.x - truth.points[:, 0], events.y - truth.points[:, 1])[truth.cause == Cause.SIGNAL.code]
-    return study.finite(float(np.nanmedian(apart))) if len(apart) else None
+    apart = apart[np.isfinite(apart)]
+    median, rms = (np.median(apart), np.sqrt(np.mean(apart**2))) if len(apart) else (np.nan, np.nan)
+    return {"median_px": study.finite(float(median)), "rms_px": study.finite(float(rms))}
 
 
 def _corners(
@@ -401,25 +432,32 @@ def _quality(
     frames: Sequence[Any], gap_us: int,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Return the quality of the tracks of corners for each limit; a value is None if there are no tracks."""
+    tracks = link_corners(t, xy, gap_us=gap_us)
+    found = _curve(streams, tracks, place[tracks.index[tracks.first]], frames)
+    return [row | {"gap": gap_us / 1e3} for row in found]
+
+
+def _curve(
+    streams: Streams, tracks: Tracks, places: NDArray[np.floating], frames: Sequence[FrameTruth]
+) -> list[dict[str, Any]]:
+    """Return the quality of tracks for each limit as values of rows. ``places``: where each track begins [m]."""
     scene = streams.simulation.scene
     assert isinstance(scene, WorldScene)
-    tracks = link_corners(t, xy, gap_us=gap_us)
-    truth = true_paths(tracks, place[tracks.index[tracks.first]], streams.camera, scene.trajectory, frames)
-    return [_values(q) | {"gap": gap_us / 1e3} for q in quality_curve(tracks, truth, LIMITS_PX)]
-
-
-def _values(q: TrackQuality) -> dict[str, Any]:
-    """Return the quality of tracks as values of a row."""
-    values = (float(q.number), 1e3 * q.lifetime_s, q.error_px, q.update_hz)
-    return {"limit": q.limit_px, **dict(zip(VALUES, map(study.finite, values), strict=True))}
+    truth = true_paths(tracks, places, streams.camera, scene.trajectory, frames)
+    span_s = (streams.end_us - streams.start_us) * 1e-6
+    rows = []
+    for q in quality_curve(tracks, truth, LIMITS_PX):
+        values = (float(q.number), q.total_s / span_s, 1e3 * q.lifetime_s, q.error_px, q.update_hz)
+        rows.append({"limit": q.limit_px, **dict(zip(VALUES, map(study.finite, values), strict=True))})
+    return rows
 
 
 def tables(results: Sequence[CellResult]) -> list[Table]:
     """Return the quality at the limit of the comparison, and the curves of lifetime and error over the limit."""
     rows = study.rows_of(results, "rows")
     by = ("scene", "camera", "detector", "stream")
-    names = ("seeds", "tracks", "std of tracks", "lifetime [ms]", "std", "error [px]", "std of error",
-             "updates [1/s]", "std of updates")  # fmt: skip
+    names = ("seeds", "tracks", "std of tracks", "alive at a time", "std of alive", "lifetime [ms]", "std",
+             "error [px]", "std of error", "updates [1/s]", "std of updates")  # fmt: skip
     standard = [r for r in rows if r["limit"] == LIMIT_PX]
     panels = ("scene", "camera", "detector")
 
@@ -435,9 +473,10 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
               "A plain camera at rest has no tracks.",
               Chart("camera", "lifetime [ms]", "stream", "std", panels=("scene", "detector"),
                     kind=study.ChartKind.BARS)),
-        Table("corners_compensation", "Error of the compensation, apex 1°", ("scene", "camera", "stream", "seeds",
-              "median [px]", "std"), study.grouped(study.rows_of(results, "errors"), ("scene", "camera", "stream"),
-              ["median_px"]), "Events of signals; rounding to pixels does not count, as both share a pixel."),
+        Table("corners_compensation", "Error of the compensation, apex 1°",
+              ("scene", "camera", "stream", "seeds", "median [px]", "std", "rms [px]", "std of rms"),
+              study.grouped(study.rows_of(results, "errors"), ("scene", "camera", "stream"), ["median_px", "rms_px"]),
+              "Events of signals; rounding to pixels does not count, as both share a pixel."),
         over_limit("corners_lifetime", "lifetime_ms", "lifetime [ms]"),
         over_limit("corners_error", "error_px", "error [px]"),
         Table("corners_gap", "Lifetime over the largest time between two corner events of a track",
@@ -462,29 +501,39 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
         found = differences(rows, "lifetime_ms", ami, plain, relative=True)
         return judge(number, text, found, f"the lifetime {against}", above=SUBSTANTIAL)
 
-    still = [{**r, "camera": "any"} for r in of(rows) if r["camera"] == "still" and r["scene"] == "room"]
-    handheld = [{**r, "camera": "any"} for r in of(moving) if r["scene"] == "room"]
-    change = [r | {"moves": moves} for moves, part in ((False, still), (True, handheld)) for r in part]
+    room = ranges([r for r in of(rows) if r["scene"] == "room"], "error_px")
     return [
-        judge(6, "More corners are tracked (eFAST, moving camera).",
-              differences(of(moving), "number", ami, plain, relative=True), f"the number of tracks {against}",
-              above=0.0),
+        judge(6, "More corners are tracked at a time (eFAST, moving camera).",
+              differences(of(moving), "alive", ami, plain, relative=True),
+              f"the mean number of tracks that are alive {against}", above=0.0),
         longer(6, f"Tracks live substantially longer, by {SUBSTANTIAL:.0%} (eFAST, moving camera).", of(moving)),
         judge(6, "Their error is about 1.5 px.", differences(of(moving), "error_px", ami),
               f"the mean error of '{Stream.CALIBRATED}'", above=PAPER_ERROR_PX[0], below=PAPER_ERROR_PX[1], unit="px"),
-        judge(6, f"The error does not depend on the camera's motion, within {SAME_PX:g} px.",
-              differences(change, "error_px", ami | {"moves": True}, ami | {"moves": False}),
-              f"the error of '{Stream.CALIBRATED}' in motion less that at rest", above=-SAME_PX, below=SAME_PX,
+        judge(6, f"Their error is slightly larger than the S-EV's, by up to {SLIGHT_PX:g} px (moving camera).",
+              differences(of(moving), "error_px", ami, plain),
+              f"the error of '{Stream.CALIBRATED}' less that of '{Stream.PLAIN}'", above=0.0, below=SLIGHT_PX,
               unit="px"),
-        untestable(6, "More corners are tracked than by a standard camera in hard light.", "no world has dim light"),
-        *(judge(7, f"The update rate of the {name} is far above that of a standard camera: more than twice 60/s.",
+        judge(6, f"Their error does not depend on the camera's motion, within {SAME_PX:g} px (room).",
+              differences(room, "error_px", ami, by=("scene",)),
+              f"the range of the error of '{Stream.CALIBRATED}' over the camera's motions, with rest,", below=SAME_PX,
+              unit="px"),
+        untestable(6, "More corners are tracked than by a standard camera in hard light.", "no world has dim light, "
+                   "and the paper states neither the light nor the noise of the cameras in it, which would decide"),
+        *(judge(7, f"A track of the {name} gets more than {1.0 + FAR:g} times as many updates per second as one of a "
+                "standard camera with 60 frames/s (eFAST; the paper's 'far above' has no number).",
                 differences([r for r in moving if r["limit"] == LIMIT_PX], "update_hz",
                             stream | {"detector": CornerMethod.EFAST},
                             {"stream": Frames.FAST, "detector": FRAME_CORNERS}, relative=True),
-                "the rate of updates of a track (eFAST) less that of frames, relative to the latter,", above=1.0)
+                "the updates of a track per second less those of frames, relative to the latter,", above=FAR)
           for name, stream in (("S-EV", plain), ("AMI-EV", ami))),
-        judge(11, "The median error of the compensation is at most 2 px (apex 1°).",
-              differences(study.rows_of(results, "errors"), "median_px", ami), f"the error of '{Stream.CALIBRATED}'",
+        judge(None, "The error is smaller than that of as many corners at random places.",
+              differences(of(moving), "error_px", ami, {"stream": CHANCE}),
+              f"the error of '{Stream.CALIBRATED}' less that of chance", below=0.0, unit="px"),
+        judge(None, "Tracks live longer than those of as many corners at random places.",
+              differences(of(moving), "lifetime_ms", ami, {"stream": CHANCE}),
+              f"the lifetime of '{Stream.CALIBRATED}' less that of chance", above=0.0, unit="ms"),
+        judge(None, "The rms error of the exact compensation is at most 2 px (apex 1°).",
+              differences(study.rows_of(results, "errors"), "rms_px", ami), f"the error of '{Stream.CALIBRATED}'",
               below=2.0, unit="px"),
         *(longer(None, f"Longer with {name} and a limit of {limit:g} px.", of(moving, method, limit))
           for name, method in (("eFAST", CornerMethod.EFAST), ("Arc*", CornerMethod.ARC))

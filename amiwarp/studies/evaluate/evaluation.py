@@ -116,8 +116,8 @@ OTHERS = (VERMILION, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, BLACK, GREY)
 """Colours of other series, in their order."""
 CHANCE = "chance"
 """Name of the level of chance."""
-REFERENCE_COLOURS = {CHANCE: GREY, "truth": BLACK}
-"""Colours of the level of chance and of the truth, next to the streams."""
+REFERENCE_COLOURS = {CHANCE: GREY, "zero flow": GREY, "truth": BLACK}
+"""Colours of the levels of chance and of predicting nothing, and of the truth, next to the streams."""
 MARKERS = "osD^vPX*"
 """Markers that distinguish the series without colour."""
 

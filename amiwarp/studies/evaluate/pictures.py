@@ -18,7 +18,7 @@ from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import Reconstruction
 from amiwarp.simulation.pictures import DARK
 from amiwarp.studies.evaluate import study
-from amiwarp.studies.evaluate.claims import Claim, differences, judge
+from amiwarp.studies.evaluate.claims import Claim, differences, judge, untestable
 from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Frames, Settings, Stream, Streams, Table
 from amiwarp.validation import real
 
@@ -118,14 +118,15 @@ PROTOCOL = (
     "prism in the middle of the window, in log intensity, after a fit of gain and offset, which events do not "
     "determine. NIQE needs no truth; its natural pictures are eight of scikit-image's own (astronaut, brick, camera, "
     "chelsea, coffee, grass, gravel, rocket; public domain or CC0), each in three sizes. Without usable events "
-    "a picture is uniform and has no NIQE. No other implementation of NIQE was compared, so NIQE decides no claim. Of "
-    "the standard camera, the last frame that is complete at the end of the window is compared."
+    "a picture is uniform and has no NIQE. NIQE is the paper's measure, so it decides its claim; no other "
+    "implementation of NIQE was compared. SSIM and PSNR need the truth, so they are checks of ours. Of the standard "
+    "camera, the last frame that is complete at the end of the window is compared."
 )
 DIFFERENCES = (
     "The paper uses the network E2VID, which is not part of amiwarp, and reports NIQE only, as curves, by statistics "
     "that its authors fitted to other pictures. Values of NIQE are therefore comparable between our streams only."
 )
-VERSION = 4
+VERSION = 5
 NEEDS_TRUTH = True
 
 STEP_US = 1000
@@ -170,8 +171,9 @@ class Values(TypedDict):
 
 
 def conditions(settings: Settings) -> list[Condition]:
-    """Return the room at rest and moving; in full also the desk, moving."""
-    scenes = [("room", "still"), ("room", "handheld")] + ([] if settings.quick else [("desk", "handheld")])
+    """Return the room at rest and moving; in full also in fast motion, and the desk, moving."""
+    scenes = [("room", "still"), ("room", "handheld")]
+    scenes += [] if settings.quick else [("room", "fast"), ("desk", "handheld")]
     return [c for world, motion in scenes for c in settings.conditions(world=world, trajectory=motion)]
 
 
@@ -280,19 +282,33 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 
 
 def claims(results: Sequence[CellResult]) -> list[Claim]:
-    """Return the verdicts on the quality at rest and in motion by NIQE and SSIM, and by PSNR."""
+    """Return the verdicts on the quality at rest and in motion by NIQE; and by SSIM and PSNR."""
     rows = [r for r in study.rows_of(results, "time") if r["method"] == "own"]
+    best = _best_lengths([r for r in study.rows_of(results, "length") if r["method"] == "own"])
 
-    def claim(number: int | None, text: str, camera: str, score: str, unit: str = "") -> Claim:
-        found = differences([r for r in rows if r["camera"] == camera], score, {"stream": Stream.CALIBRATED},
-                            {"stream": Stream.PLAIN})  # fmt: skip
+    def claim(number: int | None, text: str, moving: bool, score: str, unit: str = "", rows: Any = rows) -> Claim:
+        found = differences([r for r in rows if (r["camera"] != "still") == moving], score,
+                            {"stream": Stream.CALIBRATED}, {"stream": Stream.PLAIN})  # fmt: skip
         what = f"the {score.upper()} of '{Stream.CALIBRATED}' less that of '{Stream.PLAIN}'"
         limit = {"below": 0.0} if score == "niqe" else {"above": 0.0}
         return judge(number, text, found, what, unit=unit, **limit)
 
+    niqe = "(NIQE, the paper's measure, with statistics of our own)"
     return [
-        *(claim(4, f"Pictures are better {when} ({by}).", camera, score)
-          for score, by in (("niqe", "NIQE, the paper's measure, with statistics of our own"), ("ssim", "SSIM"))
-          for camera, when in (("still", "at rest"), ("handheld", "in motion"))),
-        claim(None, "Better in motion by PSNR.", "handheld", "psnr", "dB"),
+        claim(4, f"Pictures are better at rest {niqe}.", False, "niqe"),
+        claim(4, f"Pictures are better in motion {niqe}.", True, "niqe"),
+        untestable(4, "Pictures of both cameras are satisfying in motion.",
+                   "the paper states no NIQE from which on a picture is satisfying"),
+        claim(None, "Pictures are better at rest (SSIM).", False, "ssim"),
+        claim(None, "Pictures are better in motion (SSIM).", True, "ssim"),
+        claim(None, "Better in motion by PSNR.", True, "psnr", "dB"),
+        claim(None, "Better in motion if each has the window that is best for it (SSIM).", True, "ssim", rows=best),
     ]  # fmt: skip
+
+
+def _best_lengths(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows of each stream's best length of the window, by the mean SSIM over the seeds of a case."""
+    names = ("scene", "camera", "stream", "turns")
+    mean: dict[tuple[Any, ...], Any] = {row[:4]: row[5] for row in study.grouped(rows, names, ["ssim"])}
+    best = {key[:3]: max((k for k in mean if k[:3] == key[:3]), key=lambda k: mean[k]) for key in mean}
+    return [r for r in rows if tuple(r[n] for n in names) == best[tuple(r[n] for n in names[:3])]]

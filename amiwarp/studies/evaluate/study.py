@@ -229,8 +229,8 @@ class Condition:
 
     @property
     def setup(self) -> Condition:
-        """Recording of a still scene that the same prism and sensor are calibrated from."""
-        return replace(self, world="room", trajectory="still", seed=SETUP_SEED, duration_s=SETUP_S)
+        """Recording of a still scene by the usual lens that the same prism and sensor are calibrated from."""
+        return replace(self, world="room", trajectory="still", seed=SETUP_SEED, duration_s=SETUP_S, focal_px=FOCAL_PX)
 
     def simulation(self, device: str) -> Simulation:
         """Return the simulation of the AMI-EV under this condition."""
@@ -465,7 +465,7 @@ class Streams(RecordedStreams):
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """Calibration of the prism, or None if it was refused.
+        """Calibration of the prism behind this recording's lens, or None if it was refused.
 
         Its phase is that at the start of this recording: the encoder is absolute, but a simulated one starts at 0.
         """
@@ -473,7 +473,8 @@ class Streams(RecordedStreams):
         if found is None:
             return None
         phase = found.parameters["phase"] + self.condition.phase - self.setup.phase
-        return replace(found, parameters={**found.parameters, "phase": math.remainder(phase, 2.0 * math.pi)})
+        parameters = {**found.parameters, "phase": math.remainder(phase, 2.0 * math.pi)}
+        return replace(found, camera=self.camera, parameters=parameters)
 
     @cached_property
     def true_model(self) -> Model:

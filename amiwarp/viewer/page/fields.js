@@ -53,8 +53,7 @@ export const NumberField = {
   },
 };
 
-// While the slider moves, its values are sent as the server takes them. The last one is sent as if it were typed, because
-// calls to the server overtake values that wait.
+// While the slider is held, it shows where it is held, and not the value that comes back from the server.
 export const KnobField = {
   components: { NumberField },
   props: { name: String, label: String, unit: String, value: Number, least: Number, most: Number, step: Number, truth: Number,
@@ -64,12 +63,13 @@ export const KnobField = {
     <label :for="'slider-' + name">{{ label }} ({{ unit }})</label>
     <span class="note" v-if="note">{{ note }}</span>
     <div class="track">
-      <input type="range" :id="'slider-' + name" :min="least" :max="most" :step="step" :value="value"
-        @input="$emit('drag', Number($event.target.value))" @change="$emit('typed', $event.target.value)" @focus="$emit('chosen')"/>
+      <input type="range" :id="'slider-' + name" :min="least" :max="most" :step="step" :value="held ?? value"
+        @input="held = $event.target.valueAsNumber, $emit('drag', held)" @change="held = null, $emit('typed', $event.target.value)" @focus="$emit('chosen')"/>
       <i v-if="truth !== null && truth !== undefined" class="truth" :title="'known truth: ' + truth"
         :style="{ left: 'calc(8px + (100% - 16px) * ' + (truth - least) / (most - least) + ')' }"></i>
     </div>
-    <NumberField :id="'field-' + name" :aria-label="label + ', number'" :value="value" :low="low" :high="high" :unit="unit"
+    <NumberField :id="'field-' + name" :aria-label="label + ', number'" :value="held ?? value" :low="low" :high="high" :unit="unit"
       @typed="$emit('typed', $event)"/>
   </div>`,
+  data: () => ({ held: null }),
 };

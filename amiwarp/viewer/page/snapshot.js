@@ -85,7 +85,7 @@ export function savePicture(name, words, state, download) {
 
 // Save the images as they are seen, each pixel as a square, with their colour bars.
 export function saveImages(name, words, state, download) {
-  const both = state.get('has_model') ? [['before', 'image_scale']] : [];
+  const both = state.get('turn_ms') ? [['before', 'image_scale']] : [];
   const shown = [...both, ['after', 'after_scale']].filter(([key]) => state.get(key));
   if (!shown.length) return;
   const { width, height, step } = state.get('after');
