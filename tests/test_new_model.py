@@ -28,9 +28,19 @@ VALUES = {"apex": TRUE_PRISM.apex, "phase": TRUE_PHASE, "power": CYLINDER}
 MOST_FILES = 6
 """Largest number of files of the package that know a model by name."""
 LOADED = """
+import dataclasses
+import numpy as np
+import amiwarp
 import tests.cylinder_model
 from amiwarp.viewer import layout
-print(layout.SLIDERS["power"], 'name="power"' in layout.template())
+from amiwarp.viewer.inspector import Inspector
+camera = amiwarp.Camera.from_fov(32, 24, 0.6)
+recording = amiwarp.simulate(np.eye(32, dtype=np.float32), camera, amiwarp.Prism(0.02), duration_s=0.1)
+inspector = Inspector(recording)
+names = [slider["name"] for slider in layout.sliders(inspector)]
+inspector.set(dataclasses.replace(inspector.knobs, model="cylinder"))
+slider = layout.sliders(inspector)[-1]
+print("power" in names, slider["name"], slider["label"], slider["least"], slider["most"], slider["step"])
 """
 
 
@@ -122,7 +132,7 @@ def test_programs_list_its_parameter(cylinder: Any, tmp_path: Path) -> None:
         [sys.executable, "-c", LOADED],
         cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True,
     ).stdout  # fmt: skip
-    assert "('cylinder power', '', ('-0.1', '0.1', '0.001'), \"model === 'cylinder'\") True" in printed
+    assert "False power cylinder power -0.1 0.1 0.001" in printed
 
 
 def test_nothing_is_left_of_it() -> None:

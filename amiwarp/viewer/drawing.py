@@ -43,6 +43,7 @@ from amiwarp.plotting.colours import (
 from amiwarp.plotting.figures import instance_colours
 from amiwarp.plotting.meshes import Box
 from amiwarp.reconstruction.picture import Picture, Reconstruction
+from amiwarp.validation import choice
 from amiwarp.viewer.inspector import (
     STORES,
     DisplayedWindow,
@@ -541,6 +542,10 @@ class Look:
     """Whether both clouds are drawn in one frame, with the first one in grey."""
     titles: tuple[str, ...] = ("as recorded", "compensated")
     """Titles of the clouds. With a single title, only the second cloud is drawn."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "colour", choice(Colour, self.colour, "colour"))
+        object.__setattr__(self, "axis", choice(Axis, self.axis, "axis"))
 
     def for_clouds(self, titles: Sequence[str]) -> Look:
         """Return the look for clouds with these titles. A single cloud gets the whole picture."""
