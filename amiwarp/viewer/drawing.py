@@ -559,16 +559,6 @@ def font() -> Path:
     return Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"
 
 
-def check_opengl() -> None:
-    """Select EGL for VTK on Linux. Raises :class:`AmiwarpError` without EGL, where VTK would end the process."""
-    if not sys.platform.startswith("linux"):
-        return
-    if find_library("EGL") is None:
-        raise AmiwarpError("VTK needs OpenGL (EGL) to draw; on Debian run: apt-get install libegl1 libgl1-mesa-dri")
-    # by default VTK tries X first, and crashes if libX11 is missing; EGL needs no display
-    os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"
-
-
 class Scene:
     """Event clouds before and after compensation, with one camera for both, their legend and a caption."""
 
@@ -582,8 +572,10 @@ class Scene:
         number of renderers for other parts; they follow the :data:`OWN_RENDERERS` of the scene. Without ``off_screen``,
         a window shows the scene. Raises :class:`AmiwarpError` if VTK cannot draw on this machine.
         """
-        if off_screen:
-            check_opengl()
+        if off_screen and sys.platform.startswith("linux"):
+            if find_library("EGL") is None:  # VTK would end the process
+                raise AmiwarpError("VTK needs OpenGL (EGL); on Debian run: apt-get install libegl1 libgl1-mesa-dri")
+            os.environ["VTK_DEFAULT_OPENGL_WINDOW"] = "vtkEGLRenderWindow"  # needs neither a display nor libX11
         import pyvista
 
         parts = 1, OWN_RENDERERS + more

@@ -454,7 +454,13 @@ class Window(layout.Actions):
         shown, look = self.shown, self._look
         lines = drawing.shown_lines(self.inspector, shown, look.axis, self.b, self._picked)
         if self.compensates:
-            self._plot_orbit(*drawing.orbit_lines(self.inspector, shown, self._picked))
+            chart, plots = self._plots["orbit"]
+            orbit, column = drawing.orbit_lines(self.inspector, shown, self._picked)
+            moved = orbit[:, :2] - column[:, :2]  # of the scene point of the orbit by the prism, over one turn
+            for k in range(2):
+                plots[k].update(orbit[:, 2], moved[:, k])
+            low, high = moved.min(), max(moved.max(), moved.min() + 1e-3)
+            chart.x_range, chart.y_range = (0.0, 360.0), (1.1 * low, high + LEGEND_SHARE * (high - low))
         self.scene.show(shown, look, lines, drawing.caption(self.inspector, shown))
         for name in self.curves:
             self._plot_curve(name)
@@ -589,15 +595,6 @@ class Window(layout.Actions):
             inside = value is not None and x[0] <= value <= x[-1]
             line.update([value, value], ends) if inside else line.update([], [])
         chart.x_range, chart.y_range = (x[0], x[-1]), ends
-
-    def _plot_orbit(self, orbit: NDArray[Any], column: NDArray[Any]) -> None:
-        """Plot how far the prism displaces the scene point of the orbit, over one turn."""
-        chart, lines = self._plots["orbit"]
-        moved = orbit[:, :2] - column[:, :2]
-        for k in range(2):
-            lines[k].update(orbit[:, 2], moved[:, k])
-        low, high = moved.min(), max(moved.max(), moved.min() + 1e-3)
-        chart.x_range, chart.y_range = (0.0, 360.0), (1.1 * low, high + LEGEND_SHARE * (high - low))
 
     def _show_statistics(self) -> None:
         """Show the statistics of the selected events, as the page does."""
