@@ -239,9 +239,8 @@ class Network:
 
     def _run(self, events: Any, width: int, height: int, states: Any, options: dict[str, Any]) -> tuple[Any, Any]:
         """Return the result for a window and the states after it. ``states``: those before it, None for the first."""
-        device_for(events, self._device if isinstance(events, DeviceEvents) else None)
         known = {name: value for name, value in options.items() if value is not None}
-        found = self._input(on_device(events, self._device), width=width, height=height, **known)
+        found = self._input(self._on_own_device(events), width=width, height=height, **known)
         grid = _as_array(found, self._device, "the input function's result")
         if grid.ndim != 3 or grid.shape[1:] != (height, width):
             raise AmiwarpError(
@@ -249,6 +248,11 @@ class Network:
             )
         out, states = self._run_grids(grid.reshape((1, *grid.shape)), states)
         return out[0] if isinstance(events, DeviceEvents) else out[0].numpy(), states
+
+    def _on_own_device(self, events: Any) -> DeviceEvents:
+        """Return events on the network's device. Raises :class:`AmiwarpError` if they are on another one."""
+        device_for(events, self._device if isinstance(events, DeviceEvents) else None)
+        return on_device(events, self._device)
 
     def _run_grids(self, grids: wp.array, states: Any) -> tuple[wp.array, Any]:
         """Return the results for inputs of windows, shape (n, channels, height, width), and the states after them."""
@@ -283,7 +287,7 @@ class _QuarterTurn(Network):
     def _iterate(self, recording: Recording, windows: Windows, optic: dict[str, Any]) -> Iterator[Any]:
         size = recording.events.size
         for events, some in _in_lots(recording, windows, MOST_AT_ONCE):
-            sums = sums_of_windows(on_device(events, self._device), *size, some, optic["model"], optic["encoder"])
+            sums = sums_of_windows(self._on_own_device(events), *size, some, optic["model"], optic["encoder"])
             out, _ = self._run_grids(_as_array(sums, self._device, "the sums"), None)
             pictures = out if isinstance(events, DeviceEvents) else out.numpy()
             yield from (pictures[k] for k in range(len(some)))
