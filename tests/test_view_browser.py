@@ -200,6 +200,8 @@ def page(kept: tuple[Any, Any, dict[str, Any]], tabs: Tabs, nothing_fails: None)
 def ready(page: Any) -> None:
     """Wait until the page shows a window, and no part of it waits for an update."""
     page.locator("#curve-text, #sharpness").first.wait_for()
+    # trame keeps changes back while a call is pending
+    page.wait_for_function("!trame.state.dirtyKeys.size && !trame.state.client.isBusy()")
     page.evaluate("trame.trigger('answer')")  # the server has taken what the test has changed
     page.wait_for_function(
         "document.querySelector('#updating').style.display === 'none'"
