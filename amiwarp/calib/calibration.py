@@ -30,7 +30,7 @@ from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
 from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, CalibrationOptions, Settings
-from amiwarp.calib.sharpness import Search
+from amiwarp.calib.sharpness_search import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, MemoryEvents, Recording

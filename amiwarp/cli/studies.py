@@ -504,7 +504,8 @@ def run_design(
     seen = _camera_of_design(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
-    from amiwarp.simulation.description import Scene, SensorModel
+    from amiwarp.simulation.description import Scene
+    from amiwarp.simulation.sensor_model import SensorModel
     from amiwarp.studies.demo import earth
     from amiwarp.studies.design import design, draw
 
