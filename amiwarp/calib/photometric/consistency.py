@@ -306,6 +306,8 @@ left 0.02 to 0.62 of it, shakes by 30 % of the prism's motion 0.84 to 1.7."""
 LEAST_SHAKE_GAIN = 0.0025
 """Smallest share of the squared residuals that a shake must explain beyond all causes together. An index that is wrong
 by 0.06 left 0.0013 to it at most while no cause freed it, shakes by 30 % of the prism's motion 0.0048 or more."""
+HINT = 3.0
+"""Number of standard deviations of a cause from which on a shake of the camera is looked for."""
 LEAST_FURTHER_GAIN = 0.0005
 """Smallest share that a further cause must remove once the given lens has turned out to be wrong."""
 LEAST_MOVE_PX = 0.005
@@ -426,8 +428,7 @@ class Consistency:
 def check_consistency(cost: Cost, best: Vector) -> Consistency:
     """Check the answer ``best`` [px]. The map must be solved there; it is not changed."""
     space = cost.space
-    columns = _columns(cost, best) | _rotation_columns(cost, best)
-    causes = testable(space)
+    columns, causes = _columns(cost, best), testable(space)
     doubtful = bool(set(LENS) & set(space.names))
     screened = causes if doubtful else [c for c in causes if c in SCREENED]
     for cause in screened:
@@ -438,20 +439,23 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
     alike = [c for c in screened if c in (INDEX, SHAPES[0])] if cylinder in screened else []
     gates = [c for c in screened if c in GATED and c not in alike]
     least_gain = LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN
-    for group in telling(cost, [_cause_columns(cost, best, cause) for cause in gates], least_gain):
+    gated = [_rotation_columns(cost, best), *(_cause_columns(cost, best, cause) for cause in gates)]
+    for group in telling(cost, gated, least_gain):
         columns |= group
     for cause in alike if set(cylinder.names) <= columns.keys() else ():
         columns |= _cause_columns(cost, best, cause)
     fit, shake_px = linear_fit(cost, columns), 0.0
     findings = _findings(cost, best, fit, screened, least_gain)
-    if findings and not doubtful:
+    hint = _hints_at_lens(space, fit, screened) and not _rotation_gain(space, fit)
+    if not doubtful and (findings or hint):
         for cause in causes:
             if cause not in SCREENED:
                 columns |= _cause_columns(cost, best, cause)
         columns |= _shake_columns(cost, best)
-        fit = linear_fit(cost, columns)
-        findings = _findings(cost, best, fit, causes, LEAST_GAIN)
-        shake_px = _shake(space, fit)
+        wider = linear_fit(cost, columns)
+        shake_px = _shake(space, wider)
+        if findings:
+            fit, findings = wider, _findings(cost, best, wider, causes, LEAST_GAIN)
     brightness = cost.brightness
     systematic = _systematic(space, fit) + map_errors(space, best, fit, brightness.count, brightness.tiles.density)
     systematic += lens_errors(space, best, fit, least_gain) + (_doubt(space, fit, causes) if doubtful else 0.0)
@@ -802,6 +806,12 @@ def px_per_rad(space: ParameterSpace, best: Vector) -> float:
     return float(np.linalg.norm(best[:2])) if space.cartesian else space.pixels.get("phase", 0.0)
 
 
+def _hints_at_lens(space: ParameterSpace, fit: LinearFit, causes: list[Cause]) -> bool:
+    """Return whether a cause is notable, if not certain: a shake in time with the prism looks a little like a lens."""
+    found = (fit.adding(space.names, cause.names)[1:] for cause in causes if {*cause.names} <= {*fit.names})
+    return any(significance >= HINT and gain >= LEAST_FURTHER_GAIN for significance, gain in found)
+
+
 def _shake(space: ParameterSpace, fit: LinearFit) -> float:
     """Return the amplitude of a shake that explains much of what all causes together leave [px]; 0 if none does."""
     if not {*SHAKE} <= {*fit.names}:
@@ -819,7 +829,7 @@ def _shake(space: ParameterSpace, fit: LinearFit) -> float:
 
 def _rotation_gain(space: ParameterSpace, fit: LinearFit) -> float:
     """Return the share of the squared residuals that a slow rotation of the camera explains; 0 if not significant."""
-    if space.moving:
+    if space.moving or not {*RATES} <= {*fit.names}:
         return 0.0
     _, significance, gain = fit.adding(space.names, RATES)
     return gain if significance >= SIGNIFICANT else 0.0
