@@ -177,7 +177,7 @@ class Cost:
         """Derivatives of the brightness map by each parameter [1/px], from which the next solution starts."""
         self.columns: dict[str, tuple[Any, Any]] = {}
         """Derivatives of the residuals at the last solution, on the device, by name; each with the part of it that no
-        change of the map explains."""
+        change of the map explains, or None if that was not needed yet."""
         self._by_angle: tuple[Any, Any] | None = None
         self.paths: TilePaths | None = None
         """Paths of the tiles; None if their scenes move with the camera's rotation alone."""
