@@ -33,7 +33,8 @@ from amiwarp import (
 from amiwarp.calib import calibration
 from amiwarp.calib.parameters import ParameterSpace, make_space
 from amiwarp.calib.photometric import consistency, stage
-from amiwarp.calib.photometric.consistency import CAUSES, Consistency, Finding, LinearFit
+from amiwarp.calib.photometric.causes import FACES, FOCAL_LENGTH, SEAT, SIDE
+from amiwarp.calib.photometric.consistency import Consistency, Finding, LinearFit
 from amiwarp.calib.photometric.stage import LARGEST_ROTATION_GAIN, LARGEST_STILL_COST, judge_consistency
 from amiwarp.studies.stability.cells import polygons
 
@@ -245,7 +246,7 @@ def test_a_camera_that_shakes_with_the_prism_is_refused(
 
 
 def test_two_explanations_are_named_with_what_to_free() -> None:
-    side, seat, faces = (SimpleNamespace(cause=CAUSES[k]) for k in (2, -2, -1))
+    side, seat, faces = (SimpleNamespace(cause=cause) for cause in (SIDE, SEAT, FACES))
     said = stage.rival_in_words(seat, faces, 0.09)  # type: ignore[arg-type]
     assert "seat in its mount" in said
     assert "evenness of the prism's faces" in said
@@ -320,7 +321,7 @@ def outcome(**values: Any) -> Consistency:
 
 
 def test_what_is_said_and_refused() -> None:
-    lens = Finding(CAUSES[0], moved_px=0.2, gain=0.1, significance=20.0, start=np.zeros(3))
+    lens = Finding(FOCAL_LENGTH, moved_px=0.2, gain=0.1, significance=20.0, start=np.zeros(3))
     for found, words, error in (
         (outcome(findings=(lens,)), "focal length seems to be wrong", 0.2),
         (outcome(spread=(0.3, 0.0)), "size of the orbit differs by 0.30 px", 0.3),

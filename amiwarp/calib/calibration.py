@@ -2,7 +2,7 @@
 
 :func:`calibrate` runs a :class:`Calibrator`, and for the model ``auto`` lets a :class:`ModelChooser` choose among the
 models. :func:`prepare` sets up an attempt: the encoder, the events and the parameter space. The attempt is made by the
-stages of the settings; the photometric stage also corrects lens, prism and sensor, see ``photometric/consistency.py``.
+stages of the settings; the photometric stage also corrects lens, prism and sensor, see ``photometric/causes.py``.
 If it still says that something is wrong, :meth:`Calibrator.run` makes further attempts, in this order:
 
 1. with an error of the encoder that repeats every turn corrected

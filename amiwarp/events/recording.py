@@ -193,7 +193,8 @@ class Events:
     """Polarity, shape ``(n,)``: 1 is ON, 0 is OFF."""
 
     def __post_init__(self) -> None:
-        columns, shape = (self.x, self.y, self.t, self.p), (np.size(self.t),)
+        columns: tuple[NDArray[Any], ...] = (self.x, self.y, self.t, self.p)
+        shape = (np.size(self.t),)
         if not all(isinstance(column, np.ndarray) and column.shape == shape for column in columns):
             for name, column in zip(COLUMNS, columns, strict=True):
                 instance(column, np.ndarray, f"events' {name}")

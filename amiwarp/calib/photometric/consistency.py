@@ -8,8 +8,8 @@ residual each of a few likely causes would remove, were it free.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -17,22 +17,37 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.calib.parameters import DRIFTS, RATES, ParameterSpace, orbit_names, phase_names, widened
+from amiwarp.calib.parameters import DRIFTS, RATES, ParameterSpace, orbit_names, phase_names
+from amiwarp.calib.photometric.causes import (
+    ASPECT,
+    CAUSES,
+    CENTER,
+    FACES,
+    FLAT_SIDE,
+    GATED,
+    INDEX,
+    SCREENED,
+    SEAT,
+    SHAPES,
+    SIDE,
+    Cause,
+    other_side,
+    turned,
+    with_cause,
+)
 from amiwarp.calib.photometric.cost import place_arguments, size_and_phase_directions
 from amiwarp.errors import AmiwarpError
 from amiwarp.kernels.equations import by_shift, multiply
 from amiwarp.kernels.launch import launch
 from amiwarp.optics.camera import LENS, Camera, CameraRotation, given_lens
 from amiwarp.optics.models import MODELS, Model, compensate_by_each, predicted_error, rms
-from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection, as_wedge
+from amiwarp.optics.prism import as_wedge
 
 if TYPE_CHECKING:
     from amiwarp.calib.photometric.cost import Cost
 
     Vector = NDArray[np.float64]
 
-
-# Causes of an answer that does not hold everywhere in the image: what may be wrong in the given camera and prism.
 
 HARMONICS = ("cos 1", "sin 1", "cos 2", "sin 2")
 """Names of the unknown factors of cos e, sin e, cos 2e and sin 2e in the error of the encoder's angle e."""
@@ -42,72 +57,6 @@ PATTERNS = (*HARMONICS, *SKEW)
 """Names of all errors of the prism's angle that are examined, in the order of ``PairSet.angle_patterns``."""
 SHAKE = ("shake x cos", "shake x sin", "shake y cos", "shake y sin")
 """Names of the unknown amplitudes of a rotation of the camera about x and y that repeats every turn [px]."""
-FLAT_SIDE = "flat_side"
-"""Name of the unknown that is 0 for the given flat side of the prism, and 1 for the other."""
-
-
-@dataclass(frozen=True)
-class Cause:
-    """One thing that may be wrong, and the parameters that correct it."""
-
-    words: str
-    """What is wrong, in words."""
-    names: tuple[str, ...]
-    """Names of the parameters that correct it."""
-
-    @property
-    def rank(self) -> int:
-        """Position in :data:`CAUSES`: of causes with equal evidence, the first one counts."""
-        return CAUSES.index(self)
-
-
-CENTER = Cause("the principal point", ("center_x", "center_y"))
-INDEX = Cause("the refractive index of the prism", ("index",))
-CAUSES = (
-    Cause("the focal length", ("focal_length",)),
-    CENTER,
-    Cause("the flat side of the prism", (FLAT_SIDE,)),
-    INDEX,
-    Cause("the lens distortion k1", ("k1",)),
-    Cause("the ratio of the focal lengths fy / fx", ("fy_over_fx",)),
-    Cause("the direction of the prism's axis", ("tilt_x", "tilt_y")),
-    Cause("the prism's seat in its mount", ("wobble_x", "wobble_y")),
-    Cause("the evenness of the prism's faces", ("cylinder_x", "cylinder_y")),
-)
-"""All causes that the photometric stage can name and correct, the likeliest first."""
-ASPECT, SHAPES = CAUSES[5], CAUSES[7:]
-GATED = (INDEX, ASPECT, *SHAPES)
-"""Causes whose effect is examined only if a first look, without the map's change, finds one."""
-SCREENED = (*CAUSES[:3], *GATED)
-"""Causes that every answer is tested for. The effects of the others resemble those of the first two."""
-
-
-def turned(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, float]:
-    """Return values that deflect the axial ray as before if the prism's other side is flat."""
-    prism, index = as_wedge(space.prism), values.get("index", space.prism.index)
-    deflection = Prism(values["apex"], index, prism.flat_side).deflection
-    phase = math.remainder(values["phase"] + math.pi, math.tau)
-    return {**values, "apex": apex_from_deflection(deflection, index, _other(prism)), "phase": phase}
-
-
-def other_side(space: ParameterSpace) -> ParameterSpace:
-    """Return the parameter space with the prism's other side flat."""
-    prism = as_wedge(space.prism)
-    apex = apex_from_deflection(prism.deflection, prism.index, _other(prism))
-    return replace(space, prism=Prism(apex, prism.index, _other(prism)), start=turned(space, space.start))
-
-
-def _other(prism: Prism) -> FlatSide:
-    return FlatSide.CAMERA if prism.flat_side is FlatSide.SCENE else FlatSide.SCENE
-
-
-def with_cause(space: ParameterSpace, cause: Cause, values: Mapping[str, float]) -> tuple[ParameterSpace, Vector]:
-    """Return the space in which a cause is corrected or free, and the vector of ``values`` there."""
-    if cause.names == (FLAT_SIDE,):
-        space, values = other_side(space), turned(space, values)
-    else:
-        space = widened(space, tuple(n for n in cause.names if n not in space.names))
-    return space, space.to_vector({**space.start, **values})
 
 
 # Linearised fits about the photometric stage's answer: what would change if one more parameter were free.
@@ -435,14 +384,13 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         if cause not in GATED:
             columns |= _cause_columns(cost, best, cause)
     # wobble and index look like cylinder power: where the first look finds none of that, it finds none of them
-    cylinder = SHAPES[1]
-    alike = [c for c in screened if c in (INDEX, SHAPES[0])] if cylinder in screened else []
+    alike = [c for c in screened if c in (INDEX, SEAT)] if FACES in screened else []
     gates = [c for c in screened if c in GATED and c not in alike]
     least_gain = LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN
     gated = [_rotation_columns(cost, best), *(_cause_columns(cost, best, cause) for cause in gates)]
     for group in telling(cost, gated, least_gain):
         columns |= group
-    for cause in alike if set(cylinder.names) <= columns.keys() else ():
+    for cause in alike if set(FACES.names) <= columns.keys() else ():
         columns |= _cause_columns(cost, best, cause)
     fit, shake_px = linear_fit(cost, columns), 0.0
     findings = _findings(cost, best, fit, screened, least_gain)
@@ -769,7 +717,7 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> AngleFi
     others: dict[str, Any] = {}
     if not names:
         # cylinder power stands for wobble too, which has nearly the same effect
-        for cause in (c for c in testable(cost.space) if c in SCREENED and c not in (INDEX, SHAPES[0])):
+        for cause in (c for c in testable(cost.space) if c in SCREENED and c not in (INDEX, SEAT)):
             others |= {n: x for n, x in _cause_columns(cost, best, cause).items() if n not in given}
     fit = linear_fit(cost, given | angles | others)
     names = names or _told(fit, [*given, *others], groups)
@@ -853,7 +801,7 @@ def testable(space: ParameterSpace) -> list[Cause]:
         return []
     # a prism whose other side is flat looks nearly like one with cylinder power
     shaped = {n for cause in SHAPES for n in cause.names} & set(space.names)
-    return [c for c in CAUSES if not set(c.names) & set(space.names) and not (shaped and c.names == (FLAT_SIDE,))]
+    return [c for c in CAUSES if not set(c.names) & set(space.names) and not (shaped and c.names == SIDE.names)]
 
 
 def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
@@ -861,7 +809,7 @@ def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
     space = cost.space
     values = space.to_values(best)
     try:
-        if cause.names == (FLAT_SIDE,):
+        if cause.names == SIDE.names:
             ends = place_arguments(other_side(space), turned(space, values)), place_arguments(space, values)
             return {FLAT_SIDE: once(cost, FLAT_SIDE, partial(cost.brightness.find_slope, *ends, 1.0))}
         wide, v = with_cause(space, cause, values)
@@ -890,7 +838,7 @@ def _corrected(cost: Cost, best: Vector, cause: Cause, change: Vector) -> tuple[
     space, n = cost.space, len(best)
     here = space.build(space.to_values(best))
     wide, v = with_cause(space, cause, space.to_values(best))
-    if cause.names == (FLAT_SIDE,):
+    if cause.names == SIDE.names:
         return float(change[n]) * distance(wide.build(wide.to_values(v)), here), v
     low, high = wide.bounds()
     v = np.clip(v + change, low, high)

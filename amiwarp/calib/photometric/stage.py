@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from amiwarp.brightness.solver import BrightnessMap, SensorTiming, Tiles, darkness, off_excess, set_lags
 from amiwarp.calib.nlopt_solver import SearchStage, maximise
 from amiwarp.calib.parameters import MOTION, ParameterSpace, like_size, units
-from amiwarp.calib.photometric import consistency
+from amiwarp.calib.photometric import causes, consistency
 from amiwarp.calib.photometric.cost import (
     GRID,
     Cost,
@@ -1188,7 +1188,7 @@ LARGEST_LAST_STEP_PX = 0.01
 class _Corrected:
     """Answer after the correction of a cause."""
 
-    cause: consistency.Cause
+    cause: causes.Cause
     answer: Answer
     cost: float
     """Cost with a new map, which compares with that of other answers."""
@@ -1259,7 +1259,7 @@ def checked(search: AnswerSearch, answer: Answer) -> Answer:
 
 def rival_in_words(best: _Corrected, rival: _Corrected, px: float) -> str:
     """Return that two explanations, ``px`` apart, explain the events equally well, and what to do."""
-    frees = [",".join(n for n in each.cause.names if n != consistency.FLAT_SIDE) for each in (best, rival)]
+    frees = [",".join(n for n in each.cause.names if n != causes.FLAT_SIDE) for each in (best, rival)]
     remedy = " or ".join(f"--free apex,phase,{names}" for names in frees if names)
     return (
         f"the events do not tell whether {best.cause.words} or {rival.cause.words} is wrong: both explain them as "
@@ -1288,7 +1288,7 @@ def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Co
         least = min(t.cost for t in among)
         return least + share * (here - least)
 
-    given = [t for t in tried if t.cause not in consistency.SHAPES]
+    given = [t for t in tried if t.cause not in causes.SHAPES]
     if given and min(t.cost for t in given) <= near_best(tried, GIVEN_SHARE):
         tried = given
     best, *rivals = sorted((t for t in tried if t.cost <= near_best(tried, TIE_SHARE)), key=lambda t: t.cause.rank)
@@ -1298,9 +1298,9 @@ def _best_correction(search: AnswerSearch, answer: Answer, check: consistency.Co
 def _corrected(search: AnswerSearch, finding: consistency.Finding, v: Vector, most_cost: float) -> _Corrected | None:
     """Return the answer with a cause corrected, or None if it costs far more than ``most_cost``. The space stays."""
     cost, space, sharpest, cause = search.cost, search.cost.space, search.sharpest, finding.cause
-    cost.space, _ = consistency.with_cause(space, cause, space.to_values(v))
-    if cause.names == (consistency.FLAT_SIDE,):
-        search.sharpest = consistency.turned(space, sharpest)
+    cost.space, _ = causes.with_cause(space, cause, space.to_values(v))
+    if cause.names == causes.SIDE.names:
+        search.sharpest = causes.turned(space, sharpest)
     stage, found = replace(search, most_cost=most_cost).descend(finding.start), None
     if -stage.score <= SAME_COST * most_cost:
         answer = search.judged(stage)
@@ -1312,7 +1312,7 @@ def _corrected(search: AnswerSearch, finding: consistency.Finding, v: Vector, mo
 def _significant(found: _Corrected) -> bool:
     """Return whether a corrected parameter differs significantly from the given one. A turned prism always does."""
     result, start = found.answer.result, found.space.start
-    names = [n for n in found.cause.names if n != consistency.FLAT_SIDE]
+    names = [n for n in found.cause.names if n != causes.FLAT_SIDE]
     return not names or any(
         abs(result.parameters[n] - start[n]) >= consistency.SIGNIFICANT * result.uncertainty[n] for n in names
     )

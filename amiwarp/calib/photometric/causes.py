@@ -1,0 +1,87 @@
+"""What may be wrong in the given camera and prism, if an answer does not hold everywhere in the image.
+
+The photometric stage tests an answer for these causes, and frees the parameters of one (``consistency.py``,
+``stage.py``). A new cause needs its line in :data:`CAUSES`, and parameters with ranges in
+:func:`amiwarp.calib.parameters.widened`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amiwarp.calib.parameters import ParameterSpace, widened
+from amiwarp.optics.prism import FlatSide, Prism, apex_from_deflection, as_wedge
+
+if TYPE_CHECKING:
+    Vector = NDArray[np.float64]
+
+FLAT_SIDE = "flat_side"
+"""Name of the unknown that is 0 for the given flat side of the prism, and 1 for the other."""
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One thing that may be wrong, and the parameters that correct it."""
+
+    words: str
+    """What is wrong, in words."""
+    names: tuple[str, ...]
+    """Names of the parameters that correct it."""
+
+    @property
+    def rank(self) -> int:
+        """Position in :data:`CAUSES`: of causes with equal evidence, the first one counts."""
+        return CAUSES.index(self)
+
+
+FOCAL_LENGTH = Cause("the focal length", ("focal_length",))
+CENTER = Cause("the principal point", ("center_x", "center_y"))
+SIDE = Cause("the flat side of the prism", (FLAT_SIDE,))
+INDEX = Cause("the refractive index of the prism", ("index",))
+DISTORTION = Cause("the lens distortion k1", ("k1",))
+ASPECT = Cause("the ratio of the focal lengths fy / fx", ("fy_over_fx",))
+AXIS = Cause("the direction of the prism's axis", ("tilt_x", "tilt_y"))
+SEAT = Cause("the prism's seat in its mount", ("wobble_x", "wobble_y"))
+FACES = Cause("the evenness of the prism's faces", ("cylinder_x", "cylinder_y"))
+CAUSES = (FOCAL_LENGTH, CENTER, SIDE, INDEX, DISTORTION, ASPECT, AXIS, SEAT, FACES)
+"""All causes that the photometric stage can name and correct, the likeliest first."""
+SHAPES = (SEAT, FACES)
+"""Causes that make the prism uneven."""
+GATED = (INDEX, ASPECT, *SHAPES)
+"""Causes whose effect is examined only if a first look, without the map's change, finds one."""
+SCREENED = (FOCAL_LENGTH, CENTER, SIDE, *GATED)
+"""Causes that every answer is tested for. The effects of the others resemble those of the first two."""
+
+
+def turned(space: ParameterSpace, values: Mapping[str, float]) -> dict[str, float]:
+    """Return values that deflect the axial ray as before if the prism's other side is flat."""
+    prism, index = as_wedge(space.prism), values.get("index", space.prism.index)
+    deflection = Prism(values["apex"], index, prism.flat_side).deflection
+    phase = math.remainder(values["phase"] + math.pi, math.tau)
+    return {**values, "apex": apex_from_deflection(deflection, index, _other(prism)), "phase": phase}
+
+
+def other_side(space: ParameterSpace) -> ParameterSpace:
+    """Return the parameter space with the prism's other side flat."""
+    prism = as_wedge(space.prism)
+    apex = apex_from_deflection(prism.deflection, prism.index, _other(prism))
+    return replace(space, prism=Prism(apex, prism.index, _other(prism)), start=turned(space, space.start))
+
+
+def _other(prism: Prism) -> FlatSide:
+    return FlatSide.CAMERA if prism.flat_side is FlatSide.SCENE else FlatSide.SCENE
+
+
+def with_cause(space: ParameterSpace, cause: Cause, values: Mapping[str, float]) -> tuple[ParameterSpace, Vector]:
+    """Return the space in which a cause is corrected or free, and the vector of ``values`` there."""
+    if cause.names == (FLAT_SIDE,):
+        space, values = other_side(space), turned(space, values)
+    else:
+        space = widened(space, tuple(n for n in cause.names if n not in space.names))
+    return space, space.to_vector({**space.start, **values})
