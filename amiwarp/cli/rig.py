@@ -36,7 +36,7 @@ from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orb
 from amiwarp.validation import real
 
 if TYPE_CHECKING:
-    from amiwarp.calib import Calibration
+    from amiwarp.calib.result import Calibration
     from amiwarp.compensation.streams import Compensated
     from amiwarp.live.stream.packets import Source
     from amiwarp.live.stream.session import RawConsumer, Session, SessionStatus
@@ -368,7 +368,7 @@ def run_live(
 
     Every event is written once, in order. Events outside the image and events with an extrapolated angle are marked.
     """
-    from amiwarp.calib import Calibration
+    from amiwarp.calib.result import Calibration
     from amiwarp.compensation.recordings import check_size
     from amiwarp.live.stream.session import clock_offset
 

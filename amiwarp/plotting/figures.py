@@ -12,9 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import Calibration
 from amiwarp.calib.calibration_events import thin
-from amiwarp.calib.result import cost_surface
+from amiwarp.calib.result import Calibration, cost_surface
 from amiwarp.choices import Tone
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.events.recording import Events, Recording

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import Calibration
+from amiwarp.calib.result import Calibration
 from amiwarp.choices import Layers
 from amiwarp.compensation.recordings import BlockCompensator, check_size
 from amiwarp.compensation.streams import Compensated

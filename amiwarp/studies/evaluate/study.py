@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from scipy import ndimage, special
 from scipy.spatial import KDTree
 
-from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib import Settings as CalibrationSettings
+from amiwarp.calib.calibration import calibrate
+from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import PhotometricSettings
+from amiwarp.calib.settings import Settings as CalibrationSettings
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, Recording
