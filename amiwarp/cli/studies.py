@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import json
 import math
 import time
@@ -34,7 +32,7 @@ from amiwarp.cli.common import (
 )
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.io.files import check_output, own_folder, write_text
+from amiwarp.io.files import check_output, own_folder, write_csv, write_text
 from amiwarp.io.formats import make_folder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
@@ -504,9 +502,10 @@ def run_design(
     seen = _camera_of_design(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
+    from amiwarp.plotting.figures import save_png_and_svg
     from amiwarp.simulation.description import Scene, SensorModel
     from amiwarp.studies.demo import earth
-    from amiwarp.studies.design import design, draw
+    from amiwarp.studies.design import chart, design
 
     make_folder(out)
     kinds = ("png", "svg", "json", "csv")
@@ -531,8 +530,8 @@ def run_design(
                                progress=part(advance, DESIGN_SHARE, 1.0))  # fmt: skip
     data = design_summary(made)
     write_text(Path(files["json"]), json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
-    write_text(Path(files["csv"]), _csv(data["choices"]))
-    draw(out / "design", made)
+    _write_csv(files["csv"], data["choices"])
+    save_png_and_svg(chart(made), out / "design")
     if compared is None:
         report(common, {**data, "files": files, "device": device}, design_lines(made, files))
         return
@@ -540,8 +539,8 @@ def run_design(
 
     optics_data = comparison_summary(compared)
     write_text(Path(files["optics_json"]), json.dumps(plain(optics_data), indent=1, allow_nan=False) + "\n")
-    write_text(Path(files["optics_csv"]), _csv(optics_data["optics"]))
-    optics_comparison.draw(out / "optics", compared)
+    _write_csv(files["optics_csv"], optics_data["optics"])
+    save_png_and_svg(optics_comparison.chart(compared), out / "optics")
     lines = [*design_lines(made, {}), *comparison_lines(compared), "", *files.values()]
     report(common, {**data, "comparison": optics_data, "files": files, "device": device}, lines)
 
@@ -611,12 +610,8 @@ def _fields(c: Choice) -> dict[str, Any]:
     }
 
 
-def _csv(rows: list[dict[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({**row, "misses": "+".join(row["misses"])} for row in rows)
-    return text.getvalue()
+def _write_csv(path: str, rows: list[dict[str, Any]]) -> None:
+    write_csv(Path(path), rows[0], ({**row, "misses": "+".join(row["misses"])}.values() for row in rows))
 
 
 def design_lines(design: Design, files: dict[str, str]) -> list[Any]:
@@ -877,8 +872,6 @@ def stability_lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, t
 
 
 # ``amiwarp evaluate``: the AMI-EV against a plain event camera, as its paper evaluates it, on simulated worlds.
-
-"""Time over which the speed is averaged [s]; recordings differ in length."""
 
 
 def run_evaluate(

@@ -345,6 +345,12 @@ def save_svg(figure: Any, path: Path) -> None:
     write_text(path, text.getvalue())
 
 
+def save_png_and_svg(figure: Any, path: Path) -> None:
+    """Write a figure as ``path`` with the endings .png and .svg; each write is atomic."""
+    save(figure, path.with_suffix(".png"))
+    save_svg(figure, path.with_suffix(".svg"))
+
+
 def indexed(rgb: NDArray[np.uint8]) -> Any:
     """Return the picture ``(height, width, 3)`` with a palette of :data:`GREYS` even greys and other colours.
 
