@@ -49,6 +49,13 @@ if TYPE_CHECKING:
 # Functions that ``record`` and ``live`` share: event source, link to the controller, status line, end of session.
 
 _in_source = partial(typer.Option, rich_help_panel="Source")
+SourceArgument = Annotated[
+    str,
+    typer.Argument(
+        help="Source: camera:, camera:SERIAL or camera:MODEL (then biases: camera:evk4,diff_on=20), dv, prophesee, "
+        "tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
+    ),
+]
 SecondRatio = Annotated[
     float | None,
     _in_source(
@@ -346,13 +353,7 @@ class ProcessingOptions:
 
 
 def run_live(
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="Source: camera:, camera:SERIAL or camera:MODEL (then biases: camera:evk4,diff_on=20), dv, prophesee, "
-            "tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
-        ),
-    ],
+    source: SourceArgument,
     *,
     calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
     outputs: OutputOptions,
@@ -544,13 +545,7 @@ def _live_lines(d: dict[str, Any]) -> list[str]:
 
 
 def run_record(
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="Source: camera:, camera:SERIAL or camera:MODEL (then biases: camera:evk4,diff_on=20), dv, prophesee, "
-            "tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
-        ),
-    ],
+    source: SourceArgument,
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
     stream: SourceOptions,

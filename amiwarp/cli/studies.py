@@ -124,6 +124,11 @@ def run_warm_up(*, common: Common) -> None:
 
 # ``amiwarp dataset``: thousands of simulated recordings from a specification, with a manifest.
 
+Scheduler = Annotated[str | None, typer.Option(help="Address of a Dask scheduler. Default: processes of this machine.")]
+LocalWorkers = Annotated[
+    int | None,
+    typer.Option(min=1, help="Number of local processes. Default: one for each GPU, or for each core without GPU."),
+]
 AVERAGE_S = 600.0
 """Time over which the speed is averaged [s]; recordings differ in length."""
 SHOWN = 5
@@ -138,13 +143,8 @@ def run_dataset(
         bool,
         typer.Option("--dry-run", help="Only estimate the number of recordings, their size and the time; make none."),
     ] = False,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler. Default: processes of this machine.")
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Number of local processes. Default: one for each GPU, or for each core without GPU."),
-    ] = None,
+    scheduler: Scheduler = None,
+    workers: LocalWorkers = None,
     common: Common,
 ) -> None:
     """Make thousands of simulated recordings from a specification, with labels, splits and a manifest.
@@ -901,13 +901,8 @@ def run_evaluate(
             "repeated. Simulated worlds are then left out, unless --only is given."
         ),
     ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler. Default: processes of this machine.")
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Number of local processes. Default: one for each GPU, or for each core without GPU."),
-    ] = None,
+    scheduler: Scheduler = None,
+    workers: LocalWorkers = None,
     common: Common,
 ) -> None:
     """Check the AMI-EV paper's results: compare with a plain event camera on simulated worlds, and write a report.
