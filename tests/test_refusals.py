@@ -66,7 +66,7 @@ def test_a_wrong_direction_of_the_encoder_is_named(still: Recording) -> None:
 
 
 def test_an_encoder_that_slips_at_every_half_turn_is_no_turning_camera(texture: np.ndarray) -> None:
-    camera = Camera.from_fov(160, 120, math.radians(60.0))
+    camera = Camera.from_fov(120, 90, math.radians(60.0))
     recording = simulate(texture, camera, TRUE_PRISM, duration_s=0.34, seed=3)
     assert recording.encoder is not None
     angle = recording.encoder.angle
