@@ -1,5 +1,6 @@
 """Shared fixtures: devices, a headless browser, the folder of real recordings, a picture and a simulated recording."""
 
+import contextlib
 import gc
 import importlib
 import math
@@ -69,6 +70,16 @@ def pytest_configure(config: pytest.Config) -> None:
             importlib.import_module(module.name)
         for device in wp.get_devices():
             load_all(device)
+
+
+def pytest_collection(session: pytest.Session) -> None:
+    """Let each of xdist's processes compile a part of the files before it collects all, or each would compile all."""
+    worker = getattr(session.config, "workerinput", None)
+    if worker is not None and session.config.args == session.config.getini("testpaths"):
+        number = int(worker["workerid"].removeprefix("gw"))
+        for path in sorted(Path(__file__).parent.glob("test_*.py"))[number :: worker["workercount"]]:
+            with contextlib.suppress(Exception, pytest.skip.Exception):  # collection imports it again, and reports that
+                importlib.import_module(f"tests.{path.stem}")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
