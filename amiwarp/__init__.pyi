@@ -56,9 +56,9 @@ from .imaging.corners import find_background_activity as find_background_activit
 from .imaging.iwe import iwe as iwe
 from .imaging.metrics import edge_blur as edge_blur
 from .imaging.metrics import model_error as model_error
-from .imaging.metrics import sharpness as sharpness
 from .imaging.metrics import truth_model as truth_model
 from .imaging.networks import Network as Network
+from .imaging.sharpness import sharpness as sharpness
 from .imaging.tensors import ToTensor as ToTensor
 from .imaging.tensors import Windows as Windows
 from .imaging.tensors import collate as collate
@@ -129,7 +129,6 @@ from .simulation.description import Frames as Frames
 from .simulation.description import Mirror as Mirror
 from .simulation.description import PrismMotion as PrismMotion
 from .simulation.description import Scene as Scene
-from .simulation.description import SensorModel as SensorModel
 from .simulation.description import SimulationValues as SimulationValues
 from .simulation.description import Vibration as Vibration
 from .simulation.event_sensor import EventSensor as EventSensor
@@ -137,6 +136,7 @@ from .simulation.pictures import PictureFolder as PictureFolder
 from .simulation.pictures import Pictures as Pictures
 from .simulation.pictures import PictureStack as PictureStack
 from .simulation.pictures import VideoFile as VideoFile
+from .simulation.sensor_model import SensorModel as SensorModel
 from .simulation.simulator import Simulation as Simulation
 from .simulation.simulator import TruthRenderer as TruthRenderer
 from .simulation.simulator import simulate as simulate

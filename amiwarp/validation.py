@@ -422,7 +422,11 @@ def _fits_number(value: Any) -> bool:
 
 
 def _fits_array(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and not np.ma.is_masked(value)
+    return (
+        isinstance(value, np.ndarray)
+        and value.dtype.kind in "biuf"
+        and (type(value) is np.ndarray or not np.ma.is_masked(value))
+    )
 
 
 def _fits_path(value: Any) -> bool:

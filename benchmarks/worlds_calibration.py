@@ -1,6 +1,6 @@
 """Calibrate recordings of simulated worlds with a camera at rest, handheld, and in fast motion.
 
-    python -m benchmarks.worlds_calibration [--device cuda:0] [--size 320 240] [--out FILE.json]
+    python -m benchmarks.worlds_calibration [--device cuda:0] [--size 320 240] [--rpm 720] [--out FILE.json]
 
 The error is the rms difference [px] between the displacements of the calibrated model and of the true prism, over the
 image and a turn. A camera that translates causes parallax, which differs over the image. Each row therefore gives
@@ -23,6 +23,7 @@ from amiwarp import (
     AmiwarpError,
     Camera,
     Prism,
+    PrismMotion,
     Settings,
     Simulation,
     WorldScene,
@@ -34,8 +35,8 @@ from amiwarp import (
 from amiwarp.simulation.scenery import DeviceWorld, movers_speed, parallax_speed
 from amiwarp.simulation.worlds.named import TRAJECTORIES, WORLDS
 
-SECONDS, APEX, RPM = 0.4, math.radians(1.0), 720.0
-"""Length of a recording [s], true apex angle [rad], and speed of the prism [turns/min]."""
+SECONDS, APEX = 0.4, math.radians(1.0)
+"""Length of a recording [s], and true apex angle [rad]."""
 NOMINAL = 1.1
 """Ratio of the nominal to the true apex angle. It is not 1, so that the search does not start at the truth."""
 
@@ -48,17 +49,18 @@ def image_speeds(scene: WorldScene, camera: Camera, device: str) -> tuple[float,
     return parallax, float(movers_speed(world, camera, scene.trajectory, t).max())
 
 
-def row(name: str, trajectory: str, size: tuple[int, int], device: str) -> dict[str, Any]:
+def row(name: str, trajectory: str, size: tuple[int, int], rpm: float, device: str) -> dict[str, Any]:
     """Return the result of the calibration of one simulated recording."""
     camera, prism = Camera.from_fov(*size, math.radians(60.0)), Prism(APEX)
     world, path = named_world(name, trajectory, duration_s=SECONDS)
     scene = WorldScene(world, path)
     began = time.perf_counter()
-    simulation = Simulation(scene, camera, prism, SECONDS, nominal_prism=Prism(NOMINAL * APEX), device=device)
+    nominal = Prism(NOMINAL * APEX)
+    simulation = Simulation(scene, camera, prism, SECONDS, PrismMotion(rpm), nominal_prism=nominal, device=device)
     recording = simulation.run()
     simulated = time.perf_counter() - began
     parallax, movers = image_speeds(scene, camera, device)
-    prism_speed = camera.fx * (prism.index - 1.0) * APEX * RPM / 60.0 * 2.0 * math.pi
+    prism_speed = camera.fx * (prism.index - 1.0) * APEX * rpm / 60.0 * 2.0 * math.pi
     found = {"world": name, "trajectory": trajectory, "events": len(recording.events), "simulated_in_s": simulated,
              "parallax_px_s": parallax, "movers_px_s": movers, "parallax_share": parallax / prism_speed}  # fmt: skip
     assert recording.camera is not None
@@ -78,6 +80,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--size", type=int, nargs=2, default=(320, 240))
+    parser.add_argument("--rpm", type=float, default=720.0, help="speed of the prism [turns/min]")
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), choices=list(WORLDS))
     parser.add_argument("--trajectories", nargs="+", default=list(TRAJECTORIES), choices=list(TRAJECTORIES))
     parser.add_argument("--out", type=Path)
@@ -85,10 +88,11 @@ def main() -> None:
     rows = []
     for trajectory in args.trajectories:
         for name in args.worlds:
-            rows.append(row(name, trajectory, tuple(args.size), args.device))
+            rows.append(row(name, trajectory, tuple(args.size), args.rpm, args.device))
             print(json.dumps(rows[-1]), flush=True)
     if args.out is not None:
-        report = {"machine": str(wp.get_device(args.device).name), "size": list(args.size), "rows": rows}
+        machine = str(wp.get_device(args.device).name)
+        report = {"machine": machine, "size": list(args.size), "rpm": args.rpm, "rows": rows}
         args.out.write_text(json.dumps(report, indent=1) + "\n")
 
 

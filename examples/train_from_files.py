@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -24,6 +25,7 @@ import amiwarp
 
 BINS, WINDOW_US = 5, 25_000
 SIDE, DIRECTIONS, DURATION_US, STEP_US, AT_ONCE = 128, 4, 204_000, 2_000, 16  # of the recordings that are made
+COLUMNS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}  # in the order of a batch: largest first
 
 
 def make_data(folder: Path, recordings: int, device: str) -> None:
@@ -66,14 +68,24 @@ def cut(recording: amiwarp.Recording, labels: dict[str, Any]) -> tuple[list[amiw
     return blocks, labels["class"], recording.events.size
 
 
-def join(items: list[Any]) -> tuple[list[torch.Tensor], amiwarp.Windows, list[Any]]:
-    """Return the events of several recordings, their windows, and the class of each window, in a worker process.
+def join(items: list[Any]) -> tuple[torch.Tensor, list[int], list[Any]]:
+    """Return the events of several recordings, the number in each window, and its class, in a worker process.
 
-    PyTorch passes its tensors to the main process in shared memory, without a copy.
+    PyTorch passes a tensor to the main process in shared memory, but each one costs both processes several messages. So
+    all columns are in one tensor of bytes.
     """
-    events, windows = amiwarp.collate([block for blocks, _, _ in items for block in blocks])
+    blocks = [block for blocks, _, _ in items for block in blocks]
+    columns = [getattr(block, name).view(np.uint8) for name in COLUMNS for block in blocks]
     classes = [label for blocks, label, _ in items for _ in blocks]
-    return [torch.from_numpy(getattr(events, name)) for name in ("x", "y", "t", "p")], windows, classes
+    return torch.from_numpy(np.concatenate(columns)), [len(block) for block in blocks], classes
+
+
+def unpack(packed: torch.Tensor) -> amiwarp.Events:
+    """Return the events in the bytes that :func:`join` has joined, without a copy."""
+    ends = np.cumsum([np.dtype(kind).itemsize for kind in COLUMNS.values()])
+    parts = np.split(packed.numpy(), ends[:-1] * (len(packed) // ends[-1]))
+    columns = {name: part.view(kind) for (name, kind), part in zip(COLUMNS.items(), parts, strict=True)}
+    return amiwarp.Events(**columns)
 
 
 class Block(nn.Module):
@@ -104,8 +116,11 @@ def make_network(classes: int) -> nn.Module:
 
 def on_device(loader: Any, names: list[Any], size: tuple[int, int], device: str) -> Iterator[Any]:
     """Yield the voxel grids and classes of each batch, on the device."""
-    for columns, windows, classes in loader:
-        events, _ = amiwarp.collate([amiwarp.Events(*(column.numpy() for column in columns))], device=device)
+    for packed, counts, classes in loader:
+        found = unpack(packed)
+        ends = np.cumsum([0, *counts])
+        windows = amiwarp.windows(found, ranges=np.stack([ends[:-1], ends[1:]], axis=1))
+        events, _ = amiwarp.collate([found], device=device)
         grids = amiwarp.voxel_grid(events, *size, BINS, windows=windows, normalize=True, device=device)
         yield torch.from_dlpack(grids), torch.tensor([names.index(c) for c in classes], device=device)
 

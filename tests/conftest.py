@@ -31,6 +31,9 @@ from amiwarp.kernels.launch import load_all
 from amiwarp.tasks import cores, limited_cpu_threads
 from tests import SHARE
 
+with contextlib.suppress(ImportError):
+    # PyTorch's CUDA build imports Triton, which ends a process in which VTK has drawn with Mesa before.
+    importlib.import_module("triton")
 wp.init()
 # The many processes that tests start would otherwise compile the package each time, and each of xdist's all the tests.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -44,7 +44,7 @@ from amiwarp.calib.model_choice import (
     linear_motions,
     trial_for,
 )
-from amiwarp.calib.sharpness import split_turns
+from amiwarp.calib.sharpness_search import split_turns
 from amiwarp.optics.models import compensate_by_each, rms
 from amiwarp.optics.models import rungs as wedge_models
 from tests.conftest import COARSE

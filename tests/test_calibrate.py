@@ -36,7 +36,7 @@ from amiwarp.calib.calibration import prepare
 from amiwarp.calib.calibration_events import RUN, thin
 from amiwarp.calib.first_guess import estimate_rpm
 from amiwarp.calib.parameters import make_space
-from amiwarp.calib.sharpness import PARTS
+from amiwarp.calib.sharpness_search import PARTS
 from amiwarp.optics.models import MODELS, rungs, wrap_angle
 from tests.conftest import NOMINAL_PRISM, TRUE_PRISM
 

@@ -48,7 +48,7 @@ from amiwarp.calib.settings import STAGES
 from amiwarp.choices import Axis, Colour, Tone, View
 from amiwarp.imaging.export import IweFiles, to_picture
 from amiwarp.imaging.iwe import CanvasShape
-from amiwarp.imaging.metrics import SharpnessMeter
+from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.live.queues import PacketQueue, Policy
 from amiwarp.optics.models import MODELS, build_model
 from amiwarp.reconstruction.picture import save_picture, tones

@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from amiwarp.imaging.iwe import CanvasShape, Image
-from amiwarp.imaging.metrics import EDGE_SMOOTHING_PX, LEAST_PADDING, STRONG, edge_coherence
+from amiwarp.imaging.sharpness import EDGE_SMOOTHING_PX, LEAST_PADDING, STRONG, edge_coherence
 
 INSET = 8
 

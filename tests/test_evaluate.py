@@ -18,7 +18,7 @@ from scipy.special import ndtr
 import amiwarp
 from amiwarp.cli.common import made_again
 from amiwarp.io.json_files import sealed
-from amiwarp.simulation.description import SensorModel
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.evaluate import apex_speed, corners, fading, study, texture
 from amiwarp.studies.evaluate.claims import Verdict

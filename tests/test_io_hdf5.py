@@ -13,8 +13,8 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from amiwarp import AmiwarpError, open_recording
-from amiwarp.io import reading_process
+from amiwarp import AmiwarpError, Encoder, MemoryEvents, Recording, open_recording, save_recording
+from amiwarp.io import hdf5_files, reading_process
 from amiwarp.io.hdf5_files import CHUNK, checksum, decode
 from amiwarp.io.reading_process import Reply, borrow, give_back, run
 from reference.io_samples import make_events, refusal, to_faery, write_dsec, write_native
@@ -390,6 +390,61 @@ def test_native_recordings_need_no_process_once_opened(tmp_path):
     assert len(source.between(source.t_first, source.t_last + 1)) == 600
 
 
+@pytest.fixture
+def requests(monkeypatch) -> list[str]:
+    """Names of the functions that are called in reading processes."""
+    sent: list[str] = []
+    send = reading_process.ReadingProcess.send
+    monkeypatch.setattr(
+        reading_process.ReadingProcess,
+        "send",
+        lambda self, function, *arguments: sent.append(str(function)) or send(self, function, *arguments),
+    )
+    return sent
+
+
+def test_a_native_recording_takes_one_request(tmp_path, requests):
+    encoder = Encoder(np.arange(0, 1000, 10), np.arange(100.0))
+    recording = Recording(MemoryEvents(EVENTS, 346, 260), encoder=encoder)
+    save_recording(tmp_path / "a.h5", recording)
+    found = open_recording(tmp_path / "a.h5")
+    assert len(found.events.slice(0, 600)) == 600
+    np.testing.assert_array_equal(found.encoder.angle, encoder.angle)
+    assert requests == ["amiwarp.io.hdf5_server:open_file"]
+
+
+def test_what_was_found_in_a_file_is_remembered_until_it_changes(monkeypatch, tmp_path, requests):
+    path = tmp_path / "a.h5"
+    save_recording(path, Recording(MemoryEvents(EVENTS, 346, 260), metadata={"place": "near"}))
+    assert open_recording(path).metadata["place"] == "near"
+    assert len(requests) == 1
+    assert open_recording(path).metadata["place"] == "near"
+    assert len(requests) == 2  # it has been written just now
+    monkeypatch.setattr(hdf5_files, "UNCHANGED_NS", 0)
+    time.sleep(0.05)  # clocks of file systems have steps of some milliseconds
+    for _ in range(3):
+        found = open_recording(path)
+        np.testing.assert_array_equal(found.events.slice(0, 600).t, EVENTS.t)
+    assert len(requests) == 3
+    with h5py.File(path, "r+") as file:
+        file["metadata"].attrs["place"] = "afar"
+    assert open_recording(path).metadata["place"] == "afar"
+    assert len(requests) == 4
+
+
+def test_only_so_many_files_are_remembered(monkeypatch, tmp_path, requests):
+    monkeypatch.setattr(hdf5_files, "UNCHANGED_NS", 0)
+    monkeypatch.setattr(hdf5_files, "REMEMBERED", len(hdf5_files._remembered) + 2)
+    for name in "abc":
+        write_native(tmp_path / f"{name}.h5", EVENTS)
+    time.sleep(0.05)
+    for name in "abc":
+        open_recording(tmp_path / f"{name}.h5")
+    assert len(hdf5_files._remembered) == hdf5_files.REMEMBERED
+    open_recording(tmp_path / "c.h5")
+    assert len(requests) == 3
+
+
 @pytest.mark.parametrize("name", ["bitshuffle", "bzip2"])
 def test_damaged_chunks_of_any_filter(dsec, name):
     """Bitshuffle crashed on such chunks and bzip2 hung, and the process with it."""
@@ -413,15 +468,19 @@ def test_damaged_chunks_of_any_filter(dsec, name):
     assert False in outcomes
 
 
-def test_a_filter_that_hangs(monkeypatch, dsec):
+@pytest.mark.parametrize(("name", "found"), [("events/x", r"0 \.\. 1"), ("encoder/t", r"0 \.\. 600")])
+def test_a_filter_that_hangs(monkeypatch, dsec, name, found):
     """The bzip2 filter loops for ever on a truncated stream."""
     monkeypatch.setattr(reading_process, "CPU_SECONDS", 2)
     with h5py.File(dsec, "r+") as file:
-        del file["events/x"]
-        file.create_dataset("events/x", data=EVENTS.x, chunks=(600,), **hdf5plugin.BZip2())
-        _, stored = file["events/x"].id.read_direct_chunk((0,))
-        file["events/x"].id.write_direct_chunk((0,), stored[: len(stored) // 2])
-    message = r"a\.h5: .*dataset 'events/x' \(bzip2\), elements 0 \.\. 1: reading took over 2 s"
+        if name in file:
+            del file[name]
+        file.create_dataset(name, data=EVENTS.x, chunks=(600,), **hdf5plugin.BZip2())
+        _, stored = file[name].id.read_direct_chunk((0,))
+        file[name].id.write_direct_chunk((0,), stored[: len(stored) // 2])
+        if name == "encoder/t":
+            file["encoder/angle"] = np.arange(600.0)
+    message = rf"a\.h5: .*dataset '{name}' \(bzip2\), elements {found}: reading took over 2 s"
     with pytest.raises(AmiwarpError, match=message):
         open_recording(dsec).events.slice(0, 600)
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from amiwarp import AmiwarpError, Camera, ExactModel, Prism, edge_blur, model_error
-from amiwarp.imaging.metrics import contrast, entropy, find_edges, picture_quality
+from amiwarp.imaging.metrics import find_edges, picture_quality
+from amiwarp.imaging.sharpness import contrast, entropy
 
 
 def circle_events(sigma: float, noise: int = 0, seed: int = 0) -> np.ndarray:

@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from amiwarp import AmiwarpError, Sharpness, sharpness
 from amiwarp.imaging.iwe import CanvasShape
-from amiwarp.imaging.metrics import PAPER_ETA, SharpnessMeter, gaussian
+from amiwarp.imaging.sharpness import PAPER_ETA, SharpnessMeter, gaussian
 
 
 @pytest.fixture

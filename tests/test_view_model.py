@@ -37,8 +37,8 @@ from amiwarp.choices import Axis, Colour, View
 from amiwarp.imaging import regions
 from amiwarp.imaging.export import save_values
 from amiwarp.imaging.iwe import CanvasShape, Votes
-from amiwarp.imaging.metrics import random_variance, relative_variance
 from amiwarp.imaging.regions import suggest_region
+from amiwarp.imaging.sharpness import random_variance, relative_variance
 from amiwarp.io import event_rates, spans
 from amiwarp.io.event_rates import EventRates
 from amiwarp.optics.models import MODELS, Model, size_names

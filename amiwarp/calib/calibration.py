@@ -1,11 +1,17 @@
 """Calibration of the prism from a recording, to be read from top to bottom.
 
 :func:`calibrate` runs a :class:`Calibrator`, and for the model ``auto`` lets a :class:`ModelChooser` choose among the
-models. A calibrator makes attempts by the stages of the settings. If no brightness map explains the events, it tries
-three causes in turn. Hot or flickering pixels are masked and the attempt repeated. The camera's rotation is freed, also
-at a low cost if it explains much of the rest, and then dropped from the result. A wrong scale of the encoder ends in an
-error. :func:`prepare` sets up an attempt: the encoder, the events and the parameter space. Without an encoder, an
-attempt also examines whether the prism's speed varies, and finds the path of its angle.
+models. :func:`prepare` sets up an attempt: the encoder, the events and the parameter space. The attempt is made by the
+stages of the settings; the photometric stage also corrects lens, prism and sensor, see ``photometric/consistency.py``.
+If it still says that something is wrong, :meth:`Calibrator.run` makes further attempts, in this order:
+
+1. with an error of the encoder that repeats every turn corrected
+2. without hot and flickering pixels, if no brightness map explains the events
+3. without the parts of the image in which something moves; if there are none and no map explains the events, with the
+   encoder's direction or scale corrected, which ends in an error that says so, or with the camera's rotation free
+4. with the camera's rotation free, also at a low cost if it explains much of the rest; it is dropped from the result
+
+Without an encoder, an attempt also examines whether the prism's speed varies, and finds the path of its angle.
 """
 
 from __future__ import annotations
@@ -30,7 +36,7 @@ from amiwarp.calib.photometric.cost import upload_ahead
 from amiwarp.calib.prism_path import GATE_PAIRS, GATE_TILES, LEAST_DEVIATION_PX, PathFit, speed_in_words, varying_paths
 from amiwarp.calib.result import Calibration, PhotometricSummary, StageSummary, constant_speed
 from amiwarp.calib.settings import AUTO, LINEAR_UNKNOWNS, CalibrationOptions, Settings
-from amiwarp.calib.sharpness import Search
+from amiwarp.calib.sharpness_search import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder, check_prisms
 from amiwarp.events.recording import Events, MemoryEvents, Recording

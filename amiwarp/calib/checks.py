@@ -10,7 +10,7 @@ from amiwarp.calib.bad_pixels import BadPixelSummary
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.imaging.iwe import Image
-from amiwarp.imaging.metrics import edge_coherence
+from amiwarp.imaging.sharpness import edge_coherence
 from amiwarp.optics.models import MODELS, Model
 from amiwarp.optics.prism import Prism
 

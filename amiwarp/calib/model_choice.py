@@ -23,13 +23,13 @@ from amiwarp.calib.parameters import DRIFTS, MOTION, ParameterSpace, like_size, 
 from amiwarp.calib.photometric.cost import LEAST_CURVATURE, UNDETERMINED_PX
 from amiwarp.calib.result import Calibration, FreedParameter, ModelCandidate, ModelChoice, PhotometricSummary
 from amiwarp.calib.settings import Settings
-from amiwarp.calib.sharpness import STEP_PX, HalfSharpness, Quadratic, gradient, padding, split_turns
+from amiwarp.calib.sharpness_search import STEP_PX, HalfSharpness, Quadratic, gradient, padding, split_turns
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.iwe import CanvasShape, Votes
-from amiwarp.imaging.metrics import SharpnessMeter
+from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.optics.models import MODELS, ExactModel, Model, compensate_by_each, predicted_error, rms, rungs, wrap_angle
 from amiwarp.optics.prism import UnsizedPrism, as_wedge
 from amiwarp.validation import real

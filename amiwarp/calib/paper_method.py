@@ -17,7 +17,7 @@ from amiwarp.calib.calibration import prepare
 from amiwarp.calib.nlopt_solver import SearchStage, best_of
 from amiwarp.calib.result import Calibration, StageSummary
 from amiwarp.calib.settings import STAGES, Settings
-from amiwarp.calib.sharpness import Search
+from amiwarp.calib.sharpness_search import Search
 from amiwarp.choices import Sharpness
 from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.tasks import Progress

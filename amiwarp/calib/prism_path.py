@@ -30,7 +30,7 @@ from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Recording
 
 if TYPE_CHECKING:
-    from amiwarp.calib.sharpness import Search
+    from amiwarp.calib.sharpness_search import Search
 
 Vector = NDArray[np.float64]
 

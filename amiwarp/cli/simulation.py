@@ -32,16 +32,8 @@ from amiwarp.io.formats import check_ending
 from amiwarp.io.pixel_map import PixelMap
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Plate, Prism
-from amiwarp.simulation.description import (
-    CameraMotion,
-    EncoderModel,
-    Mirror,
-    Moved,
-    PrismMotion,
-    Scene,
-    SensorModel,
-    Vibration,
-)
+from amiwarp.simulation.description import CameraMotion, EncoderModel, Mirror, Moved, PrismMotion, Scene, Vibration
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.world import WorldScene
 
 if TYPE_CHECKING:

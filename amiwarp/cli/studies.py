@@ -503,7 +503,8 @@ def run_design(
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
     from amiwarp.plotting.figures import save_png_and_svg
-    from amiwarp.simulation.description import Scene, SensorModel
+    from amiwarp.simulation.description import Scene
+    from amiwarp.simulation.sensor_model import SensorModel
     from amiwarp.studies.demo import earth
     from amiwarp.studies.design import chart, design
 

@@ -16,15 +16,8 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.device_events import (
-    DeviceEvents,
-    check_sensor,
-    encoder_pieces,
-    limits,
-    second_pieces,
-    wait,
-)
-from amiwarp.events.encoder import Encoder, EncoderStream, check_prisms
+from amiwarp.events.device_events import DeviceEvents, check_sensor, limits, wait
+from amiwarp.events.encoder import Encoder, EncoderStream, check_prisms, encoder_pieces, second_pieces
 from amiwarp.events.recording import Events, held_bytes
 from amiwarp.imaging.iwe import CanvasShape, Votes
 from amiwarp.imaging.positions import LaunchPlan

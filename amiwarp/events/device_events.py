@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from amiwarp import validation
 from amiwarp.errors import AmiwarpError
 from amiwarp.events import recording as checks
-from amiwarp.events.encoder import Encoder
+from amiwarp.events.encoder import Encoder, encoder_pieces, second_pieces
 from amiwarp.events.recording import DEFAULT_BLOCK, Events, EventSource, described, regroup, slice_bounds
 from amiwarp.kernels import events as kernels
 from amiwarp.kernels.launch import launch
@@ -177,42 +177,6 @@ def _on_device(
     rows = wp.array(pieces, dtype=wp.int64, device=device)  # one copy to the device instead of three
     buckets = wp.array(first.astype(np.int32), dtype=int, device=device)
     return buckets, rows[0], rows[1].view(wp.uint64), rows[2].view(wp.uint64)
-
-
-def encoder_pieces(encoder: Encoder, t_first: int, t_last: int) -> tuple[int, Any, Any, Any]:
-    """Return origin, starts, angles and slopes of :class:`EncoderParams`.
-
-    The encoder must cover the span of event times.
-    """
-    # The clock offset is split into its whole and its fractional part. A piece starts at the first whole event time
-    # at or after its sample.
-    whole = math.floor(encoder.clock_offset_us)
-    begins = encoder.t - whole
-    low = min(max(int(np.searchsorted(begins, t_first, side="right")) - 1, 0), begins.size - 2)
-    high = min(max(int(np.searchsorted(begins, t_last, side="right")), low + 1), begins.size - 1)
-    turns = encoder.angle[low : high + 1] / (2.0 * math.pi)
-    slope = np.diff(turns) / np.diff(encoder.t[low : high + 1])
-    origin = int(begins[low])
-    angle = _wrapped(turns[:-1] + slope * (encoder.clock_offset_us - whole))
-    return origin, begins[low:high] - origin, angle, _wrapped(slope)
-
-
-def second_pieces(second: Encoder, t_first: int, t_last: int, origin: int) -> tuple[Any, Any, Any]:
-    """Return starts, angles and slopes of :class:`EncoderParams` for the second encoder.
-
-    ``origin``: event time from which the starts count, that of the first encoder [us].
-    """
-    own, start, angle, slope = encoder_pieces(second, t_first, t_last)
-    start, behind = start + (own - origin), own - origin
-    if behind > 0:  # the first piece reaches back to the origin
-        start[:1], angle[:1] = 0, angle[:1] - slope[:1] * np.uint64(behind)
-    return start, angle, slope
-
-
-def _wrapped(turns: Any) -> Any:
-    """Return turns without their whole part as uint64, in units of 2**-64 turn."""
-    part = np.maximum(turns - np.floor(turns + 0.5), -0.5)
-    return np.ldexp(part, 64).astype(np.int64).view(np.uint64)
 
 
 THREADS = 1 << 15

@@ -193,10 +193,11 @@ class Events:
     """Polarity, shape ``(n,)``: 1 is ON, 0 is OFF."""
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "t", "p"):
-            instance(getattr(self, name), np.ndarray, f"events' {name}")
-        shapes = {name: getattr(self, name).shape for name in ("x", "y", "t", "p")}
-        if any(shape != (self.t.size,) for shape in shapes.values()):
+        columns, shape = (self.x, self.y, self.t, self.p), (np.size(self.t),)
+        if not all(isinstance(column, np.ndarray) and column.shape == shape for column in columns):
+            for name, column in zip(COLUMNS, columns, strict=True):
+                instance(column, np.ndarray, f"events' {name}")
+            shapes = {name: column.shape for name, column in zip(COLUMNS, columns, strict=True)}
             raise AmiwarpError(f"event arrays have shapes {shapes}; expected one length (n,)")
         if self.t.dtype != np.int64 or self.p.dtype != np.uint8:
             raise AmiwarpError(f"events' t is {self.t.dtype}, p is {self.p.dtype}; expected int64 and uint8")

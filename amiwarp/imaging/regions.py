@@ -12,7 +12,7 @@ from amiwarp.choices import Sharpness
 from amiwarp.events.recording import Events
 from amiwarp.imaging.export import PERCENTILE
 from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes
-from amiwarp.imaging.metrics import SharpnessMeter, random_variance, relative_variance
+from amiwarp.imaging.sharpness import SharpnessMeter, random_variance, relative_variance
 from amiwarp.optics.models import Model
 
 Region = tuple[int, int, int, int]
@@ -61,7 +61,7 @@ class RegionSharpness:
         """Return variance and sharpness of the smoothed region.
 
         The variance over mean, as :attr:`amiwarp.Sharpness.VARIANCE`, grows with the number of events. The sharpness,
-        see :func:`amiwarp.imaging.metrics.relative_variance`, does not depend on it. ``offset_us`` is added to the
+        see :func:`amiwarp.imaging.sharpness.relative_variance`, does not depend on it. ``offset_us`` is added to the
         encoder's clock offset [us].
         """
         self._votes.add_events(model, events, drift=offset_us)

@@ -235,12 +235,13 @@ def collate(blocks: Sequence[Events] | Sequence[DeviceEvents], *, device: Any = 
         raise AmiwarpError("a batch needs at least one block, and all blocks Events or all DeviceEvents")
     ends = np.concatenate([[0], np.cumsum([len(block) for block in blocks])]).astype(np.int64)
     joined = kinds.pop().concatenate(blocks)
+    if isinstance(joined, DeviceEvents):
+        device_for(joined, device)
+    found = _at_indices(joined, ends[:-1], ends[1:])
     if isinstance(joined, Events) and device is not None:
         joined = on_device(joined, wp.get_device(device))
         wait(joined.device)
-    elif isinstance(joined, DeviceEvents):
-        device_for(joined, device)
-    return joined, _at_indices(joined, ends[:-1], ends[1:])
+    return joined, found
 
 
 def on_device(events: Events | DeviceEvents, device: Any) -> DeviceEvents:

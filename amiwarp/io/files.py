@@ -65,7 +65,7 @@ LONGEST_LINE = 1000
 """Longest accepted line of a text file [characters]."""
 
 _sources: weakref.WeakKeyDictionary[object, tuple[Path, ...]] = weakref.WeakKeyDictionary()
-"""Files that each open event source reads."""
+"""Files that each open event source reads, or folders of them."""
 
 
 @dataclass
@@ -123,8 +123,8 @@ def input_folder(folder: Path) -> Path:
 
 
 def register_reader(source: object, *paths: Path) -> None:
-    """Register the files that ``source`` reads, or the files in a folder, until it is garbage-collected."""
-    _sources[source] = tuple(file for path in paths for file in (path.iterdir() if path.is_dir() else (path,)))
+    """Register the files that ``source`` reads, or folders with such files, until it is garbage-collected."""
+    _sources[source] = paths
 
 
 def note_input(path: Path) -> None:
@@ -152,7 +152,9 @@ def inputs_noted(paths: Iterable[Path]) -> Iterator[None]:
 
 def inputs_in_use() -> tuple[Path, ...]:
     """Return the files that open event sources read, and those that the running command has read."""
-    return (*(path for paths in list(_sources.values()) for path in paths), *(_command.read if _command else ()))
+    given = [path for paths in list(_sources.values()) for path in paths]
+    files = [file for path in given for file in (path.iterdir() if path.is_dir() else (path,))]
+    return (*files, *(_command.read if _command else ()))
 
 
 def same_file(first: Path, second: Path) -> bool:

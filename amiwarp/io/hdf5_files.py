@@ -10,13 +10,14 @@ import io
 import math
 import os
 import threading
+import time
 import weakref
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,6 +192,18 @@ def _fold_carries(total: int) -> int:
     return (total - 1) % 65535 + 1 if total else 0
 
 
+_kept_memory = threading.local()
+
+
+def _padded_chunk(dtype: np.dtype[Any], row: tuple[int, ...]) -> NDArray[Any]:
+    """Return memory of this thread for a chunk, until the next call: new memory takes as long as decoding."""
+    size = CHUNK * dtype.itemsize * math.prod(row)
+    found: NDArray[np.uint8] = getattr(_kept_memory, "bytes", np.empty(0, np.uint8))
+    if found.size < size:
+        found = _kept_memory.bytes = np.empty(size, np.uint8)
+    return found[:size].view(dtype).reshape(CHUNK, *row)
+
+
 class StoredColumn:
     """Dataset of the native layout whose chunks threads read in parallel, without HDF5."""
 
@@ -212,7 +225,8 @@ class StoredColumn:
     def read(self, start: int, stop: int) -> NDArray[Any] | None:
         """Return the elements with ``start <= index < stop``, at least one, or None if a chunk is damaged."""
         first, last = start // CHUNK, (stop - 1) // CHUNK
-        if first == last and (stop - start < CHUNK and stop != self._count):
+        kept = self._last
+        if first == last and ((stop - start < CHUNK and stop != self._count) or (kept and kept[0] == first)):
             chunk = self._chunk(first)
             return None if chunk is None else chunk[start - first * CHUNK : stop - first * CHUNK].copy()
         out = self._decoded(first, last)
@@ -234,9 +248,15 @@ class StoredColumn:
         return os.pread(self._handle, size, offset)
 
     def _decoded(self, first: int, last: int) -> NDArray[Any] | None:
-        """Return the chunks from ``first`` to ``last``, or None if one of them is damaged."""
-        out = np.empty(((last + 1 - first) * CHUNK, *self._row), self._dtype)
-        return out if decode([self.encoded(at) for at in range(first, last + 1)], out) else None
+        """Return the elements of the chunks from ``first`` to ``last``, or None if one of the chunks is damaged."""
+        stored = [self.encoded(at) for at in range(first, last + 1)]
+        out = np.empty((min((last + 1) * CHUNK, self._count) - first * CHUNK, *self._row), self._dtype)
+        if rest := len(out) % CHUNK:  # of the padded last chunk
+            chunk = _padded_chunk(self._dtype, self._row)
+            if not decode([stored.pop()], chunk):
+                return None
+            out[-rest:] = chunk[:rest]
+        return out if not stored or decode(stored, out[: len(out) - rest]) else None
 
 
 def make_dataset(
@@ -520,13 +540,11 @@ FORMAT_VERSION = 1
 # Access to the file, which a separate process opens.
 #
 # Files of amiwarp have a checksum on each chunk. Their chunks are read and decoded in this process, on all cores. HDF5
-# in the reading process reads files of other layouts or filters, and all that is read once when a file is opened.
+# in the reading process reads files of other layouts or filters, and all that is read once when a file is opened. A
+# recording of amiwarp takes one request: a request costs more than reading some 10,000 events.
 
 PIECE = 1 << 20
 """Number of elements that the reading process reads per request."""
-
-READ_ON_DEMAND = ("events/", "truth/x", "truth/y", "truth/events/", "ms_to_idx")
-"""Prefixes of the datasets that are read repeatedly after a file was opened."""
 
 SERVER = "amiwarp.io.hdf5_server"
 """Name of the module that runs in the reading process."""
@@ -547,19 +565,27 @@ class Hdf5File:
         self._process: list[ReadingProcess] = []  # at most one; the finalizer has the same list
         handle = os.open(input_path(path), os.O_RDONLY | getattr(os, "O_BINARY", 0))
         self.close = weakref.finalize(self, _close, handle, self._process)
-        found = os.fstat(handle)
-        self._identity = [found.st_dev, found.st_ino]
-        try:
-            about = self._start()
-        except BaseException:
-            self.close()
-            raise
+        file = os.fstat(handle)
+        self._identity = [file.st_dev, file.st_ino]
+        state = (topic, *self._identity, file.st_size, file.st_mtime_ns, file.st_ctime_ns)
+        found = _remembered.get(state)
+        if found is None:
+            try:
+                found = self._find()
+                if not found[0]["open"]:
+                    _give_back(self._process)
+                    if time.time_ns() - max(file.st_mtime_ns, file.st_ctime_ns) > UNCHANGED_NS:
+                        _remember(state, found)
+            except BaseException:
+                self.close()
+                raise
+        about, at_once = found
         self._attributes = about["attributes"]
         self.layout, self.group = str(about["layout"]), str(about["group"])
         """Layout of the file (native, m3ed, mvsec or ecf), and the group of its events."""
         self.unfinished = bool(about["unfinished"])
         """Whether the file is still being written, or the program that wrote it was interrupted."""
-        self.columns = {name: Column(self, handle, name, column) for name, column in about["columns"].items()}
+        self.columns = {name: Column(self, handle, name, column, at_once) for name, column in about["columns"].items()}
         """Datasets of the file by name. They refer to the file weakly, so a reader must keep the file."""
 
     def attributes(self, group: str) -> Mapping[str, Any] | None:
@@ -567,31 +593,61 @@ class Hdf5File:
         found: Mapping[str, Any] | None = self._attributes.get(group)
         return found
 
-    def settle(self) -> None:
-        """Finish opening the file: give the reading process back unless datasets that are read repeatedly need it."""
-        if all(column.is_stored for name, column in self.columns.items() if name.startswith(READ_ON_DEMAND)):
-            with self._lock:
-                _give_back(self._process)
-
     def ask(self, function: str, *arguments: Any) -> list[NDArray[Any]]:
         """Call a function in the reading process, which is restarted after Ctrl-C and in a fork of this process."""
         with self._lock:
             if not self._process or not self._process[0].usable:
-                self._start()
+                self._start(again=True)
             return self._process[0].call(f"{SERVER}:{function}", *arguments)[1]
 
-    def _start(self) -> Any:
+    def _find(self) -> Found:
+        """Let the reading process open the file for the first time."""
+        try:
+            return self._start(again=False)
+        except AmiwarpError:
+            if self._process[0].usable:
+                raise
+        return self._start(again=True)  # a dataset that crashed HDF5 is named when it is read alone
+
+    def _start(self, *, again: bool) -> Found:
         self._process[:] = [borrow()]
-        about, _ = self._process[0].call(f"{SERVER}:open_file", self._absolute, self._topic)
-        if about["identity"] != self._identity:
+        found = self._process[0].call(f"{SERVER}:open_file", str(self._absolute), self._topic, again)
+        if found[0]["identity"] != self._identity:
             raise AmiwarpError("was replaced by another file while it was read; open the file again")
-        return about
+        return found
+
+
+Found: TypeAlias = tuple[Any, list[NDArray[Any]]]
+"""What the reading process found in a file: its description, and the values of the datasets that it has read."""
+
+REMEMBERED, REMEMBERED_BYTES, PLACE_BYTES = 1024, 1 << 16, 150
+"""Largest number of files that are remembered, largest size of one in memory, and that of a chunk's place [bytes]. To
+read a larger file takes longer than to open it."""
+
+UNCHANGED_NS = 2 * 10**9
+"""Time without a change after which a file is remembered [ns]: two changes in close succession have the same time."""
+
+_remembered: dict[tuple[Any, ...], Found] = {}
+"""What was found in files, by their state, so that a training opens each file only in its first epoch."""
+
+
+def _remember(state: tuple[Any, ...], found: Found) -> None:
+    """Remember what was found in a file, if it is small, in place of the file that has been known for longest."""
+    places = sum(len(column["places"] or ()) for column in found[0]["columns"].values())
+    if PLACE_BYTES * places + sum(values.nbytes for values in found[1]) <= REMEMBERED_BYTES:
+        _remembered[state] = found
+        if len(_remembered) > REMEMBERED:
+            with contextlib.suppress(KeyError, RuntimeError):  # another thread has changed it
+                del _remembered[next(iter(_remembered))]
 
 
 class Column:
     """Dataset that is read by rows: of numbers, or of arrays of one shape."""
 
-    def __init__(self, file: Hdf5File, handle: int, name: str, about: Mapping[str, Any]) -> None:
+    def __init__(
+        self, file: Hdf5File, handle: int, name: str, about: Mapping[str, Any], at_once: Sequence[NDArray[Any]]
+    ) -> None:
+        """Take what the reading process found: ``about`` this dataset, and the values of all that it has read."""
         self._file = weakref.proxy(file)
         self.name = name
         """Name of the dataset in the file."""
@@ -602,14 +658,10 @@ class Column:
         self.row = tuple(int(size) for size in about["row"])
         """Shape of a row: empty for numbers."""
         self._stored = None if places is None else StoredColumn(handle, self.dtype, self._count, places, self.row)
+        self._values = at_once[about["at_once"]] if "at_once" in about else None
 
     def __len__(self) -> int:
         return self._count
-
-    @property
-    def is_stored(self) -> bool:
-        """Whether the dataset's chunks are read without HDF5."""
-        return self._stored is not None
 
     def encoded(self, start: int, stop: int) -> list[bytes] | None:
         """Return the stored chunks of the elements with ``start <= index < stop``, which begin a chunk; None if HDF5
@@ -629,6 +681,9 @@ class Column:
                     f"dataset '{self.name}' has a damaged chunk: its checksum is wrong; copy the file again"
                 )
             return values
+        values, self._values = self._values, None  # they are read once
+        if values is not None and (start, stop) == (0, self._count):
+            return self._rows(values.copy(), start, stop)
         piece = max(1, PIECE // max(1, math.prod(self.row)))
         parts = [self._ask(at, min(at + piece, stop)) for at in range(start, stop, piece)]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
@@ -639,6 +694,10 @@ class Column:
         except AmiwarpError as error:
             where = f"dataset '{self.name}' ({self._filters}), elements {start} .. {stop}"
             raise AmiwarpError(f"{where}: {error}") from error
+        return self._rows(values, start, stop)
+
+    def _rows(self, values: NDArray[Any], start: int, stop: int) -> NDArray[Any]:
+        """Return values from the reading process in the shape of rows."""
         if values.size != (stop - start) * math.prod(self.row) or values.dtype != self.dtype:
             raise AmiwarpError(f"dataset '{self.name}' changed while it was read; open the file again")
         return values.reshape(stop - start, *self.row)
@@ -693,7 +752,7 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
         raise AmiwarpError(
             f"{path}: camera is {found.width}x{found.height}, events are {events.size}; both must have the same size"
         )
-    recording = Recording(
+    return Recording(
         events=events,
         camera=found,
         encoder=None if file.attributes("encoder") is None else _read_encoder(path, file),
@@ -704,8 +763,6 @@ def _read_recording(path: Path, file: Hdf5File) -> Recording:
         imu=read_imu(path, file),
         frames=read_frames(path, file),
     )
-    file.settle()
-    return recording
 
 
 def _attributes(file: Hdf5File, group: str) -> Mapping[str, Any]:

@@ -9,8 +9,9 @@ import ctypes
 import math
 import os
 import re
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
+from functools import cache
+from typing import Any, NamedTuple
 
 import h5py  # noqa: TID253 - only the reading process imports this module
 import hdf5plugin  # noqa: F401, TID253 - its import registers the filters
@@ -21,28 +22,25 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.io.file_scan import microseconds, whole_pixels
 from amiwarp.io.hdf5_files import BLOSC, CHUNK, FLETCHER32, FORMAT
 from amiwarp.io.prophesee import Columns
-from amiwarp.io.reading_process import Reply, keep, kept
+from amiwarp.io.reading_process import Reply, forget, keep, kept
 
 # Layouts of other data sets' HDF5 files: M3ED, MVSEC and Prophesee's. Runs in the reading process.
 #
 # M3ED stores columns like amiwarp, in other groups. :mod:`amiwarp.io.hdf5_server` reads the others.
 
-Member = Callable[[Any, str], Any]
-"""Function that returns a member of a file by its name, or None, and refuses links."""
-
 SIDES = ("left", "right")
 
 
-def find_layout(file: Any, topic: str | None, member: Member) -> tuple[str, str]:
+def find_layout(file: Any, topic: str | None, find: "Finder") -> tuple[str, str]:
     """Return the layout of a file, and the group of its events. ``topic`` chooses among several cameras."""
-    found = {f"prophesee/{side}": "m3ed" for side in SIDES if member(file, f"prophesee/{side}/t") is not None}
-    found |= {f"davis/{side}": "mvsec" for side in SIDES if member(file, f"davis/{side}/events") is not None}
-    found |= {"CD": "ecf"} if member(file, "CD/events") is not None else {}
+    found = {f"prophesee/{side}": "m3ed" for side in SIDES if find(f"prophesee/{side}/t") is not None}
+    found |= {f"davis/{side}": "mvsec" for side in SIDES if find(f"davis/{side}/events") is not None}
+    found |= {"CD": "ecf"} if find("CD/events") is not None else {}
     listed = ", ".join(found)
-    if isinstance(member(file, "events"), h5py.Group) and not found:
+    if isinstance(find("events"), h5py.h5g.GroupID) and not found:
         found, listed = {"": "native"}, "none, as it holds one stream of events"
     if not found:
-        names = ", ".join(list(file)[:20]) or "none"
+        names = ", ".join(list(h5py.Group(file))[:20]) or "none"
         raise AmiwarpError(f"HDF5 without a group 'events'; expected events/x, y, t, p; its groups are {names}")
     if topic is not None and topic not in found:
         raise AmiwarpError(f"has no events in '{topic}'; the choices for --topic are {listed}")
@@ -57,14 +55,14 @@ M3ED_COLUMNS = {**{f"events/{name}": name for name in "xytp"}, "ms_to_idx": "ms_
 """Names of M3ED's datasets by those of the native layout."""
 
 
-def m3ed_attributes(file: Any, group: str, member: Member) -> dict[str, dict[str, Any]]:
+def m3ed_attributes(group: str, find: "Finder") -> dict[str, dict[str, Any]]:
     """Return the camera of an M3ED file as attributes of the native layout."""
     values = {}
     for name, count in (("resolution", 2), ("intrinsics", 4), ("distortion_coeffs", 4)):
-        dataset = member(file, f"{group}/calib/{name}")
-        if dataset is None or dataset.shape != (count,) or dataset.dtype.kind not in "iuf":
+        dataset = find(f"{group}/calib/{name}")
+        if not isinstance(dataset, h5py.h5d.DatasetID) or dataset.shape != (count,) or dataset.dtype.kind not in "iuf":
             return {}
-        values[name] = dataset[()].tolist()
+        values[name] = _whole(dataset).tolist()
     size = dict(zip(("width", "height"), map(int, values["resolution"]), strict=True))
     pinhole = dict(zip(("fx", "fy", "cx", "cy"), map(float, values["intrinsics"]), strict=True))
     lens = {"distortion_model": "radial_tangential", "distortion": [*map(float, values["distortion_coeffs"]), 0.0]}
@@ -143,6 +141,9 @@ READ_AT_ONCE = (
 )  # fmt: skip
 """Datasets that are read into memory at once, and therefore have stricter size limits."""
 
+READ_ON_DEMAND = ("events/", "truth/x", "truth/y", "truth/events/", "ms_to_idx")
+"""Prefixes of the datasets that are read repeatedly after a file was opened."""
+
 AT_ONCE_BYTES, AT_ONCE_RATIO = 1 << 24, 1000
 """Limits of the datasets in :data:`READ_AT_ONCE`: size in memory [bytes], or ratio to the size in the file. The larger
 limit applies."""
@@ -165,112 +166,172 @@ FILTERS = {1: "deflate", 2: "shuffle", 3: "fletcher32", 4: "szip", 5: "nbit", 6:
 """Names of HDF5 filters by number, for messages."""
 
 
-def open_file(path: str, topic: str | None) -> Reply:
-    """Open a file and return its identity, layout, whether it is unfinished, its attributes and its datasets."""
+def open_file(path: str, topic: str | None, again: bool) -> Reply:
+    """Open a file, and return all that is needed to read it, with the values of datasets that HDF5 reads at once.
+
+    The file stays open for :func:`read` if HDF5 is needed to read events. If the file is opened ``again``, it stays
+    open in any case, and no values are read.
+    """
     file, unfinished = _open(path)
     keep("file", file)
-    columns: dict[str, Any] = {}
-    keep("columns", columns)
-    layout, group = find_layout(file, topic, member)
-    groups = {name: found for name in ATTRIBUTES if (found := _group(file, name)) is not None}
+    find = Finder(file)
+    layout, group = find_layout(file, topic, find)
+    groups = {name: found for name in ATTRIBUTES if (found := _group(find, name)) is not None}
     attributes = {name: dict(_attributes(found, name)) for name, found in groups.items()}
     ours = attributes.get("/", {}).get("format") == FORMAT
     names = {name: name for name in COLUMNS if ours or not name.startswith(("imu/", "frames/"))}
     if layout == "m3ed":
         names = {name: f"{group}/{theirs}" for name, theirs in M3ED_COLUMNS.items()}
-        attributes = m3ed_attributes(file, group, member)
-    described = {}
+        attributes = m3ed_attributes(group, find)
+    columns: dict[str, Any] = {}
+    keep("columns", columns)
+    described, values = {}, []
+    about = _FileFacts(path, unfinished, _is_plain(file), os.path.getsize(path))
     for name, stored in names.items() if layout in ("native", "m3ed") else ():
-        dataset = member(file, stored)
+        dataset = find(stored)
         if dataset is not None:
-            described[name] = _describe(dataset, name, COLUMNS[name], path, unfinished)
+            described[name] = _describe(dataset, name, COLUMNS[name], about)
             columns[name] = dataset
+    stays_open = again
+    for name, column in described.items():
+        if column["places"] is None:
+            if name in READ_AT_ONCE and not again:
+                with contextlib.suppress(Exception):  # reading this dataset alone reports the error
+                    values += read(name, 0, column["count"])[1]
+                    column["at_once"] = len(values) - 1
+            stays_open |= "at_once" not in column and (name in READ_AT_ONCE or name.startswith(READ_ON_DEMAND))
+    identity = _identity(file, path)
+    if not stays_open:
+        forget()
     return {
-        "identity": _identity(file),
+        "identity": identity,
         "layout": layout,
         "group": group,
         "unfinished": unfinished,
         "attributes": attributes,
         "columns": described,
-    }, []
+        "open": stays_open,
+    }, values
 
 
 def read(name: str, start: int, stop: int) -> Reply:
     """Return the rows ``start`` to ``stop`` (excluded) of a dataset."""
     dataset = kept("columns")[name]
-    return None, [np.atleast_1d(dataset[()] if dataset.ndim == 0 else dataset[start:stop])]
+    whole = (start, stop) == (0, (dataset.shape or (1,))[0])
+    return None, [np.atleast_1d(_whole(dataset) if whole else h5py.Dataset(dataset)[start:stop])]
+
+
+def _whole(stored: Any) -> NDArray[Any]:
+    """Return all values of a dataset or an attribute."""
+    values = np.zeros(stored.shape, stored.dtype)
+    if isinstance(stored, h5py.h5d.DatasetID):
+        stored.read(h5py.h5s.ALL, h5py.h5s.ALL, values)
+    else:
+        stored.read(values)
+    return values
 
 
 def _open(path: str) -> tuple[Any, bool]:
     """Open a file and return whether it is unfinished. HDF5 opens unfinished files only if they are live recordings."""
+    name, how, access = os.fsencode(path), h5py.h5f.ACC_RDONLY, _access()
     try:
-        return h5py.File(path, "r", rdcc_nbytes=CACHE_BYTES), False
+        return h5py.h5f.open(name, how, fapl=access), False
     except OSError:
-        access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-        access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
-        # HDF5 reads a block with a wrong checksum again, 100 times by default, and doubles the pause each time, which
-        # takes forever. h5py does not expose this setting.
-        with contextlib.suppress(AttributeError, OSError):
-            attempts = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
-            attempts(ctypes.c_int64(access.id), ctypes.c_uint(ATTEMPTS))
         with contextlib.suppress(OSError):
-            how = h5py.h5f.ACC_RDONLY | h5py.h5f.ACC_SWMR_READ
-            return h5py.File(h5py.h5f.open(os.fsencode(path), how, fapl=access)), True
+            return h5py.h5f.open(name, how | h5py.h5f.ACC_SWMR_READ, fapl=access), True
         raise
 
 
-def _identity(file: Any) -> list[int]:
+@cache
+def _access() -> Any:
+    """Return the settings with which files are opened."""
+    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
+    access.set_fclose_degree(h5py.h5f.CLOSE_STRONG)
+    elements, slots, _, preemption = access.get_cache()
+    access.set_cache(elements, slots, CACHE_BYTES, preemption)
+    # HDF5 reads a block of an unfinished file with a wrong checksum again, 100 times by default, and doubles the pause
+    # each time, which takes forever. h5py does not expose this setting.
+    with contextlib.suppress(AttributeError, OSError):
+        attempts = ctypes.CDLL(h5py.h5p.__file__).H5Pset_metadata_read_attempts
+        attempts(ctypes.c_int64(access.id), ctypes.c_uint(ATTEMPTS))
+    return access
+
+
+def _identity(file: Any, path: str) -> list[int]:
     """Return device and inode of the open file. They identify it even if its name refers to another file by now."""
-    found = os.fstat(file.id.get_vfd_handle()) if hasattr(os, "pread") else os.stat(file.filename)
+    found = os.fstat(file.get_vfd_handle()) if hasattr(os, "pread") else os.stat(path)
     return [found.st_dev, found.st_ino]
 
 
-def member(file: Any, name: str) -> Any:
-    """Return a group or dataset of the file, or None. All access to objects of the file goes through here.
+def _is_plain(file: Any) -> bool:
+    """Return whether HDF5's places of chunks are places in the file, which another process can read."""
+    plain = hasattr(os, "pread") and file.get_access_plist().get_driver() == h5py.h5fd.SEC2
+    return bool(plain and file.get_create_plist().get_userblock() == 0)
 
-    Raises :class:`AmiwarpError` for links, and for datasets whose values are in other files.
+
+class Finder:
+    """Function that finds a group or dataset of an open file, once each. All access to its objects goes through it.
+
+    It raises :class:`AmiwarpError` for links, and for datasets whose values are in other files. It uses h5py's
+    low-level objects, which take less time.
     """
-    found = file
-    for part in name.strip("/").split("/"):
-        if not isinstance(found, h5py.Group):
+
+    def __init__(self, file: Any) -> None:
+        self._found: dict[str, Any] = {"": h5py.h5g.open(file, b"/")}
+
+    def __call__(self, name: str) -> Any:
+        """Return the object of that name, or None."""
+        if name not in self._found:
+            self._found[name] = self._open(name)
+        return self._found[name]
+
+    def _open(self, name: str) -> Any:
+        folder, _, last = name.rpartition("/")
+        parent, key = self(folder), last.encode()
+        if not isinstance(parent, h5py.h5g.GroupID) or not parent.links.exists(key):
             return None
-        if not part:
-            continue
-        if not found.id.links.exists(part.encode()):
-            return None
-        if found.id.links.get_info(part.encode()).type != h5py.h5l.TYPE_HARD:
+        if parent.links.get_info(key).type != h5py.h5l.TYPE_HARD:
             raise AmiwarpError(f"'{name}' is a soft or external link; replace the link by a copy of the data")
-        found = found[part]
-    if isinstance(found, h5py.Dataset):
-        creation = found.id.get_create_plist()
-        if creation.get_layout() == h5py.h5d.VIRTUAL or creation.get_external_count():
-            raise AmiwarpError(f"dataset '{name}' takes its values from other files; copy the values into this file")
-    return found
+        found = h5py.h5o.open(parent, key)
+        if isinstance(found, h5py.h5d.DatasetID):
+            creation = found.get_create_plist()
+            if creation.get_layout() == h5py.h5d.VIRTUAL or creation.get_external_count():
+                raise AmiwarpError(
+                    f"dataset '{name}' takes its values from other files; copy the values into this file"
+                )
+        return found
 
 
-def _group(file: Any, name: str) -> Any:
-    found = member(file, name)
-    if found is not None and not isinstance(found, h5py.Group):
+def member(file: h5py.File, name: str) -> Any:
+    """Return a group or dataset of the file, or None, as :class:`Finder`."""
+    found = Finder(file.id)(name)
+    kinds = {h5py.h5d.DatasetID: h5py.Dataset, h5py.h5g.GroupID: h5py.Group}
+    return kinds[type(found)](found) if type(found) in kinds else None
+
+
+def _group(find: Finder, name: str) -> Any:
+    found = find(name.strip("/"))
+    if found is not None and not isinstance(found, h5py.h5g.GroupID):
         raise AmiwarpError(f"'{name}' is not a group; see docs/reference/recording-format.md")
     return found
 
 
 def _attributes(group: Any, name: str) -> Iterator[tuple[str, Any]]:
-    wanted = ATTRIBUTES[name] or [_text(found) for found in group.attrs]
+    wanted = ATTRIBUTES[name] or [_text(found) for found in h5py.Group(group).attrs]
     for attribute in wanted:
-        if attribute in group.attrs:
+        if h5py.h5a.exists(group, attribute.encode()):
             yield attribute, _value(group, name, attribute)
 
 
 def _value(group: Any, name: str, attribute: str) -> Any:
     """Return the value of an attribute: a number, a string, or a list of these."""
-    stored = group.attrs.get_id(attribute)
+    stored = h5py.h5a.open(group, attribute.encode())
     classes = (h5py.h5t.INTEGER, h5py.h5t.FLOAT, h5py.h5t.STRING, h5py.h5t.ENUM)
-    if stored.get_type().get_class() not in classes or stored.get_space().get_simple_extent_type() == h5py.h5s.NULL:
+    if stored.get_type().get_class() not in classes or stored.shape is None:
         raise AmiwarpError(f"{name} attribute '{attribute}' is neither a number nor a string; remove it")
     if stored.get_storage_size() > ATTRIBUTE_BYTES:
         raise AmiwarpError(f"{name} attribute '{attribute}' has over {ATTRIBUTE_BYTES} bytes; the file is damaged")
-    return _plain(group.attrs[attribute])
+    return _plain(_whole(stored)[()])
 
 
 def _plain(value: Any) -> Any:
@@ -290,38 +351,69 @@ def _text(value: Any) -> str:
     return stored.decode("utf-8", "replace")
 
 
-def _describe(dataset: Any, name: str, kinds: str, path: str, unfinished: bool) -> dict[str, Any]:
+class _FileFacts(NamedTuple):
+    """What is known of an open file when its datasets are described."""
+
+    path: str
+    unfinished: bool
+    """Whether it may still grow."""
+    plain: bool
+    """See :func:`_is_plain`."""
+    size: int
+    """Size when it was opened [bytes]."""
+
+    def size_now(self) -> int:
+        """Return the size of the file [bytes]."""
+        return os.path.getsize(self.path) if self.unfinished else self.size
+
+
+class _Dataset(NamedTuple):
+    """Dataset with properties that are used several times; h5py would ask HDF5 each time. Its names are h5py's."""
+
+    id: Any
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    chunks: tuple[int, ...] | None
+    filters: list[Any]
+
+
+def _describe(found: Any, name: str, kinds: str, about: _FileFacts) -> dict[str, Any]:
     """Return type, length and filters of a dataset.
 
     If the chunks are read without HDF5, their positions in the file are returned too.
     """
     dimensions = DIMENSIONS.get(name, 1)
-    if not isinstance(dataset, h5py.Dataset) or dataset.ndim != dimensions:
+    shape = found.shape if isinstance(found, h5py.h5d.DatasetID) else None
+    if shape is None or len(shape) != dimensions:
         wanted = "one-dimensional" if dimensions == 1 else f"{dimensions}-dimensional"
         raise AmiwarpError(f"no {wanted} dataset '{name}'; the file is incomplete")
-    dtype = dataset.dtype
-    if dtype.kind not in kinds or dtype.fields is not None:
-        raise AmiwarpError(f"dataset '{name}' is {dtype}; see docs/reference/recording-format.md")
+    creation = found.get_create_plist()
+    filters = [creation.get_filter(at) for at in range(creation.get_nfilters())]
+    chunked = creation.get_layout() == h5py.h5d.CHUNKED
+    dataset = _Dataset(found, shape, found.dtype, creation.get_chunk() if chunked else None, filters)
+    if dataset.dtype.kind not in kinds or dataset.dtype.fields is not None:
+        raise AmiwarpError(f"dataset '{name}' is {dataset.dtype}; see docs/reference/recording-format.md")
     if row_bytes(dataset) > CHUNK_BYTES or (dataset.chunks or dataset.shape)[1:] != dataset.shape[1:]:
         raise AmiwarpError(
             f"dataset '{name}' has rows of over {CHUNK_BYTES >> 20} MiB, or chunks of partial rows; "
             "rewrite the file with chunks of whole rows"
         )
-    creation = dataset.id.get_create_plist()
-    filters = [creation.get_filter(at) for at in range(creation.get_nfilters())]
     places: list[tuple[int, int]] | None = None
     if dataset.chunks is None:
-        count = plain_length(dataset, name, path)
+        count = plain_length(dataset, name, about.size_now())
     else:
-        chunks = _chunks(dataset, name, filters, path, unfinished)
-        count = _chunked_length(dataset, name, chunks, unfinished)
-        places = stored_places(dataset, filters, chunks[: -(-count // CHUNK)])
+        chunks = _chunks(dataset, name, about)
+        count = _chunked_length(dataset, name, chunks, about.unfinished)
+        places = _stored_places(dataset, chunks[: -(-count // CHUNK)]) if about.plain else None
+        if places is None:
+            _check_heads(dataset, name, chunks, about.path)
     if name in READ_AT_ONCE and count * row_bytes(dataset) > max(
         AT_ONCE_BYTES, AT_ONCE_RATIO * dataset.id.get_storage_size()
     ):
         raise AmiwarpError(f"dataset '{name}' declares {count} elements, too many for its size; the file is damaged")
-    names = [FILTERS.get(code, f"filter {code}") for code, *_ in filters]
-    return {"dtype": dtype.str, "count": count, "filters": names, "places": places, "row": dataset.shape[1:]}
+    shown = [FILTERS.get(code, f"filter {code}") for code, *_ in filters]
+    row = dataset.shape[1:]
+    return {"dtype": dataset.dtype.str, "count": count, "filters": shown, "places": places, "row": row}
 
 
 def row_bytes(dataset: Any) -> int:
@@ -329,12 +421,12 @@ def row_bytes(dataset: Any) -> int:
     return int(dataset.dtype.itemsize) * math.prod(dataset.shape[1:])
 
 
-def plain_length(dataset: Any, name: str, path: str) -> int:
+def plain_length(dataset: Any, name: str, file_bytes: int) -> int:
     """Return the length of a dataset without chunks, after checking that the file holds all of it."""
     count, offset = int(dataset.shape[0]) if dataset.shape else 1, dataset.id.get_offset()
     declared, stored = count * row_bytes(dataset), dataset.id.get_storage_size()
     compact = dataset.id.get_create_plist().get_layout() == h5py.h5d.COMPACT
-    inside = compact or (offset is not None and offset + declared <= os.path.getsize(path))
+    inside = compact or (offset is not None and offset + declared <= file_bytes)
     if count and (stored < declared or not inside):
         raise AmiwarpError(
             f"dataset '{name}' declares {count} elements, which the file does not hold; copy the file again"
@@ -359,43 +451,47 @@ def _chunked_length(dataset: Any, name: str, chunks: list[Any], unfinished: bool
     return count
 
 
-def _chunks(dataset: Any, name: str, filters: list[Any], path: str, unfinished: bool) -> list[Any]:
-    """Return all chunks of a dataset in order, after checking each chunk.
-
-    HDF5 and its Blosc filter would read beyond a damaged chunk.
-    """
-    if dataset.chunks[0] * row_bytes(dataset) > CHUNK_BYTES:
+def _chunks(dataset: _Dataset, name: str, about: _FileFacts) -> list[Any]:
+    """Return all chunks of a dataset in order, after checking that each lies in the file."""
+    chunk_bytes = (dataset.chunks or (0,))[0] * row_bytes(dataset)
+    if chunk_bytes > CHUNK_BYTES:
         raise AmiwarpError(
             f"dataset '{name}' has chunks of over {CHUNK_BYTES >> 20} MiB; store the dataset in smaller chunks"
         )
     chunks: list[Any] = []
     dataset.id.chunk_iter(chunks.append)
     chunks.sort(key=lambda chunk: chunk.chunk_offset[0])
-    file_bytes = os.path.getsize(path)
     # An unfiltered chunk of an interrupted recording may end beyond the file. HDF5 reads zeros there.
-    file_bytes += dataset.chunks[0] * row_bytes(dataset) if unfinished and not filters else 0
-    damaged = sum(chunk.size for chunk in chunks) > file_bytes or _blosc_disagrees(dataset, filters)
-    with open(path, "rb") as raw:
-        for chunk in chunks:
-            damaged = damaged or chunk.byte_offset is None or chunk.byte_offset + chunk.size > file_bytes
-            damaged = damaged or _chunk_is_damaged(dataset, filters, chunk, raw)
-    if damaged:
-        raise AmiwarpError(f"dataset '{name}' has a damaged chunk; copy the file again")
+    file_bytes = about.size_now() + (chunk_bytes if about.unfinished and not dataset.filters else 0)
+    # The Blosc filter's parameters are two versions, bytes per element and bytes per chunk.
+    declared = [tuple(values[2:4]) for code, _, values, _ in dataset.filters if code == BLOSC]
+    if (
+        sum(chunk.size for chunk in chunks) > file_bytes
+        or any(chunk.byte_offset is None or chunk.byte_offset + chunk.size > file_bytes for chunk in chunks)
+        or any(values != (dataset.dtype.itemsize, chunk_bytes) for values in declared)
+    ):
+        raise _damaged_chunk(name)
     return chunks
 
 
-def _blosc_disagrees(dataset: Any, filters: list[Any]) -> bool:
-    """Return whether the Blosc filter's parameters contradict the dataset's chunks."""
-    itemsize = dataset.dtype.itemsize
-    # The filter's parameters are two versions, bytes per element and bytes per chunk.
-    declared = [tuple(values[2:4]) for code, _, values, _ in filters if code == BLOSC]
-    return any(values != (itemsize, dataset.chunks[0] * row_bytes(dataset)) for values in declared)
+def _damaged_chunk(name: str) -> AmiwarpError:
+    return AmiwarpError(f"dataset '{name}' has a damaged chunk; copy the file again")
 
 
-def _chunk_is_damaged(dataset: Any, filters: list[Any], chunk: Any, raw: Any) -> bool:
+def _check_heads(dataset: _Dataset, name: str, chunks: list[Any], path: str) -> None:
+    """Check that the size of each chunk agrees with the dataset. HDF5 and its Blosc filter would read beyond a chunk.
+
+    Chunks in the native layout are not checked here, because they are read without HDF5.
+    """
+    with open(path, "rb") as raw:
+        if any(_chunk_is_damaged(dataset, chunk, raw) for chunk in chunks):
+            raise _damaged_chunk(name)
+
+
+def _chunk_is_damaged(dataset: _Dataset, chunk: Any, raw: Any) -> bool:
     """Return whether a chunk's stored size contradicts the dataset."""
-    codes = [code for code, *_ in filters]
-    chunk_bytes = dataset.chunks[0] * row_bytes(dataset)
+    codes = [code for code, *_ in dataset.filters]
+    chunk_bytes = (dataset.chunks or (0,))[0] * row_bytes(dataset)
     if not codes:
         return bool(chunk.size != chunk_bytes)
     if codes[0] != BLOSC:
@@ -408,13 +504,10 @@ def _chunk_is_damaged(dataset: Any, filters: list[Any], chunk: Any, raw: Any) ->
     return len(header) < 16 or int.from_bytes(header[4:8], "little") != chunk_bytes or chunk.filter_mask != 0
 
 
-def stored_places(dataset: Any, filters: list[Any], chunks: list[Any]) -> list[tuple[int, int]] | None:
+def _stored_places(dataset: _Dataset, chunks: list[Any]) -> list[tuple[int, int]] | None:
     """Return offset and size of every chunk in the native layout [bytes]; None for other layouts, which HDF5 reads."""
-    file = dataset.file
-    plain = hasattr(os, "pread") and file.driver == "sec2" and file.userblock_size == 0 and dataset.dtype.isnative
-    if not plain or dataset.chunks[0] != CHUNK or [code for code, *_ in filters] != [BLOSC, FLETCHER32]:
-        return None
-    if any(chunk.filter_mask for chunk in chunks):
+    native = dataset.dtype.isnative and [code for code, *_ in dataset.filters] == [BLOSC, FLETCHER32]
+    if not native or (dataset.chunks or (0,))[0] != CHUNK or any(chunk.filter_mask for chunk in chunks):
         return None
     return [(chunk.byte_offset, chunk.size) for chunk in chunks]
 
@@ -496,7 +589,7 @@ def _check_rows(dataset: Any, name: str, path: str) -> None:
 def check_stored(dataset: Any, name: str, path: str) -> None:
     """Check that the file holds all of a dataset, in chunks that fit into memory."""
     if dataset.chunks is None:
-        plain_length(dataset, name, path)
+        plain_length(dataset, name, os.path.getsize(path))
         return
     chunks = math.prod(-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True))
     if chunks != dataset.id.get_num_chunks():

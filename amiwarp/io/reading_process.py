@@ -19,6 +19,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -65,6 +66,7 @@ class ReadingProcess:
             start_new_session=True,
         )
         self._preparing = False
+        self._keeps = False  # whether the process keeps values for the present reader
         self._requests: Any = self._child.stdin
         self._replies: Any = self._child.stdout
         self.close = weakref.finalize(self, _end, self._child, self.owner)
@@ -124,9 +126,15 @@ class ReadingProcess:
         except BaseException:
             self.close()  # the rest of this reply must not be read as the next reply
             raise
+        self._keeps = reply["keeps"]
         if "error" in reply:
             raise AmiwarpError(reply["error"])
         return reply["result"], arrays
+
+    def forget(self) -> None:
+        """Let the process close and drop all values that it keeps for a reader."""
+        if self._keeps:
+            self.call(forget)
 
     def _fill(self, buffer: Any) -> Any:
         if self._replies.readinto(buffer) != len(buffer):
@@ -190,10 +198,10 @@ def start_ahead(module: str) -> None:
 
 def give_back(process: ReadingProcess) -> None:
     """Keep a reading process for the next reader, or end it. Starting one takes about 0.3 s."""
-    if process.usable:
+    if process.close.alive and process.owner == os.getpid():
         with contextlib.suppress(AmiwarpError):
-            process.call(forget)
-            _keep_idle(process)
+            process.forget()
+            _keep_idle(process)  # its next reader finds out whether it is still alive
             return
     process.close()
 
@@ -272,7 +280,7 @@ def serve() -> None:
             request = json.loads(line)
             _limit(request["cpu_s"], request["memory_bytes"])
             head, arrays = _answer(request)
-            encoded = json.dumps(head).encode()
+            encoded = json.dumps({**head, "keeps": bool(_state)}).encode()
             replies.write(struct.pack("<I", len(encoded)) + encoded)
             for array in arrays:
                 replies.write(array.data if array.size else b"")
@@ -301,16 +309,31 @@ def _limit(cpu_s: int, memory_bytes: int) -> None:
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
-        used = resource.getrusage(resource.RUSAGE_SELF)
-        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
-        hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
-        soft = int(used.ru_utime + used.ru_stime) + 1 + cpu_s
-        resource.setrlimit(resource.RLIMIT_CPU, (soft if hard < 0 else min(soft, hard), hard))
-        with open("/proc/self/statm", encoding="ascii") as sizes:
-            taken = int(sizes.read().split()[0]) * resource.getpagesize()
-        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-        soft = taken + memory_bytes
-        resource.setrlimit(resource.RLIMIT_AS, (soft if hard < 0 else min(soft, hard), hard))
+        _set_limit(resource.RLIMIT_CORE, 0)
+        _set_limit(resource.RLIMIT_CPU, int(time.process_time()) + 1 + cpu_s)
+        taken = int(os.pread(_memory_sizes(), 64, 0).split()[0]) * resource.getpagesize()
+        _set_limit(resource.RLIMIT_AS, taken + memory_bytes)
+
+
+_limits: dict[int, tuple[int, int]] = {}
+"""Limit and hard limit that were set last, by resource."""
+
+
+def _set_limit(which: int, soft: int) -> None:
+    """Set the limit of a resource, unless it is set already."""
+    import resource
+
+    before, hard = _limits.get(which) or resource.getrlimit(which)
+    soft = soft if hard < 0 else min(soft, hard)
+    if soft != before or which not in _limits:
+        resource.setrlimit(which, (soft, hard))
+        _limits[which] = soft, hard
+
+
+@cache
+def _memory_sizes() -> int:
+    """Open the file in which Linux shows the memory that this process takes."""
+    return os.open("/proc/self/statm", os.O_RDONLY)
 
 
 def prepare(module: str) -> Reply:

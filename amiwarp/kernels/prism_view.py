@@ -7,6 +7,7 @@ from amiwarp.kernels.refraction import (
     ExactParams,
     compensate_about_axis,
     compensate_uneven,
+    prism_shift,
     ray_without_prism,
     refract_in_prism_frame,
 )
@@ -104,22 +105,6 @@ def level_at(view: View, step: Step, u: float, v: float) -> float:
     col = texel_of(x, view.width)
     row = texel_of(y, view.height)
     return blend_maps(view, step, row * view.width + col, x - float(col), y - float(row))
-
-
-@wp.func
-def prism_shift(m: ExactParams, along: float, z: float) -> float:
-    """Return the distance by which the prism shifts a bearing along the azimuth; NaN if no light passes.
-
-    The formula is the same as in kernels/refraction.py. ``along`` and ``z`` are the components of the bearing along the
-    azimuth and the axis. There are no branches, as :func:`texels_ahead` requires: the square root of a negative number
-    gives NaN, which propagates to the result.
-    """
-    inside = m.index2 - 1.0
-    if m.flat_to_scene == 1:
-        q = m.sin_apex * along + m.cos_apex * z
-        return m.sin_apex * (wp.sqrt(inside + q * q) - wp.where(q > 0.0, q, NAN))
-    q = m.sin_apex * along + m.cos_apex * wp.sqrt(inside + z * z)
-    return m.sin_apex * (wp.sqrt(q * q - inside) - q)
 
 
 @wp.func

@@ -246,6 +246,21 @@ def refract_in_prism_frame(
 
 
 @wp.func
+def prism_shift(m: ExactParams, along: float, z: float) -> float:
+    """Return the shift of :func:`refract_in_prism_frame` for a unit direction, as the simulator computes it.
+
+    ``along`` and ``z`` are the components of the direction along w and the axis. There are no branches, so that LLVM
+    computes several shifts at once: if no light passes, the square root of a negative number gives NaN.
+    """
+    inside = m.index2 - 1.0
+    if m.flat_to_scene == 1:
+        q = m.sin_apex * along + m.cos_apex * z
+        return m.sin_apex * (wp.sqrt(inside + q * q) - wp.where(q > 0.0, q, NAN))
+    q = m.sin_apex * along + m.cos_apex * wp.sqrt(inside + z * z)
+    return m.sin_apex * (wp.sqrt(q * q - inside) - q)
+
+
+@wp.func
 def tip(m: ExactParams, x: float, y: float, z: float, w0: float, w1: float, sine: float):
     """Rotate a direction as the wobble tips the prism: out of the prism's frame, or into it by the negative sine."""
     u0 = w0 * m.wobble_cos - w1 * m.wobble_sin

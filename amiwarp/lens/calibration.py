@@ -27,7 +27,7 @@ from amiwarp.calib.photometric.cost import Cost, Slopes
 from amiwarp.calib.photometric.stage import LARGEST_COST, Equations
 from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import PhotometricSettings, Settings
-from amiwarp.calib.sharpness import Search
+from amiwarp.calib.sharpness_search import Search
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import MemoryEvents, Recording
 from amiwarp.lens.board import Board, Corners, opencv

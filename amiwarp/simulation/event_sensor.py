@@ -14,7 +14,7 @@ from amiwarp.events.device_events import NAMES, DeviceEvents, import_array, wait
 from amiwarp.imaging.tensors import Windows
 from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.optics.camera import LARGEST_SIZE
-from amiwarp.simulation.description import SensorModel
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import LATEST_US, KeyBuffer, bus_of, row_scan, sensor_params
 from amiwarp.validation import TIME_LIMIT, array, guarded, instance, on_gpu, whole
 

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.imaging.metrics import gaussian
+from amiwarp.imaging.sharpness import gaussian
 from amiwarp.kernels import prism_view, world_rays
 from amiwarp.kernels import world as kernels
 from amiwarp.kernels.launch import launch

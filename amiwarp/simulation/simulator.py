@@ -34,12 +34,12 @@ from amiwarp.simulation.description import (
     Moved,
     PrismMotion,
     Scene,
-    SensorModel,
     SimulationValues,
     Vibration,
 )
 from amiwarp.simulation.pictures import DARK
 from amiwarp.simulation.scenery import DeviceWorld, MapRing, WorldMapRing, WorldSight
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.tasks import Progress
 from amiwarp.validation import TIME_LIMIT, array, guarded, real, shown

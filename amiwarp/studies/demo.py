@@ -26,7 +26,7 @@ from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.events.recording import Recording
 from amiwarp.imaging import metrics
-from amiwarp.imaging.metrics import gaussian
+from amiwarp.imaging.sharpness import gaussian
 from amiwarp.io import open_recording
 from amiwarp.io.files import check_output
 from amiwarp.io.formats import make_folder
@@ -54,7 +54,8 @@ from amiwarp.optics.models import MODELS, ExactModel
 from amiwarp.optics.prism import Prism, as_wedge
 from amiwarp.plotting.figures import EventViews, Grid, Reconstructed, draw_demo
 from amiwarp.reconstruction.picture import Picture, Reconstruction, save_picture
-from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
+from amiwarp.simulation.description import PrismMotion, Scene
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.tasks import Progress, part, silent
 

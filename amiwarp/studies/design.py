@@ -16,8 +16,9 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import EllipseModel, ExactModel, Model, predicted_error, rungs
 from amiwarp.optics.prism import Prism
 from amiwarp.plotting import figures
-from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
+from amiwarp.simulation.description import PrismMotion, Scene
 from amiwarp.simulation.scenery import place_scene, seen_bearings
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.tasks import Progress, part, silent
 

@@ -23,7 +23,8 @@ from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import LARGEST_INVERSE_DEPTH, ExactModel, Model, PlateModel, RisleyModel
 from amiwarp.optics.prism import LARGEST_THICKNESS, Plate, Prism
 from amiwarp.plotting import figures
-from amiwarp.simulation.description import Mirror, PrismMotion, Scene, SensorModel, Vibration
+from amiwarp.simulation.description import Mirror, PrismMotion, Scene, Vibration
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.simulation.worlds.world import Body, Material, Mesh, Trajectory, World, WorldScene
 from amiwarp.studies.design import (

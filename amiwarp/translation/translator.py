@@ -18,14 +18,15 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, MetadataValue, Recording
 from amiwarp.imaging.iwe import CanvasShape, Votes, upload_events
-from amiwarp.imaging.metrics import SharpnessMeter
+from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.io.formats import detect_format, open_recording
 from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.optics.models import ExactModel
 from amiwarp.optics.prism import Prism
 from amiwarp.reconstruction.picture import Reconstruction
-from amiwarp.simulation.description import CameraMotion, EncoderModel, Frames, PrismMotion, Scene, SensorModel, Still
+from amiwarp.simulation.description import CameraMotion, EncoderModel, Frames, PrismMotion, Scene, Still
 from amiwarp.simulation.pictures import PICTURE_SUFFIXES, Pictures, open_pictures, read_picture
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.tasks import Progress
 from amiwarp.translation import sources

@@ -20,10 +20,10 @@ from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Events, MemoryEvents, Recording
 from amiwarp.imaging.export import GAMMA, save_png
-from amiwarp.imaging.metrics import random_variance
 from amiwarp.imaging.palette import OFF_COLOUR, OFF_ON_BLACK, ON_COLOUR, ON_ON_BLACK
 from amiwarp.imaging.regions import SMOOTHING_PX, Region, inside
 from amiwarp.imaging.residuals import WIDEST_PX, at_pixels, residual
+from amiwarp.imaging.sharpness import random_variance
 from amiwarp.imaging.tensors import latest_times
 from amiwarp.io.depth_map import DepthMap
 from amiwarp.io.files import check_output, interrupts_later

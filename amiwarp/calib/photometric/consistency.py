@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -229,7 +229,8 @@ def linear_fit(cost: Cost, columns: dict[str, Any]) -> LinearFit:
     b = cost.brightness
     b.prepare_projection()
     for name, column in columns.items():
-        if name not in cost.columns or cost.columns[name][0] is not column:
+        known, left = cost.columns.get(name, (None, None))
+        if left is None or known is not column:
             cost.columns[name] = column, cost.unexplained(column, steps=MAP_STEPS)
     left = [cost.columns[name][1] for name in columns]
     next(cost.meanwhile, None)
@@ -297,12 +298,16 @@ LEAST_GAIN = 0.002
 """Smallest share of the squared residuals that a cause must remove. Right answers leave 0.001 at most."""
 LEAST_ANGLE_GAIN = 0.01
 """Smallest share that an error of the prism's angle must remove. Right angles leave 0.003 at most."""
+FIRST_LOOK = 0.5
+"""Share of what is asked of an error of the angle that it must have before all that may look like it is examined."""
 SHAKE_SHARE = 0.75
 """A shake counts if it explains this share of what all causes together explain, with fewer unknowns. Eight wrong lenses
 left 0.02 to 0.62 of it, shakes by 30 % of the prism's motion 0.84 to 1.7."""
 LEAST_SHAKE_GAIN = 0.0025
 """Smallest share of the squared residuals that a shake must explain beyond all causes together. An index that is wrong
 by 0.06 left 0.0013 to it at most while no cause freed it, shakes by 30 % of the prism's motion 0.0048 or more."""
+HINT = 3.0
+"""Number of standard deviations of a cause from which on a shake of the camera is looked for."""
 LEAST_FURTHER_GAIN = 0.0005
 """Smallest share that a further cause must remove once the given lens has turned out to be wrong."""
 LEAST_MOVE_PX = 0.005
@@ -423,8 +428,7 @@ class Consistency:
 def check_consistency(cost: Cost, best: Vector) -> Consistency:
     """Check the answer ``best`` [px]. The map must be solved there; it is not changed."""
     space = cost.space
-    columns = _columns(cost, best) | _rotation_columns(cost, best)
-    causes = testable(space)
+    columns, causes = _columns(cost, best), testable(space)
     doubtful = bool(set(LENS) & set(space.names))
     screened = causes if doubtful else [c for c in causes if c in SCREENED]
     for cause in screened:
@@ -435,20 +439,23 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
     alike = [c for c in screened if c in (INDEX, SHAPES[0])] if cylinder in screened else []
     gates = [c for c in screened if c in GATED and c not in alike]
     least_gain = LEAST_FURTHER_GAIN if doubtful else LEAST_GAIN
-    for group in telling(cost, [_cause_columns(cost, best, cause) for cause in gates], least_gain):
+    gated = [_rotation_columns(cost, best), *(_cause_columns(cost, best, cause) for cause in gates)]
+    for group in telling(cost, gated, least_gain):
         columns |= group
     for cause in alike if set(cylinder.names) <= columns.keys() else ():
         columns |= _cause_columns(cost, best, cause)
     fit, shake_px = linear_fit(cost, columns), 0.0
     findings = _findings(cost, best, fit, screened, least_gain)
-    if findings and not doubtful:
+    hint = _hints_at_lens(space, fit, screened) and not _rotation_gain(space, fit)
+    if not doubtful and (findings or hint):
         for cause in causes:
             if cause not in SCREENED:
                 columns |= _cause_columns(cost, best, cause)
         columns |= _shake_columns(cost, best)
-        fit = linear_fit(cost, columns)
-        findings = _findings(cost, best, fit, causes, LEAST_GAIN)
-        shake_px = _shake(space, fit)
+        wider = linear_fit(cost, columns)
+        shake_px = _shake(space, wider)
+        if findings:
+            fit, findings = wider, _findings(cost, best, wider, causes, LEAST_GAIN)
     brightness = cost.brightness
     systematic = _systematic(space, fit) + map_errors(space, best, fit, brightness.count, brightness.tiles.density)
     systematic += lens_errors(space, best, fit, least_gain) + (_doubt(space, fit, causes) if doubtful else 0.0)
@@ -629,16 +636,21 @@ def slopes(cost: Cost, space: ParameterSpace, v: Vector, names: Iterable[str]) -
 
     They are on the device. The map must be solved at ``v``.
     """
-    columns, known = {}, cost.columns if space is cost.space else {}
-    for name in names:
-        if name in known:
-            columns[name] = known[name][0]
-            continue
+
+    def by(name: str) -> Any:
         step = np.zeros(len(v))
         step[space.names.index(name)] = SLOPE_PX
         up, down = (place_arguments(space, space.to_values(at)) for at in (v + step, v - step))
-        columns[name] = cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
-    return columns
+        return cost.brightness.find_slope(up, down, 2.0 * SLOPE_PX)
+
+    return {name: once(cost, name, partial(by, name)) for name in names}
+
+
+def once(cost: Cost, name: str, find: Callable[[], Any]) -> Any:
+    """Return a derivative of the residuals by name, which is found once for each solution of the map."""
+    if name not in cost.columns:
+        cost.columns[name] = find(), None
+    return cost.columns[name][0]
 
 
 def shifted(cost: Cost, v: Vector, shift: Any) -> Any:
@@ -654,13 +666,16 @@ def shifted(cost: Cost, v: Vector, shift: Any) -> Any:
 
 def _rotation_columns(cost: Cost, best: Vector) -> dict[str, Any]:
     """Return the derivatives of the residuals by a slow rotation of the camera about each axis, if it is not free."""
-    space, at, columns = cost.space, cost.at(best), {}
+    space, at = cost.space, cost.at(best)
     half_s = max(0.5 * float(np.ptp(cost.brightness.pairs.some_times)), 1e-6)
-    for k, name in enumerate(RATES if not space.moving else ()):
-        x, y, z = np.eye(3)[k] * (SLOPE_PX / space.camera.fx / half_s)
+
+    def about(axis: Vector) -> Any:
+        x, y, z = axis * (SLOPE_PX / space.camera.fx / half_s)
         # one-sided differences: a camera at rest is faster to compute, and only the gain counts
-        columns[name] = cost.brightness.find_slope({**at, "camera_rotation": CameraRotation((x, y, z))}, at, SLOPE_PX)
-    return columns
+        return cost.brightness.find_slope({**at, "camera_rotation": CameraRotation((x, y, z))}, at, SLOPE_PX)
+
+    axes = zip(RATES if not space.moving else (), np.eye(3), strict=False)
+    return {name: once(cost, name, partial(about, axis)) for name, axis in axes}
 
 
 def _shake_columns(cost: Cost, best: Vector) -> dict[str, Any]:
@@ -746,28 +761,38 @@ def fit_angles(cost: Cost, best: Vector, names: tuple[str, ...] = ()) -> AngleFi
     groups = [{name: angles[name] for name in group} for group in (HARMONICS, SKEW) if angles.keys() >= {*group}]
     if not angles or not (names or telling(cost, groups, LEAST_ANGLE_GAIN)):
         return None
-    given = _rivals_of_angles(cost, best)
+    given = slopes(cost, cost.space, best, cost.space.names)
+    if not names and not _told(linear_fit(cost, given | angles), [*given], groups, FIRST_LOOK):
+        return None
+    given |= _rotation_columns(cost, best)
+    given |= _cause_columns(cost, best, ASPECT) if ASPECT in testable(cost.space) else {}
     others: dict[str, Any] = {}
     if not names:
         # cylinder power stands for wobble too, which has nearly the same effect
         for cause in (c for c in testable(cost.space) if c in SCREENED and c not in (INDEX, SHAPES[0])):
             others |= {n: x for n, x in _cause_columns(cost, best, cause).items() if n not in given}
     fit = linear_fit(cost, given | angles | others)
+    names = names or _told(fit, [*given, *others], groups)
     if not names:
-        for group, other in ((HARMONICS, SKEW), (SKEW, HARMONICS)) if len(groups) == 2 else ((SKEW, ()),):
-            _, significance, gain = fit.adding((*given, *others, *other), group)
-            names += group if significance >= SIGNIFICANT and gain >= LEAST_ANGLE_GAIN else ()
-        if not names:
-            return None
+        return None
     found = dict(zip(names, fit.fit((*given, *names)).change[len(given) :].tolist(), strict=True))
     change = np.array([found.get(name, 0.0) for name in PATTERNS])
     return AngleFit(names, change, px_per_rad(cost.space, best) * rms_angle(cost.space.camera, change))
 
 
-def _rivals_of_angles(cost: Cost, best: Vector) -> dict[str, Any]:
-    """Return the derivatives of the residuals by what may look like an error of the prism's angle."""
-    columns = slopes(cost, cost.space, best, cost.space.names) | _rotation_columns(cost, best)
-    return columns | (_cause_columns(cost, best, ASPECT) if ASPECT in testable(cost.space) else {})
+def _told(
+    fit: LinearFit, others: Sequence[str], groups: Sequence[Iterable[str]], share: float = 1.0
+) -> tuple[str, ...]:
+    """Return the names of those groups of errors of the angle that are significant beyond the columns ``others``.
+
+    ``share`` is a factor of what is asked of them.
+    """
+    names: tuple[str, ...] = ()
+    for group in groups:
+        rest = (n for other in groups if other is not group for n in other)
+        _, significance, gain = fit.adding((*others, *rest), (*group,))
+        names += (*group,) if significance >= share * SIGNIFICANT and gain >= share * LEAST_ANGLE_GAIN else ()
+    return names
 
 
 def rms_angle(camera: Camera, factors: Vector) -> float:
@@ -779,6 +804,12 @@ def rms_angle(camera: Camera, factors: Vector) -> float:
 def px_per_rad(space: ParameterSpace, best: Vector) -> float:
     """Return how far events move per angle of the prism [px rms/rad]."""
     return float(np.linalg.norm(best[:2])) if space.cartesian else space.pixels.get("phase", 0.0)
+
+
+def _hints_at_lens(space: ParameterSpace, fit: LinearFit, causes: list[Cause]) -> bool:
+    """Return whether a cause is notable, if not certain: a shake in time with the prism looks a little like a lens."""
+    found = (fit.adding(space.names, cause.names)[1:] for cause in causes if {*cause.names} <= {*fit.names})
+    return any(significance >= HINT and gain >= LEAST_FURTHER_GAIN for significance, gain in found)
 
 
 def _shake(space: ParameterSpace, fit: LinearFit) -> float:
@@ -798,7 +829,7 @@ def _shake(space: ParameterSpace, fit: LinearFit) -> float:
 
 def _rotation_gain(space: ParameterSpace, fit: LinearFit) -> float:
     """Return the share of the squared residuals that a slow rotation of the camera explains; 0 if not significant."""
-    if space.moving:
+    if space.moving or not {*RATES} <= {*fit.names}:
         return 0.0
     _, significance, gain = fit.adding(space.names, RATES)
     return gain if significance >= SIGNIFICANT else 0.0
@@ -832,7 +863,7 @@ def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
     try:
         if cause.names == (FLAT_SIDE,):
             ends = place_arguments(other_side(space), turned(space, values)), place_arguments(space, values)
-            return {FLAT_SIDE: cost.brightness.find_slope(*ends, 1.0)}
+            return {FLAT_SIDE: once(cost, FLAT_SIDE, partial(cost.brightness.find_slope, *ends, 1.0))}
         wide, v = with_cause(space, cause, values)
     except AmiwarpError:
         return {}  # it moves no event

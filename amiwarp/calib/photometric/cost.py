@@ -19,7 +19,7 @@ from amiwarp.calib.calibration_events import EventsAhead
 from amiwarp.calib.nlopt_solver import SearchStage, best_of
 from amiwarp.calib.parameters import RATES, ParameterSpace
 from amiwarp.calib.settings import GAUSS_NEWTON, PhotometricSettings
-from amiwarp.calib.sharpness import reach
+from amiwarp.calib.sharpness_search import reach
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, MemoryEvents, Recording
@@ -30,7 +30,7 @@ from amiwarp.kernels.map_positions import PATH_TERMS as POWERS
 from amiwarp.optics.models import MODELS
 
 if TYPE_CHECKING:
-    from amiwarp.calib.sharpness import Search
+    from amiwarp.calib.sharpness_search import Search
 
     Vector = NDArray[np.float64]
 
@@ -177,7 +177,7 @@ class Cost:
         """Derivatives of the brightness map by each parameter [1/px], from which the next solution starts."""
         self.columns: dict[str, tuple[Any, Any]] = {}
         """Derivatives of the residuals at the last solution, on the device, by name; each with the part of it that no
-        change of the map explains."""
+        change of the map explains, or None if that was not needed yet."""
         self._by_angle: tuple[Any, Any] | None = None
         self.paths: TilePaths | None = None
         """Paths of the tiles; None if their scenes move with the camera's rotation alone."""

@@ -35,7 +35,7 @@ from amiwarp.calib.photometric.cost import (
 )
 from amiwarp.calib.result import PhotometricSummary, StageSummary
 from amiwarp.calib.settings import GAUSS_NEWTON, LINEAR_UNKNOWNS, PhotometricSettings
-from amiwarp.calib.sharpness import LEAST_INSIDE_PX, Search
+from amiwarp.calib.sharpness_search import LEAST_INSIDE_PX, Search
 from amiwarp.events.recording import Recording
 from amiwarp.optics.camera import LENS, Camera
 from amiwarp.optics.models import MODELS

@@ -23,7 +23,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder, EncoderStream, rpm_between, start_of_last_run
 from amiwarp.events.recording import OVERHEAD, Events, MemoryEvents, Recording, held_bytes
 from amiwarp.imaging.iwe import CanvasShape
-from amiwarp.imaging.metrics import SharpnessMeter
+from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.io.native_writer import LiveWriter
 from amiwarp.live.link.clocks import CameraClock, ClockMap, monotonic_us
 from amiwarp.live.link.link import Link, LinkUpdate

@@ -22,7 +22,7 @@ from amiwarp.io.files import check_output, read_text, write_csv, write_text
 from amiwarp.io.formats import make_folder
 from amiwarp.optics.models import MODELS, rungs
 from amiwarp.plotting import figures
-from amiwarp.simulation.description import SensorModel
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.studies.chart import measurement
 from amiwarp.studies.chart.measurement import KnownRecording, Row
 from amiwarp.studies.cluster import machine, versions

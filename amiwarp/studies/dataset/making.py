@@ -41,7 +41,8 @@ from amiwarp.io.plain_files import save_tensors
 from amiwarp.kernels import launch
 from amiwarp.optics.camera import LARGEST_SIZE, Camera
 from amiwarp.optics.prism import Prism
-from amiwarp.simulation.description import CameraMotion, PrismMotion, Scene, SensorModel
+from amiwarp.simulation.description import CameraMotion, PrismMotion, Scene
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Engine, RecordedTruth, Simulation, chosen_instants
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.simulation.worlds.world_files import POSE_FILES, open_world

@@ -23,7 +23,8 @@ from amiwarp.io.files import errors_name, open_input
 from amiwarp.io.json_files import LARGEST_INTEGER, at_field, build, fields_of, read_json, read_toml
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
-from amiwarp.simulation.description import LONGEST_S, PrismMotion, SensorModel
+from amiwarp.simulation.description import LONGEST_S, PrismMotion
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.named.catalogue import WORLDS
 from amiwarp.validation import one_of, real, shown, whole
 

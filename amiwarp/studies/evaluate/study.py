@@ -33,7 +33,8 @@ from amiwarp.imaging.metrics import TRUTH_PERCENTILES, picture_quality
 from amiwarp.optics.camera import Camera, CameraRotation
 from amiwarp.optics.models import Model
 from amiwarp.optics.prism import Prism
-from amiwarp.simulation.description import PrismMotion, Scene, SensorModel
+from amiwarp.simulation.description import PrismMotion, Scene
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation, TruthRenderer
 from amiwarp.simulation.worlds.named.catalogue import named_world
 from amiwarp.simulation.worlds.world import WorldScene

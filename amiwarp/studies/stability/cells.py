@@ -30,7 +30,8 @@ from amiwarp.io.json_files import CellStore, build, fields_of, value_of
 from amiwarp.optics.camera import Camera, RadialTangential
 from amiwarp.optics.models import ExactModel, build_model, predicted_error
 from amiwarp.optics.prism import FlatSide, Prism
-from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, SensorModel, Still
+from amiwarp.simulation.description import CameraMotion, EncoderModel, PrismMotion, Scene, Still
+from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.simulator import Simulation
 from amiwarp.studies.cluster import Workers, machine, result_of, run_jobs
 from amiwarp.tasks import Progress

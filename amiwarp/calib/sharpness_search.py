@@ -30,7 +30,7 @@ from amiwarp.calib.settings import Settings, stage_share
 from amiwarp.choices import Sharpness
 from amiwarp.events.recording import Events
 from amiwarp.imaging.iwe import CanvasShape, Image, TileVotes, UploadedEvents, Votes, upload_events
-from amiwarp.imaging.metrics import SharpnessMeter
+from amiwarp.imaging.sharpness import SharpnessMeter
 from amiwarp.optics.camera import Camera, border
 from amiwarp.optics.models import MODELS, Model, build_model, points_on_host
 from amiwarp.tasks import Progress

@@ -1,0 +1,305 @@
+"""Sharpness of an image of warped events, and the directions of its edges."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from amiwarp.choices import Sharpness
+from amiwarp.errors import AmiwarpError
+from amiwarp.events.device_events import cast, import_array
+from amiwarp.imaging.iwe import CanvasShape, Image
+from amiwarp.kernels import iwe as kernels
+from amiwarp.kernels.iwe import SEGMENT, STRIP, find_largest, gather_sums, smooth_and_add, smooth_votes, sum_directions
+from amiwarp.kernels.launch import BLOCK_DIM, Program, launch, page_locked
+from amiwarp.validation import array, choice, guarded, on_gpu, real
+
+# Sharpness of an image of warped events: five measures with one signature. For all of them, higher is sharper.
+
+_Step = tuple[Any, int, list[Any], Any, int]
+"""Kernel with its number of threads, its inputs, its output, and the fewest threads of a CPU slice."""
+PAPER_ETA = 1.0
+"""Parameter η of the paper's sharpness cost J [events]; He et al. do not state the value that they used."""
+LARGEST_SMOOTHING = 1000.0
+"""Largest accepted standard deviation of the smoothing Gaussian [px]."""
+LEAST_PADDING = 6
+"""Smallest padding of a meter's image [px]; the measure of edge directions smooths it, too."""
+
+
+class SharpnessMeter:
+    """Measures the sharpness of images of one canvas, after smoothing. Owns its buffers."""
+
+    def __init__(self, canvas: CanvasShape, kind: Sharpness, *, smoothing: float, device: Any) -> None:
+        """Allocate buffers. ``smoothing``: standard deviation of the Gaussian [canvas px]; 0 disables smoothing."""
+        weights = gaussian(smoothing)
+        self.kind = choice(Sharpness, kind, "sharpness")
+        self.device = wp.get_device(device)
+        self.image = Image(canvas, max(len(weights), LEAST_PADDING), self.device)
+        """Image whose sharpness is measured [events per pixel]; the caller writes its pixels."""
+        self._weights = wp.array(weights, dtype=float, device=device)
+        layers, rows, columns = canvas.shape
+        self._n = layers // canvas.parts * rows * columns
+        strips = -(-rows // int(STRIP)) * self.image.frame.blocks
+        unrolled = self.device.is_cuda and 1 < len(weights) <= kernels.MOST_UNROLLED
+        self.takes_votes = unrolled and self.kind is Sharpness.VARIANCE
+        """Whether :meth:`launch` takes votes."""
+        if self.takes_votes:
+            strips = -(-rows * columns // BLOCK_DIM)
+        self._sums = wp.empty((layers, strips), dtype=wp.vec2d, device=device)
+        self._host = self._sums
+        if self.device.is_cuda:
+            self._host = page_locked(self, (layers,), wp.vec2d, self.device)
+            # the same memory, into which a kernel writes: a copy would take longer
+            self._sum = wp.array(ptr=self._host.ptr, dtype=wp.vec2d, shape=layers, device=self.device)
+            if len(weights) > 1:
+                _ = self._smoothed  # a captured graph must not allocate it
+        self._sums_on_host = self._host.numpy().reshape(canvas.parts, -1, 2)
+
+    def launch(self, votes: Any = None) -> None:
+        """Measure :attr:`image` on the device without waiting for the result.
+
+        Instead of the image, its ``votes`` [1/256 event] may be given in the same memory layout.
+        """
+        assert votes is None or self.takes_votes
+        if self.device.is_cpu:
+            self._program.launch()
+            return
+        for kernel, n, inputs, out, _ in self._fused_steps(votes) if self.takes_votes else self._steps():
+            launch(kernel, n, inputs, [out], device=self.device)
+        threads = self._sum.size * BLOCK_DIM
+        wp.launch(gather_sums, threads, [self._sums], [self._sum], device=self.device, block_dim=BLOCK_DIM)
+
+    def _fused_steps(self, votes: Any) -> Iterator[_Step]:
+        """Yield what :meth:`_steps` does, in fewer kernels: for the variance on CUDA."""
+        taps, frame, out = len(self._weights), self.image.frame, self._smoothed[0]
+        if votes is None:
+            inputs = [self.image.pixels, self._weights, 1, frame]
+            yield kernels.smooth_few(taps), self.image.blocks, inputs, out, 512
+        else:
+            yield smooth_votes(taps), self.image.blocks, [votes, self._weights, frame], out, 512
+        threads = self._sums.shape[1] * BLOCK_DIM
+        inputs = [out, self._weights, frame, threads]
+        yield smooth_and_add(taps), self._sums.size * BLOCK_DIM, inputs, self._sums.flatten(), 512
+
+    def _steps(self) -> Iterator[_Step]:
+        """Yield each kernel with its number of threads, inputs, output, and the fewest threads of a CPU slice."""
+        smoothed, frame, width = self.image.pixels, self.image.frame, self.image.width
+        taps = len(self._weights)
+        if self.device.is_cpu and self.kind is Sharpness.VARIANCE and 1 < taps <= kernels.MOST_UNROLLED:
+            kernel, inputs = kernels.smooth_and_sum(taps), [smoothed, self._weights, frame]
+            yield kernel, self._sums.size, inputs, self._sums.flatten(), 64
+            return
+        if taps > 1:
+            yield from smoothing_steps(self.image, self._weights, self._smoothed)
+            smoothed = self._smoothed[-1]
+        kernel = kernels.sum_terms(width, list(Sharpness).index(self.kind))
+        yield kernel, self._sums.size, [smoothed, frame, PAPER_ETA], self._sums.flatten(), 64
+
+    @cached_property
+    def _smoothed(self) -> list[Any]:
+        """Buffers for the image, smoothed along rows and, if that is stored, along both axes."""
+        return [wp.zeros_like(self.image.pixels) for _ in range(1 if self.takes_votes else 2)]
+
+    @cached_property
+    def _program(self) -> Program:
+        """Recorded launches for a CPU, where a new launch takes about as long as the kernel."""
+        program = Program(self.device)
+        for kernel, n, inputs, out, smallest in self._steps():
+            program.add(kernel, n, inputs, [out], smallest=smallest)
+        return program
+
+    def results(self) -> list[float]:
+        """Wait, and return the sharpness of each part of the last measured image."""
+        if self.device.is_cuda:
+            wp.synchronize_stream(self.device)
+        sums = self._sums_on_host
+        few = sums[:, 0] if sums.shape[1] == 1 else sums.sum(axis=1)  # NumPy takes microseconds even for sums of one
+        return [self._score(total, terms) for total, terms in few.tolist()]
+
+    @property
+    def finite(self) -> bool:
+        """Whether all values of the last measured image were finite."""
+        return bool(np.isfinite(self._sums_on_host[..., 0]).all())
+
+    def measure(self) -> float:
+        """Return the sharpness of :attr:`image`, which has one part."""
+        self.launch()
+        return self.results()[0]
+
+    def _score(self, total: float, terms: float) -> float:
+        """Return the sharpness from the sum of the image's pixels and the sum of the measure's terms."""
+        if total <= 0.0:
+            return 0.0
+        if self.kind is Sharpness.VARIANCE:
+            return terms / total - total / self._n
+        if self.kind is Sharpness.PAPER_J:
+            return -terms
+        if self.kind is Sharpness.ENTROPY:
+            return terms / total - math.log(total)
+        return terms / total
+
+
+def smoothing_steps(image: Image, weights: wp.array, out: list[wp.array]) -> Iterator[_Step]:
+    """Yield the two steps that smooth an image along its rows and columns, as :meth:`SharpnessMeter._steps` does.
+
+    ``out``: buffers of the layout of the image for the result of each step.
+    """
+    unrolled = image.device.is_cuda and len(weights) <= kernels.MOST_UNROLLED
+    smooth = kernels.smooth_few(len(weights)) if unrolled else kernels.smooth(image.width)
+    smoothed = image.pixels
+    for step, result in zip((1, image.frame.stride), out, strict=True):
+        yield smooth, image.blocks, [smoothed, weights, step, image.frame], result, 512
+        smoothed = result
+
+
+def gaussian(sigma: float) -> NDArray[np.float32]:
+    """Return the weights of a Gaussian at 0, 1, … 3 sigma pixels; [1] for sigma 0.
+
+    The symmetric kernel of these weights sums to 1.
+    """
+    sigma = real(sigma, "smoothing", 0.0, LARGEST_SMOOTHING, " px, a standard deviation")
+    if sigma < 1e-6:  # the weights of the neighbours are 0 in float32
+        return np.ones(1, dtype=np.float32)
+    k = np.arange(math.ceil(3.0 * sigma) + 1)
+    weights = np.exp(-0.5 * (k / sigma) ** 2)
+    return (weights / (weights[0] + 2.0 * weights[1:].sum())).astype(np.float32)
+
+
+def random_variance(smoothing: float) -> float:
+    """Return the variance over mean of an image of random events: bilinear votes at dithered places, then smoothed.
+
+    ``smoothing``: standard deviation of the Gaussian [px].
+    """
+    weights = gaussian(smoothing).astype(np.float64)
+    both = np.concatenate([weights[:0:-1], weights])
+    # Bilinear votes share an event by 1 - u and u, with u from 0 to 1: 2/3 is the mean of (1 - u)² + u².
+    return ((2.0 * float(both @ both) + float(both[1:] @ both[:-1])) / 3.0) ** 2
+
+
+def relative_variance(variance: float, mean: float, smoothing: float) -> float:
+    """Return the variance of the density of events over the square of its mean, which more events do not change.
+
+    It is 0 for events at random places, whatever their number: the variance that counting gives them is subtracted.
+
+    Parameters
+    ----------
+    variance : float
+        Variance over mean of an image of bilinear votes of dithered events, from :class:`SharpnessMeter`.
+    mean : float
+        Mean of that image [events per pixel], above 0.
+    smoothing : float
+        Standard deviation of the Gaussian that smoothed the image [px].
+
+    Returns
+    -------
+    float
+        The relative variance. It is negative only by noise.
+    """
+    return (variance - random_variance(smoothing)) / mean
+
+
+@guarded
+def sharpness(
+    image: Any,
+    kind: Sharpness = Sharpness.VARIANCE,
+    *,
+    smoothing: float = 0.0,
+    device: Any = None,
+) -> float:
+    """Compute the sharpness of an image of warped events.
+
+    Parameters
+    ----------
+    image : array
+        Image [events per pixel], shape ``(height, width)`` or ``(2, height, width)``: an array of NumPy, Warp, PyTorch,
+        CuPy, JAX or any other library with DLPack.
+    kind : Sharpness, optional
+        Sharpness measure.
+    smoothing : float, optional
+        Standard deviation of a Gaussian applied first [px]; 0 disables it.
+    device : str or warp.Device, optional
+        Device to compute on, by default that of the image.
+
+    Returns
+    -------
+    float
+        Sharpness. Higher is sharper; 0 for an image without events.
+
+    Raises
+    ------
+    AmiwarpError
+        If the image has another shape or holds values that are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> edge = np.zeros((8, 8), np.float32)
+    >>> edge[:, 3] = 8.0
+    >>> even = np.ones((8, 8), np.float32)
+    >>> amiwarp.sharpness(edge), amiwarp.sharpness(even)
+    (7.0, 0.0)
+    """
+    on_device = on_gpu(image) or isinstance(image, wp.array)
+    image = cast(import_array(image, "image"), wp.float32) if on_device else array(image, "image")
+    if image.ndim not in (2, 3) or not image.size or (image.ndim == 3 and len(image) > 2):
+        raise AmiwarpError(f"image has shape {image.shape}; expected (height, width) or (2, height, width)")
+    stack = image.reshape((-1, *image.shape[-2:]))
+    canvas = CanvasShape(stack.shape[2], stack.shape[1], per_polarity=len(stack) == 2)
+    if not on_device and not np.all(np.isfinite(stack)):
+        raise AmiwarpError(f"image of shape {image.shape} holds a value that is not finite; replace it")
+    if device is None:
+        device = image.device if on_device else "cpu"
+    meter = SharpnessMeter(canvas, kind, smoothing=smoothing, device=device)
+    meter.image.write(stack.to(meter.device) if on_device else stack)
+    found = meter.measure()
+    if not meter.finite:
+        raise AmiwarpError(f"image of shape {image.shape} holds a value that is not finite; replace it")
+    return found
+
+
+def contrast(image: NDArray[np.float32]) -> float:
+    """Return the variance over mean of an IWE: 1 for events at random pixels, higher for sharper images."""
+    return sharpness(image, Sharpness.VARIANCE)
+
+
+def entropy(image: NDArray[np.float32]) -> float:
+    """Return the entropy of the events' distribution over the pixels of an IWE [nat]: lower for sharper images."""
+    return -sharpness(image, Sharpness.ENTROPY)
+
+
+# How much the edges in an image run in one direction.
+
+EDGE_SMOOTHING_PX = 1.5
+"""Standard deviation of the Gaussian that smooths an image before its gradients are computed [px]."""
+STRONG = 0.1
+"""Share of the largest squared gradient above which a gradient counts."""
+FEW_SEGMENTS = 512
+"""Smallest number of segments for which a second CPU thread is used."""
+
+
+def edge_coherence(image: Image, inset: int) -> float:
+    """Return the coherence of an image's edge directions, |Σ g² e^{2iφ}| / Σ g² over gradients (g, φ), 0 to 1.
+
+    It is 1 if all edges are parallel. Gradients are those of the sum of all layers. Noise has no direction and lowers
+    the coherence, so weak gradients are left out, and so are pixels within ``inset`` of the image's border.
+    """
+    device, (layers, rows, columns) = image.device, image.shape
+    weights = wp.array(gaussian(EDGE_SMOOTHING_PX), dtype=float, device=device)
+    buffers = [wp.zeros_like(image.pixels) for _ in range(2)]
+    for kernel, n, inputs, out, smallest in smoothing_steps(image, weights, buffers):
+        launch(kernel, n, inputs, [out], device=device, smallest=smallest)
+    n = max(0, rows - 2 * inset) * max(0, -(-(columns - 2 * inset) // int(SEGMENT)))
+    largest: Any = wp.zeros(max(1, n), dtype=float, device=device)
+    inputs = [buffers[1], image.frame, layers, inset]
+    launch(find_largest, n, inputs, [largest], device=device, smallest=FEW_SEGMENTS)
+    limit = STRONG * float(largest.numpy().max())
+    sums: Any = wp.zeros(max(1, n), dtype=wp.vec3d, device=device)
+    launch(sum_directions, n, [*inputs, limit], [sums], device=device, smallest=FEW_SEGMENTS)
+    total, x, y = sums.numpy().sum(axis=0).tolist()
+    return math.hypot(x, y) / total if total > 0.0 else 0.0
