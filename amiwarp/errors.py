@@ -1,6 +1,8 @@
 """Exception for bad input, whose message says what was given, what was expected and what to do."""
 
+import importlib
 import re
+from typing import Any
 
 
 class AmiwarpError(ValueError):
@@ -43,3 +45,14 @@ def printable(text: str) -> str:
     that reverse the direction of writing, or bytes that are not UTF-8. All of these are escaped, as in ``\\x1b``.
     """
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def optional_module(name: str, extra: str, need: str) -> Any:
+    """Import a module of an optional library. Raises :class:`AmiwarpError` if it is missing.
+
+    ``extra``: the package's extra that installs it; ``need``: the message without the remedy.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise AmiwarpError(f"{need}; run: pip install 'amiwarp[{extra}]'") from error

@@ -75,6 +75,16 @@ def pytest_configure(config: pytest.Config) -> None:
             load_all(device)
 
 
+def pytest_collection(session: pytest.Session) -> None:
+    """Let each of xdist's processes compile a part of the files before it collects all, or each would compile all."""
+    worker = getattr(session.config, "workerinput", None)
+    if worker is not None and session.config.args == session.config.getini("testpaths"):
+        number = int(worker["workerid"].removeprefix("gw"))
+        for path in sorted(Path(__file__).parent.glob("test_*.py"))[number :: worker["workercount"]]:
+            with contextlib.suppress(Exception, pytest.skip.Exception):  # collection imports it again, and reports that
+                importlib.import_module(f"tests.{path.stem}")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the longest files. The order within a file stays."""
     rank = {name: k for k, name in enumerate(LONGEST_FIRST)}

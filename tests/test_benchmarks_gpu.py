@@ -1,9 +1,12 @@
 """The benchmark of several GPUs, tested without one: jobs shared by Dask workers."""
 
+import contextlib
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,8 +26,26 @@ def test_cells_are_compared_by_their_results() -> None:
     assert two_gpus.difference("files", {"0.h5": "x"}, {"0.h5": "y"}) == math.inf
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:distributed.*")
 def test_two_workers_make_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    out = tmp_path / "two.json"
+    """Two processes make the files of one worker, which is a thread of this process."""
+    from distributed import Client, LocalCluster
+
+    processes, out = two_gpus.cluster, tmp_path / "two.json"
+
+    @contextlib.contextmanager
+    def cluster(count: int, share: int, gpus: tuple[str, ...]) -> Iterator[Any]:
+        if count > 1:
+            with processes(count, share, gpus) as client:
+                yield client
+            return
+        with (
+            LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as local,
+            Client(local) as client,
+        ):
+            yield client
+
+    monkeypatch.setattr(two_gpus, "cluster", cluster)
     words = ["--device", "cpu", "--jobs", "files", "--seconds", "0.01", "--events", "20000", "--folder", str(tmp_path)]
     words += ["--limit-s", "600"]  # both rows are made on a busy machine, too
     monkeypatch.setattr("sys.argv", ["two_gpus", *words, "--out", str(out)])

@@ -9,6 +9,7 @@ from typing import get_type_hints
 import numpy as np
 import pytest
 
+import amiwarp
 from amiwarp import (
     AmiwarpError,
     Calibration,
@@ -25,7 +26,6 @@ from amiwarp import (
     SensorModel,
     Settings,
     Sharpness,
-    calib,
     model_error,
     open_recording,
     predicted_error,
@@ -40,7 +40,7 @@ from amiwarp.calib.sharpness_search import PARTS
 from amiwarp.optics.models import MODELS, rungs, wrap_angle
 from tests.conftest import NOMINAL_PRISM, TRUE_PRISM
 
-calibrate = functools.partial(calib.calibrate, stages=("sharpness",))
+calibrate = functools.partial(amiwarp.calibrate, stages=("sharpness",))
 
 
 def error_px(recording: Recording, model: object) -> float:
@@ -169,7 +169,7 @@ def test_an_uneven_prism_is_found(texture: np.ndarray, name: str, x: float, y: f
     recording = simulate(
         texture, camera, Prism(math.radians(4)), duration_s=0.17, motion=motion, sensor=SensorModel.ideal(0.25)
     )
-    c = calib.calibrate(recording, free=("apex", "phase", f"{name}_x", f"{name}_y"), model="exact")
+    c = amiwarp.calibrate(recording, free=("apex", "phase", f"{name}_x", f"{name}_y"), model="exact")
     assert c.parameters[f"{name}_x"] == pytest.approx(x, rel=0.02)
     assert c.parameters[f"{name}_y"] == pytest.approx(y, rel=0.02)
     assert c.warnings == ()

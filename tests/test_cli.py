@@ -465,7 +465,7 @@ def test_interrupt_leaves_nothing(place: Path, command: str, number: signal.Sign
     }[command]
     script = f"{INTERRUPTIBLE}; sys.argv[0] = 'amiwarp'; from amiwarp.__main__ import main"
     script += (
-        "; import amiwarp.calib as c; calibrate = c.calibrate; "
+        "; import amiwarp.calib.calibration as c; calibrate = c.calibrate; "
         "c.calibrate = lambda *a, **k: (print('at work', flush=True), calibrate(*a, **k))[1]; main()"
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}

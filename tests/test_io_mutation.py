@@ -15,8 +15,8 @@ from reference.mutation_files import KINDS, Checker, check, mutated, sample
 
 MUTANTS = 20
 """Mutants per kind of input. ``benchmarks.fuzz``, which ``.ci/run`` runs too, checks as many others as time allows."""
-CONVERTED = 60
-"""Mutants per format that are converted: of formats with checksums, few are read."""
+CONVERTED = 30, 60
+"""Least and most mutants per format that are converted: of formats with checksums, few are read."""
 ENDLESS = {"native": (31,), "truth": (52,)}
 """More mutants, in which HDF5 searches without end."""
 
@@ -101,7 +101,9 @@ def test_converted_mutants_are_whole_or_absent(tmp_path, name):
     data = original.read_bytes()
     (tmp_path / "out").mkdir()
     outcomes = {"read": 0, "refused": 0}
-    for seed in range(CONVERTED):
+    for seed in range(CONVERTED[1]):
+        if seed >= CONVERTED[0] and min(outcomes.values()) > 0:
+            break
         path = tmp_path / f"mutant{seed}{original.suffix}"
         path.write_bytes(mutated(data, random.Random(f"convert {name} {seed}")))
         out = tmp_path / "out" / f"{seed}.h5"

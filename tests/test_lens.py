@@ -353,10 +353,10 @@ def recordings() -> list[amiwarp.Recording]:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stop after two passes, with a third of the pairs: the images are small."""
+    """Stop after two passes, with a sixth of the pairs: the images are small."""
     monkeypatch.setattr(calibration, "MOST_PASSES", 2)
-    monkeypatch.setattr(calibration, "PAIRS", calibration.PAIRS // 3)
-    monkeypatch.setattr(calibration, "FINE_PAIRS", calibration.FINE_PAIRS // 3)
+    monkeypatch.setattr(calibration, "PAIRS", calibration.PAIRS // 6)
+    monkeypatch.setattr(calibration, "FINE_PAIRS", calibration.FINE_PAIRS // 6)
 
 
 @pytest.mark.usefixtures("quick")

@@ -28,7 +28,7 @@ from amiwarp.optics.models import compensate_by_each
 from amiwarp.viewer.inspector import Inspector
 from tests.conftest import COARSE
 
-CAMERA = Camera.from_fov(160, 120, math.radians(60.0))
+CAMERA = Camera.from_fov(120, 90, math.radians(60.0))
 PRISM = Prism(math.radians(2.0))
 LATENCY_US = 100.0
 """Latency of the simulated sensor [us]."""
@@ -132,7 +132,7 @@ def test_repetition_gives_the_path_of_a_ramp(spun_up: tuple[Recording, PrismMoti
 def test_events_that_do_not_repeat_have_no_path() -> None:
     rng = np.random.default_rng(0)
     events = simulate(rng.integers(0, 255, (60, 80), dtype=np.uint8), CAMERA, PRISM, duration_s=0.02).events
-    short = Recording(MemoryEvents(events.slice(0, len(events)), 160, 120), CAMERA, None, PRISM, None, {}, "short")
+    short = Recording(MemoryEvents(events.slice(0, len(events)), 120, 90), CAMERA, None, PRISM, None, {}, "short")
     assert varying_paths(short) == []
 
 

@@ -65,10 +65,11 @@ def test_labels_belong_to_the_caller(folder: Path) -> None:
     assert dataset[0][1] == {"k": 0}
 
 
-def test_a_spawned_process_of_a_loader_reads_it(folder: Path) -> None:
+def test_a_loader_reads_the_copy_of_a_worker(folder: Path) -> None:
+    """A spawned process gets a pickled copy. ``examples/train_from_files.py``, which a test runs, starts one."""
     data = pytest.importorskip("torch.utils.data")
-    dataset = RecordedDataset(folder, "train", transform=count_events)
-    loader = data.DataLoader(dataset, batch_size=2, num_workers=1, multiprocessing_context="spawn")
+    dataset = pickle.loads(pickle.dumps(RecordedDataset(folder, "train", transform=count_events)))
+    loader = data.DataLoader(dataset, batch_size=2)
     assert [[column.tolist() for column in batch] for batch in loader] == [[[3, 1], [0, 1]], [[4, 0], [2, 3]]]
 
 

@@ -66,7 +66,7 @@ def test_a_wrong_direction_of_the_encoder_is_named(still: Recording) -> None:
 
 
 def test_an_encoder_that_slips_at_every_half_turn_is_no_turning_camera(texture: np.ndarray) -> None:
-    camera = Camera.from_fov(160, 120, math.radians(60.0))
+    camera = Camera.from_fov(120, 90, math.radians(60.0))
     recording = simulate(texture, camera, TRUE_PRISM, duration_s=0.34, seed=3)
     assert recording.encoder is not None
     angle = recording.encoder.angle
@@ -183,8 +183,10 @@ ENCODERS: dict[str, Callable[[], Encoder | None]] = {
 }
 
 
-@pytest.mark.parametrize("encoder", ENCODERS)
-@pytest.mark.parametrize("what", USELESS)
+@pytest.mark.parametrize(
+    ("what", "encoder"),
+    [(what, encoder) for what in USELESS for encoder in ENCODERS if what == "noise" or encoder in ("good", "none")],
+)
 def test_events_of_no_use_are_refused_with_a_reason(what: str, encoder: str) -> None:
     made = MemoryEvents(USELESS[what](), WIDTH, HEIGHT)
     recording = Recording(made, CAMERA, ENCODERS[encoder](), Prism(math.radians(2.0)), name="recording")

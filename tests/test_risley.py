@@ -18,6 +18,7 @@ from amiwarp.events.device_events import encoder_params
 from amiwarp.imaging.iwe import CanvasShape, Votes, upload_events
 from amiwarp.kernels.refraction import PairParams, advanced, state_of
 from reference import optics as reference
+from tests.conftest import COARSE
 from tests.test_world_truth import square
 
 CAMERA = Camera.from_fov(320, 240, math.radians(60.0))
@@ -162,7 +163,7 @@ def test_it_is_calibrated_stored_and_compensated(recording: amiwarp.Recording, t
     assert recording.encoder is not None
     t = np.arange(0, 500_000, 777)
     np.testing.assert_array_equal(opened.encoder.angles_at(t), recording.encoder.angles_at(t))
-    found = amiwarp.calibrate(opened)
+    found = amiwarp.calibrate(opened, events=100_000, photometric=COARSE)
     assert found.model_name == "risley"
     xy, theta = samples(2000)
     truth = RisleyModel(CAMERA, PAIR, *PHASES)

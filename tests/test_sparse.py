@@ -79,7 +79,7 @@ def test_a_map_that_follows_a_wrong_answer_confirms_nothing() -> None:
     assert error is None or error < 0.1
 
 
-@pytest.mark.parametrize(("seed", "noise"), [(0, 0.0), (1, 0.1), (2, 0.2), (3, 0.35)])
+@pytest.mark.parametrize(("seed", "noise"), [(0, 0.0), (3, 0.35)])
 def test_sparse_pictures_are_right_or_refused(seed: int, noise: float) -> None:
     rng = np.random.default_rng(seed)
     recording = sparse(seed, lines_and_dots(seed, 4, 4, int(rng.integers(32, 50)), rng.uniform(0.5, 1.2)), noise)

@@ -211,7 +211,7 @@ def test_a_second_interrupt_drops_what_waits() -> None:
     class Counting(Slow):
         def append_encoder(self, t_us: np.ndarray, angle: np.ndarray, index_t_us: np.ndarray, *, second: bool) -> None:
             jobs.append(len(t_us))
-            time.sleep(0.05)
+            time.sleep(0.005)
 
     def interrupt(_: object) -> None:
         if jobs:

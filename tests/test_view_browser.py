@@ -975,7 +975,7 @@ def test_at_a_zoom_of_200_percent_the_clouds_fill_the_window_and_the_rest_is_bel
 
 
 def test_a_large_sensor_is_shown_soon_in_squares_of_pixels(opened: Open) -> None:
-    rng, n, (width, height) = np.random.default_rng(0), 60_000, (4096, 2304)
+    rng, n, (width, height) = np.random.default_rng(0), 60_000, (2880, 1620)
     x, y = rng.integers(0, width, n), rng.integers(0, height, n)
     x[: n // 2] = 1000 + rng.normal(0.0, 2.0, n // 2).astype(np.int64)
     events = Events.from_arrays(x, y, np.sort(rng.integers(0, 200_000, n)), rng.integers(0, 2, n))

@@ -425,5 +425,5 @@ def test_large_world_files_are_refused_before_they_are_parsed(tmp_path: Path) ->
 def test_without_trimesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     quad(tmp_path / "quad.obj")
     monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(AmiwarpError, match=r"need trimesh; install it by: pip install 'amiwarp\[worlds\]'"):
+    with pytest.raises(AmiwarpError, match=r"need trimesh; run: pip install 'amiwarp\[worlds\]'"):
         load_mesh(tmp_path / "quad.obj")

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.calib import Calibration, Settings
 from amiwarp.calib.parameters import values_of
-from amiwarp.calib.settings import PhotometricSettings
+from amiwarp.calib.result import Calibration
+from amiwarp.calib.settings import PhotometricSettings, Settings
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import errors_name, write_text
 from amiwarp.io.formats import check_ending

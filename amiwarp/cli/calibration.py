@@ -46,8 +46,7 @@ from amiwarp.optics.camera import CameraRotation
 from amiwarp.tasks import Progress
 
 if TYPE_CHECKING:
-    from amiwarp.calib import Calibration
-    from amiwarp.calib.result import ModelCandidate, ModelChoice
+    from amiwarp.calib.result import Calibration, ModelCandidate, ModelChoice
     from amiwarp.calib.settings import PhotometricSettings
     from amiwarp.imaging.export import IweFiles
     from amiwarp.reconstruction.picture import Picture, Reconstruction
@@ -276,9 +275,10 @@ def run_calibrate(
 
     No initial guess is needed. A photometric stage refines the result.
     """
-    from amiwarp.calib import Settings, calibrate
+    from amiwarp.calib.calibration import calibrate
     from amiwarp.calib.paper_method import calibrate_as_paper
     from amiwarp.calib.presets import Preset
+    from amiwarp.calib.settings import Settings
 
     device = choose_device(common.device)
     base = Settings() if preset is None else Preset.load(preset, "calibration").calibration_settings()
@@ -503,8 +503,8 @@ def run_compensate(
 
     A PNG shows counts from 0 (black) to their 99.5th percentile over pixels with events (white), with gamma 0.5.
     """
-    from amiwarp.calib import Calibration
     from amiwarp.calib.presets import Preset, simplified
+    from amiwarp.calib.result import Calibration
     from amiwarp.compensation.recordings import compensate
     from amiwarp.io.depth_map import DepthMap
 
@@ -681,7 +681,7 @@ def run_reconstruct(
     brightness. With --network, the windows of a video follow one another by default, and up to 24 windows before that
     of a picture give a recurrent network its states.
     """
-    from amiwarp.calib import Calibration
+    from amiwarp.calib.result import Calibration
     from amiwarp.reconstruction.picture import MASK_SUFFIXES, VIDEO, Reconstruction, check_path
 
     check_path(out)
@@ -884,7 +884,7 @@ def run_pixels(
     20 pairs of events, so a longer recording reaches pixels that see less texture.
     """
     from amiwarp.brightness.solver import SensorTiming
-    from amiwarp.calib import Calibration
+    from amiwarp.calib.result import Calibration
     from amiwarp.reconstruction.pixels import pixel_thresholds
 
     check_ending(out, "pixel maps are written", [".npz"])
@@ -956,7 +956,7 @@ def run_depth(
 
     Scene and camera must be still. Depths are unknown where the events do not determine them to 10 %.
     """
-    from amiwarp.calib import Calibration
+    from amiwarp.calib.result import Calibration
     from amiwarp.reconstruction.depth_at_rest import depth
 
     check_ending(out, "depth maps are written", [".npz"])

@@ -461,7 +461,7 @@ def run_convert(
 
 def _write_for_viewer(recording: Recording, out: Path, options: ViewerOptions, common: Common, began: float) -> None:
     """Write a file for a viewer, and report it."""
-    from amiwarp.calib import Calibration
+    from amiwarp.calib.result import Calibration
     from amiwarp.plotting.viewers import FRAME_US, save_for_viewer
 
     device = choose_device(common.device)

@@ -36,7 +36,7 @@ from amiwarp.live.stream.adaptive import SpeedController, SpeedKeeper, prism_orb
 from amiwarp.validation import real
 
 if TYPE_CHECKING:
-    from amiwarp.calib import Calibration
+    from amiwarp.calib.result import Calibration
     from amiwarp.compensation.streams import Compensated
     from amiwarp.live.stream.packets import Source
     from amiwarp.live.stream.session import RawConsumer, Session, SessionStatus
@@ -49,6 +49,13 @@ if TYPE_CHECKING:
 # Functions that ``record`` and ``live`` share: event source, link to the controller, status line, end of session.
 
 _in_source = partial(typer.Option, rich_help_panel="Source")
+SourceArgument = Annotated[
+    str,
+    typer.Argument(
+        help="Source: camera:, camera:SERIAL or camera:MODEL (then biases: camera:evk4,diff_on=20), dv, prophesee, "
+        "tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
+    ),
+]
 SecondRatio = Annotated[
     float | None,
     _in_source(
@@ -346,13 +353,7 @@ class ProcessingOptions:
 
 
 def run_live(
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="Source: camera:, camera:SERIAL or camera:MODEL (then biases: camera:evk4,diff_on=20), dv, prophesee, "
-            "tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
-        ),
-    ],
+    source: SourceArgument,
     *,
     calibration: Annotated[Path, typer.Option(help="Calibration file from 'amiwarp calibrate' (.json).")],
     outputs: OutputOptions,
@@ -368,7 +369,7 @@ def run_live(
 
     Every event is written once, in order. Events outside the image and events with an extrapolated angle are marked.
     """
-    from amiwarp.calib import Calibration
+    from amiwarp.calib.result import Calibration
     from amiwarp.compensation.recordings import check_size
     from amiwarp.live.stream.session import clock_offset
 
@@ -544,13 +545,7 @@ def _live_lines(d: dict[str, Any]) -> list[str]:
 
 
 def run_record(
-    source: Annotated[
-        str,
-        typer.Argument(
-            help="Source: camera:, camera:SERIAL or camera:MODEL (then biases: camera:evk4,diff_on=20), dv, prophesee, "
-            "tcp:HOST:PORT, unix:PATH, '-' for standard input, or a file to replay."
-        ),
-    ],
+    source: SourceArgument,
     out: Annotated[Path, typer.Argument(help="Recording to write (.h5)."), OUTPUT],
     *,
     stream: SourceOptions,

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import json
 import math
 import time
@@ -34,7 +32,7 @@ from amiwarp.cli.common import (
 )
 from amiwarp.errors import AmiwarpError
 from amiwarp.io import open_recording
-from amiwarp.io.files import check_output, own_folder, write_text
+from amiwarp.io.files import check_output, own_folder, write_csv, write_text
 from amiwarp.io.formats import make_folder
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import FlatSide, Prism
@@ -126,6 +124,11 @@ def run_warm_up(*, common: Common) -> None:
 
 # ``amiwarp dataset``: thousands of simulated recordings from a specification, with a manifest.
 
+Scheduler = Annotated[str | None, typer.Option(help="Address of a Dask scheduler. Default: processes of this machine.")]
+LocalWorkers = Annotated[
+    int | None,
+    typer.Option(min=1, help="Number of local processes. Default: one for each GPU, or for each core without GPU."),
+]
 AVERAGE_S = 600.0
 """Time over which the speed is averaged [s]; recordings differ in length."""
 SHOWN = 5
@@ -140,13 +143,8 @@ def run_dataset(
         bool,
         typer.Option("--dry-run", help="Only estimate the number of recordings, their size and the time; make none."),
     ] = False,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler. Default: processes of this machine.")
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Number of local processes. Default: one for each GPU, or for each core without GPU."),
-    ] = None,
+    scheduler: Scheduler = None,
+    workers: LocalWorkers = None,
     common: Common,
 ) -> None:
     """Make thousands of simulated recordings from a specification, with labels, splits and a manifest.
@@ -504,10 +502,11 @@ def run_design(
     seen = _camera_of_design(camera, size)
     glass = Prism(0.0, grid.index, grid.flat_side)
     device = choose_device(common.device)
+    from amiwarp.plotting.figures import save_png_and_svg
     from amiwarp.simulation.description import Scene
     from amiwarp.simulation.sensor_model import SensorModel
     from amiwarp.studies.demo import earth
-    from amiwarp.studies.design import design, draw
+    from amiwarp.studies.design import chart, design
 
     make_folder(out)
     kinds = ("png", "svg", "json", "csv")
@@ -532,8 +531,8 @@ def run_design(
                                progress=part(advance, DESIGN_SHARE, 1.0))  # fmt: skip
     data = design_summary(made)
     write_text(Path(files["json"]), json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
-    write_text(Path(files["csv"]), _csv(data["choices"]))
-    draw(out / "design", made)
+    _write_csv(files["csv"], data["choices"])
+    save_png_and_svg(chart(made), out / "design")
     if compared is None:
         report(common, {**data, "files": files, "device": device}, design_lines(made, files))
         return
@@ -541,8 +540,8 @@ def run_design(
 
     optics_data = comparison_summary(compared)
     write_text(Path(files["optics_json"]), json.dumps(plain(optics_data), indent=1, allow_nan=False) + "\n")
-    write_text(Path(files["optics_csv"]), _csv(optics_data["optics"]))
-    optics_comparison.draw(out / "optics", compared)
+    _write_csv(files["optics_csv"], optics_data["optics"])
+    save_png_and_svg(optics_comparison.chart(compared), out / "optics")
     lines = [*design_lines(made, {}), *comparison_lines(compared), "", *files.values()]
     report(common, {**data, "comparison": optics_data, "files": files, "device": device}, lines)
 
@@ -612,12 +611,8 @@ def _fields(c: Choice) -> dict[str, Any]:
     }
 
 
-def _csv(rows: list[dict[str, Any]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({**row, "misses": "+".join(row["misses"])} for row in rows)
-    return text.getvalue()
+def _write_csv(path: str, rows: list[dict[str, Any]]) -> None:
+    write_csv(Path(path), rows[0], ({**row, "misses": "+".join(row["misses"])}.values() for row in rows))
 
 
 def design_lines(design: Design, files: dict[str, str]) -> list[Any]:
@@ -879,8 +874,6 @@ def stability_lines(atlas: Atlas, files: dict[str, Path], new: int, left: int, t
 
 # ``amiwarp evaluate``: the AMI-EV against a plain event camera, as its paper evaluates it, on simulated worlds.
 
-"""Time over which the speed is averaged [s]; recordings differ in length."""
-
 
 def run_evaluate(
     *,
@@ -909,13 +902,8 @@ def run_evaluate(
             "repeated. Simulated worlds are then left out, unless --only is given."
         ),
     ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler. Default: processes of this machine.")
-    ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Number of local processes. Default: one for each GPU, or for each core without GPU."),
-    ] = None,
+    scheduler: Scheduler = None,
+    workers: LocalWorkers = None,
     common: Common,
 ) -> None:
     """Check the AMI-EV paper's results: compare with a plain event camera on simulated worlds, and write a report.

@@ -234,7 +234,7 @@ class StartOptions:
         ``latest``: function that returns the latest events of a live stream, or None. ``most_points``: largest number
         of points in each cloud, or None.
         """
-        from amiwarp.calib import Calibration
+        from amiwarp.calib.result import Calibration
         from amiwarp.io.depth_map import DepthMap
         from amiwarp.optics.models import MODELS
         from amiwarp.viewer.inspector import Inspector

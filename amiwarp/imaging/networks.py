@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.device_events import DeviceEvents, device_for, find_indices, time_span, wait
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
@@ -429,12 +429,7 @@ class _TorchFile:
     dtype = wp.float32
 
     def __init__(self, path: Path, device: Any) -> None:
-        try:
-            import torch
-        except ImportError as error:
-            raise AmiwarpError(
-                f"{path}: a TorchScript file needs PyTorch; run: pip install 'amiwarp[torch]'"
-            ) from error
+        torch = optional_module("torch", "torch", f"{path}: a TorchScript file needs PyTorch")
         self.path, self._torch = path, torch
         if device.is_cuda and not torch.cuda.is_available():
             raise AmiwarpError(f"{path}: PyTorch has no CUDA here; install its CUDA version, or give device='cpu'")
@@ -472,10 +467,7 @@ class _OnnxFile:
     """ONNX file, run by onnxruntime."""
 
     def __init__(self, path: Path, device: Any) -> None:
-        try:
-            import onnxruntime
-        except ImportError as error:
-            raise AmiwarpError(f"{path}: an ONNX file needs onnxruntime; run: pip install 'amiwarp[onnx]'") from error
+        onnxruntime = optional_module("onnxruntime", "onnx", f"{path}: an ONNX file needs onnxruntime")
         self.path, self._device = path, device
         self._place = ("cuda", device.ordinal) if device.is_cuda else ("cpu", 0)
         provider = "CUDAExecutionProvider" if device.is_cuda else "CPUExecutionProvider"

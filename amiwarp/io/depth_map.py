@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from amiwarp.errors import AmiwarpError
 from amiwarp.io.files import NewFile
 from amiwarp.io.formats import check_ending
-from amiwarp.io.plain_files import map_arrays, save_map
+from amiwarp.io.plain_files import ArrayMap
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import array, guarded
 
@@ -26,7 +26,7 @@ ARRAYS = ("inverse_depth", "std", "points")
 
 @guarded
 @dataclass(frozen=True, eq=False)
-class DepthMap:
+class DepthMap(ArrayMap):
     """Inverse depth of what each pixel sees through a rotating tilted plate, from the camera's resting centre.
 
     Raises
@@ -43,6 +43,7 @@ class DepthMap:
     array([[ True, False]])
     """
 
+    _WHAT, _COMMAND, _KINDS, _AXES = "depth map", "amiwarp depth", dict.fromkeys(ARRAYS, "f"), {"points": 3}
     inverse_depth: NDArray[np.float32]
     """Inverse depth [1/m], shape (height, width); NaN where it is unknown."""
     std: NDArray[np.float32]
@@ -100,23 +101,6 @@ class DepthMap:
         filled[near] = gaussian_filter(weight * filled, FILL_PX)[near] / weights[near]
         return filled.astype(np.float32)
 
-    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the map to a file of NumPy arrays with the names of the attributes.
-
-        Parameters
-        ----------
-        path : str or Path
-            The file, which ends in ``.npz``.
-        overwrite : bool, default False
-            Whether to replace an existing file.
-
-        Raises
-        ------
-        AmiwarpError
-            If the file has another extension, exists and ``overwrite`` is False, or cannot be written.
-        """
-        save_map(Path(path), "depth map", {name: getattr(self, name) for name in ARRAYS}, overwrite=overwrite)
-
     def save_points(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write the known points to a PLY file, coloured from near (yellow) to far (violet).
 
@@ -148,26 +132,3 @@ class DepthMap:
         )
         with NewFile(path, overwrite=overwrite) as new, open(new.part, "wb") as file:
             file.write(cloud.export(file_type="ply"))
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> DepthMap:
-        """Read a map that :meth:`save` wrote.
-
-        Parameters
-        ----------
-        path : str or Path
-            The file.
-
-        Returns
-        -------
-        DepthMap
-            The map.
-
-        Raises
-        ------
-        AmiwarpError
-            If the file cannot be read, or does not hold the arrays of a map. The message names the array.
-        """
-        kinds = dict.fromkeys(ARRAYS, "f")
-        with map_arrays(Path(path), "depth map", "amiwarp depth", kinds, {"points": 3}) as values:
-            return cls(**values)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import csv
 import errno
 import io
 import os
@@ -565,6 +566,13 @@ def write_text(path: Path, text: str, *, overwrite: bool = False) -> None:
     """Write a text file, complete or not at all. Raises :class:`AmiwarpError` as :class:`NewFile` does."""
     with NewFile(path, overwrite=overwrite) as new:
         new.part.write_text(text, encoding="utf-8", newline="\n")
+
+
+def write_csv(path: Path, names: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """Write a table as CSV, with a first line of ``names``, as :func:`write_text` does."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([names, *rows])
+    write_text(path, text.getvalue())
 
 
 @cache

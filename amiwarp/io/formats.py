@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.recording import Recording
 from amiwarp.io.files import check_regular, errors_name, name_kind, open_input
 from amiwarp.io.json_files import read_json
@@ -449,11 +449,7 @@ def check_ending(path: Path, what: str, endings: Collection[str], remedy: str | 
 
 def video_library(path: Path) -> Any:
     """Return PyAV, to read or write a video file. Raises :class:`AmiwarpError` where it is not installed."""
-    try:
-        import av
-    except ImportError as error:
-        raise AmiwarpError(f"{path}: videos need PyAV; install it by: pip install 'amiwarp[video]'") from error
-    return av
+    return optional_module("av", "video", f"{path}: videos need PyAV")
 
 
 def make_folder(path: Path) -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.io.plain_files import map_arrays, save_map
+from amiwarp.io.plain_files import ArrayMap
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.validation import array, guarded
 
@@ -20,7 +18,7 @@ FASTEST_HZ = 1e6
 """Largest rate of a hot pixel [1/s]: events have times in microseconds."""
 KINDS = {"on": "f", "off": "f", "on_std": "f", "off_std": "f", "on_pairs": "iu", "off_pairs": "iu", "hot_hz": "f",
          "dead": "b"}  # fmt: skip
-"""Arrays of a map and the kinds of their data types, as in ``numpy.dtype.kind``."""
+"""Arrays of a map and the kinds of their data types."""
 RANGES = {"on": THRESHOLDS, "off": THRESHOLDS, "on_std": (0.0, 1e6), "off_std": (0.0, 1e6), "on_pairs": (0, 2**31 - 1),
           "off_pairs": (0, 2**31 - 1), "hot_hz": (0.0, FASTEST_HZ), "dead": (0, 1)}  # fmt: skip
 """Smallest and largest value of each array."""
@@ -31,7 +29,7 @@ TYPES = {"f": np.float32, "iu": np.int32, "b": np.bool_}
 
 @guarded
 @dataclass(frozen=True, eq=False)
-class PixelMap:
+class PixelMap(ArrayMap):
     """Thresholds of every pixel, and the hot and dead pixels of a sensor.
 
     Thresholds are relative to the median of their polarity: the events alone do not tell the contrast in the scene.
@@ -51,6 +49,7 @@ class PixelMap:
     PixelMap(4 x 3 px, 12 with an ON threshold, 12 with an OFF threshold, 0 hot, 0 dead)
     """
 
+    _WHAT, _COMMAND, _KINDS = "pixel map", "amiwarp pixels", KINDS
     on: NDArray[np.float32]
     """ON threshold, relative to the median of all pixels; NaN if it is not known."""
     off: NDArray[np.float32]
@@ -104,42 +103,3 @@ class PixelMap:
     def hot(self) -> NDArray[np.bool_]:
         """Whether a pixel is hot: it fires at random, shape (height, width)."""
         return self.hot_hz > 0.0
-
-    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the map to a file of NumPy arrays with the names of the attributes.
-
-        Parameters
-        ----------
-        path : str or Path
-            The file, which ends in ``.npz``.
-        overwrite : bool, default False
-            Whether to replace an existing file.
-
-        Raises
-        ------
-        AmiwarpError
-            If the file has another extension, exists and ``overwrite`` is False, or cannot be written.
-        """
-        save_map(Path(path), "pixel map", {name: getattr(self, name) for name in KINDS}, overwrite=overwrite)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> PixelMap:
-        """Read a map that :meth:`save` wrote.
-
-        Parameters
-        ----------
-        path : str or Path
-            The file.
-
-        Returns
-        -------
-        PixelMap
-            The map.
-
-        Raises
-        ------
-        AmiwarpError
-            If the file cannot be read, or does not hold the arrays of a map. The message names the array.
-        """
-        with map_arrays(Path(path), "pixel map", "amiwarp pixels", KINDS) as values:
-            return cls(**values)

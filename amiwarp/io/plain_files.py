@@ -1,13 +1,16 @@
 """Plain formats of events: text and NumPy arrays, which are read and written, and the .bin files of N-MNIST."""
 
+from __future__ import annotations
+
 import contextlib
 import math
+import os
 import shutil
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, BinaryIO, TypeAlias
+from typing import IO, Any, BinaryIO, ClassVar, Self, TypeAlias
 
 import numpy as np
 from numpy.lib import format as npy
@@ -295,26 +298,65 @@ def save_rows(path: Path, names: Sequence[str], blocks: Iterable[tuple[NDArray[A
             np.savetxt(file, np.column_stack(block), fmt=form)
 
 
-@contextlib.contextmanager
-def map_arrays(
-    path: Path, what: str, command: str, kinds: Mapping[str, str], axes: Mapping[str, int] | None = None
-) -> Iterator[dict[str, NDArray[Any]]]:
-    """Read the arrays that :func:`save_map` wrote; errors in the ``with`` block name the file.
+class ArrayMap:
+    """Map with values for each pixel, which a file of NumPy arrays holds: a dataclass of the arrays."""
 
-    ``command`` makes such a map. ``kinds``: kinds of data types that each array may have; ``axes``: numbers of axes of
-    the arrays that do not have two.
-    """
-    values = {}
-    with errors_name(path, lambda: f"is no {what}"), zipfile.ZipFile(input_path(path)) as archive:
-        names = archive.namelist()
-        for name, allowed in kinds.items():
-            if f"{name}.npy" not in names:
-                raise AmiwarpError(f"has no array {name}; make the map with '{command}'")
-            with open_array(archive, name, allowed) as (stream, shape, dtype):
-                if len(shape) != (axes or {}).get(name, 2) or max(shape) > LARGEST_SIZE:
-                    raise AmiwarpError(f"array {name} has shape {shape}; expected (height, width)")
-                values[name] = np.frombuffer(stream.read(math.prod(shape) * dtype.itemsize), dtype).reshape(shape)
-        yield values
+    _WHAT: ClassVar[str]
+    """Name of such a map in messages."""
+    _COMMAND: ClassVar[str]
+    """Command that makes one."""
+    _KINDS: ClassVar[Mapping[str, str]]
+    """Kinds of data types that each array may have, as in ``numpy.dtype.kind``."""
+    _AXES: ClassVar[Mapping[str, int]] = {}
+    """Numbers of axes of the arrays that do not have two."""
+
+    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write the map to a file of NumPy arrays with the names of the attributes.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file, which ends in ``.npz``.
+        overwrite : bool, default False
+            Whether to replace an existing file.
+
+        Raises
+        ------
+        AmiwarpError
+            If the file has another extension, exists and ``overwrite`` is False, or cannot be written.
+        """
+        save_map(Path(path), self._WHAT, {name: getattr(self, name) for name in self._KINDS}, overwrite=overwrite)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a map that :meth:`save` wrote.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file.
+
+        Returns
+        -------
+        Self
+            The map.
+
+        Raises
+        ------
+        AmiwarpError
+            If the file cannot be read, or does not hold the arrays of a map. The message names the array.
+        """
+        values, path = {}, Path(path)
+        with errors_name(path, lambda: f"is no {cls._WHAT}"), zipfile.ZipFile(input_path(path)) as archive:
+            names = archive.namelist()
+            for name, allowed in cls._KINDS.items():
+                if f"{name}.npy" not in names:
+                    raise AmiwarpError(f"has no array {name}; make the map with '{cls._COMMAND}'")
+                with open_array(archive, name, allowed) as (stream, shape, dtype):
+                    if len(shape) != cls._AXES.get(name, 2) or max(shape) > LARGEST_SIZE:
+                        raise AmiwarpError(f"array {name} has shape {shape}; expected (height, width)")
+                    values[name] = np.frombuffer(stream.read(math.prod(shape) * dtype.itemsize), dtype).reshape(shape)
+            return cls(**values)
 
 
 def save_tensors(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

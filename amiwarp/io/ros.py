@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.recording import Events, Recording, regroup
 from amiwarp.io.file_scan import FileEvents, Packet, read_sensors
 from amiwarp.io.files import errors_name, scratch_folder
@@ -311,13 +311,12 @@ def read_others(notes: dict[str, int], path: str, topic: str) -> Iterator[tuple[
 @contextlib.contextmanager
 def opened_bag(path: str) -> Iterator[tuple[Any, bool]]:
     """Open a bag by its content, not its ending. Return the library's reader, and whether the bag is of ROS 1."""
-    try:
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2.reader import DirectoryReader
-        from rosbags.rosbag2.storage_mcap import McapReader
-        from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
-    except ImportError as error:
-        raise AmiwarpError("is a ROS bag; to read it, run: pip install 'amiwarp[ros]'") from error
+    optional_module("rosbags", "ros", "is a ROS bag, which needs rosbags")
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2.reader import DirectoryReader
+    from rosbags.rosbag2.storage_mcap import McapReader
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
     head = b""
     if not os.path.isdir(path):
         with open(path, "rb") as file:
@@ -506,15 +505,10 @@ class PacketEncoder:
 
     def __init__(self, about: Outline) -> None:
         """Load rosbags. Raises :class:`AmiwarpError` if it is missing."""
-        try:
-            from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-        except ImportError as error:
-            raise AmiwarpError(
-                f"{about.path}: ROS bags need rosbags; install it by: pip install 'amiwarp[ros]'"
-            ) from error
-        self.store = get_typestore(Stores.ROS2_HUMBLE)
+        types = optional_module("rosbags.typesys", "ros", f"{about.path}: ROS bags need rosbags")
+        self.store = types.get_typestore(types.Stores.ROS2_HUMBLE)
         """Definitions of the message and of its parts."""
-        self.store.register(get_types_from_msg(PACKET_DEFINITION, MESSAGE))
+        self.store.register(types.get_types_from_msg(PACKET_DEFINITION, MESSAGE))
         self._about, self._clock, self._count = about, _Clock(about.bag), 0
         self._encoder = Evt3Encoder(origin_of(about))
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.io.files import NewFile
 from amiwarp.io.formats import check_ending
 from amiwarp.simulation.worlds.world import Body, Material, Mesh, Trajectory, World
@@ -31,11 +31,7 @@ PAGE_MM = 25.4
 
 def opencv() -> Any:
     """Return the module ``cv2``; raise :class:`AmiwarpError` if it is not installed."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise AmiwarpError("boards need OpenCV: pip install 'amiwarp[lens]'") from error
-    return cv2
+    return optional_module("cv2", "lens", "boards need OpenCV")
 
 
 @guarded

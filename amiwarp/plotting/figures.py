@@ -12,9 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import Calibration
 from amiwarp.calib.calibration_events import thin
-from amiwarp.calib.result import cost_surface
+from amiwarp.calib.result import Calibration, cost_surface
 from amiwarp.choices import Tone
 from amiwarp.compensation.recordings import compensate_events
 from amiwarp.events.recording import Events, Recording
@@ -344,6 +343,12 @@ def save_svg(figure: Any, path: Path) -> None:
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None})
     write_text(path, text.getvalue())
+
+
+def save_png_and_svg(figure: Any, path: Path) -> None:
+    """Write a figure as ``path`` with the endings .png and .svg; each write is atomic."""
+    save(figure, path.with_suffix(".png"))
+    save_svg(figure, path.with_suffix(".svg"))
 
 
 def indexed(rgb: NDArray[np.uint8]) -> Any:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import Calibration
+from amiwarp.calib.result import Calibration
 from amiwarp.choices import Axis, Vote
 from amiwarp.compensation.recordings import check_size, compensate_events
 from amiwarp.errors import AmiwarpError

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import Calibration
+from amiwarp.calib.result import Calibration
 from amiwarp.choices import Layers
 from amiwarp.compensation.recordings import BlockCompensator, check_size
 from amiwarp.compensation.streams import Compensated
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
 from amiwarp.imaging.export import to_picture
@@ -130,12 +130,9 @@ TIMELINE = "sensor_time"
 
 def rerun_module() -> Any:
     """Import Rerun. Raises :class:`AmiwarpError` if it is missing."""
-    try:
-        import rerun
-        import rerun.chunk  # noqa: F401
-    except ImportError as error:
-        raise AmiwarpError("Rerun needs its library; install it by: pip install 'amiwarp[rerun]'") from error
-    return rerun
+    for name in ("rerun.chunk", "rerun"):
+        module = optional_module(name, "rerun", "Rerun needs its library")
+    return module
 
 
 def rerun_chunks(window: Window) -> Iterator[Any]:
@@ -204,12 +201,9 @@ ANGLE_SCHEMA = {"title": "amiwarp.PrismAngle", "type": "object", "properties": {
 
 def foxglove_module() -> Any:
     """Import Foxglove's library. Raises :class:`AmiwarpError` if it is missing."""
-    try:
-        import foxglove
-        import foxglove.messages  # noqa: F401
-    except ImportError as error:
-        raise AmiwarpError("Foxglove needs its library; install it by: pip install 'amiwarp[foxglove]'") from error
-    return foxglove
+    for name in ("foxglove.messages", "foxglove"):
+        module = optional_module(name, "foxglove", "Foxglove needs its library")
+    return module
 
 
 def foxglove_topics() -> dict[str, tuple[str, Any]]:
@@ -239,14 +233,11 @@ def foxglove_messages(window: Window) -> Iterator[tuple[str, int, bytes]]:
 def write_foxglove(part: Path, content: Iterable[Window], about: Outline) -> None:
     """Write windows to an MCAP file for Foxglove, with the recorded events as packets of ROS 2 if they are whole."""
     foxglove_module()
-    try:
-        from mcap.writer import Writer
-    except ImportError as error:
-        raise AmiwarpError("Foxglove needs mcap; install it by: pip install 'amiwarp[foxglove]'") from error
+    mcap = optional_module("mcap.writer", "foxglove", "Foxglove needs mcap")
     encoder = PacketEncoder(about)
     definition = encoder.store.generate_msgdef(MESSAGE, ros_version=2)[0].encode()
     with open(part, "wb") as file:
-        writer = Writer(file)
+        writer = mcap.Writer(file)
         writer.start(library="amiwarp")
         channels: dict[str, int] = {}
         known = {topic: (kind, one.name, one.encoding, one.data) for topic, (kind, one) in foxglove_topics().items()}

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from amiwarp._version import __version__
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.kernels import launch
 from amiwarp.tasks import cpu_threads
 from amiwarp.validation import whole
@@ -72,10 +72,7 @@ def start_workers(command: str, extra: str, scheduler: str | None, count: int, d
         with single_worker() as alone:
             yield alone
         return
-    try:
-        distributed: Any = importlib.import_module("distributed")  # distributed has no type hints
-    except ModuleNotFoundError as error:
-        raise AmiwarpError(f"'{command}' needs Dask; run: pip install 'amiwarp[{extra}]'") from error
+    distributed = optional_module("distributed", extra, f"'{command}' needs Dask")
     with contextlib.ExitStack() as stack:
         where: Any = scheduler
         if scheduler is None:

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from amiwarp import kernels
 from amiwarp.brightness.solver import SensorTiming
-from amiwarp.calib import Calibration, calibrate
+from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.calibration_events import thin
 from amiwarp.calib.model_choice import CIRCLES
+from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import PhotometricSettings
 from amiwarp.compensation.recordings import compensate, compensate_events
 from amiwarp.events.recording import Recording

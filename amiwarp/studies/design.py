@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -606,13 +605,6 @@ HIGHEST = 0.77
 """Height of the largest value in a panel, as a share of the panel; text stands above it."""
 LOWEST_ERROR = 1e-3
 """Smallest error that is drawn [px]; smaller errors are drawn at this value."""
-
-
-def draw(path: Path, design: Design) -> None:
-    """Write the chart as ``path`` with the endings .png and .svg; each write is atomic."""
-    figure = chart(design)
-    figures.save(figure, path.with_suffix(".png"))
-    figures.save_svg(figure, path.with_suffix(".svg"))
 
 
 def chart(design: Design) -> Any:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
-from pathlib import Path
 from textwrap import fill
 from typing import Any, ClassVar
 
@@ -671,13 +670,6 @@ REACH = 1.75
 """Half height of the panel of a drawn path, in radii of the motion."""
 LETTERS_OF_CELL = 13
 """Largest number of letters on a line of a cell of words."""
-
-
-def draw(path: Path, comparison: Comparison) -> None:
-    """Write the chart as ``path`` with the endings .png and .svg; each write is atomic."""
-    figure = chart(comparison)
-    figures.save(figure, path.with_suffix(".png"))
-    figures.save_svg(figure, path.with_suffix(".svg"))
 
 
 def chart(comparison: Comparison) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.choices import CONTRAST
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.recording import Events, EventSource
 from amiwarp.io.files import errors_name, input_path
 from amiwarp.optics.camera import Camera
@@ -137,14 +137,7 @@ SMALLEST_SIDE = 16
 
 def load_opencv() -> Any:
     """Return OpenCV. Raises :class:`AmiwarpError` if it is not installed."""
-    try:
-        import cv2
-    except ImportError as error:
-        raise AmiwarpError(
-            "motion between pictures needs OpenCV, which is not installed; "
-            "run pip install 'amiwarp[translate]', or choose interpolation 'blend'"
-        ) from error
-    return cv2
+    return optional_module("cv2", "translate", "motion between pictures needs OpenCV, unlike interpolation 'blend'")
 
 
 @contextlib.contextmanager

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import Calibration, Settings, calibrate
-from amiwarp.calib.settings import AUTO
+from amiwarp.calib.calibration import calibrate
+from amiwarp.calib.result import Calibration
+from amiwarp.calib.settings import AUTO, Settings
 from amiwarp.choices import View
 from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError

@@ -9,7 +9,7 @@ from operator import attrgetter
 from typing import Any, TypeAlias
 from urllib.parse import parse_qsl, urlencode
 
-from amiwarp.calib import Calibration
+from amiwarp.calib.result import Calibration
 from amiwarp.choices import Axis, Colour, View
 from amiwarp.errors import AmiwarpError
 from amiwarp.optics.models import MODELS, alternatives, size_names

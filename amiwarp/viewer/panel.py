@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from amiwarp.calib import Calibration
+from amiwarp.calib.result import Calibration
 from amiwarp.choices import Axis, Colour, View, Vote
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording

@@ -16,7 +16,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from amiwarp.calib import calibrate
 from amiwarp.calib.result import Calibration
 from amiwarp.choices import Sharpness
 from amiwarp.compensation.streams import EXTRAPOLATED, NO_ANGLE, OUTSIDE, Compensated, Compensator
@@ -80,7 +79,10 @@ class PhaseCheck:
 
         ``every_s``: interval between estimates [s]; ``say`` is called with a message if the phase changed.
         """
+        from amiwarp.calib.calibration import calibrate  # takes long to load, and ``record`` does not need it
+
         self._calibration, self._every_s, self._say = calibration, every_s, say
+        self._calibrate = calibrate
         self._due, self._closed = 0.0, False
         self._recent: deque[Events] = deque()
         self.held_bytes = 0
@@ -178,7 +180,7 @@ class PhaseCheck:
                               known.prism, name="the stream")  # fmt: skip
         start = {n: x for n, x in known.parameters.items() if n not in ("clock_offset", "rpm")}
         try:
-            found = calibrate(
+            found = self._calibrate(
                 recording, model=known.model_name, free=names, start=start, stages=("sharpness",), events=100_000,
                 bounds=bounds, global_evaluations=EVALUATIONS, local_algorithm="LN_SBPLX", device="cpu",
             )  # fmt: skip

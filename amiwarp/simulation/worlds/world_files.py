@@ -88,7 +88,7 @@ def load_mesh(path: str | Path, *, up: str | None = None, scale: float = 1.0) ->
     up = one_of(up or ("y" if kind in Y_UP else "z"), ("y", "z"), "axis that points up")
     turn = real(scale, "mesh scale", 1e-9, 1e9) * (TO_Z_UP if up == "y" else np.eye(3))
     if importlib.util.find_spec("trimesh") is None:
-        raise AmiwarpError(f"{path}: mesh files need trimesh; install it by: pip install 'amiwarp[worlds]'")
+        raise AmiwarpError(f"{path}: mesh files need trimesh; run: pip install 'amiwarp[worlds]'")
     with errors_name(path, lambda: "cannot be read as a mesh"):
         process = borrow()
         try:

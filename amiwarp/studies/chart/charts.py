@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import json
 import math
@@ -20,7 +18,7 @@ from amiwarp.errors import AmiwarpError
 from amiwarp.events.recording import Recording
 from amiwarp.imaging.iwe import TURNS
 from amiwarp.imaging.palette import BLACK, BLUE, GREEN, MODEL_COLOURS, ORANGE, PINK, SKY_BLUE, VERMILION
-from amiwarp.io.files import check_output, read_text, write_text
+from amiwarp.io.files import check_output, read_text, write_csv, write_text
 from amiwarp.io.formats import make_folder
 from amiwarp.optics.models import MODELS, rungs
 from amiwarp.plotting import figures
@@ -208,8 +206,7 @@ def draw(path: Path, rows: Sequence[Row], title: str, note: str) -> None:
                   bbox_to_anchor=(LEFT / WIDTH, (below - AXIS - listed - 0.1) / height),
                   borderpad=0.0, borderaxespad=0.2, columnspacing=1.6, labelspacing=0.45)  # fmt: skip
     figure.text(LEFT / WIDTH, 0.08 / height, note, fontsize=TINY, color="#404040")
-    figures.save(figure, path.with_suffix(".png"))
-    figures.save_svg(figure, path.with_suffix(".svg"))
+    figures.save_png_and_svg(figure, path)
 
 
 def _panels(figure: Any, rows: Sequence[Row], bottom: float) -> list[ChartPanel]:
@@ -460,7 +457,7 @@ def make(
     charts = Charts(tuple(compensated), tuple(calibrated), files, (*notes, *more), _about(known, device))
     # figures come last, because a GPU machine may lack their packages
     write_text(files["data"], json.dumps({**charts.about, **_data(charts)}, indent=1, allow_nan=False) + "\n")
-    write_text(files["table"], _csv([*compensated, *calibrated]))
+    _write_csv(files["table"], [*compensated, *calibrated])
     return charts.draw(out)
 
 
@@ -518,8 +515,8 @@ def _data(charts: Charts) -> dict[str, Any]:
     return out
 
 
-def _csv(rows: Sequence[Row]) -> str:
-    """Return the rows as CSV, one line per measured setting. Settings that a row lacks are empty."""
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Write the rows as CSV, one line per measured setting. Settings that a row lacks are empty."""
     fixed = ("chart", "job", "label", "default", "on_front", "error_px", "mev_per_s", "ms", "spread",
              "repeats", "image_error")  # fmt: skip
     on = {
@@ -537,9 +534,5 @@ def _csv(rows: Sequence[Row]) -> str:
             plain["stages"] = "+".join(plain["stages"])
         known = {n: getattr(r, n, None) for n in fixed} | {"on_front": id(r) in on, "ms": r.seconds * 1e3}
         flat.append(known | plain)
-    names = list(dict.fromkeys([*fixed, *(n for line in flat for n in line)]))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    return text.getvalue()
+    names = dict.fromkeys([*fixed, *(n for line in flat for n in line)])
+    write_csv(path, names, ([line.get(name, "") for name in names] for line in flat))

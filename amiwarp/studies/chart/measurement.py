@@ -18,9 +18,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from amiwarp.calib import Calibration, Settings, calibrate
+from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.presets import settings_to, simplified
-from amiwarp.calib.settings import STAGES, PhotometricSettings
+from amiwarp.calib.result import Calibration
+from amiwarp.calib.settings import STAGES, PhotometricSettings, Settings
 from amiwarp.choices import Vote
 from amiwarp.compensation.recordings import compensate
 from amiwarp.errors import AmiwarpError

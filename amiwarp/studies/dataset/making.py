@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp._version import __version__
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.device_events import DeviceEvents
 from amiwarp.events.recording import Events
 from amiwarp.events.truth import MAPS, FrameTruth
@@ -476,10 +476,7 @@ JOURNAL, TABLE = "journal.jsonl", "manifest.parquet"
 
 def require_pyarrow() -> Any:
     """Return pyarrow. Raises :class:`AmiwarpError` if it is not installed."""
-    try:
-        return importlib.import_module("pyarrow")
-    except ModuleNotFoundError as error:
-        raise AmiwarpError("'amiwarp dataset' needs pyarrow; run: pip install 'amiwarp[dataset]'") from error
+    return optional_module("pyarrow", "dataset", "'amiwarp dataset' needs pyarrow")
 
 
 def check_folder(out: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import csv
 import importlib
 import io
 import json
@@ -21,7 +20,7 @@ from amiwarp._version import __version__
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import BLACK, BLUE, GREEN, ORANGE, PINK, SKY_BLUE, VERMILION
 from amiwarp.io import open_recording
-from amiwarp.io.files import NewFile, check_output, own_folder, write_text
+from amiwarp.io.files import NewFile, check_output, own_folder, write_csv, write_text
 from amiwarp.io.formats import make_folder
 from amiwarp.io.json_files import CellStore, fields_of, value_of
 from amiwarp.kernels.launch import load_all, load_kernels
@@ -291,7 +290,7 @@ def write(out: Path, sections: Sequence[Section], settings: Settings, processor_
         make_folder(out / folder)
     figures: dict[str, Figure] = {}
     for table in (t for s in sections for t in s.tables):
-        _write_csv(out / "tables" / f"{table.name}.csv", table)
+        write_csv(out / "tables" / f"{table.name}.csv", table.columns, table.rows)
         if (figure := draw(table)) is not None:
             figures[table.name] = figure
             for kind in ("png", "pdf"):
@@ -322,14 +321,6 @@ def _json(one: Section) -> dict[str, Any]:
     return {**data, "claims": [asdict(c) | {"paper": c.paper} for c in one.claims], "tables": tables}
 
 
-def _write_csv(path: Path, table: Table) -> None:
-    buffer = io.StringIO()
-    rows = csv.writer(buffer, lineterminator="\n")
-    rows.writerow(table.columns)
-    rows.writerows(table.rows)
-    write_text(path, buffer.getvalue())
-
-
 def _kind(picture: study.Picture) -> str:
     return "gif" if len(picture.frames) > 1 else "png"
 
@@ -352,10 +343,7 @@ def _page(
     sections: Sequence[Section], figures: Mapping[str, Figure], films: Mapping[str, bytes], about: dict[str, Any]
 ) -> str:
     """Return the report as a page of HTML without references to other files."""
-    try:
-        import jinja2
-    except ModuleNotFoundError as error:
-        raise AmiwarpError("'amiwarp evaluate' needs Jinja2; run: pip install 'amiwarp[evaluate]'") from error
+    jinja2 = study.library("jinja2")
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
@@ -366,7 +354,7 @@ def _page(
     compact = {t.name: pivoted(t) for s in sections for t in s.tables if not t.long}
     claims = {n: (paper, [c for s in sections for c in s.claims if c.number == n]) for n, paper in PAPER.items()}
     template = environment.get_template("report.html.j2")
-    return template.render(sections=sections, claims=claims, images=images, compact=compact, about=about)
+    return str(template.render(sections=sections, claims=claims, images=images, compact=compact, about=about))
 
 
 def _data(kind: str, data: bytes) -> str:

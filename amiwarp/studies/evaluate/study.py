@@ -6,7 +6,6 @@ import base64
 import contextlib
 import enum
 import hashlib
-import importlib
 import io
 import json
 import math
@@ -21,11 +20,12 @@ from numpy.typing import NDArray
 from scipy import ndimage, special
 from scipy.spatial import KDTree
 
-from amiwarp.calib import Calibration, calibrate
-from amiwarp.calib import Settings as CalibrationSettings
+from amiwarp.calib.calibration import calibrate
+from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import PhotometricSettings
+from amiwarp.calib.settings import Settings as CalibrationSettings
 from amiwarp.compensation.recordings import compensate_events
-from amiwarp.errors import AmiwarpError
+from amiwarp.errors import AmiwarpError, optional_module
 from amiwarp.events.recording import Events, Recording
 from amiwarp.events.truth import EventTruth, FrameTruth
 from amiwarp.imaging.iwe import CanvasShape, Votes
@@ -802,11 +802,7 @@ def check_pictures(texts: Sequence[str], axes: int, what: str) -> None:
 
 def library(name: str) -> Any:
     """Return a module of an optional library. Raises :class:`AmiwarpError` if it is not installed."""
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        what = name.partition(".")[0]
-        raise AmiwarpError(f"'amiwarp evaluate' needs {what}; run: pip install 'amiwarp[evaluate]'") from error
+    return optional_module(name, "evaluate", f"'amiwarp evaluate' needs {name.partition('.')[0]}")
 
 
 # Gaussian smoothing of images.

@@ -17,10 +17,11 @@ from scipy.optimize import minimize
 
 from amiwarp._version import __version__
 from amiwarp.brightness.solver import SensorTiming
-from amiwarp.calib import Calibration, Settings, calibrate
+from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.paper_method import calibrate_as_paper
 from amiwarp.calib.presets import settings_to
-from amiwarp.calib.settings import AUTO, STAGES
+from amiwarp.calib.result import Calibration
+from amiwarp.calib.settings import AUTO, STAGES, Settings
 from amiwarp.choices import Sharpness
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import TWO_PI, Encoder

@@ -1,6 +1,5 @@
 """Report of the stability study: rates along each axis, aims, a summary, tables and figures."""
 
-import csv
 import io
 import json
 import math
@@ -18,7 +17,7 @@ from scipy.stats import binomtest
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging.palette import BLACK, BLUE, PINK, SKY_BLUE
-from amiwarp.io.files import NewFile, write_text
+from amiwarp.io.files import NewFile, write_csv, write_text
 from amiwarp.plotting.figures import blank, save
 from amiwarp.studies.stability import cells as study
 from amiwarp.studies.stability.cells import Axis, Cell, Condition, Method, Outcome, Result, Store, Stored, identity
@@ -329,7 +328,7 @@ class Atlas:
         """Write atlas.json, atlas.csv and summary.md, and return their paths; each write is atomic."""
         files = {"data": folder / "atlas.json", "table": folder / "atlas.csv", "summary": folder / "summary.md"}
         write_text(files["data"], _json(self))
-        write_text(files["table"], _csv(self.spots))
+        _write_csv(files["table"], self.spots)
         write_text(files["summary"], _markdown(self))
         return files
 
@@ -402,8 +401,8 @@ def _json(atlas: Atlas) -> str:
     return head + ',\n "spots": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n"
 
 
-def _csv(spots: Sequence[AxisPoint]) -> str:
-    """Return the points of the study as CSV, one line per point."""
+def _write_csv(path: Path, spots: Sequence[AxisPoint]) -> None:
+    """Write the points of the study as CSV, one line per point."""
 
     def line(s: AxisPoint) -> dict[str, Any]:
         out: dict[str, Any] = {"axis": s.axis.name, "field": s.axis.field, "value": s.value, "unit": s.axis.unit,
@@ -418,11 +417,7 @@ def _csv(spots: Sequence[AxisPoint]) -> str:
 
     lines = [line(s) for s in spots]
     names = dict.fromkeys(n for each in sorted(lines, key=len, reverse=True) for n in each)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(lines)
-    return text.getvalue()
+    write_csv(path, names, ([each.get(name, "") for name in names] for each in lines))
 
 
 def _markdown(atlas: Atlas) -> str:
