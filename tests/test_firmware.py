@@ -601,8 +601,7 @@ def test_the_link_through_damage_and_a_reset(desk: Desk) -> None:
         wait(lambda: link._follower._connection.decoder.received.damaged > 20)
         desk.damage = bytes
         sent = link._number
-        wait(lambda: link._number > sent + 2)
-        assert is_at(link, 1, 600.0)
+        wait(lambda: link._number > sent + 2 and is_at(link, 1, 600.0))  # the faults of the damage are cleared
         said()
         assert not any(n.restarted for n in news)
         t, angle = (np.concatenate([getattr(n, name) for n in news]) for name in ("t_us", "angle"))

@@ -255,8 +255,6 @@ left 0.02 to 0.62 of it, shakes by 30 % of the prism's motion 0.84 to 1.7."""
 LEAST_SHAKE_GAIN = 0.0025
 """Smallest share of the squared residuals that a shake must explain beyond all causes together. An index that is wrong
 by 0.06 left 0.0013 to it at most while no cause freed it, shakes by 30 % of the prism's motion 0.0048 or more."""
-HINT = 3.0
-"""Number of standard deviations of a cause from which on a shake of the camera is looked for."""
 LEAST_FURTHER_GAIN = 0.0005
 """Smallest share that a further cause must remove once the given lens has turned out to be wrong."""
 LEAST_MOVE_PX = 0.005
@@ -394,16 +392,14 @@ def check_consistency(cost: Cost, best: Vector) -> Consistency:
         columns |= _cause_columns(cost, best, cause)
     fit, shake_px = linear_fit(cost, columns), 0.0
     findings = _findings(cost, best, fit, screened, least_gain)
-    hint = _hints_at_lens(space, fit, screened) and not _rotation_gain(space, fit)
-    if not doubtful and (findings or hint):
+    if findings and not doubtful:
         for cause in causes:
             if cause not in SCREENED:
                 columns |= _cause_columns(cost, best, cause)
         columns |= _shake_columns(cost, best)
-        wider = linear_fit(cost, columns)
-        shake_px = _shake(space, wider)
-        if findings:
-            fit, findings = wider, _findings(cost, best, wider, causes, LEAST_GAIN)
+        fit = linear_fit(cost, columns)
+        findings = _findings(cost, best, fit, causes, LEAST_GAIN)
+        shake_px = _shake(space, fit)
     brightness = cost.brightness
     systematic = _systematic(space, fit) + map_errors(space, best, fit, brightness.count, brightness.tiles.density)
     systematic += lens_errors(space, best, fit, least_gain) + (_doubt(space, fit, causes) if doubtful else 0.0)
@@ -752,12 +748,6 @@ def rms_angle(camera: Camera, factors: Vector) -> float:
 def px_per_rad(space: ParameterSpace, best: Vector) -> float:
     """Return how far events move per angle of the prism [px rms/rad]."""
     return float(np.linalg.norm(best[:2])) if space.cartesian else space.pixels.get("phase", 0.0)
-
-
-def _hints_at_lens(space: ParameterSpace, fit: LinearFit, causes: list[Cause]) -> bool:
-    """Return whether a cause is notable, if not certain: a shake in time with the prism looks a little like a lens."""
-    found = (fit.adding(space.names, cause.names)[1:] for cause in causes if {*cause.names} <= {*fit.names})
-    return any(significance >= HINT and gain >= LEAST_FURTHER_GAIN for significance, gain in found)
 
 
 def _shake(space: ParameterSpace, fit: LinearFit) -> float:

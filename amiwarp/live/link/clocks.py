@@ -71,6 +71,10 @@ class ClockMap:
         own = np.asarray(own_us, np.int64)
         return own + np.rint(self.offset_us + self.drift * (own - self.at_us)).astype(np.int64)
 
+    def std_us(self, own_us: float) -> float:
+        """Return the standard deviation of a mapped time [us]. It grows with the distance from :attr:`at_us`."""
+        return math.hypot(self.offset_std_us, self.drift_std * (own_us - self.at_us))
+
 
 def fit_to_pulses(own_us: ArrayLike, other_us: ArrayLike, sigma_us: float = 1.0) -> ClockMap:
     """Fit a clock map to pulses that both clocks recorded.

@@ -837,6 +837,13 @@ class Link(BackgroundLoop):
         """Stop the motor. Raises :class:`AmiwarpError` if the controller refuses the command."""
         self._command(protocol.Stop(), "stop")
 
+    def set_counts(self, per_turn: int) -> None:
+        """Set the encoder's counts per turn in the controller.
+
+        Raises :class:`AmiwarpError` if it refuses the command.
+        """
+        self._command(protocol.SetCounts(per_turn), f"set {per_turn} counts per turn")
+
     def _command(self, message: protocol.Message, what: str) -> None:
         """Send a command and wait for its answer. ``what``: name of the command in messages."""
         if self._follower.text:
