@@ -632,7 +632,7 @@ _remembered: dict[tuple[Any, ...], Found] = {}
 
 
 def _remember(state: tuple[Any, ...], found: Found) -> None:
-    """Remember what was found in a file, if it is small, in place of the file that has been known for longest."""
+    """Remember what was found in a small file. If there are too many, forget the file that was remembered first."""
     places = sum(len(column["places"] or ()) for column in found[0]["columns"].values())
     if PLACE_BYTES * places + sum(values.nbytes for values in found[1]) <= REMEMBERED_BYTES:
         _remembered[state] = found

@@ -80,7 +80,7 @@ def _other(prism: Prism) -> FlatSide:
 
 def with_cause(space: ParameterSpace, cause: Cause, values: Mapping[str, float]) -> tuple[ParameterSpace, Vector]:
     """Return the space in which a cause is corrected or free, and the vector of ``values`` there."""
-    if cause.names == (FLAT_SIDE,):
+    if cause == SIDE:
         space, values = other_side(space), turned(space, values)
     else:
         space = widened(space, tuple(n for n in cause.names if n not in space.names))

@@ -791,7 +791,7 @@ def testable(space: ParameterSpace) -> list[Cause]:
         return []
     # a prism whose other side is flat looks nearly like one with cylinder power
     shaped = {n for cause in SHAPES for n in cause.names} & set(space.names)
-    return [c for c in CAUSES if not set(c.names) & set(space.names) and not (shaped and c.names == SIDE.names)]
+    return [c for c in CAUSES if not set(c.names) & set(space.names) and not (shaped and c == SIDE)]
 
 
 def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
@@ -799,7 +799,7 @@ def _cause_columns(cost: Cost, best: Vector, cause: Cause) -> dict[str, Any]:
     space = cost.space
     values = space.to_values(best)
     try:
-        if cause.names == SIDE.names:
+        if cause == SIDE:
             ends = place_arguments(other_side(space), turned(space, values)), place_arguments(space, values)
             return {FLAT_SIDE: once(cost, FLAT_SIDE, partial(cost.brightness.find_slope, *ends, 1.0))}
         wide, v = with_cause(space, cause, values)
@@ -828,7 +828,7 @@ def _corrected(cost: Cost, best: Vector, cause: Cause, change: Vector) -> tuple[
     space, n = cost.space, len(best)
     here = space.build(space.to_values(best))
     wide, v = with_cause(space, cause, space.to_values(best))
-    if cause.names == SIDE.names:
+    if cause == SIDE:
         return float(change[n]) * distance(wide.build(wide.to_values(v)), here), v
     low, high = wide.bounds()
     v = np.clip(v + change, low, high)

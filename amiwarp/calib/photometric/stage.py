@@ -1299,7 +1299,7 @@ def _corrected(search: AnswerSearch, finding: consistency.Finding, v: Vector, mo
     """Return the answer with a cause corrected, or None if it costs far more than ``most_cost``. The space stays."""
     cost, space, sharpest, cause = search.cost, search.cost.space, search.sharpest, finding.cause
     cost.space, _ = causes.with_cause(space, cause, space.to_values(v))
-    if cause.names == causes.SIDE.names:
+    if cause == causes.SIDE:
         search.sharpest = causes.turned(space, sharpest)
     stage, found = replace(search, most_cost=most_cost).descend(finding.start), None
     if -stage.score <= SAME_COST * most_cost:
