@@ -127,7 +127,9 @@ def run_warm_up(*, common: Common) -> None:
 Scheduler = Annotated[str | None, typer.Option(help="Address of a Dask scheduler. Default: processes of this machine.")]
 LocalWorkers = Annotated[
     int | None,
-    typer.Option(min=1, help="Number of local processes. Default: one for each GPU, or for each core without GPU."),
+    typer.Option(
+        min=1, help="Number of local processes. Default: up to four for each GPU, or one for each core without GPU."
+    ),
 ]
 AVERAGE_S = 600.0
 """Time over which the speed is averaged [s]; recordings differ in length."""

@@ -31,6 +31,8 @@ ANY_GPU = "cuda"
 MOST_WORKERS = 4096
 """Largest number of local workers."""
 
+WORKERS_PER_GPU = 4
+"""Local workers that share a GPU by default: what they do on the CPU takes several times as long."""
 LOCAL_CONFIGURATION = {
     "distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1},
     "distributed.worker.profile.enabled": False,
@@ -100,12 +102,16 @@ def _visible_gpus() -> tuple[str, ...]:
 
 
 def worker_count(workers: int | None, device: str) -> int:
-    """Return the number of local workers; by default one for each GPU or each core."""
+    """Return the number of local workers; by default one for each core, or :data:`WORKERS_PER_GPU` for each GPU.
+
+    A GPU does not get more of them than it has cores.
+    """
     if workers is not None:
         return whole(workers, "workers", 1, MOST_WORKERS)
     if device != ANY_GPU:
         return cpu_threads() if device == "cpu" else 1
-    return max(1, gpu_count(launch.start_quietly()))
+    gpus = max(1, gpu_count(launch.start_quietly()))
+    return gpus * min(WORKERS_PER_GPU, max(1, cpu_threads() // gpus))
 
 
 def threads_of_worker(device: str, workers: int | None) -> int | None:

@@ -85,7 +85,7 @@ print(f"{plan.missing} recordings, about {plan.size_bytes / 1e6:.2g} MB")
 #
 # On the command line this is ``amiwarp dataset shapes.toml shapes``. One worker is
 # a part of this process; without ``workers`` there is one process for each core, or
-# for each GPU. A second call would find everything in place.
+# up to four for each GPU. A second call would find everything in place.
 
 done = amiwarp.make_dataset(specification, folder / "shapes", workers=1)
 print(f"{done.made} recordings, {done.events:,} events")

@@ -693,8 +693,8 @@ def make_dataset(
         Address of a Dask scheduler, such as ``tcp://10.0.0.1:8786``. By default, processes of this machine do the
         work. All workers need access to ``out`` and to the sources under the same paths.
     workers : int, optional
-        Number of local processes. By default one for each core, or for each GPU. One worker runs in this process, and
-        needs no Dask.
+        Number of local processes. By default one for each core, or up to four for each GPU. One worker runs in this
+        process, and needs no Dask.
     device : str, optional
         ``cpu``; ``cuda`` for all GPUs, which the workers share evenly; or one GPU, such as ``cuda:0``.
     progress : Progress, optional
@@ -936,7 +936,7 @@ def plan_dataset(
     out : str or Path
         Folder of the data set, which need not exist.
     workers : int, optional
-        Number of workers. By default one for each core, or for each GPU.
+        Number of workers. By default one for each core, or up to four for each GPU.
     device : str, optional
         Device as for :func:`make_dataset`.
     progress : Progress, optional

@@ -610,8 +610,8 @@ def evaluate(
     scheduler : str, optional
         Address of a Dask scheduler. By default the work is done on this machine.
     workers : int, optional
-        Number of local processes, by default one for each GPU, or for each core without a GPU. With 1 everything runs
-        in this process.
+        Number of local processes, by default up to four for each GPU, or one for each core without a GPU. With 1
+        everything runs in this process.
     device : str, optional
         Device of the workers; ``cuda`` for all GPUs.
     seed : int, optional
