@@ -1,6 +1,5 @@
 """Evaluation of corners: how long corner tracks live, and how far they are from the truth."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypedDict
@@ -283,8 +282,6 @@ DIFFERENCES = (
 VERSION = 4
 NEEDS_TRUTH = True
 
-APEX = math.radians(1.0)
-"""Apex angle of the paper's evaluation of features [rad]."""
 LIMIT_PX = 5.0
 """Distance from the truth at which a track ends in the comparison [px]."""
 GAPS_US = (10_000, 25_000, 50_000)
@@ -338,7 +335,7 @@ class Values(TypedDict):
 def conditions(settings: Settings) -> list[Condition]:
     """Return the scenes without the street, with the apex angle of the paper's features."""
     scenes = [c for c in settings.scenes() if c.world != "street"]
-    return [replace(condition, apex=APEX) for condition in scenes]
+    return [replace(condition, apex=study.FEATURES_APEX) for condition in scenes]
 
 
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:

@@ -256,7 +256,9 @@ class Values(TypedDict):
 
 def conditions(settings: Settings) -> list[Condition]:
     """Return the ball before a moving camera. The lens sees the whole throw."""
-    return settings.conditions(world="ball", trajectory="handheld", focal_px=study.wide_focal(settings))
+    return settings.conditions(
+        world="ball", trajectory="handheld", apex=study.FEATURES_APEX, focal_px=study.wide_focal(settings)
+    )
 
 
 def measure(streams: Streams, settings: Settings) -> dict[str, Any]:

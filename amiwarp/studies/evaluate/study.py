@@ -116,6 +116,8 @@ INDEX = 1.55
 FOCAL_PX = 554.0
 """Focal length [px]: that of 640 px over a field of view of 60 deg. A smaller image is the middle of the sensor: its
 displacements in pixels are the same."""
+FEATURES_APEX = math.radians(1.0)
+"""Apex angle of the paper's corners and segmentation [rad]; elsewhere it is 0.5 deg."""
 NOMINAL = 1.15
 """Nominal apex angle that calibration starts from, relative to the true one."""
 
