@@ -87,20 +87,22 @@ def test_tables_and_verdicts_of_timing_errors(cells: list[CellResult]) -> None:
     ours = [v for text, v in verdict.items() if text.startswith("With exact refraction")]
     assert ours == [Verdict.REPRODUCED, Verdict.NOT_REPRODUCED]  # 0 < 0.57 px, but 0.8 > 0.7 px
     assert [v for text, v in verdict.items() if "is larger than that of 1°" in text] == [Verdict.REPRODUCED] * 2
-    assert [v for text, v in verdict.items() if "what the paper states" in text] == [Verdict.NOT_REPRODUCED]
     system = [v for text, v in verdict.items() if text.startswith("The error of a system as the paper's")]
-    assert system == [Verdict.NOT_TESTABLE, Verdict.REPRODUCED]  # 0.5° is not in these results
+    assert system == [Verdict.NOT_TESTABLE, Verdict.REPRODUCED, Verdict.REPRODUCED]  # 0.5° is not in these results
     assert [v for text, v in verdict.items() if text.startswith("The circle's error")] == [
-        Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.REPRODUCED, Verdict.REPRODUCED,
+        Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.REPRODUCED, Verdict.REPRODUCED,  # 0.5°
+        Verdict.REPRODUCED, Verdict.NOT_REPRODUCED, Verdict.REPRODUCED, Verdict.NOT_REPRODUCED,  # 1°
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("timed", "none", "expected"), [
-    (1.0, 0.63, [Verdict.REPRODUCED, Verdict.REPRODUCED]),
-    (0.75, 0.63, [Verdict.NOT_REPRODUCED, Verdict.REPRODUCED]),
-    (1.0, 0.9, [Verdict.REPRODUCED, Verdict.NOT_REPRODUCED]),
+@pytest.mark.parametrize(("timed", "none", "caused", "expected"), [
+    (1.0, 0.63, Verdict.REPRODUCED, [Verdict.REPRODUCED, Verdict.REPRODUCED]),
+    (0.75, 0.63, Verdict.NOT_REPRODUCED, [Verdict.NOT_REPRODUCED, Verdict.REPRODUCED]),
+    (1.0, 0.9, Verdict.NOT_REPRODUCED, [Verdict.REPRODUCED, Verdict.NOT_REPRODUCED]),
 ])  # fmt: skip
-def test_a_surge_is_one_with_timing_errors_and_not_without(timed: float, none: float, expected: list[Verdict]) -> None:
+def test_a_surge_is_one_with_timing_errors_and_not_without(
+    timed: float, none: float, caused: Verdict, expected: list[Verdict]
+) -> None:
     """Blur at 1440 rpm, with and without timing errors; at lower speeds it is 0.65 and 0.7 px, or 0.58 and 0.6 px."""
     turn = Condition(DISCS, "still", math.radians(1.0), cutoff_hz=1000.0)
     cells = [CellResult("apex_speed", replace(turn, rpm=rpm, seed=seed), {"errors": [
@@ -110,8 +112,10 @@ def test_a_surge_is_one_with_timing_errors_and_not_without(timed: float, none: f
              for rpm, first, second in ((360.0, 0.65, 0.58), (720.0, 0.7, 0.6), (1440.0, timed, none))
              for seed in (1, 2)]  # fmt: skip
     found = [c for c in apex_speed.claims(cells) if "(apex 1°)" in c.text]
-    assert [c.verdict for c in found if c.number == 13] == expected
-    assert [c.verdict for c in found if c.number is None] == expected
+    assert [c.verdict for c in found if c.number == 13] == [caused]
+    checks = {measure: [c.verdict for c in found if c.number is None and f"the {measure}" in c.text]
+              for measure in ("edge blur", "blur")}  # fmt: skip
+    assert checks == {"edge blur": expected, "blur": [caused, *expected]}
     assert len(check_tables(apex_speed, cells)["apex_speed_surge"].rows) == 4
 
 
@@ -125,7 +129,7 @@ def test_an_error_in_proportion_to_the_speed_does_not_surge() -> None:
 def test_more_events_and_more_error_with_apex_and_speed() -> None:
     """The event rate grows with apex and speed, the blur with the apex only."""
     made = [CellResult("apex_speed", Condition(DISCS, "still", math.radians(degrees), rpm, seed, cutoff_hz=1000.0), {
-                "rows": [{"degrees": degrees, "delay": 0.0, "blur": blur + 0.01 * seed, "edge_blur": None,
+                "rows": [{"degrees": degrees, "delay": 0.0, "blur": 1.0, "edge_blur": blur + 0.01 * seed,
                           "mev_per_s": degrees * rpm / 720.0 + 0.01 * seed}]})
             for degrees, rpm, blur in ((0.5, 720.0, 0.6), (1.0, 720.0, 0.8), (2.0, 720.0, 1.0), (0.5, 1440.0, 0.5))
             for seed in (1, 2)]  # fmt: skip
@@ -176,14 +180,14 @@ def edge_cell(seed: int, along: dict[Stream, float]) -> CellResult:
     return CellResult("edges", Condition(seed=seed), {"images": images, "rows": rows, "sectors": sectors})
 
 
-def test_edges_are_judged_by_the_margin_over_chance() -> None:
+def test_edges_are_judged_by_the_score_and_checked_by_the_margin_over_chance() -> None:
     cells = [edge_cell(seed, {Stream.PLAIN: 0.5, Stream.CALIBRATED: 1.0}) for seed in (1, 2)]
     check_tables(edges, cells)
     claims = {c.text: c for c in edges.claims(cells)}
-    (margin,) = (c for text, c in claims.items() if text.startswith("Event images of the moving"))
+    (margin,) = (c for text, c in claims.items() if text.startswith("They are better than chance"))
     assert (margin.verdict, margin.ours) == (Verdict.NOT_REPRODUCED, "-0.3 [-0.3, -0.3], 2 seeds")
-    (score,) = (c for text, c in claims.items() if text.startswith("The score itself"))
-    assert (score.verdict, score.number) == (Verdict.REPRODUCED, None)
+    (score,) = (c for text, c in claims.items() if text.startswith("Event images of the moving"))
+    assert (score.verdict, score.number) == (Verdict.REPRODUCED, 2)
 
 
 @pytest.mark.parametrize(("plain", "ami", "expected"), [
@@ -297,8 +301,10 @@ def test_lengths_of_recordings_are_judged(short: tuple[float, ...], usual: float
                 {"cost": convexity.PIXELS, "window": window, "error": error, "found": float(error <= 1.0), "minima": 1,
                  "phase_half": 20.0}
                 for window, error in ((0.25, short[seed]), (2.0, usual), (4.0, 0.2))]}) for seed in (0, 1)]  # fmt: skip
-    claims = [c for c in convexity.claims(cells) if c.number == 16 and ("0.25 s" in c.text or "4 s" in c.text)]
+    claims = [c for c in convexity.claims(cells) if c.verdict is not Verdict.NOT_TESTABLE]
+    claims = [c for text in ("0.25 s", "4 s") for c in claims if text in c.text]
     assert [c.verdict for c in claims] == expected
+    assert [c.number for c in claims] == [None, 16]  # the grid says nothing of how an optimiser converges
 
 
 # Fading.
@@ -310,6 +316,9 @@ def test_fading_is_judged_by_its_size_and_by_how_rare_it_is() -> None:
     values = {"rows": classes, "whole": [{"lowest": 0.9}]}
     cells = [CellResult("fading", Condition("room", "fast", seed=seed), values) for seed in (1, 2)]
     yes = Verdict.REPRODUCED
-    assert [c.verdict for c in fading.claims(cells)] == [yes, yes, yes, Verdict.NOT_REPRODUCED]
+    assert [c.verdict for c in fading.claims(cells)] == [
+        yes, Verdict.NOT_TESTABLE, yes, yes, Verdict.NOT_REPRODUCED,
+    ]  # fmt: skip
     assert fading.claims(cells)[2].ours.startswith("0.05 ")
+    assert fading.claims(cells)[3].ours.startswith("0.9 ")
     check_tables(fading, cells)

@@ -284,6 +284,8 @@ NEEDS_TRUTH = True
 
 LIMIT_PX = 5.0
 """Distance from the truth at which a track ends in the comparison [px]."""
+SOME_LIMITS_PX = (2.0, LIMIT_PX, 10.0)
+"""Distances for which verdicts are given [px]."""
 GAPS_US = (10_000, 25_000, 50_000)
 """Largest times between two corner events of a track, for the sensitivity curve [us]."""
 INSTANTS = 5
@@ -293,7 +295,7 @@ SOURCES = {
     Stream.RAW: (Stream.TRUE, Stream.CALIBRATED, Stream.SELF, Stream.RAW),
 }
 """Streams whose positions are those of the events of another stream, by that stream."""
-PAPER_ERROR_PX, SLIGHT_PX, SAME_PX = (1.0, 2.0), 1.0, 0.5
+PAPER_ERROR_PX, SLIGHT_PX, SAME_PX = (1.0, 2.0), 1.0, 0.1
 """Range of an error of about 1.5 px, and changes of the error that count as slight and as none [px]."""
 FAR = 1.0
 """Relative difference of an update rate that is far above another one."""
@@ -473,7 +475,8 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
         Table("corners_compensation", "Error of the compensation, apex 1°",
               ("scene", "camera", "stream", "seeds", "median [px]", "std", "rms [px]", "std of rms"),
               study.grouped(study.rows_of(results, "errors"), ("scene", "camera", "stream"), ["median_px", "rms_px"]),
-              "Events of signals; rounding to pixels does not count, as both share a pixel."),
+              "Events of signals; rounding to pixels does not count, as both share a pixel. The sensor's delay counts: "
+              "the true model is that of the moment when the light changed, the true place that of the event."),
         over_limit("corners_lifetime", "lifetime_ms", "lifetime [ms]"),
         over_limit("corners_error", "error_px", "error [px]"),
         Table("corners_gap", "Lifetime over the largest time between two corner events of a track",
@@ -494,18 +497,17 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
     def of(rows: list[dict[str, Any]], detector: CornerMethod = CornerMethod.EFAST, limit: float = LIMIT_PX) -> Any:
         return [r for r in rows if (r["detector"], r["limit"]) == (detector, limit)]
 
-    def longer(number: int | None, text: str, rows: list[dict[str, Any]]) -> Claim:
+    def longer(text: str, rows: list[dict[str, Any]]) -> Claim:
         found = differences(rows, "lifetime_ms", ami, plain, relative=True)
-        return judge(number, text, found, f"the lifetime {against}", above=SUBSTANTIAL)
+        return judge(None, text, found, f"the lifetime {against}", above=SUBSTANTIAL)
 
     room = ranges([r for r in of(rows) if r["scene"] == "room"], "error_px")
     return [
         judge(6, "More corners are tracked at a time (eFAST, moving camera).",
               differences(of(moving), "alive", ami, plain, relative=True),
               f"the mean number of tracks that are alive {against}", above=0.0),
-        longer(6, f"Tracks live substantially longer, by {SUBSTANTIAL:.0%} (eFAST, moving camera).", of(moving)),
-        judge(6, "Their error is about 1.5 px.", differences(of(moving), "error_px", ami),
-              f"the mean error of '{Stream.CALIBRATED}'", above=PAPER_ERROR_PX[0], below=PAPER_ERROR_PX[1], unit="px"),
+        untestable(6, "Tracks live substantially longer, with an error of about 1.5 px.",
+                   "the paper does not state at which error a track ends, and that decides both: see the checks"),
         judge(6, f"Their error is slightly larger than the S-EV's, by up to {SLIGHT_PX:g} px (moving camera).",
               differences(of(moving), "error_px", ami, plain),
               f"the error of '{Stream.CALIBRATED}' less that of '{Stream.PLAIN}'", above=0.0, below=SLIGHT_PX,
@@ -523,6 +525,14 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
                             {"stream": Frames.FAST, "detector": FRAME_CORNERS}, relative=True),
                 "the updates of a track per second less those of frames, relative to the latter,", above=FAR)
           for name, stream in (("S-EV", plain), ("AMI-EV", ami))),
+        judge(None, "More are tracked than of as many corners at random places.",
+              differences(of(moving), "alive", ami, {"stream": CHANCE}),
+              f"the mean number of tracks that are alive of '{Stream.CALIBRATED}' less that of chance", above=0.0),
+        judge(None, "More are tracked than by a standard camera with 60 frames/s in good light.",
+              differences([r for r in moving if r["limit"] == LIMIT_PX], "alive",
+                          ami | {"detector": CornerMethod.EFAST}, {"stream": Frames.FAST, "detector": FRAME_CORNERS},
+                          relative=True),
+              "the mean number of tracks that are alive less that of frames, relative to the latter,", above=0.0),
         judge(None, "The error is smaller than that of as many corners at random places.",
               differences(of(moving), "error_px", ami, {"stream": CHANCE}),
               f"the error of '{Stream.CALIBRATED}' less that of chance", below=0.0, unit="px"),
@@ -532,7 +542,10 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
         judge(None, "The rms error of the exact compensation is at most 2 px (apex 1°).",
               differences(study.rows_of(results, "errors"), "rms_px", ami), f"the error of '{Stream.CALIBRATED}'",
               below=2.0, unit="px"),
-        *(longer(None, f"Longer with {name} and a limit of {limit:g} px.", of(moving, method, limit))
-          for name, method in (("eFAST", CornerMethod.EFAST), ("Arc*", CornerMethod.ARC))
-          for limit in (LIMITS_PX[0], LIMIT_PX, LIMITS_PX[-1]) if (method, limit) != (CornerMethod.EFAST, LIMIT_PX)),
+        *(judge(None, f"The error is about 1.5 px if tracks end {limit:g} px from the truth.",
+                differences(of(moving, limit=limit), "error_px", ami), f"the mean error of '{Stream.CALIBRATED}'",
+                above=PAPER_ERROR_PX[0], below=PAPER_ERROR_PX[1], unit="px") for limit in SOME_LIMITS_PX),
+        *(longer(f"Tracks live longer by {SUBSTANTIAL:.0%} with {name} and a limit of {limit:g} px (moving camera).",
+                 of(moving, method, limit))
+          for name, method in (("eFAST", CornerMethod.EFAST), ("Arc*", CornerMethod.ARC)) for limit in SOME_LIMITS_PX),
     ]  # fmt: skip

@@ -525,22 +525,26 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
         return judge(number, text, found, f"{VALUES_IN_WORDS[value]} of '{Stream.CALIBRATED}' less that of '{other}'",
                      above=0.0)  # fmt: skip
 
-    steady = ranges([r for r in rows if r["camera"] != "still" and r["tolerance"] == USUAL and r["truth"] == CANNY],
-                    "margin")  # fmt: skip
+    def steadier(number: int | None, text: str, value: str, tolerance: float) -> Claim:
+        moving = [r for r in rows if r["camera"] != "still" and r["tolerance"] == tolerance and r["truth"] == CANNY]
+        found = differences(ranges(moving, value), value, {"stream": Stream.CALIBRATED}, {"stream": Stream.PLAIN},
+                            by=("scene",))  # fmt: skip
+        return judge(number, text, found, f"the range of {VALUES_IN_WORDS[value]} over the motions of "
+                     f"'{Stream.CALIBRATED}' less that of '{Stream.PLAIN}'", below=0.0)  # fmt: skip
+
     return [
-        more(2, "Event images of the moving AMI-EV fit the picture's edges better than chance by a larger margin "
-             "(Canny, 6 px).", "margin"),
-        more(2, "So they do at rest, where the S-EV sees nothing.", "margin", moving=False),
-        judge(2, "Their margin is steadier over the camera's motions.",
-              differences(steady, "margin", {"stream": Stream.CALIBRATED}, {"stream": Stream.PLAIN}, by=("scene",)),
-              f"the range of the margin over the motions of '{Stream.CALIBRATED}' less that of '{Stream.PLAIN}'",
-              below=0.0),
+        more(2, "Event images of the moving AMI-EV fit the picture's edges better (Canny, 6 px).", "f"),
+        steadier(2, "They do so more steadily over the camera's motions.", "f", USUAL),
         more(2, "Their entropy is higher (moving camera).", "entropy"),
         *_fading(study.rows_of(results, "sectors")),
-        more(None, "The score itself is higher at 6 px, where chance scores high.", "f"),
+        more(None, "They are better than chance by a larger margin at 6 px, where chance scores high.", "margin"),
+        more(None, "So they are at rest, where the S-EV sees nothing.", "margin", moving=False),
         more(None, "The margin over chance is larger at a tolerance of 1.5 px.", "margin", tolerance=STRICT),
+        steadier(None, "That margin is steadier over the camera's motions.", "margin", STRICT),
         more(None, "It is larger for geometric edges, at 1.5 px.", "margin", tolerance=STRICT, truth=GEOMETRY),
         more(None, "It is larger at 1.5 px than that of an S-EV with as many events.", "margin", tolerance=STRICT,
+             other=Stream.SAME_COUNT),
+        more(None, "The entropy is higher than that of an S-EV with as many events.", "entropy",
              other=Stream.SAME_COUNT),
     ]  # fmt: skip
 

@@ -284,7 +284,7 @@ def tables(results: Sequence[CellResult]) -> list[Table]:
 def claims(results: Sequence[CellResult]) -> list[Claim]:
     """Return the verdicts on the quality at rest and in motion by NIQE; and by SSIM and PSNR."""
     rows = [r for r in study.rows_of(results, "time") if r["method"] == "own"]
-    best = _best_lengths([r for r in study.rows_of(results, "length") if r["method"] == "own"])
+    lengths = [r for r in study.rows_of(results, "length") if r["method"] == "own"]
 
     def claim(number: int | None, text: str, moving: bool, score: str, unit: str = "", rows: Any = rows) -> Claim:
         found = differences([r for r in rows if (r["camera"] != "still") == moving], score,
@@ -302,13 +302,15 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
         claim(None, "Pictures are better at rest (SSIM).", False, "ssim"),
         claim(None, "Pictures are better in motion (SSIM).", True, "ssim"),
         claim(None, "Better in motion by PSNR.", True, "psnr", "dB"),
-        claim(None, "Better in motion if each has the window that is best for it (SSIM).", True, "ssim", rows=best),
+        *(claim(None, f"Better in motion if each has the window that is best for it ({score.upper()}).", True, score,
+                rows=_best_lengths(lengths, score)) for score in ("ssim", "niqe")),
     ]  # fmt: skip
 
 
-def _best_lengths(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows of each stream's best length of the window, by the mean SSIM over the seeds of a case."""
+def _best_lengths(rows: Sequence[dict[str, Any]], score: str) -> list[dict[str, Any]]:
+    """Return the rows of each stream's best length of the window, by the mean SSIM or NIQE over the seeds of a case."""
     names = ("scene", "camera", "stream", "turns")
-    mean: dict[tuple[Any, ...], Any] = {row[:4]: row[5] for row in study.grouped(rows, names, ["ssim"])}
-    best = {key[:3]: max((k for k in mean if k[:3] == key[:3]), key=lambda k: mean[k]) for key in mean}
+    mean: dict[tuple[Any, ...], Any] = {row[:4]: row[5] for row in study.grouped(rows, names, [score])}
+    choose = min if score == "niqe" else max
+    best = {key[:3]: choose((k for k in mean if k[:3] == key[:3]), key=lambda k: mean[k]) for key in mean}
     return [r for r in rows if tuple(r[n] for n in names) == best[tuple(r[n] for n in names[:3])]]
