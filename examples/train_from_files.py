@@ -24,14 +24,14 @@ from torch import nn
 import amiwarp
 
 BINS, WINDOW_US = 5, 25_000
-SIDE, DIRECTIONS, DURATION_US, STEP_US, AT_ONCE = 128, 4, 204_000, 2_000, 16  # of the recordings that are made
+DIRECTIONS, DURATION_US, STEP_US, AT_ONCE = 4, 204_000, 2_000, 16  # of the recordings that are made
 COLUMNS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}  # in the order of a batch: largest first
 
 
 def make_data(folder: Path, recordings: int, device: str) -> None:
     """Write recordings of plain cameras, each of which sees a grating that moves in one of several directions."""
-    items = []
-    y, x = torch.meshgrid(*2 * [torch.arange(SIDE, device=device, dtype=torch.float32)], indexing="ij")
+    items, side = [], 128 if device.startswith("cuda") else 64
+    y, x = torch.meshgrid(*2 * [torch.arange(side, device=device, dtype=torch.float32)], indexing="ij")
     for first in range(0, recordings, AT_ONCE):
         n = min(AT_ONCE, recordings - first)
         random = torch.rand((4, n, 1, 1), generator=torch.Generator().manual_seed(first)).to(device)
@@ -39,7 +39,7 @@ def make_data(folder: Path, recordings: int, device: str) -> None:
         angle = (torch.tensor(labels, device=device)[:, None, None] + 0.4 * random[0] - 0.2) * (math.tau / DIRECTIONS)
         length, contrast, speed = 8 + 24 * random[1], 0.2 + 0.25 * random[2], 0.03 + 0.06 * random[3]  # px, 1, px/ms
         sensor = amiwarp.EventSensor(
-            n, SIDE, SIDE, amiwarp.SensorModel.preset("davis346"), seed=list(range(first, first + n)), device=device
+            n, side, side, amiwarp.SensorModel.preset("davis346"), seed=list(range(first, first + n)), device=device
         )
         parts: list[list[amiwarp.Events]] = [[] for _ in range(n)]
         for t_us in range(0, DURATION_US + 1, STEP_US):
@@ -51,7 +51,7 @@ def make_data(folder: Path, recordings: int, device: str) -> None:
                 part.append(host[start:stop])
         for k, (part, label) in enumerate(zip(parts, labels, strict=True), first):
             found = amiwarp.Events.concatenate(part)
-            amiwarp.save_recording(folder / f"{k}.h5", amiwarp.Recording(amiwarp.MemoryEvents(found, SIDE, SIDE)))
+            amiwarp.save_recording(folder / f"{k}.h5", amiwarp.Recording(amiwarp.MemoryEvents(found, side, side)))
             items.append({"file": f"{k}.h5", "split": "train", "labels": {"class": label}, "events": len(found)})
     manifest = {"format": "amiwarp-dataset", "version": 1, "items": items}
     (folder / "manifest.json").write_text(json.dumps(manifest))
