@@ -19,6 +19,7 @@ import amiwarp
 from amiwarp.cli.common import made_again
 from amiwarp.io.json_files import sealed
 from amiwarp.simulation.sensor_model import SensorModel
+from amiwarp.studies import cluster
 from amiwarp.studies.cluster import single_worker
 from amiwarp.studies.evaluate import apex_speed, corners, fading, study, texture
 from amiwarp.studies.evaluate.claims import Verdict
@@ -395,6 +396,15 @@ def test_a_quick_run_holds_every_evaluation() -> None:
         math.radians(0.5),
         math.radians(1.0),
     ]  # seeds, scenes and lenses share them
+
+
+def test_the_number_of_workers_is_limited_by_cores_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "cpu_threads", lambda: 6)
+    monkeypatch.setattr(cluster, "gpu_count", lambda _: 2)
+    assert [cluster.worker_count(None, device) for device in ("cpu", "cuda", "cuda:1")] == [6, 6, 1]
+    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 10 << 30)
+    assert [cluster.worker_count(n, "cpu", 4 << 30) for n in (None, 5)] == [2, 5]
+    assert cluster.worker_count(None, "cuda", 20 << 30) == 1
 
 
 def test_jobs_share_conditions() -> None:

@@ -2,7 +2,7 @@
 
 import contextlib
 import functools
-import importlib
+import importlib.util
 import logging
 import os
 import platform
@@ -101,17 +101,21 @@ def _visible_gpus() -> tuple[str, ...]:
     return tuple(given.split(",")[:count]) if given else tuple(map(str, range(count)))
 
 
-def worker_count(workers: int | None, device: str) -> int:
+def worker_count(workers: int | None, device: str, bytes_each: int = 0) -> int:
     """Return the number of local workers; by default one for each core, or :data:`WORKERS_PER_GPU` for each GPU.
 
-    A GPU does not get more of them than it has cores.
+    A GPU does not get more of them than it has cores, nor the machine more than its memory has ``bytes_each`` for.
     """
     if workers is not None:
         return whole(workers, "workers", 1, MOST_WORKERS)
-    if device != ANY_GPU:
-        return cpu_threads() if device == "cpu" else 1
-    gpus = max(1, gpu_count(launch.start_quietly()))
-    return gpus * min(WORKERS_PER_GPU, max(1, cpu_threads() // gpus))
+    if device == ANY_GPU:
+        gpus = max(1, gpu_count(launch.start_quietly()))
+        count = gpus * min(WORKERS_PER_GPU, max(1, cpu_threads() // gpus))
+    else:
+        count = cpu_threads() if device == "cpu" else 1
+    if bytes_each and count > 1 and importlib.util.find_spec("distributed"):
+        count = max(1, min(count, importlib.import_module("distributed.system").MEMORY_LIMIT // bytes_each))
+    return count
 
 
 def threads_of_worker(device: str, workers: int | None) -> int | None:

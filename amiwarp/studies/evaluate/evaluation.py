@@ -43,6 +43,8 @@ EVALUATIONS = (
     "texture", "edges", "pictures", "corners", "segmentation", "flow", "pose", "apex_speed", "fading", "convexity",
 )  # fmt: skip
 """Names of the evaluations, in the order of the report: each is a module of this folder, see :class:`Evaluation`."""
+BYTES_PER_PIXEL = 52_000
+"""Memory of a worker [bytes per pixel]: 50 million events of two seconds, with their ground truth, at 320x240 px."""
 UNCALIBRATED = ("apex_speed", "fading", "convexity")
 """Names of the evaluations that need no calibration."""
 
@@ -610,8 +612,8 @@ def evaluate(
     scheduler : str, optional
         Address of a Dask scheduler. By default the work is done on this machine.
     workers : int, optional
-        Number of local processes, by default up to four for each GPU, or one for each core without a GPU. With 1
-        everything runs in this process.
+        Number of local processes, by default up to four for each GPU, or one for each core without a GPU, as far
+        as the memory goes. With 1 everything runs in this process.
     device : str, optional
         Device of the workers; ``cuda`` for all GPUs.
     seed : int, optional
@@ -645,7 +647,7 @@ def evaluate(
         check_output(folder / name)
     chosen = only or EVALUATIONS
     jobs = plan(chosen, settings, [Path(r) for r in recordings], worlds=bool(only) or not recordings)
-    count = worker_count(workers, device)
+    count = worker_count(workers, device, settings.width * settings.height * BYTES_PER_PIXEL)
     if scheduler is None:
         jobs = [replace(job, threads=max(1, cpu_threads() // count)) for job in jobs]
     store = Store(folder / "cells")
