@@ -270,7 +270,6 @@ class DisplayedWindow(DrawnWindow):
     """Sharpness of ``image_after`` in the region."""
     beside: DisplayedWindow | None = None
     """The same time of another recording, whose events, as recorded, the first cloud and image show instead."""
-
     is_beside: bool = False
     """Whether this is another recording, of which less may be known."""
 
@@ -301,8 +300,6 @@ MOST_POINTS, WINDOW_POINTS = 100_000, 1_000_000
 """Largest number of points in each event cloud: of the page, which sends them to a browser, and of the window."""
 CURVE_EVENTS = 200_000
 """Largest number of events that a sharpness curve uses."""
-
-
 MOST_EVENTS = 2_000_000
 """Largest number of events in the image of a window. Of a fuller window, evenly spaced runs are read."""
 FOV_DEG = 60.0
@@ -651,7 +648,7 @@ class Inspector:
         loaded = self.loaded
         if self.selection.region is not None:
             loaded = self._load(loaded.span.start_us, loaded.span.length_us, replace(self.selection, region=None))
-        (before, _), (after, _) = self._unmoved(loaded), self._measured(loaded, self.knobs)
+        (before, _), (after, _) = self._measured(loaded, None), self._measured(loaded, self.knobs)
         orbit_px = np.abs(border_displacements(self.model)).max(initial=0.0)
         return suggest_region(before, after, margin=math.ceil(orbit_px))
 
@@ -683,7 +680,7 @@ class Inspector:
         if (window, selection) != (self.window, self.selection):
             self.open(*window, selection)
         w = self.loaded
-        image, sharpness = self._unmoved(w)
+        image, sharpness = self._measured(w, None)
         return DisplayedWindow(
             w.span, w.region, w.selected, w.events, w.truth, w.before, w.before, self._wrapped(w, self.knobs), image,
             image_after, sharpness, sharpness, is_beside=True,
@@ -703,7 +700,7 @@ class Inspector:
             other = self.beside._beside(w.span, self.selection, image_after)
             image, sharpness = other.image_before, other.sharpness_before
         else:
-            image, sharpness = self._unmoved(w) if against is None else self._measured(w, against)
+            image, sharpness = self._measured(w, against)
         return DisplayedWindow(
             w.span, w.region, w.selected, w.events, w.truth, xy, self._moved(w, knobs), self._wrapped(w, knobs), image,
             image_after, sharpness, sharpness_after, other,
@@ -728,18 +725,13 @@ class Inspector:
         thread that uses the imager; by default, it has an imager of its own.
         """
         w, imager = self.loaded, imager or RegionSharpness(self.recording.events.size, self.device)
-        on_device: dict[float, UploadedEvents] = {}
+        part = w.counted[:: max(1, -(-len(w.counted) // CURVE_EVENTS))]
+        undrawn = replace(w, counted=part, events=w.events[:0], angles={})
 
         def sharpness(knobs: Knobs | None) -> float:
             if self.closed:
                 raise AmiwarpError(f"{self.recording.name}: is closed")
-            given = self._unprismed if knobs is None else knobs
-            rpm = 0.0 if self.has_encoder else given.rpm
-            if rpm not in on_device:
-                on_device.clear()
-                on_device[rpm] = self._upload(w.counted[:: max(1, -(-len(w.counted) // CURVE_EVENTS))], rpm)
-            model, drift_us = self.model_of(given), self._drift_us(given)
-            return imager.measure(model, on_device[rpm], drift_us, w.region)[1]
+            return imager.measure(*self.warped(undrawn, knobs), w.region)[1]
 
         return sharpness
 
@@ -903,14 +895,11 @@ class Inspector:
             encoder, t = self._encoder(rpm), w.events.t
             for old in list(w.angles)[:-1]:
                 del w.angles[old]
-            w.angles[rpm] = self._upload(w.counted, rpm), encoder.angle_at(t), encoder.speed_at(t) * 1e-6
+            # with the slope, the clock offset of the encoder can be changed afterwards
+            slope = encoder.speed_at(w.counted.t) * 1e-6 if self.has_encoder else None
+            uploaded = upload_events(w.counted, encoder, self.device, slope=slope)
+            w.angles[rpm] = uploaded, encoder.angle_at(t), encoder.speed_at(t) * 1e-6
         return w.angles[rpm]
-
-    def _upload(self, events: Events, rpm: float) -> UploadedEvents:
-        """Upload events with their prism angles, so that the clock offset of the encoder can be changed afterwards."""
-        encoder = self._encoder(rpm)
-        slope = encoder.speed_at(events.t) * 1e-6 if self.has_encoder else None
-        return upload_events(events, encoder, self.device, slope=slope)
 
     def _theta(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
         """Return the prism angles of the drawn events [rad], shape ``(n,)``."""
@@ -952,16 +941,18 @@ class Inspector:
         return image if per_polarity else image[0]
 
     def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[NDArray[np.float32], float]:
-        """Return the image of a window with these parameters, and its sharpness; as recorded if ``knobs`` is None."""
+        """Return the image of a window with these parameters, and its sharpness.
+
+        If ``knobs`` is None, it shows the events as recorded, and is measured only once.
+        """
+        if knobs is None and w.unmoved:
+            return w.unmoved[0]
         with self.lock:
             _, sharpness = self._imager.measure(*self.warped(w, knobs), w.region)
-        return self.counts(w, knobs), sharpness
-
-    def _unmoved(self, w: LoadedWindow) -> tuple[NDArray[np.float32], float]:
-        """Return the image of a window as recorded, and its sharpness."""
-        if not w.unmoved:
-            w.unmoved.append(self._measured(w, None))
-        return w.unmoved[0]
+        found = self.counts(w, knobs), sharpness
+        if knobs is None:
+            w.unmoved.append(found)
+        return found
 
 
 # Recordings that a page can open: the files in one folder.
