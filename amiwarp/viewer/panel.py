@@ -286,7 +286,7 @@ class Panel(layout.Actions):
 
     def choose(self, name: str) -> None:
         """Select the parameter over which the sharpness curve is drawn."""
-        if name in layout.NAMES and name != self.state.knob:
+        if name in layout.SLIDERS and name != self.state.knob:
             self.state.knob = name
             self.request_slow("curve")
 
@@ -316,7 +316,7 @@ class Panel(layout.Actions):
             self.say(f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error")
             return
         self._wanted[name] = round(value, 4)
-        if name in layout.NAMES:
+        if name in layout.SLIDERS:
             self.state.knob = name
         self.show_knobs()
         self.request("knobs", change=name)
