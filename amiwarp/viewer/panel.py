@@ -817,14 +817,12 @@ def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progre
 
 # Ways to show the page, in a browser or in a notebook.
 
-LOCALHOST = "127.0.0.1"
-
 
 def serve_panel(
     make_inspector: Callable[[], Inspector],
     library: Library | None = None,
     *,
-    host: str = LOCALHOST,
+    host: str = "127.0.0.1",
     port: int = 0,
     ready: Callable[[str], None],
 ) -> None:
@@ -835,16 +833,14 @@ def serve_panel(
     Raises :class:`AmiwarpError` if the host or the port cannot be used.
     """
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(_serve(make_inspector, library, host, port, ready))
+        asyncio.run(_serve(make_inspector, library, host=host, port=port, ready=ready))
 
 
-async def _serve(
-    make_inspector: Callable[[], Inspector], library: Library | None, host: str, port: int, ready: Callable[[str], None]
-) -> None:
+async def _serve(make_inspector: Callable[[], Inspector], library: Library | None = None, **options: Any) -> None:
     def build(server: Any) -> Callable[[], None]:
         return Panel(server, make_inspector(), library).close
 
-    await serve(build, settable=layout.SETTABLE, host=host, port=port, token=secrets.token_urlsafe(16), ready=ready)
+    await serve(build, settable=layout.SETTABLE, token=secrets.token_urlsafe(16), **options)
 
 
 @guarded
@@ -941,5 +937,5 @@ def view(
         return made
 
     make_inspector()  # raises errors in the cell, before the page is served
-    serving = _serve(make_inspector, None, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
+    serving = _serve(make_inspector, ready=lambda url: display(IFrame(url, "100%", height)))
     return NotebookPage(loop.create_task(serving))
