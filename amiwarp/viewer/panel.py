@@ -91,7 +91,6 @@ class Panel(layout.Actions):
         self._progress: JobProgress | None = None
         self._wanted: dict[str, Any] = {}  # values that were set on the page, and that the inspector has not taken yet
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
-        self._downloads = 0
         use_page(server, self._folder.name)
         self.state.client_only(*layout.CLIENT_ONLY)
         self._listen()
@@ -107,7 +106,6 @@ class Panel(layout.Actions):
         folder = "" if self._library is None else str(self._library.folder)
         self.state.update({**layout.initial_state(inspector), "files": files, "folder": folder})
         self._wanted = {}
-        self.show_knobs()
         self.time_window = inspector.window or inspector.first_window()
         self.start_job(self._count_events())
         self.request("window", *(["suggestion"] if self.compensates else []))
@@ -192,7 +190,7 @@ class Panel(layout.Actions):
     async def until_drawn(self) -> None:
         """Wait until no quick update is pending."""
         while self._quick is not None and not self._quick.done():
-            await asyncio.sleep(0.005)
+            await asyncio.wait([self._quick])
 
     def start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run a job until it ends or the browser tab is closed."""
@@ -614,10 +612,9 @@ class Panel(layout.Actions):
             path = Path(self._folder.name) / name
             path.unlink(missing_ok=True)
             await self.in_thread(write, path)
-            self._downloads += 1  # a browser keeps what it has loaded from an address
-            self.server.js_call("page", "download", name, f"{self.server.name}/{name}?{self._downloads}")
-            size = f"{path.stat().st_size / 1e3:,.0f} kB"
-            self.say(f"{name}: {size}, in the browser's downloads", "success")
+            about = path.stat()  # with its time, as a browser keeps what it has loaded from an address
+            self.server.js_call("page", "download", name, f"{self.server.name}/{name}?{about.st_mtime_ns}")
+            self.say(f"{name}: {about.st_size / 1e3:,.0f} kB, in the browser's downloads", "success")
         self.state.flush()
 
     # Undo, redo, reset, and the state in the page's address
@@ -663,7 +660,6 @@ class Panel(layout.Actions):
             s.noise_ms = selection.noise_us * 1e-3
         if wanted.against != self.against:
             self.show_b(wanted.against)
-        self.show_knobs()
 
     # Updates of what the page shows
 
@@ -725,8 +721,7 @@ class Panel(layout.Actions):
         length_us = min(length_us, self.whole_us)
         await in_thread(inspector.open, start_us, length_us, self._selection())
         if suggest:
-            if await in_thread(jobs.estimate_phase, inspector):
-                self.show_knobs()
+            await in_thread(jobs.estimate_phase, inspector)
             region = await in_thread(inspector.suggest_region)
             s.update({"region_wanted": list(region), "region_kind": "suggested"})
             await in_thread(inspector.open, start_us, length_us, self._selection())
