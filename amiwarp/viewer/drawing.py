@@ -111,7 +111,6 @@ PREPARING_SHARE = 0.01
 SAME_RESIDUAL = 0.25
 """Relative change of the residual up to which the weight of the smoothness prior is kept."""
 
-
 _prepared: set[str] = set()
 """Devices on which :func:`prepare` has run."""
 
@@ -591,8 +590,8 @@ class Scene:
         self._clouds: list[Any] = []
         self._meshes: list[Any] = [None, None]
         self._drawn: list[tuple[Any, ...]] = [((), (), None)] * 2
-        self._frame: list[tuple[int, Any]] = []
-        self._lines: list[tuple[int, Any]] = []
+        self._frame: list[Any] = []
+        self._lines: list[Any] = []
         self._explained: tuple[Any, ...] = ()
         self._caption = text_actor("", "black", (0.01, 0.9))
         self.plotter.renderers[3].add_actor(self._caption, render=False, pickable=False, reset_camera=False)
@@ -746,23 +745,20 @@ class Scene:
             home.AddActor(cloud)
         for renderer in list(self.plotter.renderers)[:OWN_RENDERERS]:
             renderer.set_background(background)
-        for k, actor in self._frame:
-            self.plotter.renderers[k].remove_actor(actor, render=False)
-        self._frame = []
+        for renderer in self._views:
+            renderer.remove_actor(self._frame, render=False)
         titles = (" and ".join(look.titles),) if look.overlaid else look.titles
-        for k, title in enumerate(titles):
-            self._frame += [(k, actor) for actor in self._axes(k, look, ink, title)]
+        self._frame = [actor for k, title in enumerate(titles) for actor in self._axes(k, look, ink, title)]
 
     def _draw_lines(self, lines: Sequence[NDArray[Any]], look: Look) -> None:
         """Draw a line in each cloud, instead of those drawn before."""
         import pyvista
 
-        for k, actor in self._lines:
-            self.plotter.renderers[k].remove_actor(actor, render=False)
+        for renderer in self._views:
+            renderer.remove_actor(self._lines, render=False)
         curves = [pyvista.lines_from_points(self.box.positions(line[:, :2], line[:, 2])) for line in lines]
-        homes = [0 if look.overlaid else number for number in range(len(lines))]
-        self._lines = [(k, self._add(k, curve, color=ORBIT_COLOUR, line_width=2.5))
-                       for k, curve in zip(homes, curves, strict=True)]  # fmt: skip
+        self._lines = [self._add(0 if look.overlaid else k, curve, color=ORBIT_COLOUR, line_width=2.5)
+                       for k, curve in enumerate(curves)]  # fmt: skip
 
     def _draw_legend(self, shown: DisplayedWindow, look: Look, caption: str) -> None:
         """Draw the legend in a strip on the left, and the caption below. The clouds shrink to make room."""
@@ -859,15 +855,13 @@ def draw_depth(plotter: pyvista.Plotter, first: int, depth: DepthMap) -> None:
     x, y, z = depth.points[known].T
     cloud = pyvista.PolyData(np.column_stack([x, z, -y]))  # VTK's third axis points up
     cloud["colour"] = scale.rgb(metres[known])
-    for k, mesh in enumerate((None, image, cloud)):
+    for renderer in list(plotter.renderers)[first : first + 3]:
+        renderer.set_background(background)
+    for actor in bar_actors(scale, ink, plotter.window_size[1]):
+        plotter.renderers[first].add_actor(actor, render=False, pickable=False, reset_camera=False)
+    for k, mesh, title in ((1, image, "depth map"), (2, cloud, "its points")):
         plotter.subplot(0, first + k)
-        plotter.set_background(background, all_renderers=False)
-        if mesh is None:
-            for actor in bar_actors(scale, ink, plotter.window_size[1]):
-                plotter.add_actor(actor, render=False, pickable=False, reset_camera=False)
-            continue
         plotter.add_mesh(mesh, scalars="colour", rgb=True, lighting=False, render=False, pickable=False, point_size=3.0)
-        title = "depth map" if k == 1 else "its points"
         plotter.add_text(title, position="upper_edge", font_size=9, color=ink, render=False, font_file=str(font()))
     plotter.show_bounds(
         mesh=cloud, xtitle="x [m]", ytitle="depth [m]", ztitle="-y [m]", color=ink, location="outer", fmt="%.1f",

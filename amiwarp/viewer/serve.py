@@ -546,7 +546,6 @@ def _trame_globals_restored() -> Iterator[None]:
 
 def _remove_from_trame(server: Any) -> None:
     """Remove the server from trame's global variables, which would keep it alive."""
-
     from trame_client.widgets.core import HTML_CTX
 
     if HTML_CTX._server is server:
