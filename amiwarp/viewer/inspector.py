@@ -29,6 +29,7 @@ from amiwarp.imaging.corners import find_background_activity
 from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, iwe, upload_events
 from amiwarp.imaging.regions import Region, RegionSharpness, inside, suggest_region
 from amiwarp.io.depth_map import DepthMap
+from amiwarp.io.formats import EXTENSIONS
 from amiwarp.io.spans import Span, read_span
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, PHASE, Model, PlateModel, RisleyModel, alternatives, build_model
@@ -156,8 +157,7 @@ class Knobs:
     def value(self, name: str) -> float | None:
         """Return the value of a parameter; None if it is not known and has no slider."""
         if name not in OTHERS:
-            known: float | None = getattr(self, name)
-            return known
+            return getattr(self, name)
         return dict(self.others).get(name, 0.0 if name in SLIDING else None)
 
     def with_values(self, values: Mapping[str, float]) -> Knobs:
@@ -819,24 +819,13 @@ class Inspector:
         encoder = self._encoder(knobs.rpm)
         return encoder.with_clock_offset(knobs.clock_offset) if self.has_encoder else encoder
 
-    @property
-    def _unprismed(self) -> Knobs:
-        """Parameters that leave all events where they were recorded."""
-        return replace(self.knobs, model=self._best_model, apex=0.0, others=())
-
     def warped(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
         """Return the model, the events on the device and their drift [us], to vote the events of a window.
 
         ``knobs``: the parameters; None for the events as recorded.
         """
-        given = self._unprismed if knobs is None else knobs
+        given = knobs or replace(self.knobs, model=self._best_model, apex=0.0, others=())  # which move no event
         return self.model_of(given), self._angles(w, given)[0], self._drift_us(given)
-
-    def positions(self, events: Events, knobs: Knobs) -> NDArray[np.float32]:
-        """Return the compensated positions of events [px], shape ``(n, 2)``."""
-        xy = np.stack([events.x, events.y], axis=1).astype(np.float32)
-        theta = self.encoder_of(knobs).angles_at(events.t).astype(np.float32)
-        return np.asarray(self.model_of(knobs).compensate_points(xy, theta), np.float32)
 
     def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:
         """Read and select the events of a time window. The events of the last one are not read again."""
@@ -957,10 +946,7 @@ class Inspector:
 
 # Recordings that a page can open: the files in one folder.
 
-SUFFIXES = {
-    ".aedat", ".aedat2", ".aedat4", ".bag", ".bin", ".csv", ".dat", ".db3", ".es", ".h5", ".hdf5", ".mcap", ".npz",
-    ".raw", ".txt",
-}  # fmt: skip
+SUFFIXES = {*EXTENSIONS, ".aedat", ".aedat2", ".bag", ".bin", ".csv", ".dat", ".es"}
 """Suffixes of files that may be recordings."""
 MOST_FILES = 200
 """Largest number of files that are listed."""
