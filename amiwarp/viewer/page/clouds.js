@@ -14,15 +14,6 @@ const REACH_PX = 8;
 const GREY = 0xff909090;
 const ORBIT = '#009e73';
 
-// Return a function that returns what it made last, until something that it is made of changes.
-function memory() {
-  let [known, value] = [[], null];
-  return (make, ...of) => {
-    if (of.length !== known.length || of.some((each, k) => each !== known[k])) [known, value] = [of, make()];
-    return value;
-  };
-}
-
 export const EventClouds = {
   props: {
     before: null, after: null, third: null, thirdBefore: null, coloursBefore: null, coloursAfter: null, orbit: null, column: null,
@@ -46,7 +37,7 @@ export const EventClouds = {
         return new Raster();
       }
     });
-    const pictures = [memory(), memory()];
+    const drawn = [[], []]; // what the rasters show
     const shape = computed(() => { // as a text, because equal texts change nothing
       const [wide, tall] = [extent.value[0] - MARGIN.left - MARGIN.right, extent.value[1] - MARGIN.top - MARGIN.bottom];
       return JSON.stringify([props.box, props.axis, props.titles.length === 1 ? tall / Math.max(wide, 1) : 0]);
@@ -113,7 +104,10 @@ export const EventClouds = {
         const projection = projected(pane);
         if (rasters[number].lost) rasters[number] = new Raster();
         const raster = rasters[number];
-        const fill = () => {
+        const key = JSON.stringify([projection, pane.width, pane.height, ratio, paper, dot, props.opacity, pane.clouds]);
+        const content = [raster, key, ...pane.clouds.flatMap((k) => [places[k].value, colours[k].value])];
+        if (content.some((each, k) => each !== drawn[number][k])) {
+          drawn[number] = content;
           const fine = { ...projection, scale: projection.scale * ratio, x: projection.x * ratio, y: projection.y * ratio };
           raster.resize(Math.max(1, Math.round(pane.width * ratio)), Math.max(1, Math.round(pane.height * ratio)));
           raster.clear(packed(paper));
@@ -122,12 +116,9 @@ export const EventClouds = {
             const grey = pane.clouds.length > 1 && k === 0 ? GREY : 0;
             raster.points(places[k].value, colours[k].value, fine, dot, props.opacity, clip, grey);
           }
-          return raster;
-        };
-        const key = JSON.stringify([projection, pane.width, pane.height, ratio, paper, dot, props.opacity, pane.clouds]);
-        const picture = pictures[number](fill, raster, key, ...pane.clouds.flatMap((k) => [places[k].value, colours[k].value]));
+        }
         context.setTransform(1, 0, 0, 1, 0, 0);
-        picture.show(context, Math.round(pane.left * ratio), Math.round(pane.top * ratio));
+        raster.show(context, Math.round(pane.left * ratio), Math.round(pane.top * ratio));
         context.setTransform(ratio, 0, 0, ratio, pane.left * ratio, pane.top * ratio);
         context.save();
         context.beginPath();
