@@ -29,7 +29,7 @@ export const EventClouds = {
       extent.value = [canvas.value.clientWidth, canvas.value.clientHeight];
       draw();
     });
-    const camera = new Camera();
+    const camera = new Camera(props.view[0]);
     const rasters = [0, 1].map(() => { // a graphics card draws the points if there is one
       try {
         return new GpuRaster();
@@ -109,8 +109,7 @@ export const EventClouds = {
         if (content.some((each, k) => each !== drawn[number][k])) {
           drawn[number] = content;
           const fine = { ...projection, scale: projection.scale * ratio, x: projection.x * ratio, y: projection.y * ratio };
-          raster.resize(Math.max(1, Math.round(pane.width * ratio)), Math.max(1, Math.round(pane.height * ratio)));
-          raster.clear(packed(paper));
+          raster.begin(Math.max(1, Math.round(pane.width * ratio)), Math.max(1, Math.round(pane.height * ratio)), packed(paper));
           const clip = clipOf(projection, pane).map((each) => Math.round(each * ratio));
           for (const k of pane.clouds) {
             const grey = pane.clouds.length > 1 && k === 0 ? GREY : 0;
@@ -222,7 +221,6 @@ export const EventClouds = {
     }
 
     onMounted(() => {
-      camera.look(props.view[0]);
       emit('card', rasters[0] instanceof GpuRaster);
       ask();
     });
