@@ -4,7 +4,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, partialmethod
 from operator import attrgetter
 from typing import Any, TypeAlias
 from urllib.parse import parse_qsl, urlencode
@@ -159,8 +159,7 @@ LIMITS = {
     **{name: p.limits for name, p in SLIDING.items()}, "rpm": (-1e5, 1e5),
     **{name: p.limits for name, p in OTHERS.items()}, "focal_length": (0.1, 1e6),
 }  # fmt: skip
-"""Smallest and largest value of each parameter in an address and a field: angles in degrees, others in their own units.
-"""
+"""Smallest and largest value of each parameter in an address and a field, in degrees or the parameter's own unit."""
 UNITS = {
     **dict.fromkeys(LIMITS, 1.0),
     **dict.fromkeys(("apex", "phase", *(name for name, p in OTHERS.items() if p.unit == "rad")), math.radians(1.0)),
@@ -497,23 +496,15 @@ class Actions:
 
     # History
 
-    def undo(self) -> None:
-        """Go back by one step."""
-        self.travel(History.undo)
-
-    def redo(self) -> None:
-        """Go forward by one step that was undone."""
-        self.travel(History.redo)
-
-    def reset(self) -> None:
-        """Show the first state again."""
-        self.travel(History.reset)
-
     def travel(self, step: Callable[[History], ViewState]) -> None:
         """Request the state that a step through the history gives."""
         self.steps = (*self.steps, step)
         self.request("state")
         self.released()
+
+    undo = partialmethod(travel, History.undo)
+    redo = partialmethod(travel, History.redo)
+    reset = partialmethod(travel, History.reset)
 
     def travelled(self) -> ViewState | None:
         """Make the requested steps, and return the state to show; None to stay."""
