@@ -38,10 +38,7 @@ from amiwarp.viewer.layout import EXPORTS, SLIDERS, UNITS, orbit_text
 # Progress of long work in threads.
 
 PROGRESS_S = 0.1
-"""Shortest interval between two progress messages of a job [s].
-
-The calibration of a small recording causes eighty per second, and the page would draw each of them.
-"""
+"""Shortest interval between two progress messages of a job [s]. The page would draw each of eighty per second."""
 
 
 class JobCancelled(Exception):
