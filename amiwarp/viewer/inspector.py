@@ -244,8 +244,7 @@ class LoadedWindow(DrawnWindow):
     """Events on the device, prism angles [rad] and speeds [rad/us] of the drawn events, without the clock offset set on
     the page, by the speed of a prism without encoder [1/min]; with an encoder, the only key is 0."""
     wrapped: dict[tuple[float, float], NDArray[np.float64]] = field(default_factory=dict)
-    """Prism angles of the drawn events from 0 to 2π [rad], by speed and drift of the clock offset; the last ones only.
-    """
+    """Last prism angles of the drawn events, from 0 to 2π [rad], by speed and drift of the clock offset."""
     unmoved: list[tuple[NDArray[np.float32], float]] = field(default_factory=list)
     """Image of the events as recorded and its sharpness, once it is measured."""
     chosen: list[Picture] = field(default_factory=list)
@@ -288,18 +287,14 @@ class DisplayedWindow(DrawnWindow):
                        after=self.after[::step], theta=self.theta[::step])  # fmt: skip
 
 
-# Statistics of the shown events.
-
-INTERVALS_US = np.logspace(0, 6, 49)
-"""Edges of the bins of the histogram of intervals [us]: eight bins per decade, from 1 us to 1 s."""
-
-
 # Selected events of a time window, on the host and with their prism angles on the device.
 
 MOST_POINTS, WINDOW_POINTS = 100_000, 1_000_000
-"""Largest number of points in each event cloud: of the page, which sends them to a browser, and of the window."""
+"""Largest number of points in each event cloud: of the page, and of the window or a browser with a graphics card."""
 CURVE_EVENTS = 200_000
 """Largest number of events that a sharpness curve uses."""
+INTERVALS_US = np.logspace(0, 6, 49)
+"""Edges of the bins of the histogram of intervals [us]: eight bins per decade, from 1 us to 1 s."""
 MOST_EVENTS = 2_000_000
 """Largest number of events in the image of a window. Of a fuller window, evenly spaced runs are read."""
 FOV_DEG = 60.0

@@ -33,12 +33,10 @@ from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
-from amiwarp.viewer.inspector import DisplayedWindow, Inspector, Knobs, Library, Selection
+from amiwarp.viewer.inspector import WINDOW_POINTS, DisplayedWindow, Inspector, Knobs, Library, Selection
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
 from amiwarp.viewer.serve import finite, serve, use_page
 
-CARD_POINTS = 1_000_000
-"""Largest number of points in each cloud of a browser that draws with a graphics card."""
 BINS = 400
 """Number of points of the drawn event rates."""
 STEP_S = 0.2
@@ -88,7 +86,7 @@ class Panel(layout.Actions):
         self._picked, self._card = -1, False
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
         self._rates: EventRates
-        self._progress: JobProgress | None = None
+        self._progress = JobProgress(self._show_progress)  # of the latest calibration or film
         self._wanted: dict[str, Any] = {}  # values that were set on the page, and that the inspector has not taken yet
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
         use_page(server, self._folder.name)
@@ -127,13 +125,11 @@ class Panel(layout.Actions):
 
     def cancel(self) -> None:
         """Stop the calibration or the film that is being made."""
-        if self._progress is not None:
-            self._progress.cancelled = True
+        self._progress.cancelled = True
 
     def end_film(self) -> None:
         """End the film that is being made with the pictures made so far."""
-        if self._progress is not None:
-            self._progress.ended = True
+        self._progress.ended = True
 
     @property
     def look(self) -> Look:
@@ -322,8 +318,8 @@ class Panel(layout.Actions):
     def use_card(self, found: bool) -> None:
         """Show more points if the browser has a graphics card to draw them."""
         self._card = found
-        if found and self.inspector.most_points < CARD_POINTS:
-            self.inspector.most_points = CARD_POINTS
+        if found and self.inspector.most_points < WINDOW_POINTS:
+            self.inspector.most_points = WINDOW_POINTS
             self.request("window")
 
     def answer(self) -> None:
@@ -595,8 +591,7 @@ class Panel(layout.Actions):
             against=self.against, with_orbit=bool(s.orbit_shown), speed=float(s.speed),
             ended=lambda: progress.ended,
         )  # fmt: skip
-        with s:
-            s.update({"busy": f"making the {layout.EXPORTS[what][0]}", "progress": 0})
+        self._show_progress(f"making the {layout.EXPORTS[what][0]}", 0.0)
         try:
             with contextlib.suppress(JobCancelled):
                 async with self.device_lock:
