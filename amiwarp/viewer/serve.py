@@ -102,7 +102,6 @@ class HostNames:
 def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:
     """Return the error to raise if the server cannot listen at ``host`` and ``port``."""
     denied = f"--port {port}: permission denied; give a port above 1023, or 0 for a free one"
-    given = f"--host {host!r} --port {port}"
     known = {
         errno.EADDRINUSE: f"--port {port}: is in use on {host}; give another port, or 0 for a free one",
         errno.EADDRNOTAVAIL: f"--host {host!r} is not an address of this machine; give one, such as 127.0.0.1",
@@ -110,7 +109,7 @@ def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:
     }  # fmt: skip
     if isinstance(error, socket.gaierror):
         return AmiwarpError(f"--host {host!r}: unknown name or address; give one of this machine, such as 127.0.0.1")
-    usual = f"{given}: cannot listen: {error.strerror or error}; give another host or port"
+    usual = f"--host {host!r} --port {port}: cannot listen: {error.strerror or error}; give another host or port"
     # newer asyncio gives no number if no address of the host is one of this machine
     return AmiwarpError(known.get(error.errno or errno.EADDRNOTAVAIL, usual))
 
@@ -135,11 +134,7 @@ Check = Callable[[Any], bool]
 
 def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
     """Return a check that accepts numbers from ``low`` to ``high``; it rejects NaN and booleans."""
-
-    def check(value: Any) -> bool:
-        return type(value) in (int, float) and low <= value <= high  # comparisons with NaN are false
-
-    return check
+    return lambda value: type(value) in (int, float) and low <= value <= high  # comparisons with NaN are false
 
 
 def one_of(*known: Any) -> Check:

@@ -48,8 +48,6 @@ HELP_PLACE, STATISTICS_PLACE = (0.35, 0.46, 0.72, 0.97), (0.735, 0.0, 1.0, 0.25)
 """Left, bottom, right and top of help and statistics, in shares of the window's size."""
 DEPTH_SHARES = (CORNER[0], 0.34, 0.67, 1.0)
 """Edges between colour bar, image and points of a depth map, in shares of the window's width."""
-VTK_FONT_FILE = 4
-"""Number by which VTK knows that a text has a font of a file."""
 HELP_PAPER = {False: "#f0f0ea", True: "#24282e"}
 """Background of help and statistics, for light (False) and dark (True) mode."""
 LEGEND_SHARE = 0.5
@@ -504,6 +502,10 @@ class Window(layout.Actions):
         return out
 
     def _make_sliders(self, names: tuple[str, ...]) -> None:
+        import pyvista
+
+        style = pyvista.TextProperty(font_file=str(drawing.font()), justification_horizontal="center",
+                                     justification_vertical="center")  # fmt: skip
         self.plotter.clear_slider_widgets()
         self.plotter.subplot(0, drawing.OWN_RENDERERS)
         self.sliders = {}
@@ -516,11 +518,7 @@ class Window(layout.Actions):
             slider.KeyPressActivationOff()  # VTK's key i would hide it
             slider.GetRepresentation().ShowSliderLabelOff()
             slider.GetRepresentation().SetEndCapWidth(0.01)
-            title = slider.GetRepresentation().GetTitleProperty()
-            title.SetFontFamily(VTK_FONT_FILE)
-            title.SetFontFile(str(drawing.font()))
-            title.BoldOff()
-            title.ShadowOff()
+            slider.GetRepresentation().GetTitleProperty().ShallowCopy(style)
             self.sliders[name] = slider
 
     def _make_charts(self) -> None:
