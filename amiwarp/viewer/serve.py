@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 ALL_INTERFACES = {"0.0.0.0": (socket.AF_INET, "192.0.2.1"), "::": (socket.AF_INET6, "2001:db8::1")}
 """Hosts that mean every address of this machine, each with its address family and a remote address reserved for
 documentation."""
-LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
-"""Names under which a machine reaches itself."""
 
 
 def normalised(host: str) -> str:
@@ -83,11 +81,11 @@ class HostNames:
     """
 
     def __init__(self, host: str) -> None:
-        names = {normalised(host), reachable(host)}
+        names = {"localhost", "127.0.0.1", "::1", normalised(host), reachable(host)}
         if not is_local(host):
             own = socket.gethostname().lower()
             names |= {own, f"{own}.local", own.partition(".")[0]}
-        self.known = LOCAL_NAMES | (names - ALL_INTERFACES.keys())
+        self.known = names - ALL_INTERFACES.keys()
 
     def accept(self, request: web.Request) -> bool:
         """Return whether the request's ``Host`` is a known name or the address at which the request arrived."""
@@ -398,7 +396,6 @@ class Tabs:
 
     def _clean_up(self, waited_s: float) -> None:
         """Release the memory of closed tabs. Retry at growing intervals while their threads still run."""
-        self._cleanup = None
         release_memory()
         if len(self._servers) > len(self._sockets):
             self._clean_up_later(min(2.0 * waited_s, LONGEST_CLEANUP_S))
