@@ -377,7 +377,7 @@ class Inspector:
         """Whether nobody looks any more: measuring the sharpness then raises :class:`AmiwarpError`."""
         self.lock = Lock()
         """Lock for the events on the device and the buffers of their images."""
-        self._imager, self._curve_imager = (RegionSharpness(source.size, device) for _ in range(2))
+        self._imager = RegionSharpness(source.size, device)
         self._votes: dict[bool, Votes] = {}
         if calibration is not None:
             self.accept(calibration)
@@ -386,7 +386,7 @@ class Inspector:
         """Return an inspector that shows the same, with buffers of its own, for another thread."""
         made, size = copy(self), self.recording.events.size
         made.lock, made._votes, made.sources = Lock(), {}, dict(self.sources)
-        made._imager, made._curve_imager = (RegionSharpness(size, self.device) for _ in range(2))
+        made._imager = RegionSharpness(size, self.device)
         made._window = made._span = None
         made.beside = None if self.beside is None else self.beside.copy()
         return made
@@ -708,18 +708,18 @@ class Inspector:
 
     def curve_points(self, name: str) -> Iterator[tuple[float, float]]:
         """Yield the points of :meth:`curve` one after the other."""
-        knobs, half, sharpness = self.knobs, CURVE_HALF_WIDTH[name], self.sharpness_meter(self._curve_imager)
+        knobs, half, sharpness = self.knobs, CURVE_HALF_WIDTH[name], self.sharpness_meter()
         values = (knobs.value(name) or 0.0) + np.linspace(-half, half, CURVE_POINTS)
         for value in values[values >= 0.0].tolist() if name == size_name(knobs.model) else values.tolist():
             yield value, sharpness(knobs.with_values({name: value}))
 
-    def sharpness_meter(self, imager: RegionSharpness | None = None) -> Callable[[Knobs | None], float]:
+    def sharpness_meter(self) -> Callable[[Knobs | None], float]:
         """Return a function that measures the sharpness of part of the window's events with given parameters.
 
-        Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and belongs to the
-        thread that uses the imager; by default, it has an imager of its own.
+        Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and has buffers of
+        its own, for one thread.
         """
-        w, imager = self.loaded, imager or RegionSharpness(self.recording.events.size, self.device)
+        w, imager = self.loaded, RegionSharpness(self.recording.events.size, self.device)
         part = w.counted[:: max(1, -(-len(w.counted) // CURVE_EVENTS))]
         undrawn = replace(w, counted=part, events=w.events[:0], angles={})
 

@@ -87,7 +87,6 @@ class Panel(layout.Actions):
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
         self._rates: EventRates
         self._progress = JobProgress(self._show_progress)  # of the latest calibration or film
-        self._wanted: dict[str, Any] = {}  # values that were set on the page, and that the inspector has not taken yet
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
         use_page(server, self._folder.name)
         self.state.client_only(*layout.CLIENT_ONLY)
@@ -103,7 +102,7 @@ class Panel(layout.Actions):
         files = [] if self._library is None else self._library.files()
         folder = "" if self._library is None else str(self._library.folder)
         self.state.update({**layout.initial_state(inspector), "files": files, "folder": folder})
-        self._wanted = {}
+        self._wanted: dict[str, Any] = {}  # values that were set on the page, and that the inspector has not taken yet
         self.time_window = inspector.window or inspector.first_window()
         self.start_job(self._count_events())
         self.request("window", *(["suggestion"] if self.compensates else []))
