@@ -11,7 +11,7 @@ from contextlib import closing, suppress
 from ctypes.util import find_library
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,15 +44,7 @@ from amiwarp.plotting.figures import instance_colours
 from amiwarp.plotting.meshes import Box
 from amiwarp.reconstruction.picture import Picture, Reconstruction
 from amiwarp.validation import choice
-from amiwarp.viewer.inspector import (
-    STORES,
-    DisplayedWindow,
-    DrawnTruth,
-    Inspector,
-    Knobs,
-    LoadedWindow,
-    colours_on_offer,
-)
+from amiwarp.viewer.inspector import DisplayedWindow, DrawnTruth, Inspector, Knobs, LoadedWindow, colours_on_offer
 
 if TYPE_CHECKING:
     import pyvista
@@ -110,7 +102,6 @@ PREPARING_SHARE = 0.01
 """Share of these events and pixels in the picture that is made only to compile and load its kernels."""
 SAME_RESIDUAL = 0.25
 """Relative change of the residual up to which the weight of the smoothness prior is kept."""
-
 
 _prepared: set[str] = set()
 """Devices on which :func:`prepare` has run."""
@@ -235,16 +226,15 @@ def make_images(
     first = inspector.beside if against is None and inspector.beside is not None else inspector
     pair = (first, first.loaded, against), (inspector, window, knobs)
     if kind is ImageKind.TIME_SURFACE:
-        images = [_time_surface(*each) for each in pair]
-    elif kind is ImageKind.COUNT and shown is not None:
+        before, after = (_time_surface(*each)[top:bottom, left:right] for each in pair)
+        scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, "viridis")
+        return ShownImages(before, after, scale)
+    if kind is ImageKind.COUNT and shown is not None:
         images = [shown.image_before, shown.image_after]
     else:
         images = [each.counts(w, k, per_polarity=kind is ImageKind.POLARITY) for each, w, k in pair]
     before, after = (each[..., top:bottom, left:right] for each in images)
-    if kind is ImageKind.TIME_SURFACE:
-        scale = Scale("time of the latest event", "ms", 0.0, window.span.length_us * 1e-3, "viridis")
-    else:
-        scale = count_scale((before, after), "polarity" if kind is ImageKind.POLARITY else "gray")
+    scale = count_scale((before, after), "polarity" if kind is ImageKind.POLARITY else "gray")
     if not (difference and kind is ImageKind.COUNT):
         return ShownImages(before, after, scale)
     most = max(float(np.abs(after - before).max()), 1.0)
@@ -263,12 +253,6 @@ def _time_surface(inspector: Inspector, window: LoadedWindow, knobs: Knobs | Non
 
 # Colours for events by cause, instance and depth, and the legend of these colours.
 
-Legend: TypeAlias = tuple[tuple[str, str], ...]
-"""Rows of a legend: a colour in hexadecimal notation, and the meaning of the colour.
-
-The colour of the title row is empty.
-"""
-
 
 def _truth_colours(colour: Colour, values: NDArray[Any]) -> NDArray[np.float64]:
     """Return the colours (0 to 1) of causes, instances or depths, shape ``(n, 3)``. The sky is grey."""
@@ -281,17 +265,18 @@ def _truth_colours(colour: Colour, values: NDArray[Any]) -> NDArray[np.float64]:
     return np.asarray(np.where((values == 0)[:, None], to_rgb(GREY), instance_colours(values)))
 
 
-def legend_of(truth: DrawnTruth, colour: Colour, most: int) -> Legend:
+def legend_of(truth: DrawnTruth, colour: Colour, most: int) -> tuple[tuple[str, str], ...]:
     """Return the legend of a colour choice; the legend is empty if a scale explains the colours.
 
-    A legend of depth has ``most`` rows. Other legends list at most ``most`` causes or instances, the most frequent
-    first, with their fractions of the drawn events, and sum up the rest.
+    Its rows are a colour in hexadecimal notation, which is empty for the title, and the meaning of the colour. A legend
+    of depth has ``most`` rows. Other legends list at most ``most`` causes or instances, the most frequent first, with
+    their fractions of the drawn events, and sum up the rest.
     """
     from matplotlib.colors import to_hex
 
     if colour is Colour.POLARITY:
         return ("", "polarity"), (ON_COLOUR, "ON: brighter"), (OFF_COLOUR, "OFF: darker")
-    if colour not in STORES:
+    if colour in colours_on_offer(None):  # which needs no ground truth
         return ()
     values, title, more = truth.values(colour), colour.value, []
     if colour is Colour.DEPTH:
@@ -335,10 +320,9 @@ def colours_of(shown: DisplayedWindow, look: Look, *, after: bool) -> NDArray[np
     if look.colour is Colour.POLARITY:
         two = np.array([to_rgb(OFF_COLOUR), to_rgb(ON_COLOUR)])
         return np.asarray((255.0 * two).astype(np.uint8)[shown.events.p])
-    if look.colour in STORES:
-        return as_bytes(_truth_colours(look.colour, shown.truth.values(look.colour)))
     scale = scale_of(shown, look.colour, dark=look.dark)
-    assert scale is not None
+    if scale is None:
+        return as_bytes(_truth_colours(look.colour, shown.truth.values(look.colour)))
     if look.colour in (Colour.ANGLE, Colour.TIME):
         return scale.rgb(third_axis(shown, Axis(look.colour.value)))
     image, xy = (shown.image_after, shown.after) if after else (shown.image_before, shown.before)
@@ -368,10 +352,7 @@ def scale_of(shown: DisplayedWindow, colour: Colour, *, dark: bool) -> Scale | N
 # Legend of the inspector's picture as VTK actors: rows of a coloured mark and the meaning of the colour, or a scale.
 
 CORNER = (0.05, 0.985)
-"""Upper left corner of the legend in the strip of the picture that is reserved for the legend.
-
-The coordinates are fractions of the width and height of the strip, from its lower left corner.
-"""
+"""Upper left corner of the legend in its strip, in shares of the strip's width and height from the lower left."""
 BAR_BOTTOM = 0.3
 """Lower end of a scale, in shares of the height of the strip."""
 FONT_SIZE, MARK = 12, "■"
@@ -392,10 +373,7 @@ def strip_share(texts: Sequence[str], width: int) -> float:
 
 
 def bar_actors(bar: Scale, ink: str, height: int) -> list[Any]:
-    """Return the actors of a vertical scale in the strip of a picture of a given height [px].
-
-    ``ink`` is the colour of the text.
-    """
+    """Return the actors of a vertical scale. ``ink``: colour of the text; ``height``: of the whole picture [px]."""
     import pyvista
     from vtkmodules.vtkRenderingAnnotation import vtkScalarBarActor
 
@@ -591,8 +569,8 @@ class Scene:
         self._clouds: list[Any] = []
         self._meshes: list[Any] = [None, None]
         self._drawn: list[tuple[Any, ...]] = [((), (), None)] * 2
-        self._frame: list[tuple[int, Any]] = []
-        self._lines: list[tuple[int, Any]] = []
+        self._frame: list[Any] = []
+        self._lines: list[Any] = []
         self._explained: tuple[Any, ...] = ()
         self._caption = text_actor("", "black", (0.01, 0.9))
         self.plotter.renderers[3].add_actor(self._caption, render=False, pickable=False, reset_camera=False)
@@ -746,23 +724,20 @@ class Scene:
             home.AddActor(cloud)
         for renderer in list(self.plotter.renderers)[:OWN_RENDERERS]:
             renderer.set_background(background)
-        for k, actor in self._frame:
-            self.plotter.renderers[k].remove_actor(actor, render=False)
-        self._frame = []
+        for renderer in self._views:
+            renderer.remove_actor(self._frame, render=False)
         titles = (" and ".join(look.titles),) if look.overlaid else look.titles
-        for k, title in enumerate(titles):
-            self._frame += [(k, actor) for actor in self._axes(k, look, ink, title)]
+        self._frame = [actor for k, title in enumerate(titles) for actor in self._axes(k, look, ink, title)]
 
     def _draw_lines(self, lines: Sequence[NDArray[Any]], look: Look) -> None:
         """Draw a line in each cloud, instead of those drawn before."""
         import pyvista
 
-        for k, actor in self._lines:
-            self.plotter.renderers[k].remove_actor(actor, render=False)
+        for renderer in self._views:
+            renderer.remove_actor(self._lines, render=False)
         curves = [pyvista.lines_from_points(self.box.positions(line[:, :2], line[:, 2])) for line in lines]
-        homes = [0 if look.overlaid else number for number in range(len(lines))]
-        self._lines = [(k, self._add(k, curve, color=ORBIT_COLOUR, line_width=2.5))
-                       for k, curve in zip(homes, curves, strict=True)]  # fmt: skip
+        self._lines = [self._add(0 if look.overlaid else k, curve, color=ORBIT_COLOUR, line_width=2.5)
+                       for k, curve in enumerate(curves)]  # fmt: skip
 
     def _draw_legend(self, shown: DisplayedWindow, look: Look, caption: str) -> None:
         """Draw the legend in a strip on the left, and the caption below. The clouds shrink to make room."""
@@ -859,15 +834,13 @@ def draw_depth(plotter: pyvista.Plotter, first: int, depth: DepthMap) -> None:
     x, y, z = depth.points[known].T
     cloud = pyvista.PolyData(np.column_stack([x, z, -y]))  # VTK's third axis points up
     cloud["colour"] = scale.rgb(metres[known])
-    for k, mesh in enumerate((None, image, cloud)):
+    for renderer in list(plotter.renderers)[first : first + 3]:
+        renderer.set_background(background)
+    for actor in bar_actors(scale, ink, plotter.window_size[1]):
+        plotter.renderers[first].add_actor(actor, render=False, pickable=False, reset_camera=False)
+    for k, mesh, title in ((1, image, "depth map"), (2, cloud, "its points")):
         plotter.subplot(0, first + k)
-        plotter.set_background(background, all_renderers=False)
-        if mesh is None:
-            for actor in bar_actors(scale, ink, plotter.window_size[1]):
-                plotter.add_actor(actor, render=False, pickable=False, reset_camera=False)
-            continue
         plotter.add_mesh(mesh, scalars="colour", rgb=True, lighting=False, render=False, pickable=False, point_size=3.0)
-        title = "depth map" if k == 1 else "its points"
         plotter.add_text(title, position="upper_edge", font_size=9, color=ink, render=False, font_file=str(font()))
     plotter.show_bounds(
         mesh=cloud, xtitle="x [m]", ytitle="depth [m]", ztitle="-y [m]", color=ink, location="outer", fmt="%.1f",

@@ -29,6 +29,7 @@ from amiwarp.imaging.corners import find_background_activity
 from amiwarp.imaging.iwe import CanvasShape, UploadedEvents, Votes, iwe, upload_events
 from amiwarp.imaging.regions import Region, RegionSharpness, inside, suggest_region
 from amiwarp.io.depth_map import DepthMap
+from amiwarp.io.formats import EXTENSIONS
 from amiwarp.io.spans import Span, read_span
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.models import MODELS, PHASE, Model, PlateModel, RisleyModel, alternatives, build_model
@@ -156,8 +157,7 @@ class Knobs:
     def value(self, name: str) -> float | None:
         """Return the value of a parameter; None if it is not known and has no slider."""
         if name not in OTHERS:
-            known: float | None = getattr(self, name)
-            return known
+            return getattr(self, name)
         return dict(self.others).get(name, 0.0 if name in SLIDING else None)
 
     def with_values(self, values: Mapping[str, float]) -> Knobs:
@@ -244,8 +244,7 @@ class LoadedWindow(DrawnWindow):
     """Events on the device, prism angles [rad] and speeds [rad/us] of the drawn events, without the clock offset set on
     the page, by the speed of a prism without encoder [1/min]; with an encoder, the only key is 0."""
     wrapped: dict[tuple[float, float], NDArray[np.float64]] = field(default_factory=dict)
-    """Prism angles of the drawn events from 0 to 2π [rad], by speed and drift of the clock offset; the last ones only.
-    """
+    """Last prism angles of the drawn events, from 0 to 2π [rad], by speed and drift of the clock offset."""
     unmoved: list[tuple[NDArray[np.float32], float]] = field(default_factory=list)
     """Image of the events as recorded and its sharpness, once it is measured."""
     chosen: list[Picture] = field(default_factory=list)
@@ -270,7 +269,6 @@ class DisplayedWindow(DrawnWindow):
     """Sharpness of ``image_after`` in the region."""
     beside: DisplayedWindow | None = None
     """The same time of another recording, whose events, as recorded, the first cloud and image show instead."""
-
     is_beside: bool = False
     """Whether this is another recording, of which less may be known."""
 
@@ -289,20 +287,14 @@ class DisplayedWindow(DrawnWindow):
                        after=self.after[::step], theta=self.theta[::step])  # fmt: skip
 
 
-# Statistics of the shown events.
-
-INTERVALS_US = np.logspace(0, 6, 49)
-"""Edges of the bins of the histogram of intervals [us]: eight bins per decade, from 1 us to 1 s."""
-
-
 # Selected events of a time window, on the host and with their prism angles on the device.
 
 MOST_POINTS, WINDOW_POINTS = 100_000, 1_000_000
-"""Largest number of points in each event cloud: of the page, which sends them to a browser, and of the window."""
+"""Largest number of points in each event cloud: of the page, and of the window or a browser with a graphics card."""
 CURVE_EVENTS = 200_000
 """Largest number of events that a sharpness curve uses."""
-
-
+INTERVALS_US = np.logspace(0, 6, 49)
+"""Edges of the bins of the histogram of intervals [us]: eight bins per decade, from 1 us to 1 s."""
 MOST_EVENTS = 2_000_000
 """Largest number of events in the image of a window. Of a fuller window, evenly spaced runs are read."""
 FOV_DEG = 60.0
@@ -385,7 +377,7 @@ class Inspector:
         """Whether nobody looks any more: measuring the sharpness then raises :class:`AmiwarpError`."""
         self.lock = Lock()
         """Lock for the events on the device and the buffers of their images."""
-        self._imager, self._curve_imager = (RegionSharpness(source.size, device) for _ in range(2))
+        self._imager = RegionSharpness(source.size, device)
         self._votes: dict[bool, Votes] = {}
         if calibration is not None:
             self.accept(calibration)
@@ -394,7 +386,7 @@ class Inspector:
         """Return an inspector that shows the same, with buffers of its own, for another thread."""
         made, size = copy(self), self.recording.events.size
         made.lock, made._votes, made.sources = Lock(), {}, dict(self.sources)
-        made._imager, made._curve_imager = (RegionSharpness(size, self.device) for _ in range(2))
+        made._imager = RegionSharpness(size, self.device)
         made._window = made._span = None
         made.beside = None if self.beside is None else self.beside.copy()
         return made
@@ -651,7 +643,7 @@ class Inspector:
         loaded = self.loaded
         if self.selection.region is not None:
             loaded = self._load(loaded.span.start_us, loaded.span.length_us, replace(self.selection, region=None))
-        (before, _), (after, _) = self._unmoved(loaded), self._measured(loaded, self.knobs)
+        (before, _), (after, _) = self._measured(loaded, None), self._measured(loaded, self.knobs)
         orbit_px = np.abs(border_displacements(self.model)).max(initial=0.0)
         return suggest_region(before, after, margin=math.ceil(orbit_px))
 
@@ -683,7 +675,7 @@ class Inspector:
         if (window, selection) != (self.window, self.selection):
             self.open(*window, selection)
         w = self.loaded
-        image, sharpness = self._unmoved(w)
+        image, sharpness = self._measured(w, None)
         return DisplayedWindow(
             w.span, w.region, w.selected, w.events, w.truth, w.before, w.before, self._wrapped(w, self.knobs), image,
             image_after, sharpness, sharpness, is_beside=True,
@@ -703,7 +695,7 @@ class Inspector:
             other = self.beside._beside(w.span, self.selection, image_after)
             image, sharpness = other.image_before, other.sharpness_before
         else:
-            image, sharpness = self._unmoved(w) if against is None else self._measured(w, against)
+            image, sharpness = self._measured(w, against)
         return DisplayedWindow(
             w.span, w.region, w.selected, w.events, w.truth, xy, self._moved(w, knobs), self._wrapped(w, knobs), image,
             image_after, sharpness, sharpness_after, other,
@@ -716,30 +708,25 @@ class Inspector:
 
     def curve_points(self, name: str) -> Iterator[tuple[float, float]]:
         """Yield the points of :meth:`curve` one after the other."""
-        knobs, half, sharpness = self.knobs, CURVE_HALF_WIDTH[name], self.sharpness_meter(self._curve_imager)
+        knobs, half, sharpness = self.knobs, CURVE_HALF_WIDTH[name], self.sharpness_meter()
         values = (knobs.value(name) or 0.0) + np.linspace(-half, half, CURVE_POINTS)
         for value in values[values >= 0.0].tolist() if name == size_name(knobs.model) else values.tolist():
             yield value, sharpness(knobs.with_values({name: value}))
 
-    def sharpness_meter(self, imager: RegionSharpness | None = None) -> Callable[[Knobs | None], float]:
+    def sharpness_meter(self) -> Callable[[Knobs | None], float]:
         """Return a function that measures the sharpness of part of the window's events with given parameters.
 
-        Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and belongs to the
-        thread that uses the imager; by default, it has an imager of its own.
+        Without parameters, it measures the events as recorded. It uses at most :data:`CURVE_EVENTS`, and has buffers of
+        its own, for one thread.
         """
-        w, imager = self.loaded, imager or RegionSharpness(self.recording.events.size, self.device)
-        on_device: dict[float, UploadedEvents] = {}
+        w, imager = self.loaded, RegionSharpness(self.recording.events.size, self.device)
+        part = w.counted[:: max(1, -(-len(w.counted) // CURVE_EVENTS))]
+        undrawn = replace(w, counted=part, events=w.events[:0], angles={})
 
         def sharpness(knobs: Knobs | None) -> float:
             if self.closed:
                 raise AmiwarpError(f"{self.recording.name}: is closed")
-            given = self._unprismed if knobs is None else knobs
-            rpm = 0.0 if self.has_encoder else given.rpm
-            if rpm not in on_device:
-                on_device.clear()
-                on_device[rpm] = self._upload(w.counted[:: max(1, -(-len(w.counted) // CURVE_EVENTS))], rpm)
-            model, drift_us = self.model_of(given), self._drift_us(given)
-            return imager.measure(model, on_device[rpm], drift_us, w.region)[1]
+            return imager.measure(*self.warped(undrawn, knobs), w.region)[1]
 
         return sharpness
 
@@ -827,24 +814,13 @@ class Inspector:
         encoder = self._encoder(knobs.rpm)
         return encoder.with_clock_offset(knobs.clock_offset) if self.has_encoder else encoder
 
-    @property
-    def _unprismed(self) -> Knobs:
-        """Parameters that leave all events where they were recorded."""
-        return replace(self.knobs, model=self._best_model, apex=0.0, others=())
-
     def warped(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[Model, UploadedEvents, float]:
         """Return the model, the events on the device and their drift [us], to vote the events of a window.
 
         ``knobs``: the parameters; None for the events as recorded.
         """
-        given = self._unprismed if knobs is None else knobs
+        given = knobs or replace(self.knobs, model=self._best_model, apex=0.0, others=())  # which move no event
         return self.model_of(given), self._angles(w, given)[0], self._drift_us(given)
-
-    def positions(self, events: Events, knobs: Knobs) -> NDArray[np.float32]:
-        """Return the compensated positions of events [px], shape ``(n, 2)``."""
-        xy = np.stack([events.x, events.y], axis=1).astype(np.float32)
-        theta = self.encoder_of(knobs).angles_at(events.t).astype(np.float32)
-        return np.asarray(self.model_of(knobs).compensate_points(xy, theta), np.float32)
 
     def _load(self, start_us: int, length_us: int, selection: Selection) -> LoadedWindow:
         """Read and select the events of a time window. The events of the last one are not read again."""
@@ -903,14 +879,11 @@ class Inspector:
             encoder, t = self._encoder(rpm), w.events.t
             for old in list(w.angles)[:-1]:
                 del w.angles[old]
-            w.angles[rpm] = self._upload(w.counted, rpm), encoder.angle_at(t), encoder.speed_at(t) * 1e-6
+            # with the slope, the clock offset of the encoder can be changed afterwards
+            slope = encoder.speed_at(w.counted.t) * 1e-6 if self.has_encoder else None
+            uploaded = upload_events(w.counted, encoder, self.device, slope=slope)
+            w.angles[rpm] = uploaded, encoder.angle_at(t), encoder.speed_at(t) * 1e-6
         return w.angles[rpm]
-
-    def _upload(self, events: Events, rpm: float) -> UploadedEvents:
-        """Upload events with their prism angles, so that the clock offset of the encoder can be changed afterwards."""
-        encoder = self._encoder(rpm)
-        slope = encoder.speed_at(events.t) * 1e-6 if self.has_encoder else None
-        return upload_events(events, encoder, self.device, slope=slope)
 
     def _theta(self, w: LoadedWindow, knobs: Knobs) -> NDArray[np.float64]:
         """Return the prism angles of the drawn events [rad], shape ``(n,)``."""
@@ -952,24 +925,23 @@ class Inspector:
         return image if per_polarity else image[0]
 
     def _measured(self, w: LoadedWindow, knobs: Knobs | None) -> tuple[NDArray[np.float32], float]:
-        """Return the image of a window with these parameters, and its sharpness; as recorded if ``knobs`` is None."""
+        """Return the image of a window with these parameters, and its sharpness.
+
+        If ``knobs`` is None, it shows the events as recorded, and is measured only once.
+        """
+        if knobs is None and w.unmoved:
+            return w.unmoved[0]
         with self.lock:
             _, sharpness = self._imager.measure(*self.warped(w, knobs), w.region)
-        return self.counts(w, knobs), sharpness
-
-    def _unmoved(self, w: LoadedWindow) -> tuple[NDArray[np.float32], float]:
-        """Return the image of a window as recorded, and its sharpness."""
-        if not w.unmoved:
-            w.unmoved.append(self._measured(w, None))
-        return w.unmoved[0]
+        found = self.counts(w, knobs), sharpness
+        if knobs is None:
+            w.unmoved.append(found)
+        return found
 
 
 # Recordings that a page can open: the files in one folder.
 
-SUFFIXES = {
-    ".aedat", ".aedat2", ".aedat4", ".bag", ".bin", ".csv", ".dat", ".db3", ".es", ".h5", ".hdf5", ".mcap", ".npz",
-    ".raw", ".txt",
-}  # fmt: skip
+SUFFIXES = {*EXTENSIONS, ".aedat", ".aedat2", ".bag", ".bin", ".csv", ".dat", ".es"}
 """Suffixes of files that may be recordings."""
 MOST_FILES = 200
 """Largest number of files that are listed."""

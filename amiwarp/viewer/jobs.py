@@ -18,7 +18,7 @@ from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import AUTO, Settings
 from amiwarp.choices import View
-from amiwarp.compensation.recordings import BlockCompensator
+from amiwarp.compensation.recordings import BlockCompensator, compensate_events
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
@@ -38,10 +38,7 @@ from amiwarp.viewer.layout import EXPORTS, SLIDERS, UNITS, orbit_text
 # Progress of long work in threads.
 
 PROGRESS_S = 0.1
-"""Shortest interval between two progress messages of a job [s].
-
-The calibration of a small recording causes eighty per second, and the page would draw each of them.
-"""
+"""Shortest interval between two progress messages of a job [s]. The page would draw each of eighty per second."""
 
 
 class JobCancelled(Exception):
@@ -240,10 +237,11 @@ def write_table(inspector: Inspector, path: Path) -> None:
 
     Raises :class:`AmiwarpError` for another suffix, or if the file exists.
     """
-    encoder, knobs = inspector.encoder_of(inspector.knobs), inspector.knobs
+    encoder, model = inspector.encoder_of(inspector.knobs), inspector.model
 
     def table(e: Events) -> tuple[NDArray[Any], ...]:
-        theta, moved = np.mod(encoder.angle_at(e.t), math.tau), inspector.positions(e, knobs)
+        theta = np.mod(encoder.angle_at(e.t), math.tau)
+        moved = compensate_events(e, model, encoder, device=inspector.device)
         return e.t, e.x, e.y, e.p, theta, moved[:, 0], moved[:, 1]
 
     tables = map(table, _selected_blocks(inspector))

@@ -4,7 +4,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, partialmethod
 from operator import attrgetter
 from typing import Any, TypeAlias
 from urllib.parse import parse_qsl, urlencode
@@ -159,16 +159,14 @@ LIMITS = {
     **{name: p.limits for name, p in SLIDING.items()}, "rpm": (-1e5, 1e5),
     **{name: p.limits for name, p in OTHERS.items()}, "focal_length": (0.1, 1e6),
 }  # fmt: skip
-"""Smallest and largest value of each parameter in an address and a field: angles in degrees, others in their own units.
-"""
+"""Smallest and largest value of each parameter in an address and a field, in degrees or the parameter's own unit."""
 UNITS = {
     **dict.fromkeys(LIMITS, 1.0),
     **dict.fromkeys(("apex", "phase", *(name for name, p in OTHERS.items() if p.unit == "rad")), math.radians(1.0)),
 }
 """Conversion from the units of page and address (angles in degrees) to the parameters' units (radians): factors."""
-HAND_LIMITS = {"fov_deg": (1.0, 170.0), "prism_index": (1.01, 3.5)}
-"""Smallest and largest value of the properties of camera and prism that can be set by hand."""
-
+GIVEN = {"fov_deg": ("field of view", "°", (1.0, 170.0)), "prism_index": ("refractive index", "", (1.01, 3.5))}
+"""Properties of camera and prism that a recording may lack: label, unit, and smallest and largest value."""
 
 _Field: TypeAlias = tuple[str, Callable[[Any], str], Callable[[str], Any]]
 
@@ -192,7 +190,7 @@ def decode_state(
     state, wrong, fields = default, [], _fields(size, duration_us)
     for key, text in parse_qsl(query.removeprefix("?"), keep_blank_values=True, errors="replace"):
         try:
-            if key in fields and not (key in HAND_LIMITS and getattr(state, key) is None):
+            if key in fields and not (key in GIVEN and getattr(state, key) is None):
                 place, _, read = fields[key]
                 state = _replaced(state, place, read(text))
             elif key == "sources":
@@ -230,14 +228,14 @@ def _fields(size: tuple[int, int], duration_us: int) -> dict[str, _Field]:
         "noise_us": ("selection.noise_us", lambda us: str(us or 0), lambda us: _whole(us, 0, LONGEST_NOISE_US) or None),
         "overlaid": one_of("overlaid", flags),
         **{name: one_of(name, {each.value: each for each in kind}) for name, kind in choices.items()},
-        **{name: (name, "{:.10g}".format, partial(_number, ends)) for name, ends in HAND_LIMITS.items()},
+        **{name: (name, "{:.10g}".format, partial(_number, ends)) for name, (_, _, ends) in GIVEN.items()},
     }  # fmt: skip
 
 
 def _texts(state: ViewState) -> dict[str, str]:
     """Return all values of a state as texts."""
     fields = {key: (attrgetter(place)(state), write) for key, (place, write, _) in _fields((0, 0), 0).items()}
-    out = {key: write(value) for key, (value, write) in fields.items() if key not in HAND_LIMITS or value is not None}
+    out = {key: write(value) for key, (value, write) in fields.items() if key not in GIVEN or value is not None}
     for before, knobs in (("", state.knobs), ("b_", state.against)):
         if knobs is not None:
             known = {name: knobs.value(name) for name in LIMITS if name not in foreign_names(knobs.model)}
@@ -285,10 +283,6 @@ def _within(value: float, low: float, high: float) -> float:
     return value
 
 
-NAMES = ("apex", "phase", "clock_offset", "rpm", *SLIDING)
-"""Names of the prism parameters that have a slider."""
-FIELD_LIMITS = {**{name: LIMITS[name] for name in NAMES}, **HAND_LIMITS}
-"""Smallest and largest value of the fields of the prism and the camera, in the page's units."""
 _OF_MODELS = {name: (p.label, {"rad": "°", "1": ""}.get(p.unit, p.unit), p.slider) for name, p in SLIDING.items()}
 SLIDERS: dict[str, tuple[str, str, tuple[float, float, float]]] = {
     "apex": ("apex angle", "°", (0.0, 3.0, 0.005)),
@@ -299,8 +293,8 @@ SLIDERS: dict[str, tuple[str, str, tuple[float, float, float]]] = {
     **{name: slider for name, slider in _OF_MODELS.items() if name not in size_names()},
 }
 """Sliders by parameter, in their order: label, unit, and (minimum, maximum, step). That of the apex may be longer."""
-GIVEN = {"fov_deg": ("field of view", "°"), "prism_index": ("refractive index", "")}
-"""Properties of camera and prism that a recording may lack: label and unit."""
+FIELD_LIMITS = {**{name: LIMITS[name] for name in SLIDERS}, **{name: ends for name, (_, _, ends) in GIVEN.items()}}
+"""Smallest and largest value of the fields of the prism and the camera, in the page's units."""
 SCOPES = ("selection", "whole recording")
 """Choices of the events that a calibration uses."""
 KEYS = (
@@ -502,23 +496,15 @@ class Actions:
 
     # History
 
-    def undo(self) -> None:
-        """Go back by one step."""
-        self.travel(History.undo)
-
-    def redo(self) -> None:
-        """Go forward by one step that was undone."""
-        self.travel(History.redo)
-
-    def reset(self) -> None:
-        """Show the first state again."""
-        self.travel(History.reset)
-
     def travel(self, step: Callable[[History], ViewState]) -> None:
         """Request the state that a step through the history gives."""
         self.steps = (*self.steps, step)
         self.request("state")
         self.released()
+
+    undo = partialmethod(travel, History.undo)
+    redo = partialmethod(travel, History.redo)
+    reset = partialmethod(travel, History.reset)
 
     def travelled(self) -> ViewState | None:
         """Make the requested steps, and return the state to show; None to stay."""
@@ -578,7 +564,7 @@ def source_state(inspector: Inspector) -> dict[str, Any]:
 
 def knob_values(inspector: Inspector) -> dict[str, float]:
     """Return the prism's parameters in the page's units, rounded as the page shows them."""
-    return {name: round((inspector.knobs.value(name) or 0.0) / UNITS[name], 4) for name in NAMES}
+    return {name: round((inspector.knobs.value(name) or 0.0) / UNITS[name], 4) for name in SLIDERS}
 
 
 def knob_state(inspector: Inspector) -> dict[str, Any]:
@@ -616,7 +602,7 @@ def given_fields(inspector: Inspector) -> list[dict[str, Any]]:
     found = {"fov_deg": ("camera" in by_hand, inspector.fov_deg), "prism_index": (prism, inspector.prism.index)}
     return [
         {"name": name, "label": label, "unit": unit, "value": round(found[name][1], 4), "low": low, "high": high}
-        for (name, (label, unit)), (low, high) in zip(GIVEN.items(), HAND_LIMITS.values(), strict=True)
+        for name, (label, unit, (low, high)) in GIVEN.items()
         if found[name][0]
     ]
 
@@ -624,7 +610,7 @@ def given_fields(inspector: Inspector) -> list[dict[str, Any]]:
 def truths(inspector: Inspector) -> dict[str, float | None]:
     """Return the known true parameters in the page's units; None for an unknown one."""
     known = inspector.truth
-    return {n: None if known is None else round((known.value(n) or 0.0) / UNITS[n], 4) for n in NAMES}
+    return {n: None if known is None else round((known.value(n) or 0.0) / UNITS[n], 4) for n in SLIDERS}
 
 
 def notes(inspector: Inspector) -> list[str]:

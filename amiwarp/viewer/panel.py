@@ -33,12 +33,10 @@ from amiwarp.tasks import Progress
 from amiwarp.validation import guarded
 from amiwarp.viewer import drawing, jobs, layout
 from amiwarp.viewer.drawing import ImageKind, Look
-from amiwarp.viewer.inspector import DisplayedWindow, Inspector, Knobs, Library, Selection
+from amiwarp.viewer.inspector import WINDOW_POINTS, DisplayedWindow, Inspector, Knobs, Library, Selection
 from amiwarp.viewer.jobs import JobCancelled, JobProgress
 from amiwarp.viewer.serve import finite, serve, use_page
 
-CARD_POINTS = 1_000_000
-"""Largest number of points in each cloud of a browser that draws with a graphics card."""
 BINS = 400
 """Number of points of the drawn event rates."""
 STEP_S = 0.2
@@ -88,10 +86,8 @@ class Panel(layout.Actions):
         self._picked, self._card = -1, False
         self._change, self._drags = "", 0  # successive changes of one name are undone together, until a release
         self._rates: EventRates
-        self._progress: JobProgress | None = None
-        self._wanted: dict[str, Any] = {}  # values that were set on the page, and that the inspector has not taken yet
+        self._progress = JobProgress(self._show_progress)  # of the latest calibration or film
         self._folder = tempfile.TemporaryDirectory(prefix="amiwarp-", ignore_cleanup_errors=True)
-        self._downloads = 0
         use_page(server, self._folder.name)
         self.state.client_only(*layout.CLIENT_ONLY)
         self._listen()
@@ -106,8 +102,7 @@ class Panel(layout.Actions):
         files = [] if self._library is None else self._library.files()
         folder = "" if self._library is None else str(self._library.folder)
         self.state.update({**layout.initial_state(inspector), "files": files, "folder": folder})
-        self._wanted = {}
-        self.show_knobs()
+        self._wanted: dict[str, Any] = {}  # values that were set on the page, and that the inspector has not taken yet
         self.time_window = inspector.window or inspector.first_window()
         self.start_job(self._count_events())
         self.request("window", *(["suggestion"] if self.compensates else []))
@@ -129,13 +124,11 @@ class Panel(layout.Actions):
 
     def cancel(self) -> None:
         """Stop the calibration or the film that is being made."""
-        if self._progress is not None:
-            self._progress.cancelled = True
+        self._progress.cancelled = True
 
     def end_film(self) -> None:
         """End the film that is being made with the pictures made so far."""
-        if self._progress is not None:
-            self._progress.ended = True
+        self._progress.ended = True
 
     @property
     def look(self) -> Look:
@@ -192,7 +185,7 @@ class Panel(layout.Actions):
     async def until_drawn(self) -> None:
         """Wait until no quick update is pending."""
         while self._quick is not None and not self._quick.done():
-            await asyncio.sleep(0.005)
+            await asyncio.wait([self._quick])
 
     def start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run a job until it ends or the browser tab is closed."""
@@ -286,7 +279,7 @@ class Panel(layout.Actions):
 
     def choose(self, name: str) -> None:
         """Select the parameter over which the sharpness curve is drawn."""
-        if name in layout.NAMES and name != self.state.knob:
+        if name in layout.SLIDERS and name != self.state.knob:
             self.state.knob = name
             self.request_slow("curve")
 
@@ -316,7 +309,7 @@ class Panel(layout.Actions):
             self.say(f"{label}: {value:g} {unit} is refused; give {low:g} to {high:g} {unit}", "error")
             return
         self._wanted[name] = round(value, 4)
-        if name in layout.NAMES:
+        if name in layout.SLIDERS:
             self.state.knob = name
         self.show_knobs()
         self.request("knobs", change=name)
@@ -324,8 +317,8 @@ class Panel(layout.Actions):
     def use_card(self, found: bool) -> None:
         """Show more points if the browser has a graphics card to draw them."""
         self._card = found
-        if found and self.inspector.most_points < CARD_POINTS:
-            self.inspector.most_points = CARD_POINTS
+        if found and self.inspector.most_points < WINDOW_POINTS:
+            self.inspector.most_points = WINDOW_POINTS
             self.request("window")
 
     def answer(self) -> None:
@@ -406,36 +399,30 @@ class Panel(layout.Actions):
         state.playing = not state.playing and (self.plays or self.can_play())
         if state.playing and not self.plays:
             self.plays = True
-            work = self._run() if self.inspector.latest is None else self._follow()
-            self.start_job(work).add_done_callback(lambda _: setattr(self, "plays", False))
+            self.start_job(self._run()).add_done_callback(lambda _: setattr(self, "plays", False))
 
     async def _run(self) -> None:
-        state, loop, elapsed_s = self.state, asyncio.get_running_loop(), PLAY_S
+        """Play the recording, or show the current events of a live stream, until the page stops it."""
+        state, loop, live = self.state, asyncio.get_running_loop(), self.inspector.latest is not None
+        elapsed_s = interval_s = FOLLOW_S if live else PLAY_S
+        counted_s = -math.inf
+        await self.until_drawn()  # of a live stream, with the suggested region
         while state.playing:
             start_s = loop.time()
             with state:
-                state.playing = self.advance(1e6 * elapsed_s * float(state.speed), loop=bool(state.loop))
+                if live:
+                    with self.errors_shown("stream"):
+                        self.inspector.renew()
+                    state.update(layout.source_state(self.inspector))
+                    if start_s >= counted_s + RATES_S:
+                        counted_s = start_s
+                        self.start_job(self._count_events())
+                    self.move(self.inspector.recording.events.t_last)
+                else:
+                    state.playing = self.advance(1e6 * elapsed_s * float(state.speed), loop=bool(state.loop))
             await self.until_drawn()
-            await asyncio.sleep(max(0.0, PLAY_S - (loop.time() - start_s)))
+            await asyncio.sleep(max(0.0, interval_s - (loop.time() - start_s)))
             elapsed_s = loop.time() - start_s
-        self.released()
-
-    async def _follow(self) -> None:
-        """Show the current events of a live stream, again and again."""
-        await self.until_drawn()  # with the suggested region
-        loop, counted_s = asyncio.get_running_loop(), -math.inf
-        while self.state.playing:
-            start_s = loop.time()
-            with self.state:
-                with self.errors_shown("stream"):
-                    self.inspector.renew()
-                self.state.update(layout.source_state(self.inspector))
-                if start_s >= counted_s + RATES_S:
-                    counted_s = start_s
-                    self.start_job(self._count_events())
-                self.move(self.inspector.recording.events.t_last)
-            await self.until_drawn()
-            await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
 
     async def _watch(self, source: LiveSource) -> None:
@@ -603,8 +590,7 @@ class Panel(layout.Actions):
             against=self.against, with_orbit=bool(s.orbit_shown), speed=float(s.speed),
             ended=lambda: progress.ended,
         )  # fmt: skip
-        with s:
-            s.update({"busy": f"making the {layout.EXPORTS[what][0]}", "progress": 0})
+        self._show_progress(f"making the {layout.EXPORTS[what][0]}", 0.0)
         try:
             with contextlib.suppress(JobCancelled):
                 async with self.device_lock:
@@ -620,10 +606,9 @@ class Panel(layout.Actions):
             path = Path(self._folder.name) / name
             path.unlink(missing_ok=True)
             await self.in_thread(write, path)
-            self._downloads += 1  # a browser keeps what it has loaded from an address
-            self.server.js_call("page", "download", name, f"{self.server.name}/{name}?{self._downloads}")
-            size = f"{path.stat().st_size / 1e3:,.0f} kB"
-            self.say(f"{name}: {size}, in the browser's downloads", "success")
+            about = path.stat()  # with its time, as a browser keeps what it has loaded from an address
+            self.server.js_call("page", "download", name, f"{self.server.name}/{name}?{about.st_mtime_ns}")
+            self.say(f"{name}: {about.st_size / 1e3:,.0f} kB, in the browser's downloads", "success")
         self.state.flush()
 
     # Undo, redo, reset, and the state in the page's address
@@ -669,7 +654,6 @@ class Panel(layout.Actions):
             s.noise_ms = selection.noise_us * 1e-3
         if wanted.against != self.against:
             self.show_b(wanted.against)
-        self.show_knobs()
 
     # Updates of what the page shows
 
@@ -731,8 +715,7 @@ class Panel(layout.Actions):
         length_us = min(length_us, self.whole_us)
         await in_thread(inspector.open, start_us, length_us, self._selection())
         if suggest:
-            if await in_thread(jobs.estimate_phase, inspector):
-                self.show_knobs()
+            await in_thread(jobs.estimate_phase, inspector)
             region = await in_thread(inspector.suggest_region)
             s.update({"region_wanted": list(region), "region_kind": "suggested"})
             await in_thread(inspector.open, start_us, length_us, self._selection())
@@ -823,14 +806,12 @@ def _guarded(call: Callable[..., Any], inspector: weakref.ref[Inspector], progre
 
 # Ways to show the page, in a browser or in a notebook.
 
-LOCALHOST = "127.0.0.1"
-
 
 def serve_panel(
     make_inspector: Callable[[], Inspector],
     library: Library | None = None,
     *,
-    host: str = LOCALHOST,
+    host: str = "127.0.0.1",
     port: int = 0,
     ready: Callable[[str], None],
 ) -> None:
@@ -841,16 +822,14 @@ def serve_panel(
     Raises :class:`AmiwarpError` if the host or the port cannot be used.
     """
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(_serve(make_inspector, library, host, port, ready))
+        asyncio.run(_serve(make_inspector, library, host=host, port=port, ready=ready))
 
 
-async def _serve(
-    make_inspector: Callable[[], Inspector], library: Library | None, host: str, port: int, ready: Callable[[str], None]
-) -> None:
+async def _serve(make_inspector: Callable[[], Inspector], library: Library | None = None, **options: Any) -> None:
     def build(server: Any) -> Callable[[], None]:
         return Panel(server, make_inspector(), library).close
 
-    await serve(build, settable=layout.SETTABLE, host=host, port=port, token=secrets.token_urlsafe(16), ready=ready)
+    await serve(build, settable=layout.SETTABLE, token=secrets.token_urlsafe(16), **options)
 
 
 @guarded
@@ -947,5 +926,5 @@ def view(
         return made
 
     make_inspector()  # raises errors in the cell, before the page is served
-    serving = _serve(make_inspector, None, LOCALHOST, 0, lambda url: display(IFrame(url, "100%", height)))
+    serving = _serve(make_inspector, ready=lambda url: display(IFrame(url, "100%", height)))
     return NotebookPage(loop.create_task(serving))

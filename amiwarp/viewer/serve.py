@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 ALL_INTERFACES = {"0.0.0.0": (socket.AF_INET, "192.0.2.1"), "::": (socket.AF_INET6, "2001:db8::1")}
 """Hosts that mean every address of this machine, each with its address family and a remote address reserved for
 documentation."""
-LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
-"""Names under which a machine reaches itself."""
 
 
 def normalised(host: str) -> str:
@@ -83,11 +81,11 @@ class HostNames:
     """
 
     def __init__(self, host: str) -> None:
-        names = {normalised(host), reachable(host)}
+        names = {"localhost", "127.0.0.1", "::1", normalised(host), reachable(host)}
         if not is_local(host):
             own = socket.gethostname().lower()
             names |= {own, f"{own}.local", own.partition(".")[0]}
-        self.known = LOCAL_NAMES | (names - ALL_INTERFACES.keys())
+        self.known = names - ALL_INTERFACES.keys()
 
     def accept(self, request: web.Request) -> bool:
         """Return whether the request's ``Host`` is a known name or the address at which the request arrived."""
@@ -102,7 +100,6 @@ class HostNames:
 def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:
     """Return the error to raise if the server cannot listen at ``host`` and ``port``."""
     denied = f"--port {port}: permission denied; give a port above 1023, or 0 for a free one"
-    given = f"--host {host!r} --port {port}"
     known = {
         errno.EADDRINUSE: f"--port {port}: is in use on {host}; give another port, or 0 for a free one",
         errno.EADDRNOTAVAIL: f"--host {host!r} is not an address of this machine; give one, such as 127.0.0.1",
@@ -110,7 +107,7 @@ def cannot_serve(error: OSError, host: str, port: int) -> AmiwarpError:
     }  # fmt: skip
     if isinstance(error, socket.gaierror):
         return AmiwarpError(f"--host {host!r}: unknown name or address; give one of this machine, such as 127.0.0.1")
-    usual = f"{given}: cannot listen: {error.strerror or error}; give another host or port"
+    usual = f"--host {host!r} --port {port}: cannot listen: {error.strerror or error}; give another host or port"
     # newer asyncio gives no number if no address of the host is one of this machine
     return AmiwarpError(known.get(error.errno or errno.EADDRNOTAVAIL, usual))
 
@@ -135,11 +132,7 @@ Check = Callable[[Any], bool]
 
 def number(low: float = -LARGEST, high: float = LARGEST) -> Check:
     """Return a check that accepts numbers from ``low`` to ``high``; it rejects NaN and booleans."""
-
-    def check(value: Any) -> bool:
-        return type(value) in (int, float) and low <= value <= high  # comparisons with NaN are false
-
-    return check
+    return lambda value: type(value) in (int, float) and low <= value <= high  # comparisons with NaN are false
 
 
 def one_of(*known: Any) -> Check:
@@ -403,7 +396,6 @@ class Tabs:
 
     def _clean_up(self, waited_s: float) -> None:
         """Release the memory of closed tabs. Retry at growing intervals while their threads still run."""
-        self._cleanup = None
         release_memory()
         if len(self._servers) > len(self._sockets):
             self._clean_up_later(min(2.0 * waited_s, LONGEST_CLEANUP_S))
@@ -546,7 +538,6 @@ def _trame_globals_restored() -> Iterator[None]:
 
 def _remove_from_trame(server: Any) -> None:
     """Remove the server from trame's global variables, which would keep it alive."""
-
     from trame_client.widgets.core import HTML_CTX
 
     if HTML_CTX._server is server:

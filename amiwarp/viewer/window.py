@@ -48,8 +48,6 @@ HELP_PLACE, STATISTICS_PLACE = (0.35, 0.46, 0.72, 0.97), (0.735, 0.0, 1.0, 0.25)
 """Left, bottom, right and top of help and statistics, in shares of the window's size."""
 DEPTH_SHARES = (CORNER[0], 0.34, 0.67, 1.0)
 """Edges between colour bar, image and points of a depth map, in shares of the window's width."""
-VTK_FONT_FILE = 4
-"""Number by which VTK knows that a text has a font of a file."""
 HELP_PAPER = {False: "#f0f0ea", True: "#24282e"}
 """Background of help and statistics, for light (False) and dark (True) mode."""
 LEGEND_SHARE = 0.5
@@ -108,8 +106,7 @@ class Window(layout.Actions):
         """
         self.scene = Scene(size, corner=CORNER, more=7, off_screen=off_screen)
         self.inspector, self.view = inspector, view
-        compensates = math.isfinite(inspector.turn_us)
-        self.look = look or Look(axis=Axis.ANGLE if compensates else Axis.TIME)
+        self.look = look or Look(axis=Axis.ANGLE if self.compensates else Axis.TIME)
         self.shown: DisplayedWindow
         """What the window shows."""
         self.help_shown = self.statistics_shown = self.depth_shown = self.plays = self.loop = self.closed = False
@@ -130,7 +127,6 @@ class Window(layout.Actions):
         self._coarse = 1
         self._curves: Iterator[None] = iter(())
         self._plots: dict[str, tuple[Any, list[Any]]] = {}
-        self._chart_homes: tuple[Any, ...] = ()
         self.curves: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = {}
         """Values and sharpness of the curves by parameter, in the units of the sliders."""
         self._stream: list[str] = []
@@ -285,8 +281,7 @@ class Window(layout.Actions):
     def pick(self, place: tuple[int, int]) -> None:
         """Describe the event that is drawn at a place, and show its orbit. ``place``: pixels from left and bottom."""
         self._picked = self.scene.event_at(place, self.shown, self._look)
-        self.message = "" if self._picked < 0 else drawing.event_text(self.shown, self._picked)
-        self.request("look")
+        self.say("" if self._picked < 0 else drawing.event_text(self.shown, self._picked))
 
     def whole(self) -> None:
         """Show the whole image."""
@@ -341,8 +336,7 @@ class Window(layout.Actions):
                 save_png(path, self.scene.picture())
             else:
                 self.inspector.as_calibration().save(path)
-            self.message = f"saved {path}"
-        self.request("look")
+            self.say(f"saved {path}")
 
     def _new_name(self, what: str) -> Path:
         name = Path(jobs.download_name(self.inspector.recording.name, what))
@@ -508,6 +502,10 @@ class Window(layout.Actions):
         return out
 
     def _make_sliders(self, names: tuple[str, ...]) -> None:
+        import pyvista
+
+        style = pyvista.TextProperty(font_file=str(drawing.font()), justification_horizontal="center",
+                                     justification_vertical="center")  # fmt: skip
         self.plotter.clear_slider_widgets()
         self.plotter.subplot(0, drawing.OWN_RENDERERS)
         self.sliders = {}
@@ -520,36 +518,32 @@ class Window(layout.Actions):
             slider.KeyPressActivationOff()  # VTK's key i would hide it
             slider.GetRepresentation().ShowSliderLabelOff()
             slider.GetRepresentation().SetEndCapWidth(0.01)
-            title = slider.GetRepresentation().GetTitleProperty()
-            title.SetFontFamily(VTK_FONT_FILE)
-            title.SetFontFile(str(drawing.font()))
-            title.BoldOff()
-            title.ShadowOff()
+            slider.GetRepresentation().GetTitleProperty().ShallowCopy(style)
             self.sliders[name] = slider
 
     def _make_charts(self) -> None:
         """Make the charts: sharpness over two parameters, displacement of a scene point in a turn, and intervals."""
         ink = drawing.BACKGROUND_AND_INK[self.look.dark][1]
-        for renderer, (chart, _) in zip(self._chart_homes, self._plots.values(), strict=False):
-            renderer.remove_chart(chart)
+        for name, (chart, _) in self._plots.items():
+            (self._statistics if name == "intervals" else self._charts).remove_chart(chart)
         self._charts.SetDraw(self.compensates)
-        self._plots, self._chart_homes = {}, (*(self._charts,) * 3, self._statistics)
+        self._plots = {}
         for k, name in enumerate((*self._curve_names(), "orbit")):
             label, unit, *_ = layout.SLIDERS.get(name, ("prism angle", "°"))
             titles = f"{label} [{unit}]" if unit else label, "displacement [px]" if name == "orbit" else "sharpness"
             curves = ORBIT_CURVES if name == "orbit" else ((ink, 2.0, "sharpness"), *MARKS)
-            self._plots[name] = self._chart(k, titles, (0.01 + 0.33 * k, 0.02, 0.32, 0.96), curves)
+            self._plots[name] = self._chart(self._charts, titles, (0.01 + 0.33 * k, 0.02, 0.32, 0.96), curves)
         titles = "log10 of the interval of a pixel [µs]", "share [%]"
-        self._plots["intervals"] = self._chart(3, titles, (0.02, 0.02, 0.96, 0.62), INTERVAL_CURVES)
+        self._plots["intervals"] = self._chart(self._statistics, titles, (0.02, 0.02, 0.96, 0.62), INTERVAL_CURVES)
 
     def _chart(
-        self, k: int, titles: tuple[str, str], place: tuple[float, ...], curves: tuple[tuple[str, float, str], ...]
+        self, home: Any, titles: tuple[str, str], place: tuple[float, ...], curves: tuple[tuple[str, float, str], ...]
     ) -> tuple[Any, list[Any]]:
-        """Make the ``k``-th chart at a place (left, bottom, width, height); return it with its empty curves."""
+        """Make a chart at a place (left, bottom, width, height) of a renderer; return it with its empty curves."""
         import pyvista
 
         paper, ink = drawing.BACKGROUND_AND_INK[self.look.dark]
-        paper = paper if k < 3 else HELP_PAPER[self.look.dark]
+        paper = HELP_PAPER[self.look.dark] if home is self._statistics else paper
         chart = pyvista.Chart2D(size=place[2:], loc=place[:2], x_label=titles[0], y_label=titles[1], grid=False)
         chart.background_color, chart.border_color = paper, paper
         for axis in (chart.x_axis, chart.y_axis):
@@ -561,7 +555,7 @@ class Window(layout.Actions):
         legend.GetBrush().SetColorF(pyvista.Color(paper).float_rgb)
         legend.GetPen().SetColorF(pyvista.Color(paper).float_rgb)
         legend.GetLabelProperties().SetColor(pyvista.Color(ink).float_rgb)
-        self._chart_homes[k].add_chart(chart)
+        home.add_chart(chart)
         return chart, lines
 
     def _curve_names(self) -> tuple[str, str]:

@@ -7,8 +7,8 @@ const PERSPECTIVE = 0.22; // strength of the perspective; views along an axis ar
 export const MARGIN = { left: 66, right: 34, top: 30, bottom: 46 }; // space for labels [px]
 
 export class Camera {
-  constructor() {
-    this.look('free');
+  constructor(view) {
+    this.look(view);
   }
 
   look(view) {

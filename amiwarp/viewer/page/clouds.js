@@ -6,22 +6,13 @@ import { drawFrame } from './frame.js';
 import { GpuRaster } from './gpu.js';
 import { Raster, nearest } from './raster.js';
 
-const { computed, onMounted, watch } = window.Vue;
+const { computed, onMounted, ref, watch } = window.Vue;
 const MOST_PIXELS = 3e6; // of the picture; a finer screen gets a coarser picture
 const HEIGHT = 0.75; // length of the third axis as a share of the width of the region
 const CLICK_PX = 3;
 const REACH_PX = 8;
 const GREY = 0xff909090;
 const ORBIT = '#009e73';
-
-// Return a function that returns what it made last, until something that it is made of changes.
-function memory() {
-  let [known, value] = [[], null];
-  return (make, ...of) => {
-    if (of.length !== known.length || of.some((each, k) => each !== known[k])) [known, value] = [of, make()];
-    return value;
-  };
-}
 
 export const EventClouds = {
   props: {
@@ -33,8 +24,12 @@ export const EventClouds = {
   template: `<div class="clouds"><canvas ref="canvas" tabindex="0" role="img" :aria-label="label" @pointerdown="pressed"
     @contextmenu.prevent @keydown="typed" @wheel.prevent="wheeled"></canvas></div>`,
   setup(props, { emit }) {
-    const canvas = sizedCanvas(() => (props.titles.length === 1 ? build() : draw()));
-    const camera = new Camera();
+    const extent = ref([1, 1]); // of the canvas [px of the page]
+    const canvas = sizedCanvas(() => {
+      extent.value = [canvas.value.clientWidth, canvas.value.clientHeight];
+      draw();
+    });
+    const camera = new Camera(props.view[0]);
     const rasters = [0, 1].map(() => { // a graphics card draws the points if there is one
       try {
         return new GpuRaster();
@@ -42,32 +37,27 @@ export const EventClouds = {
         return new Raster();
       }
     });
-    const [pictures, places, colours] = [0, 1, 2].map(() => [memory(), memory()]);
-    const scene = { places: [new Float32Array(0), new Float32Array(0)], colours: [], half: [1, 1, 1] };
+    const drawn = [[], []]; // what the rasters show
+    const shape = computed(() => { // as a text, because equal texts change nothing
+      const [wide, tall] = [extent.value[0] - MARGIN.left - MARGIN.right, extent.value[1] - MARGIN.top - MARGIN.bottom];
+      return JSON.stringify([props.box, props.axis, props.titles.length === 1 ? tall / Math.max(wide, 1) : 0]);
+    });
+    const frame = computed(() => frameOf(...JSON.parse(shape.value)));
+    const places = [
+      computed(() => place(frame.value, numbers(props.before), numbers(props.thirdBefore))),
+      computed(() => place(frame.value, numbers(props.after), numbers(props.third))),
+    ];
+    const colours = ['coloursBefore', 'coloursAfter'].map((name) => computed(() => numbers(props[name], Uint32Array)));
+    const lines = ['orbit', 'column'].map((name) => computed(() => {
+      const [line, turns] = [name, 'orbit'].map((each) => numbers(props[each]));
+      return place(frame.value, line.filter((_, k) => k % 3 !== 2), turns.filter((_, k) => k % 3 === 2));
+    }));
     const label = computed(() => {
       const names = props.titles.map(([, title]) => title).join(' and ');
       return `Event cloud${props.titles.length > 1 ? 's' : ''}, ${names}, over x, y and ${props.axis.title}. `
         + 'Drag or shift and arrow keys to turn, wheel or plus and minus to zoom.';
     });
     let waiting = false;
-
-    function build() {
-      const [W, H] = [canvas.value.clientWidth, canvas.value.clientHeight];
-      const alone = props.titles.length === 1 ? (H - MARGIN.top - MARGIN.bottom) / Math.max(W - MARGIN.left - MARGIN.right, 1) : 0;
-      const frame = frameOf(props.box, props.axis, alone);
-      const key = JSON.stringify([props.box, props.axis, frame.half]);
-      scene.half = frame.half;
-      scene.places = [[props.before, props.thirdBefore], [props.after, props.third]].map(
-        ([cloud, third], k) => places[k](() => place(frame, numbers(cloud), numbers(third)), cloud, third, key),
-      );
-      scene.colours = [props.coloursBefore, props.coloursAfter].map(
-        (bytes, k) => colours[k](() => numbers(bytes, Uint32Array), bytes),
-      );
-      const turns = numbers(props.orbit).filter((_, k) => k % 3 === 2);
-      const xy = (bytes) => numbers(bytes).filter((_, k) => k % 3 !== 2);
-      scene.lines = [props.orbit, props.column].map((bytes) => place(frame, xy(bytes), turns));
-      ask();
-    }
 
     function ask() {
       if (waiting) return;
@@ -93,8 +83,8 @@ export const EventClouds = {
     // Return the projection of a pane, with the slice of the third axis that is drawn.
     function projected(pane) {
       const [from, to] = props.slice;
-      const [low, high] = [from > 0 ? from : -1e9, to < 1 ? to : 1e9].map((share) => scene.half[2] * (2 * share - 1));
-      return { ...camera.project(scene.half, pane.width, pane.height), low, high };
+      const [low, high] = [from > 0 ? from : -1e9, to < 1 ? to : 1e9].map((share) => frame.value.half[2] * (2 * share - 1));
+      return { ...camera.project(frame.value.half, pane.width, pane.height), low, high };
     }
 
     function draw() {
@@ -114,21 +104,20 @@ export const EventClouds = {
         const projection = projected(pane);
         if (rasters[number].lost) rasters[number] = new Raster();
         const raster = rasters[number];
-        const fill = () => {
+        const key = JSON.stringify([projection, pane.width, pane.height, ratio, paper, dot, props.opacity, pane.clouds]);
+        const content = [raster, key, ...pane.clouds.flatMap((k) => [places[k].value, colours[k].value])];
+        if (content.some((each, k) => each !== drawn[number][k])) {
+          drawn[number] = content;
           const fine = { ...projection, scale: projection.scale * ratio, x: projection.x * ratio, y: projection.y * ratio };
-          raster.resize(Math.max(1, Math.round(pane.width * ratio)), Math.max(1, Math.round(pane.height * ratio)));
-          raster.clear(packed(paper));
+          raster.begin(Math.max(1, Math.round(pane.width * ratio)), Math.max(1, Math.round(pane.height * ratio)), packed(paper));
           const clip = clipOf(projection, pane).map((each) => Math.round(each * ratio));
           for (const k of pane.clouds) {
             const grey = pane.clouds.length > 1 && k === 0 ? GREY : 0;
-            raster.points(scene.places[k], scene.colours[k], fine, dot, props.opacity, clip, grey);
+            raster.points(places[k].value, colours[k].value, fine, dot, props.opacity, clip, grey);
           }
-          return raster;
-        };
-        const key = JSON.stringify([projection, pane.width, pane.height, ratio, paper, dot, props.opacity, pane.clouds]);
-        const picture = pictures[number](fill, raster, key, ...pane.clouds.flatMap((k) => [scene.places[k], scene.colours[k]]));
+        }
         context.setTransform(1, 0, 0, 1, 0, 0);
-        picture.show(context, Math.round(pane.left * ratio), Math.round(pane.top * ratio));
+        raster.show(context, Math.round(pane.left * ratio), Math.round(pane.top * ratio));
         context.setTransform(ratio, 0, 0, ratio, pane.left * ratio, pane.top * ratio);
         context.save();
         context.beginPath();
@@ -142,11 +131,11 @@ export const EventClouds = {
 
     function drawContent(context, projection, pane, [ink, paper], size) {
       const [left, top, right, bottom] = props.box;
-      const part = seenPart(scene.half, projection);
+      const part = seenPart(frame.value.half, projection);
       const axes = [
         { low: left, high: right, title: 'x (px)' }, { low: bottom, high: top, title: 'y (px)' }, props.axis,
       ].map(({ low, high, title }, k) => {
-        const at = (place) => low + ((place + scene.half[k]) / (2 * scene.half[k])) * (high - low);
+        const at = (place) => low + ((place + frame.value.half[k]) / (2 * frame.value.half[k])) * (high - low);
         const [from, to] = part.map((corner) => at(corner[k]));
         return { low: Math.min(from, to), high: Math.max(from, to), title, flipped: from > to };
       });
@@ -158,10 +147,10 @@ export const EventClouds = {
       const [x0, y0, x1, y1] = clipOf(projection, pane);
       context.rect(x0, y0, x1 - x0, y1 - y0);
       context.clip();
-      const at = (places, k) => projection.at(places.subarray(3 * k, 3 * k + 3)).slice(0, 2);
-      for (const places of pane.clouds.map((k) => scene.lines[k])) {
+      const at = (points, k) => projection.at(points.subarray(3 * k, 3 * k + 3)).slice(0, 2);
+      for (const line of pane.clouds.map((k) => lines[k].value)) {
         context.beginPath();
-        for (let k = 0; k < places.length / 3; k++) context.lineTo(...at(places, k));
+        for (let k = 0; k < line.length / 3; k++) context.lineTo(...at(line, k));
         context.stroke();
       }
       context.restore();
@@ -169,7 +158,7 @@ export const EventClouds = {
       context.lineWidth = 2;
       for (const k of props.picked >= 0 ? pane.clouds.filter((cloud) => cloud || !props.beside) : []) {
         context.beginPath();
-        context.arc(...at(scene.places[k], props.picked), 7, 0, 2 * Math.PI);
+        context.arc(...at(places[k].value, props.picked), 7, 0, 2 * Math.PI);
         context.stroke();
       }
       context.fillStyle = ink;
@@ -182,7 +171,7 @@ export const EventClouds = {
     // Return where points are drawn: below the title; in a view along an axis, within the frame, next to the ticks.
     function clipOf(projection, pane) {
       if (!projection.along) return [0, MARGIN.top - 4, pane.width, pane.height];
-      const ends = seenPart(scene.half, projection).map((corner) => projection.at(corner));
+      const ends = seenPart(frame.value.half, projection).map((corner) => projection.at(corner));
       const [xs, ys] = [0, 1].map((k) => ends.map((end) => end[k]).sort((a, b) => a - b));
       return [xs[0] - 2, ys[0] - 2, xs[1] + 3, ys[1] + 3];
     }
@@ -212,7 +201,7 @@ export const EventClouds = {
         const [pane, x, y] = under(end);
         const cloud = pane.clouds.at(-1);
         if (moved || end.type !== 'pointerup' || (!cloud && props.beside)) return; // events of another recording
-        emit('pick', nearest(scene.places[cloud], projected(pane), x, y, REACH_PX));
+        emit('pick', nearest(places[cloud].value, projected(pane), x, y, REACH_PX));
       });
     }
 
@@ -232,14 +221,10 @@ export const EventClouds = {
     }
 
     onMounted(() => {
-      camera.look(props.view[0]);
       emit('card', rasters[0] instanceof GpuRaster);
-      build();
+      ask();
     });
-    const look = ['dot', 'opacity', 'overlaid', 'dark', 'picked', 'slice'];
-    const content = Object.keys(props).filter((name) => ![...look, 'view', 'beside'].includes(name));
-    watch(content.map((name) => () => props[name]), build);
-    watch(look.map((name) => () => props[name]), () => setTimeout(ask));
+    watch(props, () => setTimeout(ask)); // then the page has the colours of dark mode
     watch(() => props.view, ([view]) => {
       camera.look(view);
       ask();

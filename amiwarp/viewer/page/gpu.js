@@ -66,16 +66,12 @@ export class GpuRaster {
     return this.gl.isContextLost();
   }
 
-  resize(width, height) {
-    [this.width, this.height] = [width, height];
-    if (this.canvas.width !== width || this.canvas.height !== height) [this.canvas.width, this.canvas.height] = [width, height];
-  }
-
-  clear(colour) {
-    const { gl } = this;
+  begin(width, height, colour) {
+    const { gl, canvas } = this;
+    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     this.paper = parts(colour);
     this.clouds = 0;
-    gl.viewport(0, 0, this.width, this.height);
+    gl.viewport(0, 0, width, height);
     gl.disable(gl.SCISSOR_TEST);
     gl.clearColor(...this.paper, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
@@ -87,11 +83,11 @@ export class GpuRaster {
     const { away, right, up, depth, scale, x, y, reach, along, low, high } = projection;
     const [x0, y0, x1, y1] = clip;
     gl.enable(gl.SCISSOR_TEST);
-    gl.scissor(x0, this.height - y1, Math.max(0, x1 - x0), Math.max(0, y1 - y0));
+    gl.scissor(x0, this.canvas.height - y1, Math.max(0, x1 - x0), Math.max(0, y1 - y0));
     for (const [name, value] of Object.entries({ right, up, away, paper: this.paper })) gl.uniform3fv(at[name], value);
     gl.uniform2f(at.slice, low, high);
     gl.uniform4f(at.centre, x, y, scale, depth);
-    gl.uniform4f(at.picture, this.width, this.height, size, reach);
+    gl.uniform4f(at.picture, this.canvas.width, this.canvas.height, size, reach);
     gl.uniform1f(at.fade, along ? 0 : FADE);
     gl.uniform1f(at.opacity, opacity);
     this.attribute(0, `${this.clouds} places`, places, [3, gl.FLOAT, false]);

@@ -86,13 +86,8 @@ const PageFrame = {
       if (address && address !== props.address) trame.trigger('restore', [address]);
     }
 
-    async function retry() {
-      try {
-        const answer = await fetch(window.location.pathname, { cache: 'no-store' });
-        if (answer.ok) window.location.reload();
-      } catch {
-        // still away: try again
-      }
+    function retry() { // until the server is back
+      fetch(window.location.pathname, { cache: 'no-store' }).then(({ ok }) => ok && window.location.reload(), () => {});
     }
 
     trame.refs.page = {

@@ -4,15 +4,13 @@
 export const FADE = 0.45; // share of the background in the colour of the farthest point, if the clouds are seen in depth
 
 export class Raster {
-  // Set the size of the picture [px].
-  resize(width, height) {
-    if (this.image && this.image.width === width && this.image.height === height) return;
-    this.image = new ImageData(width, height);
-    this.pixels = new Uint32Array(this.image.data.buffer);
-    this.depth = new Float32Array(width * height);
-  }
-
-  clear(colour) {
+  // Begin an empty picture of this size [px].
+  begin(width, height, colour) {
+    if (this.image?.width !== width || this.image.height !== height) {
+      this.image = new ImageData(width, height);
+      this.pixels = new Uint32Array(this.image.data.buffer);
+      this.depth = new Float32Array(width * height);
+    }
     this.paper = colour;
     this.pixels.fill(colour);
     this.depth.fill(-Infinity);

@@ -41,10 +41,6 @@ function wrapped(context, texts, width) {
   return texts.map((text) => text.split(' ')).flatMap(([first, ...words]) => words.reduce(add, [first]));
 }
 
-function save(context, name, download) {
-  context.canvas.toBlob((blob) => download(name, blob), 'image/png');
-}
-
 // Save the clouds as they are seen; `words` are the lines of the caption, the legend comes from the page.
 export function savePicture(name, words, state, download) {
   const canvas = document.querySelector('.clouds canvas');
@@ -80,7 +76,7 @@ export function savePicture(name, words, state, download) {
     x += 8;
   }
   for (const line of lines) context.fillText(line, GAP, (y += LINE));
-  save(context, name, download);
+  context.canvas.toBlob((blob) => download(name, blob));
 }
 
 // Save the images as they are seen, each pixel as a square, with their colour bars.
@@ -121,5 +117,5 @@ export function saveImages(name, words, state, download) {
     context.fillText(quantity, x, y + BAR + 14 + LINE);
   });
   lines.forEach((line, k) => context.fillText(line, GAP, top + h + 4 * LINE + (k + 0.8) * LINE));
-  save(context, name, download);
+  context.canvas.toBlob((blob) => download(name, blob));
 }

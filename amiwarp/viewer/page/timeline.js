@@ -112,8 +112,7 @@ export const RateTimeline = {
       });
     }
 
-    watch(['on', 'off', 'span', 'start', 'length', 'whole'].map((name) => () => props[name]), draw);
-    watch(() => props.dark, () => setTimeout(draw));
+    watch(props, () => setTimeout(draw)); // then the page has the colours of dark mode
     return { canvas, text: text_, pressed, time, typed, zoom };
   },
 };
