@@ -840,29 +840,30 @@ def test_camera_and_index_set_by_hand_are_undone_and_in_the_address(recording: R
 # calibration
 
 
-@pytest.mark.parametrize("region", [None, (20, 10, 140, 110)])
+@pytest.mark.parametrize(("region", "model"), [(None, "exact"), ((20, 10, 140, 110), "exact"), (None, "circle")])
 def test_a_calibration_uses_what_is_selected(
-    recording: Recording, inspector: Inspector, region: tuple[int, int, int, int] | None
+    recording: Recording, inspector: Inspector, region: tuple[int, int, int, int] | None, model: str
 ) -> None:
     first, truth = recording.events.t_first, inspector.truth
     assert truth is not None
     inspector.open(first + 20_000, 180_000, Selection(region=region))
     inspector.set(replace(truth, apex=0.5 * truth.apex))
     said: list[str] = []
-    settings = Settings(model="exact", stages=("sharpness",))
+    settings = Settings(model=model, stages=("sharpness",))
     found, text = find_calibration(inspector, settings, progress=lambda what, share: said.append(what))
     assert said
     assert found.camera == recording.camera
-    assert found.parameters["apex"] == pytest.approx(truth.apex, abs=math.radians(0.12))
+    apex = inspector.knobs_of(found).apex  # of a circle, that of the same size
+    assert apex == pytest.approx(truth.apex, abs=math.radians(0.12))
     words = re.search(r"region ([\d.]+) as recorded, ([\d.]+) now, ([\d.]+) with the result", text)
     assert words is not None
     before, now, after = map(float, words.groups())
     assert before < now < after
-    assert after == pytest.approx(inspector.show(truth).sharpness_after, rel=0.1)
+    assert after == pytest.approx(inspector.show(replace(truth, model=model)).sharpness_after, rel=0.1)
     scope = calibrated_events(inspector)[1]
     assert scope.startswith(f"{inspector.loaded.selected:,} events from 0.020 s to 0.200 s")
     assert ("x 20 to 139, y 10 to 109 px" in scope) is (region is not None)
-    assert text.startswith(f"found on {scope}: exact model, apex {math.degrees(found.parameters['apex']):.4g}°")
+    assert text.startswith(f"found on {scope}: {model} model, apex {math.degrees(apex):.4g}°")
     assert inspector.knobs.apex == 0.5 * truth.apex  # nothing is accepted yet
     inspector.accept(found)
     assert inspector.sources["apex"] is Source.CALIBRATED
@@ -968,6 +969,21 @@ def test_the_events_of_the_window_are_downloaded(
     assert len(written.encoder.t) < len(inspector.recording.encoder.t)
     with pytest.raises(AmiwarpError, match="write to another file"):
         write_events(inspector, path, compensated=compensated)
+
+
+def test_events_of_two_prisms_are_downloaded_with_both_encoders(tmp_path: Path) -> None:
+    events, first = MemoryEvents(random_events(2000, 40, 30), 40, 30), Encoder.constant_speed(720.0, 0, 100_000)
+    second = Encoder.constant_speed(-500.0, 0, 100_000)
+    inspector = Inspector(Recording(events, Camera.from_fov(40, 30, 1.0), first.with_second(second)))
+    inspector.open(40_000, 20_000, Selection())
+    write_events(inspector, tmp_path / "events.h5", compensated=False)
+    written = open_recording(tmp_path / "events.h5").encoder
+    assert written is not None
+    assert written.second is not None
+    t = np.arange(40_000, 60_000, 1000)
+    for found, whole in ((written, first), (written.second, second)):
+        np.testing.assert_allclose(found.angle_at(t), whole.angle_at(t))
+        assert len(found.t) < len(whole.t)
 
 
 def test_the_noise_filter_of_a_download_does_not_restart_at_its_blocks(

@@ -155,7 +155,7 @@ def find_calibration(
     sharpness = inspector.sharpness_meter()
     before, now, after = (sharpness(each) for each in (None, inspector.knobs, inspector.knobs_of(found)))
     exact, warnings = found.exact, "".join(f"; {text}" for text in found.warnings)
-    orbit = orbit_text(exact.model_name, exact.parameters.get, found.parameters["phase"])
+    orbit = orbit_text(exact.model_name, inspector.knobs_of(exact).value, found.parameters["phase"])
     return found, (
         f"found on {scope}: {found.model_name} model, {orbit}; sharpness of the region {before:.3g} as recorded, "
         f"{now:.3g} now, {after:.3g} with the result; {found.seconds:.1f} s{warnings}"
@@ -267,13 +267,14 @@ def _selected_blocks(inspector: Inspector) -> Iterator[Events]:
 
 
 def _cut(encoder: Encoder, first_us: int, last_us: int) -> Encoder:
-    """Return the samples of an encoder that cover a time span, with one more on each side."""
+    """Return the samples of an encoder, and of its second one, that cover a time span, with one more on each side."""
     first = max(int(np.searchsorted(encoder.t, first_us + encoder.clock_offset_us)) - 2, 0)
     stop = int(np.searchsorted(encoder.t, last_us + encoder.clock_offset_us)) + 2
     t, pulses = encoder.t[first:stop], encoder.index_t
     if pulses is not None:
         pulses = pulses[(pulses >= t[0]) & (pulses <= t[-1])]
-    return Encoder(t, encoder.angle[first:stop], encoder.clock_offset_us, pulses)
+    second = None if encoder.second is None else _cut(encoder.second, first_us, last_us)
+    return Encoder(t, encoder.angle[first:stop], encoder.clock_offset_us, pulses, second)
 
 
 # Films of the clouds, and the downloads that a page offers. No file is written on the server.
