@@ -4,8 +4,22 @@ All public names are listed in ``__init__.pyi``. Their modules are loaded on fir
 milliseconds only.
 """
 
+import gc
+from typing import Any
+
 import lazy_loader
 
 from amiwarp._version import __version__ as __version__
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+_load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name, without garbage collections, which would take a quarter of the time of the imports."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        return _load(name)
+    finally:
+        if collects:
+            gc.enable()

@@ -27,6 +27,7 @@ from amiwarp import (
     kernels,
     simulate,
 )
+from amiwarp.__main__ import MOST_NEW
 from amiwarp.kernels.launch import load_all
 from amiwarp.tasks import cores, limited_cpu_threads
 from tests import SHARE
@@ -35,6 +36,7 @@ with contextlib.suppress(ImportError):
     # PyTorch's CUDA build imports Triton, which ends a process in which VTK has drawn with Mesa before.
     importlib.import_module("triton")
 wp.init()
+gc.set_threshold(MOST_NEW)  # as the command line does
 # The many processes that tests start would otherwise compile the package each time, and each of xdist's all the tests.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False

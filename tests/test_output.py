@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import fcntl
+import gc
 import inspect
 import json
 import math
@@ -824,6 +825,22 @@ def test_api_calls_guard_what_they_read(place: Path) -> None:
     assert snapshot(place) == before
     calibration.save("cal.json", overwrite=True)
     assert snapshot(place) == before
+
+
+def test_a_source_that_is_no_longer_in_use_guards_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a.npz").write_bytes(b"")
+    kept = type("Source", (), {})()
+    kept.itself = kept
+    output.register_reader(kept, tmp_path / "a.npz")
+    with pytest.raises(AmiwarpError, match="is read in this run"):
+        write_text(tmp_path / "a.npz", "", overwrite=True)
+    del kept
+    gc.disable()  # it is now only in a cycle
+    try:
+        write_text(tmp_path / "a.npz", "{}", overwrite=True)
+    finally:
+        gc.enable()
+    assert (tmp_path / "a.npz").read_text() == "{}"
 
 
 def test_files_in_a_folder_that_is_read_are_inputs(tmp_path: Path) -> None:

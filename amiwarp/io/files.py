@@ -11,6 +11,7 @@ import atexit
 import contextlib
 import csv
 import errno
+import gc
 import io
 import os
 import re
@@ -351,11 +352,22 @@ def check_output(path: Path, *, overwrite: bool = False) -> Path:
     if not os.access(target.parent, os.W_OK):
         raise AmiwarpError(f"{path}: its folder {target.parent} is not writable; choose another place")
     if mode is not None:
-        if any(same_file(read, target) for read in inputs_in_use()):
+        if _is_read(target):
             raise AmiwarpError(f"{path}: is read in this run and would be lost; write to another file")
         if not _may_replace(target, overwrite):
             raise AmiwarpError(f"{path}: exists; give another name, or --force (overwrite=True in Python)")
     return target
+
+
+def _is_read(target: Path) -> bool:
+    """Return whether a file is read in this run. Sources that a garbage collection releases are in use no more."""
+
+    def found() -> bool:
+        return any(same_file(read, target) for read in inputs_in_use())
+
+    if found():
+        gc.collect()
+    return found()
 
 
 def _may_replace(target: Path, overwrite: bool) -> bool:
