@@ -399,30 +399,36 @@ class Panel(layout.Actions):
         state.playing = not state.playing and (self.plays or self.can_play())
         if state.playing and not self.plays:
             self.plays = True
-            self.start_job(self._run()).add_done_callback(lambda _: setattr(self, "plays", False))
+            work = self._run() if self.inspector.latest is None else self._follow()
+            self.start_job(work).add_done_callback(lambda _: setattr(self, "plays", False))
 
     async def _run(self) -> None:
-        """Play the recording, or show the current events of a live stream, until the page stops it."""
-        state, loop, live = self.state, asyncio.get_running_loop(), self.inspector.latest is not None
-        elapsed_s = interval_s = FOLLOW_S if live else PLAY_S
-        counted_s = -math.inf
-        await self.until_drawn()  # of a live stream, with the suggested region
+        state, loop, elapsed_s = self.state, asyncio.get_running_loop(), PLAY_S
         while state.playing:
             start_s = loop.time()
             with state:
-                if live:
-                    with self.errors_shown("stream"):
-                        self.inspector.renew()
-                    state.update(layout.source_state(self.inspector))
-                    if start_s >= counted_s + RATES_S:
-                        counted_s = start_s
-                        self.start_job(self._count_events())
-                    self.move(self.inspector.recording.events.t_last)
-                else:
-                    state.playing = self.advance(1e6 * elapsed_s * float(state.speed), loop=bool(state.loop))
+                state.playing = self.advance(1e6 * elapsed_s * float(state.speed), loop=bool(state.loop))
             await self.until_drawn()
-            await asyncio.sleep(max(0.0, interval_s - (loop.time() - start_s)))
+            await asyncio.sleep(max(0.0, PLAY_S - (loop.time() - start_s)))
             elapsed_s = loop.time() - start_s
+        self.released()
+
+    async def _follow(self) -> None:
+        """Show the current events of a live stream, again and again."""
+        await self.until_drawn()  # with the suggested region
+        loop, counted_s = asyncio.get_running_loop(), -math.inf
+        while self.state.playing:
+            start_s = loop.time()
+            with self.state:
+                with self.errors_shown("stream"):
+                    self.inspector.renew()
+                self.state.update(layout.source_state(self.inspector))
+                if start_s >= counted_s + RATES_S:
+                    counted_s = start_s
+                    self.start_job(self._count_events())
+                self.move(self.inspector.recording.events.t_last)
+            await self.until_drawn()
+            await asyncio.sleep(max(0.01, FOLLOW_S - (loop.time() - start_s)))
         self.released()
 
     async def _watch(self, source: LiveSource) -> None:
