@@ -986,6 +986,23 @@ def test_events_of_two_prisms_are_downloaded_with_both_encoders(tmp_path: Path) 
         assert len(found.t) < len(whole.t)
 
 
+@pytest.mark.parametrize("kind", [np.uint16, np.float32])
+def test_a_table_holds_the_places_that_the_model_gives(kind: Any, tmp_path: Path) -> None:
+    """Events between pixels, of a compensated file, are moved like those of a sensor."""
+    events = random_events(500, 40, 30)
+    events = Events(events.x.astype(kind), events.y.astype(kind), events.t, events.p)
+    inspector = Inspector(
+        Recording(MemoryEvents(events, 40, 30), Camera.from_fov(40, 30, 1.0), Encoder.constant_speed(720.0, 0, 100_000))
+    )
+    inspector.open(0, 100_000, Selection())
+    jobs.write_table(inspector, tmp_path / "table.npz")
+    table = np.load(tmp_path / "table.npz")
+    xy = np.stack([events.x, events.y], axis=1).astype(np.float32)
+    moved = inspector.model.compensate_points(xy, inspector.encoder.angle_at(events.t).astype(np.float32))
+    found = np.stack([table["x_compensated"], table["y_compensated"]], axis=1)
+    np.testing.assert_allclose(found, moved, atol=1e-3)
+
+
 def test_the_noise_filter_of_a_download_does_not_restart_at_its_blocks(
     inspector: Inspector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,7 @@ from amiwarp.calib.calibration import calibrate
 from amiwarp.calib.result import Calibration
 from amiwarp.calib.settings import AUTO, Settings
 from amiwarp.choices import View
-from amiwarp.compensation.recordings import BlockCompensator, compensate_events
+from amiwarp.compensation.recordings import BlockCompensator
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, Recording
@@ -241,7 +241,8 @@ def write_table(inspector: Inspector, path: Path) -> None:
 
     def table(e: Events) -> tuple[NDArray[Any], ...]:
         theta = np.mod(encoder.angle_at(e.t), math.tau)
-        moved = compensate_events(e, model, encoder, device=inspector.device)
+        xy = np.stack([e.x, e.y], axis=1).astype(np.float32)  # compensate_events refuses places between pixels
+        moved = np.asarray(model.compensate_points(xy, encoder.angles_at(e.t).astype(np.float32)))
         return e.t, e.x, e.y, e.p, theta, moved[:, 0], moved[:, 1]
 
     tables = map(table, _selected_blocks(inspector))
