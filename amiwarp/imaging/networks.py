@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import math
 import os
 import warnings
@@ -306,7 +305,9 @@ def _full_precision() -> Iterator[None]:
 
     By default they round their inputs to 10 bits (TF32), by which pictures differ with the number of windows.
     """
-    cudnn = importlib.import_module("torch").backends.cudnn
+    import torch
+
+    cudnn: Any = torch.backends.cudnn
     new = hasattr(cudnn, "conv")  # PyTorch 2.9
     place, name, full = (cudnn.conv, "fp32_precision", "ieee") if new else (cudnn, "allow_tf32", False)
     before = getattr(place, name)

@@ -390,7 +390,7 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
         both = [s | {"kind": kind} for kind, rows in (("timed", timed), ("none", none))
                 for s in surge_of([r for r in rows if r["degrees"] == degrees], measure)]  # fmt: skip
         found = differences(both, "surge", {"kind": "timed"}, {"kind": "none"}, by=("apex_name",))
-        text = f"{large[0].upper()}{large[1:]} rms make the {_named(measure)} surge above 720 rpm (apex {degrees:g}°)."
+        text = f"{large.capitalize()} rms make the {_named(measure)} surge above 720 rpm (apex {degrees:g}°)."
         return judge(number, text, found, f"the {_growth(measure)}, with timing errors less without,", above=0.0)
 
     def of(degrees: float, model: str) -> dict[str, Any]:

@@ -43,8 +43,6 @@ DIP, USUAL = (0.0, 0.5), (0.75, 1.25)
 """Classes of the relative speed that are compared: cancelling motion, and the prism alone."""
 FADED, SMALL = 0.25, 0.25
 """Loss of the event rate of a tile from which on its texture fades, and of the whole image up to which it is small."""
-PAPER_RPM = 720.0
-"""Speed of the paper's prism [turns/min]."""
 RARE = 0.1
 """Share of tiles and moments up to which cancelling motion counts as rare."""
 TILE_COLUMNS = ("camera", "rpm", "time_ms", "column", "row", "rate", "speed", "camera_speed", "marked")
@@ -239,8 +237,8 @@ def claims(results: Sequence[CellResult]) -> list[Claim]:
     found = differences(two, "rate", {"class": "dip"}, {"class": "usual"}, by=("scene", "rpm"), relative=True)
     what = "the event rate below half of the speed δ·2πf relative to that at 0.75 to 1.25 of it"
     shares: dict[str, dict[int, float]] = {}
-    for seed in dict.fromkeys(r["seed"] for r in rows if r["rpm"] == PAPER_RPM):
-        own = [r for r in rows if (r["rpm"], r["seed"]) == (PAPER_RPM, seed)]
+    for seed in dict.fromkeys(r["seed"] for r in rows if r["rpm"] == Condition.rpm):  # the paper's speed
+        own = [r for r in rows if (r["rpm"], r["seed"]) == (Condition.rpm, seed)]
         dip = sum(r["tiles"] for r in own if r["speed"] < DIP[1])
         shares.setdefault("room", {})[seed] = dip / sum(r["tiles"] for r in own)
     return [
