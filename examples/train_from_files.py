@@ -10,6 +10,7 @@ On a GPU: ``python examples/train_from_files.py --device cuda:0 --recordings 512
 import argparse
 import json
 import math
+import multiprocessing
 import os
 import tempfile
 import time
@@ -26,6 +27,7 @@ import amiwarp
 BINS, WINDOW_US = 5, 25_000
 DIRECTIONS, DURATION_US, STEP_US, AT_ONCE = 4, 204_000, 2_000, 16  # of the recordings that are made
 COLUMNS = {"t": np.int64, "x": np.uint16, "y": np.uint16, "p": np.uint8}  # in the order of a batch: largest first
+EVENT_BYTES, PAGE = sum(np.dtype(kind).itemsize for kind in COLUMNS.values()), 4096
 
 
 def make_data(folder: Path, recordings: int, device: str) -> None:
@@ -68,24 +70,45 @@ def cut(recording: amiwarp.Recording, labels: dict[str, Any]) -> tuple[list[amiw
     return blocks, labels["class"], recording.events.size
 
 
-def join(items: list[Any]) -> tuple[torch.Tensor, list[int], list[Any]]:
-    """Return the events of several recordings, the number in each window, and its class, in a worker process.
+class Join:
+    """Joins the events of several recordings in a worker process, in a slot of memory that all processes share.
 
-    PyTorch passes a tensor to the main process in shared memory, but each one costs both processes several messages. So
-    all columns are in one tensor of bytes.
+    PyTorch would pass each batch in new shared memory. To map and release it takes the main process longer than all
+    else that it does for a batch, and it holds Python's lock meanwhile. The slots stay.
     """
-    blocks = [block for blocks, _, _ in items for block in blocks]
-    columns = [getattr(block, name).view(np.uint8) for name in COLUMNS for block in blocks]
-    classes = [label for blocks, label, _ in items for _ in blocks]
-    return torch.from_numpy(np.concatenate(columns)), [len(block) for block in blocks], classes
 
+    def __init__(self, slots: int, events: int, device: str) -> None:
+        size = -(-events * EVENT_BYTES // PAGE) * PAGE
+        self.slots = torch.empty((slots, size), dtype=torch.uint8).share_memory_()
+        if device.startswith("cuda"):  # page-locked, from which a GPU copies at full speed
+            runtime = torch.cuda.cudart()
+            torch.cuda.check_error(runtime.cudaHostRegister(self.slots.data_ptr(), self.slots.numel(), 0))
+        self._free = multiprocessing.get_context("spawn").SimpleQueue()
+        for slot in range(slots):
+            self.release(slot)
 
-def unpack(packed: torch.Tensor) -> amiwarp.Events:
-    """Return the events in the bytes that :func:`join` has joined, without a copy."""
-    ends = np.cumsum([np.dtype(kind).itemsize for kind in COLUMNS.values()])
-    parts = np.split(packed.numpy(), ends[:-1] * (len(packed) // ends[-1]))
-    columns = {name: part.view(kind) for (name, kind), part in zip(COLUMNS.items(), parts, strict=True)}
-    return amiwarp.Events(**columns)
+    def __call__(self, items: list[Any]) -> tuple[int, list[int], list[Any]]:
+        """Return the slot of the batch, the number of events in each window, and its class."""
+        blocks = [block for blocks, _, _ in items for block in blocks]
+        slot = self._free.get()
+        place = self.slots[slot].numpy()
+        for name in COLUMNS:
+            columns = [getattr(block, name).view(np.uint8) for block in blocks]
+            size = sum(map(len, columns))
+            np.concatenate(columns, out=place[:size])
+            place = place[size:]
+        return slot, [len(block) for block in blocks], [label for blocks, label, _ in items for _ in blocks]
+
+    def events(self, slot: int, n: int) -> amiwarp.Events:
+        """Return the ``n`` events in a slot, without a copy."""
+        ends = n * np.cumsum([np.dtype(kind).itemsize for kind in COLUMNS.values()])
+        parts = np.split(self.slots[slot].numpy()[: n * EVENT_BYTES], ends[:-1])
+        columns = {name: part.view(kind) for (name, kind), part in zip(COLUMNS.items(), parts, strict=True)}
+        return amiwarp.Events(**columns)
+
+    def release(self, slot: int) -> None:
+        """Let the next batch use a slot."""
+        self._free.put(slot)
 
 
 class Block(nn.Module):
@@ -105,23 +128,24 @@ class Block(nn.Module):
         return torch.relu(self.body(x) + self.skip(x))
 
 
-def make_network(classes: int) -> nn.Module:
-    """Return a residual network of 1.1 million parameters."""
+def make_network(classes: int, n: int) -> nn.Module:
+    """Return a residual network of ``n`` channels in its first layers: with 64 it is ResNet-18, without its pooling."""
     return nn.Sequential(
-        nn.Conv2d(BINS, 32, 7, 2, 3, bias=False), nn.BatchNorm2d(32), nn.ReLU(), Block(32, 32), Block(32, 32),
-        Block(32, 64, 2), Block(64, 64), Block(64, 128, 2), Block(128, 128), Block(128, 160, 2),
-        nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(160, classes),
+        nn.Conv2d(BINS, n, 7, 2, 3, bias=False), nn.BatchNorm2d(n), nn.ReLU(), Block(n, n), Block(n, n),
+        Block(n, 2 * n, 2), Block(2 * n, 2 * n), Block(2 * n, 4 * n, 2), Block(4 * n, 4 * n),
+        Block(4 * n, 8 * n, 2), Block(8 * n, 8 * n), nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(8 * n, classes),
     )  # fmt: skip
 
 
-def on_device(loader: Any, names: list[Any], size: tuple[int, int], device: str) -> Iterator[Any]:
+def on_device(loader: Any, join: Join, names: list[Any], size: tuple[int, int], device: str) -> Iterator[Any]:
     """Yield the voxel grids and classes of each batch, on the device."""
-    for packed, counts, classes in loader:
-        found = unpack(packed)
+    for slot, counts, classes in loader:
         ends = np.cumsum([0, *counts])
+        found = join.events(slot, int(ends[-1]))
         windows = amiwarp.windows(found, ranges=np.stack([ends[:-1], ends[1:]], axis=1))
         events, _ = amiwarp.collate([found], device=device)
         grids = amiwarp.voxel_grid(events, *size, BINS, windows=windows, normalize=True, device=device)
+        join.release(slot)
         yield torch.from_dlpack(grids), torch.tensor([names.index(c) for c in classes], device=device)
 
 
@@ -134,7 +158,9 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=2, help="epochs; the first one is not measured")
     parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 1) - 2), help="reading processes")
     parser.add_argument("--device", default="cuda:0" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--width", type=int, help="channels of the network's first layers; default 64, on a CPU 16")
     given = parser.parse_args()
+    given.width = given.width or (64 if given.device.startswith("cuda") else 16)
     if given.epochs < 2:
         parser.error(f"--epochs is {given.epochs}; give at least 2, because the first one is not measured")
     with tempfile.TemporaryDirectory() as made:
@@ -152,12 +178,14 @@ def train(folder: Path, given: argparse.Namespace) -> None:
     epoch = max(1, len(dataset) // given.batch)  # batches
     torch.manual_seed(0)
     order = torch.utils.data.RandomSampler(dataset, num_samples=given.epochs * epoch * given.batch)
-    cuda = given.device.startswith("cuda")
+    items = json.loads((folder / "manifest.json").read_text())["items"]
+    most = given.batch * max(item["events"] for item in items)
+    join = Join(2 * given.workers + 1, most, given.device)  # each worker reads two batches ahead
     loader = torch.utils.data.DataLoader(
-        dataset, given.batch, sampler=order, collate_fn=join, num_workers=given.workers, pin_memory=cuda,
+        dataset, given.batch, sampler=order, collate_fn=join, num_workers=given.workers,
         multiprocessing_context="spawn" if given.workers else None,
     )  # fmt: skip
-    network = make_network(len(names)).to(given.device)
+    network = make_network(len(names), given.width).to(given.device)
     optimiser = torch.optim.Adam(network.parameters(), 1e-3)
 
     def step(grids: torch.Tensor, classes: torch.Tensor) -> torch.Tensor:
@@ -169,8 +197,8 @@ def train(folder: Path, given: argparse.Namespace) -> None:
 
     losses, windows, begun = [], 0, 0.0
     # On a stream of its own, the network does not wait for copies and voxel grids.
-    with torch.cuda.stream(torch.cuda.Stream(given.device) if cuda else None):
-        batches = on_device(loader, names, size, given.device)
+    with torch.cuda.stream(torch.cuda.Stream(given.device) if given.device.startswith("cuda") else None):
+        batches = on_device(loader, join, names, size, given.device)
         following = next(batches)
         while following is not None:
             batch = following  # its memory must not be used again before the network has finished
