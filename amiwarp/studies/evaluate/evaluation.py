@@ -685,7 +685,9 @@ def _run(
         processor_s = compiling.result()
     setups: dict[Condition | None, study.Setup | None] = {None: None}
     needed = {job.setup_condition: job for job in todo if job.setup_condition is not None}
-    for begun, calibrated in run_jobs(workers, run_setup, needed.values()):
+    share = max(1, workers.count() // max(1, len(needed)))  # they are few, and take the threads of idle workers, too
+    first = [replace(job, threads=job.threads and job.threads * share) for job in needed.values()]
+    for begun, calibrated in run_jobs(workers, run_setup, first):
         setups[begun.setup_condition], seconds = result_of(calibrated)
         processor_s += seconds
         progress(f"calibrated {len(setups) - 1} of {len(needed)} prisms", 0.0)
