@@ -264,6 +264,8 @@ MOST_EVENTS = (1 << 31) - 1
 """Largest number of events, and of pixels in all images of a window, that kernels can address."""
 SMALLEST = 256
 """Fewest blocks of a slice on a CPU."""
+LEAST_ADDED = 1 << 15
+"""Fewest numbers of the spare groups that a CPU thread adds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -482,12 +484,18 @@ def _add_on_cpu(
     run_together([partial(run, *part) for part in parts])
     if len(parts) == 1:
         return
-    own, values = wp.zeros(1, dtype=int, device=images.device), images.numpy()
+    own, values, pairs = wp.zeros(1, dtype=int, device=images.device), images.numpy(), []
     for part, _ in parts[1:]:
         wp.launch(kernels.find_own, 1, [inputs[2], *inputs[4:], part], [own], device=images.device)
-        to, added = (values[k * group : (k + 1) * group] for k in (int(own.numpy()[0]), part.spare))
-        (np.maximum if kernel is kernels.keep_latest_blocks else np.add)(to, added, out=to)
-        added[:] = 0
+        pairs.append([values[k * group : (k + 1) * group] for k in (int(own.numpy()[0]), part.spare)])
+
+    def add(first: int, stop: int) -> None:
+        for to, added in pairs:
+            to, added = to[first:stop], added[first:stop]
+            (np.maximum if kernel is kernels.keep_latest_blocks else np.add)(to, added, out=to)
+            added[:] = 0
+
+    run_together([partial(add, *ends) for ends in slices(group, cpu_threads(), LEAST_ADDED)])
 
 
 def _part(out: wp.array, first: int, number: int) -> wp.array:
