@@ -29,7 +29,7 @@ from amiwarp.studies.demo import EXACT_KERNELS
 from amiwarp.studies.evaluate import study
 from amiwarp.studies.evaluate.claims import PAPER, Claim
 from amiwarp.studies.evaluate.study import CellResult, Chart, Condition, Settings, Stream, Table, Value
-from amiwarp.tasks import Progress, cpu_threads, limited_cpu_threads, silent
+from amiwarp.tasks import Progress, cpu_threads, limited_cpu_threads, release_memory, silent
 from amiwarp.translation.sources import limited_opencv
 from amiwarp.validation import guarded, real, whole
 
@@ -440,18 +440,24 @@ class JobResult:
 
 
 def run_job(job: Job) -> JobResult:
-    """Simulate the condition of a job once, or open its recording, and run its evaluations."""
+    """Run the evaluations of a job, and release their memory, which a worker would otherwise keep for long."""
     began = time.process_time()
+    cells = _run_cells(job)
+    release_memory()
+    return JobResult(cells, time.process_time() - began)
+
+
+def _run_cells(job: Job) -> list[CellResult]:
+    """Simulate the condition of a job once, or open its recording, and run its evaluations."""
     with limited_cpu_threads(job.threads), limited_opencv(study.library("cv2"), cpu_threads()):
         try:
             if isinstance(job.condition, Condition):
                 streams: study.RecordedStreams = study.Streams(job.condition, job.settings.device, job.setup)
             else:
                 streams = study.RecordedStreams(open_recording(job.condition.path), job.settings.device)
-            cells = [_run_cell(name, streams, job) for name in job.evaluations]
+            return [_run_cell(name, streams, job) for name in job.evaluations]
         except AmiwarpError as error:
-            cells = [CellResult(name, job.condition, error=str(error)) for name in job.evaluations]
-    return JobResult(cells, time.process_time() - began)
+            return [CellResult(name, job.condition, error=str(error)) for name in job.evaluations]
 
 
 def run_setup(job: Job) -> tuple[study.Setup, float]:
@@ -460,6 +466,7 @@ def run_setup(job: Job) -> tuple[study.Setup, float]:
     assert job.setup_condition is not None
     with limited_cpu_threads(job.threads):
         found = study.known_setup(job.setup_condition, job.settings.device)
+    release_memory()
     return found, time.process_time() - began
 
 
