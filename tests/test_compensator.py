@@ -48,6 +48,15 @@ def streamed(encoder: Encoder = ENCODER) -> EncoderStream:
     return stream
 
 
+def test_flush_returns_events_however_long_they_may_wait() -> None:
+    model = MODELS["circle"].from_prism(CAMERA, Prism(math.radians(2.0)), 0.4)
+    with pytest.raises(AmiwarpError, match="start_us"):
+        Compensator(model, EncoderStream(), start_us=2**62)
+    compensator = Compensator(model, EncoderStream(), start_us=2**61, wait_us=2**61)
+    compensator.put(random_events(3), 2**60)
+    assert [len(packet.events) for packet in compensator.flush()] == [3]
+
+
 def joined(packets: list[Compensated]) -> tuple[Events, np.ndarray]:
     return Events.concatenate([p.events for p in packets]), np.concatenate([p.flags for p in packets])
 

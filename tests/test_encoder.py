@@ -66,6 +66,14 @@ def test_gap_of_many_turns_is_bridged_by_the_speed():
     assert encoder.gaps(200_000) == []
 
 
+@pytest.mark.parametrize("bits", [None, 40, 54, 60, 64])
+def test_wide_counters_that_fall_through_zero_are_exact(bits):
+    down = 5000 - 50 * np.arange(200)
+    count = down.astype(np.uint64) & np.uint64(2 ** (bits or 64) - 1)
+    encoder = Encoder.from_counts(1000 * np.arange(200), count, counts_per_turn=4096, counter_bits=bits)
+    np.testing.assert_allclose(encoder.angle, down * (2.0 * math.pi / 4096), rtol=1e-12)
+
+
 def test_direction_and_running_counter():
     t = np.arange(0, 100_000, 1000)
     count = 1_000_000 - np.round(50e-6 * t * 2000)
@@ -104,12 +112,12 @@ HARMONICS = (0.05, -0.1, 0.02, 0.03)
 @pytest.mark.parametrize("interval_us", [100, 90_000])
 def test_an_error_that_repeats_every_turn_is_corrected(interval_us):
     encoder = Encoder.constant_speed(720.0, 0, 500_000, interval_us=interval_us)
-    t = np.arange(0, 500_000, 37)
+    t = np.arange(*encoder.coverage, 37)
     read = encoder.angle_at(t)
     true = read + 0.05 * np.cos(read) - 0.1 * np.sin(read) + 0.02 * np.cos(2 * read) + 0.03 * np.sin(2 * read)
     bent = encoder.with_harmonics(HARMONICS)
     assert np.abs(bent.angle_at(t) - true).max() < 4e-4  # between samples, 1/64 turn apart at most
-    assert bent.coverage[1] >= encoder.coverage[1] - interval_us
+    assert bent.covers(*encoder.coverage)
     with pytest.raises(AmiwarpError, match="harmonics"):
         encoder.with_harmonics((0.1, 0.2))
 
@@ -165,6 +173,7 @@ def test_a_gap_at_the_end_is_not_extrapolated_over():
         (lambda: Encoder.from_counts([0, 9], [0, 1], counts_per_turn=10, index_t_us=[10]), "pulse at 10 us"),
         (lambda: Encoder.from_counts([0, 9], [0, 1], counts_per_turn=10, index_t_us=[]), "no index pulse"),
         (lambda: Encoder.constant_speed(np.nan, 0, 1), "constant_speed: rpm = nan is not a finite number"),
+        (lambda: Encoder.constant_speed(1.0, 0, 1, direction=2), "direction = 2"),
         (lambda: Encoder.constant_speed(1.0, -(2**62), -(2**62) + 9), "constant speed: t_first"),
         (lambda: Encoder.constant_speed(1.0, 2**62 - 9, 2**62), "constant speed: t_last"),
         (lambda: Encoder.constant_speed(1.0, 0, 1).with_clock_offset(np.inf), "clock_offset_us"),

@@ -568,8 +568,8 @@ class Compensator:
     ) -> None:
         check_prisms(encoder, model.ANGLES)
         self.encoder = encoder
-        self.wait_us = whole(wait_us, "wait_us", 0, TIME_LIMIT, " us")
-        self.start_us = whole(start_us, "start_us", 0, TIME_LIMIT, " us")
+        self.wait_us = whole(wait_us, "wait_us", 0, TIME_LIMIT >> 1, " us")  # less than in flush
+        self.start_us = whole(start_us, "start_us", 0, TIME_LIMIT >> 1, " us")
         self.most_waiting = whole(most_waiting, "most_waiting", 0, TIME_LIMIT, " events")
         self.most_bytes = whole(most_bytes, "most_bytes", 0, TIME_LIMIT, " bytes")
         self._device = wp.get_device(device)

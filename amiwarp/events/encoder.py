@@ -27,6 +27,8 @@ WIDTHS = tuple(range(8, 33))
 """Widths of hardware counters that are recognised automatically in encoder counts [bits]."""
 WIDEST = 64
 """Largest width of a hardware counter that a caller may give [bits]."""
+EXACT_BITS = 53
+"""Largest width of numbers that float64 holds exactly [bits]."""
 ONCE_A_TURN = 0
 """Value of ``counter_bits`` for a counter that restarts each turn."""
 SHORTEST_PERIOD = 3
@@ -133,6 +135,12 @@ class _Samples:
             step = near + period * np.round((steady - near) / period)
         wraps = np.round((step - raw) / period) if period else np.zeros_like(raw)
         return _Steps(period, step, wraps, expected_steps(step, self.interval))
+
+
+def check_direction(direction: int) -> None:
+    """Raise :class:`AmiwarpError` if a direction is neither 1 nor -1."""
+    if direction not in (1, -1):
+        raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
 
 
 def unwrap_counts(
@@ -476,10 +484,13 @@ class Encoder:
             If an argument is unusable, or the counts do not determine the rotation.
         """
         whole(counts_per_turn, "counts_per_turn", 1, 1 << 40)
-        if direction not in (1, -1):
-            raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
-        t = as_times(t_us)
-        counts = unwrap_counts(t, array(count, "encoder count").astype(np.float64), counts_per_turn, counter_bits)
+        check_direction(direction)
+        t, counts = as_times(t_us), array(count, "encoder count")
+        bits = counter_bits or WIDEST
+        if counts.dtype.kind in "iu" and EXACT_BITS < bits <= WIDEST:  # signed, small about 0: float64 is exact there
+            unused = WIDEST - bits
+            counts = (counts.astype(np.uint64) << np.uint64(unused)).astype(np.int64) >> unused
+        counts = unwrap_counts(t, counts.astype(np.float64), counts_per_turn, counter_bits)
         encoder = cls(t, counts * (direction * TWO_PI / counts_per_turn), clock_offset_us)
         return encoder if index_t_us is None else encoder.with_index(index_t_us)
 
@@ -564,6 +575,7 @@ class Encoder:
         array([3.1416])
         """
         rpm = real(rpm, "constant speed", -1e9, 1e9, " turns/min")
+        check_direction(direction)
         for t, what in ((t_first, "t_first"), (t_last, "t_last")):
             whole(t, f"constant speed: {what}", -TIME_LIMIT + 1, TIME_LIMIT - 1, " us")
         whole(interval_us, "constant speed: interval_us", 1, TIME_LIMIT, " us")
@@ -640,12 +652,22 @@ class Encoder:
         array([1.5997])
         """
         factors = vector(harmonics, 4, "harmonics", real)
-        parts = np.ceil(np.abs(np.diff(self.angle)) / LONGEST_BENT_STEP).astype(np.int64)
-        parts = np.clip(parts, 1, np.diff(self.t))
+        given, angle = self.t, self.angle
+        # added samples must not shorten the intervals by which the angle is extended at both ends
+        for end, inner, reach in zip((0, -1), (1, -2), self._reach, strict=True):
+            step = self.angle[end] - self.angle[inner]
+            if abs(step) > LONGEST_BENT_STEP:
+                added = int(reach) * (1 if end else -1)
+                place = given.size if end else 0
+                given = np.insert(given, place, self.t[end] + added)
+                speed = step / (self.t[end] - self.t[inner])
+                angle = np.insert(angle, place, self.angle[end] + added * speed)
+        parts = np.ceil(np.abs(np.diff(angle)) / LONGEST_BENT_STEP).astype(np.int64)
+        parts = np.clip(parts, 1, np.diff(given))
         first = np.repeat(np.arange(parts.size), parts)
         within = np.arange(first.size) - np.repeat(np.cumsum(parts) - parts, parts)
-        t = np.append(self.t[first] + within * np.diff(self.t)[first] // parts[first], self.t[-1])
-        angle = np.interp(t - self.t[0], self.t - self.t[0], self.angle)
+        t = np.append(given[first] + within * np.diff(given)[first] // parts[first], given[-1])
+        angle = np.interp(t - given[0], given - given[0], angle)
         return dataclasses.replace(self, t=t, angle=angle + periodic(angle, factors))
 
     def with_index(self, index_t_us: ArrayLike) -> Encoder:
@@ -795,14 +817,22 @@ class Encoder:
 
         For a pair of prisms, both have an angle.
         """
-        # If the first or last interval is a gap, extrapolate by the mean interval only.
-        before = min(float(self.t[1] - self.t[0]), self.interval_us)
-        after = min(float(self.t[-1] - self.t[-2]), self.interval_us)
+        before, after = self._reach
         first, last = int(self.t[0]), int(self.t[-1])
         start, end = math.ceil(first - before - self.clock_offset_us), math.floor(last + after - self.clock_offset_us)
         if self.second is None:
             return start, end
         return max(start, self.second.coverage[0]), min(end, self.second.coverage[1])
+
+    @property
+    def _reach(self) -> tuple[float, float]:
+        """Times by which the angle is extended before the first and after the last sample [us].
+
+        If the first or last interval is a gap, that is the mean interval only.
+        """
+        ends = self.t[1] - self.t[0], self.t[-1] - self.t[-2]
+        before, after = (min(float(end), self.interval_us) for end in ends)
+        return before, after
 
     @property
     def interval_us(self) -> float:
@@ -1178,8 +1208,10 @@ class EncoderStream:
             return t, angles
         if t.shape != angles.shape or t.ndim != 1:
             raise AmiwarpError(f"encoder samples have shapes t {t.shape}, angle {angles.shape}; expected one length")
-        if not np.isfinite(angles).all():
-            raise AmiwarpError(f"encoder angle is {angles[~np.isfinite(angles)][0]}; expected finite numbers")
+        if not (good := np.abs(angles) <= LARGEST_ANGLE).all():
+            raise AmiwarpError(
+                f"encoder angle is {angles[~good][0]}; expected finite numbers within {LARGEST_ANGLE:g} rad of 0"
+            )
         before = int(self._t[self._stop - 1]) if len(self) else -(2**62)
         later = _later(t, before)
         if not later.all():

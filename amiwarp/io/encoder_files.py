@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI, Encoder, UnwrapError
+from amiwarp.events.encoder import TWO_PI, Encoder, UnwrapError, check_direction
 from amiwarp.io.files import errors_name, text_lines
 from amiwarp.io.formats import TRIGGERS, Format, detect_format, io_function
 from amiwarp.validation import whole
@@ -85,8 +85,7 @@ def _encoder(
         )
     if counter_bits is not None:
         raise AmiwarpError(f"{path}: holds angles, which have no counter_bits; leave counter_bits out")
-    if direction not in (1, -1):
-        raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
+    check_direction(direction)
     return Encoder.from_angles(t, direction * np.radians(columns["angle_deg"]))
 
 
@@ -157,8 +156,7 @@ def read_encoder_triggers(
     path = Path(path)
     whole(channel, "channel", 0, 255)
     whole(counts_per_turn, "counts_per_turn", 1, 1 << 40)
-    if direction not in (1, -1):
-        raise AmiwarpError(f"direction = {direction}; expected 1 or -1")
+    check_direction(direction)
     found = detect_format(path)
     if found not in TRIGGERS:
         formats = ", ".join(one.value for one in TRIGGERS)

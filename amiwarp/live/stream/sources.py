@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from amiwarp.compensation.streams import Compensated
 from amiwarp.errors import AmiwarpError
-from amiwarp.events.encoder import TWO_PI
+from amiwarp.events.encoder import LARGEST_ANGLE, TWO_PI
 from amiwarp.events.recording import Events, Recording
 from amiwarp.io import open_recording
 from amiwarp.live.link.clocks import monotonic_us
@@ -34,11 +34,8 @@ from amiwarp.optics.prism import NominalPrism
 
 IDLE_S = 0.05
 """Longest time without a packet [s]. After this time, an empty packet is delivered."""
-LARGEST_US, LARGEST_RAD = 1 << 60, 1e12
-"""Largest accepted magnitude of a time [us] and of an angle [rad] in a stream.
-
-The difference of two such times fits int64, and float64 resolves such an angle to 0.00012 rad.
-"""
+LARGEST_US = 1 << 60
+"""Largest accepted magnitude of a time in a stream [us]: the difference of two fits int64."""
 HELLO_S = 10.0
 """Longest wait for the first message (hello) of a sender [s]."""
 
@@ -217,8 +214,8 @@ class StreamSource:
         if isinstance(message, wire.Triggers):
             return make_packet(now, triggers=message.t)
         if isinstance(message, wire.EncoderSamples):
-            if not (np.abs(message.angle) <= LARGEST_RAD).all():
-                what = f"an encoder sample is not finite or beyond {LARGEST_RAD:g} rad"
+            if not (np.abs(message.angle) <= LARGEST_ANGLE).all():
+                what = f"an encoder sample is not finite or beyond {LARGEST_ANGLE:g} rad"
                 raise AmiwarpError(f"{self.name}: {what}; correct the program that sends it")
             if not message.second:
                 return make_packet(now, encoder_t=message.t, encoder_angle=message.angle)
