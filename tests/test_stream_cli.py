@@ -285,6 +285,17 @@ def test_a_replayed_file_is_compensated_recorded_and_reported(folder: Path, tmp_
     assert {p.name for p in tmp_path.iterdir()} == {"o.h5", "r.h5", "offline.h5"}
 
 
+def test_addresses_that_the_system_chose_are_reported(folder: Path) -> None:
+    args = ["live", str(folder / "recording.h5"), "--fast", "--calibration", str(folder / "c.json"), "--device", "cpu"]
+    done = CliRunner().invoke(app, [*args, "--to", "tcp::0", "--raw-to", "tcp::0", "--json"])
+    assert done.exit_code == 0, done.stderr
+    said = json.loads(done.stdout)["messages"]
+    assert done.stderr.splitlines() == said
+    found = [re.fullmatch(r"(\w+) packets are served at tcp:127\.0\.0\.1:(\d+)", text) for text in said]
+    assert [match and match[1] for match in found] == ["uncompensated", "compensated"]
+    assert all(match and int(match[2]) > 0 for match in found)
+
+
 @pytest.mark.parametrize("when", ["up", "opened", "flowing"])
 def test_interrupted_recordings_are_whole_files(folder: Path, tmp_path: Path, when: str) -> None:
     """Ctrl-C during the start leaves no file; later it leaves a file with all events received so far."""
@@ -448,6 +459,8 @@ def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path, monke
         (["live", "recording.h5", "--calibration", "c.json", "--port", "/dev/no-such-port"], "/dev/no-such-port"),
         (["record", "recording.h5", "nowhere/o.h5", "--fast"], "nowhere"),
         (["record", "dv", "o.h5"], "amiwarp[dv]"),
+        (["live", "recording.h5", "--calibration", "c.json", "--to", "-", "--raw-to", "-"], "mix two streams"),
+        (["live", "recording.h5", "--calibration", "c.json", "--raw-to", "-", "--json"], "--json and --raw-to - both"),
     ],
     ids=lambda v: " ".join(v) if isinstance(v, list) else "",
 )

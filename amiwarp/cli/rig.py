@@ -329,8 +329,17 @@ class OutputOptions:
 
     @property
     def use_stdout(self) -> bool:
-        """Whether compensated packets go to standard output."""
+        """Whether packets go to standard output."""
         return "-" in (self.to, self.raw_to)
+
+    def check(self, *, json: bool) -> None:
+        """Raise :class:`AmiwarpError` if packets and something else would go to standard output."""
+        if self.to == self.raw_to == "-":
+            raise AmiwarpError("--to - and --raw-to - would mix two streams; give one of them tcp: or unix:")
+        if self.use_stdout and json:
+            given = "--to" if self.to == "-" else "--raw-to"
+            raise AmiwarpError(f"--json and {given} - both write to standard output; remove --json, or give {given} "
+                               "tcp: or unix:")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -373,6 +382,7 @@ def run_live(
     from amiwarp.compensation.recordings import check_size
     from amiwarp.live.stream.session import clock_offset
 
+    outputs.check(json=common.json)
     device = choose_device(common.device)
     found = Calibration.load(calibration)
     with contextlib.ExitStack() as resources:
@@ -413,21 +423,26 @@ class _Receivers:
     ) -> None:  # fmt: skip
         from amiwarp.live.stream.sockets import Forward
 
-        def sink(address: str | None, encoders: int = 1) -> SocketSink | PipeSink | None:
-            return None if address is None else _open_sink(address, found, encoders, resources, stop=stop, say=say)
+        def sink(what: str, address: str | None, encoders: int = 1) -> SocketSink | PipeSink | None:
+            if address is None:
+                return None
+            opened = _open_sink(address, found, encoders, resources, stop=stop, say=say)
+            if opened.address != address:  # for example, the system chose the port
+                say(f"{what} packets are served at {opened.address}")
+            return opened
 
         self.raw: list[RawConsumer] = []
         if options.record is not None:
             writer = _writer(options.record, source, found, compensated=False, encoders=encoders, offset_us=offset_us)
             self.raw.append(resources.enter_context(writer))
-        self.raw_sink = sink(options.raw_to, encoders)
+        self.raw_sink = sink("uncompensated", options.raw_to, encoders)
         if self.raw_sink is not None:
             self.raw.append(Forward(self.raw_sink))
         self.out = None
         if options.out is not None:
             writer = _writer(options.out, source, found, compensated=True, encoders=encoders)
             self.out = resources.enter_context(writer)
-        self.sink = sink(options.to)
+        self.sink = sink("compensated", options.to)
         self.viewers = [resources.enter_context(one) for one in _open_viewers(options, source)]
         self.raw += self.viewers
 

@@ -351,6 +351,9 @@ class PipeSink:
     accepts nothing in that time.
     """
 
+    address = "-"
+    """Its name, see :func:`open_sink`."""
+
     def __init__(self, hello: bytes, file: Any = None, *, stop: threading.Event | None = None) -> None:
         self._file = sys.stdout.buffer if file is None else file
         self._stop = stop or threading.Event()
