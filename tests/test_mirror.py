@@ -378,3 +378,6 @@ def test_programs(tmp_path: Path, texture: np.ndarray) -> None:
     )
     assert wrong.exit_code == 1
     assert "--fold-deg applies to a mirror" in wrong.stderr
+    again = runner.invoke(app, ["record", str(out), str(tmp_path / "again.h5"), "--fast"])
+    assert again.exit_code == 0, again.output
+    assert best_model(amiwarp.open_recording(tmp_path / "again.h5")) == "mirror"

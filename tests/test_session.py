@@ -394,6 +394,27 @@ def test_a_session_that_is_stopped_finishes_what_came(tmp_path: Path) -> None:
     assert len(open_recording(tmp_path / "raw.h5").events) == status.events
 
 
+def test_a_session_ends_at_its_time_and_not_at_the_next_report(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each packet of a millisecond is processed before the next one comes."""
+    now_us = 0
+    monkeypatch.setattr(session_module, "monotonic_us", lambda: now_us)
+
+    class Paced(Made):
+        def packets(self) -> Iterator[Packet]:
+            nonlocal now_us
+            until = time.monotonic() + LONG_S
+            for k in range(1, 1001):
+                now_us = 1000 * k
+                yield make_packet(now_us, Events.from_arrays([1], [1], [now_us], [1]))
+                while not stop.is_set() and session.status.events < k - 1 and time.monotonic() < until:
+                    time.sleep(1e-4)
+
+    stop, session = threading.Event(), Session(Paced([]))
+    status = session.run(stop, lambda _: None, seconds=0.25, every_s=0.2)
+    assert stop.is_set()
+    assert 0.249 <= status.seconds < 0.26
+
+
 def test_a_sink_that_fails_ends_the_session_and_says_so() -> None:
     def full(_packet: Compensated) -> None:
         raise AmiwarpError("disk: no space left")

@@ -141,6 +141,7 @@ def test_a_replay_of_two_encoders_is_compensated_and_recorded_again(
         assert live.stderr is not None
         error = live.stderr.read().decode()
     assert live.returncode == 0, error
+    assert open_recording(tmp_path / "r.h5").metadata.get("optic") == ("mirror" if name == "mirror" else None)
     assert f"{PAIR_SENT:,} events" in error
     assert json.loads(done.stdout)["events"] == PAIR_SENT
     for copy in ("r.h5", "h.h5"):
@@ -283,6 +284,13 @@ def test_a_replayed_file_is_compensated_recorded_and_reported(folder: Path, tmp_
     for name in ("x", "y", "t", "p"):
         np.testing.assert_array_equal(getattr(live.slice(0, SENT), name), getattr(offline.slice(0, SENT), name))
     assert {p.name for p in tmp_path.iterdir()} == {"o.h5", "r.h5", "offline.h5"}
+
+
+def test_a_recording_ends_at_the_given_time(folder: Path, tmp_path: Path) -> None:
+    args = ["record", str(folder / "recording.h5"), str(tmp_path / "r.h5"), "--seconds", "0.001", "--json"]
+    done = CliRunner().invoke(app, args)
+    assert done.exit_code == 0, done.stderr
+    assert json.loads(done.stdout)["events"] < SENT
 
 
 def test_addresses_that_the_system_chose_are_reported(folder: Path) -> None:

@@ -153,7 +153,7 @@ def _watch(
 
     stop = threading.Event()
     policy = Policy.BLOCK if stream.fast else Policy.DROP_OLDEST  # a late message would tell of a pose long gone
-    with StatusLine(stop, stream.seconds) as line, stream.link() as link:
+    with StatusLine() as line, stream.link() as link:
         opened = stream.open(source, line.say)
         if check_angles(opened, link) == 2:
             raise AmiwarpError(f"{source}: a lens is calibrated with one prism, the stream is that of a pair of them")
@@ -169,7 +169,7 @@ def _watch(
         with stopped_by_interrupt(stop):
             try:
                 session = Session(opened, link=link, raw=[spans], policy=policy, say=line.say)
-                check_whole(opened, session.run(stop, update))
+                check_whole(opened, session.run(stop, update, seconds=stream.seconds))
             except AmiwarpError as error:
                 if len(poses.poses) < LEAST_POSES:
                     raise

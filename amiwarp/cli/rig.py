@@ -132,8 +132,7 @@ def stopped_by_interrupt(stop: threading.Event) -> Iterator[None]:
 class StatusLine:
     """Status of a session on one line of stderr, below its messages. Without a terminal only messages are printed."""
 
-    def __init__(self, stop: threading.Event, seconds: float | None) -> None:
-        self._stop, self._seconds = stop, seconds
+    def __init__(self) -> None:
         self._console = Console(stderr=True, highlight=False)
         self._live = Live(console=self._console, refresh_per_second=5, transient=True)
         self.messages: deque[str] = deque(maxlen=1000)
@@ -157,9 +156,7 @@ class StatusLine:
             say(message)
 
     def update(self, status: SessionStatus) -> None:
-        """Show ``status``, and request the end of the session once ``seconds`` have passed."""
-        if self._seconds is not None and status.seconds >= self._seconds:
-            self._stop.set()
+        """Show ``status``."""
         if self._console.is_terminal:
             self._live.update(Text(describe(status, self._console.width), no_wrap=True, overflow="ellipsis"))
 
@@ -387,7 +384,7 @@ def run_live(
     found = Calibration.load(calibration)
     with contextlib.ExitStack() as resources:
         stop = threading.Event()
-        line = resources.enter_context(StatusLine(stop, stream.seconds))
+        line = resources.enter_context(StatusLine())
         link = resources.enter_context(stream.link())
         opened = stream.open(source, line.say)
         angles = check_angles(opened, link, second_ratio)
@@ -401,7 +398,7 @@ def run_live(
         keeper = adaptive.build(found.model, link, line.say)
         session = _session(opened, found, receivers, processing, link=link, second_ratio=second_ratio, keeper=keeper,
                            device=device, say=line.say)  # fmt: skip
-        status = _follow(session, stop, line, receivers)
+        status = _follow(session, stop, stream.seconds, line, receivers)
     data: dict[str, Any] = {
         "files": outputs.files,
         **session_summary(status, opened),
@@ -465,15 +462,17 @@ def _session(
     )  # fmt: skip
 
 
-def _follow(session: Session, stop: threading.Event, line: StatusLine, receivers: _Receivers) -> SessionStatus:
-    """Run the session to its end and show its status on ``line``."""
+def _follow(
+    session: Session, stop: threading.Event, seconds: float | None, line: StatusLine, receivers: _Receivers
+) -> SessionStatus:
+    """Run the session to its end, for at most ``seconds``, and show its status on ``line``."""
 
     def update(status: SessionStatus) -> None:
         line.update(status)
         if receivers.sink is not None:
             receivers.sink.tick()
 
-    status = session.run(stop, update)
+    status = session.run(stop, update, seconds=seconds)
     line.report_lost_packets(receivers.sink, receivers.raw_sink)
     for viewer in receivers.viewers:
         viewer.close()
@@ -531,7 +530,9 @@ def _writer(
     path: Path, source: Source, found: Calibration, *, compensated: bool, encoders: int, offset_us: float = 0.0
 ) -> LiveWriter:
     width, height = source.size
-    metadata: dict[str, Any] = _recorded_from(source)
+    metadata = _recorded_from(source)
+    if not found.model.PRISM:
+        metadata["optic"] = found.model_name
     if compensated:
         metadata["compensated_with"] = found.model_name
     return LiveWriter(path, width=width, height=height, camera=found.camera, prism=source.prism or _prism(found),
@@ -540,7 +541,7 @@ def _writer(
 
 
 def _recorded_from(source: Source) -> dict[str, Any]:
-    """Return the metadata of a recording that name the source and its camera."""
+    """Return the metadata of a recording that name the source, its camera and its optic."""
     return {"recorded_from": source.name, **getattr(source, "metadata", {})}
 
 
@@ -579,7 +580,7 @@ def run_record(
     from amiwarp.live.stream.session import Session, clock_offset
 
     stop = threading.Event()
-    with StatusLine(stop, stream.seconds) as line, stream.link() as link:
+    with StatusLine() as line, stream.link() as link:
         opened = stream.open(source, line.say)
         encoders = check_angles(opened, link, second_ratio)
         width, height = opened.size
@@ -590,7 +591,7 @@ def run_record(
         )  # fmt: skip
         with stopped_by_interrupt(stop), writer:  # in this order, so that Ctrl-C leaves no unfinished file
             session = Session(opened, link=link, second_ratio=second_ratio, raw=[writer], say=line.say)
-            status = session.run(stop, line.update)
+            status = session.run(stop, line.update, seconds=stream.seconds)
     data = {"file": str(out), **session_summary(status, opened), "messages": list(line.messages)}
     text = f"{out}: {status.events:,} events in {status.seconds:.1f} s, {data['mev_per_s']:.3g} Mev/s"
     report(

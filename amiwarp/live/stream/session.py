@@ -325,9 +325,6 @@ class SessionStatus:
     """Map from the controller's clock to the camera's; None without a link."""
     coverage: float | None = None
     """Share of the scene's edges that the last window showed, 0 to 1; None without adaptive speed."""
-    phase_away: float | None = None
-    """Difference between the latest estimated and the calibrated phase [rad], the larger of two; None without an
-    estimate."""
 
 
 class IntervalFigures:
@@ -454,20 +451,21 @@ class Session:
         self._figures = IntervalFigures(self._began_us)
 
     def run(
-        self, stop: threading.Event, on_status: Callable[[SessionStatus], None], *, every_s: float = 0.2
-    ) -> SessionStatus:
+        self, stop: threading.Event, on_status: Callable[[SessionStatus], None], *, every_s: float = 0.2,
+        seconds: float | None = None,
+    ) -> SessionStatus:  # fmt: skip
         """Process the source until it ends or ``stop`` is set, and then everything received by then.
 
-        ``on_status`` gets the status every ``every_s`` [s] and at the end. Raises the error of the source or of a
-        consumer, after everything received before it was processed. KeyboardInterrupt ends the session at once and
-        drops all waiting data.
+        The session sets ``stop`` itself after ``seconds`` [s], unless None. ``on_status`` gets the status every
+        ``every_s`` [s] and at the end. Raises the error of the source or of a consumer, after everything received
+        before it was processed. KeyboardInterrupt ends the session at once and drops all waiting data.
         """
         # No BackgroundLoop: the source may never return, then the session ends without it.
         reader = threading.Thread(target=self._read, args=(stop,), name="amiwarp-source", daemon=True)
         self._stop = stop
         reader.start()
         try:
-            self._process(stop, on_status, every_s)
+            self._process(stop, on_status, every_s, math.inf if seconds is None else seconds)
             self._finish()
         except KeyboardInterrupt:
             self._abandon()
@@ -485,7 +483,9 @@ class Session:
             raise self._failure
         return self.status
 
-    def _process(self, stop: threading.Event, on_status: Callable[[SessionStatus], None], every_s: float) -> None:
+    def _process(
+        self, stop: threading.Event, on_status: Callable[[SessionStatus], None], every_s: float, most_s: float
+    ) -> None:
         """Process packets until the queue is closed and empty."""
         due, stopped = 0.0, math.inf
         while not self._queue.ended:
@@ -493,6 +493,8 @@ class Session:
             if self._seconds >= due:
                 due = self._seconds + every_s
                 self._report(on_status)
+            if self._seconds >= most_s:
+                stop.set()
             if stop.is_set():
                 stopped = min(stopped, self._seconds)
                 if self._seconds - stopped > PATIENCE_S:  # the source's thread does not return
@@ -593,7 +595,7 @@ class Session:
         status.rpm = self.encoder.rpm
         status.coverage = None if self._keeper is None else self._keeper.coverage
         if self._phase_check is not None:
-            status.phase_away = self._phase_check.update(self.encoder)
+            self._phase_check.update(self.encoder)
         self._consumers.tick()
         if self._sharpness is not None:
             self._sharpness.restart()

@@ -91,6 +91,8 @@ class FileSource:
         # A rounding error of half a microsecond is less than 0.01 deg at 3000 rpm.
         self._samples = [(e.t - round(self.clock_offset_us), e.angle) for e in both if e is not None]
         self.encoders = len(self._samples)
+        self.metadata = {name: value for name, value in recording.metadata.items() if name == "optic"}
+        """Metadata that a recording of this source keeps: the optic, without which two angles are ambiguous."""
         self._pace, self._packet_us, self._clock, self._sleep = pace, packet_us, clock, sleep
         self._sent = [0] * self.encoders
 
