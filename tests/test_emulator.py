@@ -197,6 +197,8 @@ def test_nothing_is_left_of_a_pseudo_terminal(tmp_path: Path) -> None:
         with pytest.raises(AmiwarpError, match="already exists"):
             PseudoTerminal(Controller(Motor()), path)
         port = path.resolve()
+    with pytest.raises(AmiwarpError, match=r"there is no folder .*gone"):
+        PseudoTerminal(Controller(Motor()), tmp_path / "gone" / "prism")
     assert list(tmp_path.iterdir()) == []
     assert not port.exists()
     with PseudoTerminal(Controller(Motor())) as terminal:

@@ -183,6 +183,7 @@ def test_what_does_not_fit_is_not_sent() -> None:
         Samples((1,) * 33, (1,) * 33),
         Samples((1,), (1 << 31,)),
         Sync(-1, 0),
+        SetSpeed(1.0, 1e39),
     ):
         with pytest.raises(ValueError, match=r"\d"):
             encode(message, 0)

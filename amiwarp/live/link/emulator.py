@@ -454,8 +454,8 @@ class PseudoTerminal(BackgroundLoop):
 
     ``path``: symbolic link to the port. It exists while the emulated cable is plugged in, and points to the new port
     after a reconnection, so that programs find it under the same name. ``now_us``: emulation time [us]; default: time
-    since the creation of this object. Raises :class:`AmiwarpError` if ``path`` exists, or if the system has no
-    pseudo-terminals.
+    since the creation of this object. Raises :class:`AmiwarpError` if ``path`` exists or its folder does not,
+    or if the system has no pseudo-terminals.
     """
 
     def __init__(
@@ -469,6 +469,10 @@ class PseudoTerminal(BackgroundLoop):
         if self._path is not None and self._path.exists():
             raise AmiwarpError(
                 f"{path}: this file already exists; give another path for the link to the port, or remove the file"
+            )
+        if self._path is not None and not self._path.parent.is_dir():
+            raise AmiwarpError(
+                f"{path}: there is no folder {self._path.parent}; make it, or give another path for the port's link"
             )
         origin = monotonic_us()
         self._now_us = now_us or (lambda: monotonic_us() - origin)

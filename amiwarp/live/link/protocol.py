@@ -171,7 +171,7 @@ def encode(message: Message, sequence: int) -> bytes:
         else:
             payload = message.LAYOUT.pack(*astuple(message))
         packet = _HEADER.pack(VERSION, message.KIND, sequence & 0xFFFF) + payload
-    except struct.error as error:
+    except (struct.error, OverflowError) as error:
         raise ValueError(f"{message}: {error}") from error
     return framed(packet)
 
