@@ -568,6 +568,7 @@ def test_the_command_sets_shows_and_stops(path: Path, monkeypatch: pytest.Monkey
         (("set", "--rpm", "nan"), "--rpm nan is beyond"),
         (("set",), "needs --rpm"),
         (("stop", "--rpm", 5), "stop do not accept it"),
+        (("stop", "--ramp-rpm-s", 3), "--ramp-rpm-s applies to 'amiwarp motor set'"),
     ],
 )
 def test_a_speed_beyond_the_limit_is_refused_before_the_port_is_opened(args: tuple[object, ...], says: str) -> None:

@@ -184,7 +184,8 @@ def test_geared_prisms_are_recorded_with_both_angles(two_angles: Path, tmp_path:
         ("live single.h5 --calibration pair.json", "single.h5: there are samples of one encoder, but the calibration "
          "is that of a pair of prisms, which has two angles; give a source with the samples of both encoders"),
         ("live single.h5 --calibration mirror.json", "or --second-ratio if both are geared"),
-        ("live pair.h5 --calibration c.json", "give a calibration of a pair of prisms or of a mirror"),
+        ("live pair.h5 --calibration c.json", "pair.h5: there are two prism angles, but the calibrated "
+         "model, exact, has one; give a calibration of a pair"),
         ("live single.h5 --calibration c.json --second-ratio 1", "there are two prism angles"),
         ("live pair.h5 --calibration pair.json --second-ratio 1", "both encoders; leave --second-ratio out"),
         ("record pair.h5 o.h5 --second-ratio 1", "both encoders; leave --second-ratio out"),
@@ -469,6 +470,11 @@ def test_an_adaptive_speed_reaches_the_motor(folder: Path, tmp_path: Path, monke
         (["record", "dv", "o.h5"], "amiwarp[dv]"),
         (["live", "recording.h5", "--calibration", "c.json", "--to", "-", "--raw-to", "-"], "mix two streams"),
         (["live", "recording.h5", "--calibration", "c.json", "--raw-to", "-", "--json"], "--json and --raw-to - both"),
+        (["live", "recording.h5", "--calibration", "c.json", "--limit-rpm", "900"], "apply to --adaptive"),
+        (["live", "recording.h5", "--calibration", "c.json", "--adaptive", "--least-rpm", "2000"], "--least-rpm 2000"),
+        (["record", "recording.h5", "o.h5", "--counts-per-turn", "9"], "give its --port"),
+        (["emulate", "--recording", "recording.h5", "--camera", "unix:none", "--rpm", "9"], "--rpm applies to"),
+        (["emulate", "--link", "nowhere/prism"], "there is no folder nowhere"),
     ],
     ids=lambda v: " ".join(v) if isinstance(v, list) else "",
 )

@@ -96,6 +96,10 @@ class SourceOptions:
         ),
     ] = 0.0
 
+    def __post_init__(self) -> None:
+        if self.counts_per_turn is not None and self.port is None:
+            raise AmiwarpError("--counts-per-turn applies to a controller; give its --port, or remove the option")
+
     def open(self, spec: str, say: Callable[[str], None]) -> Source:
         """Open the source named ``spec``. ``say`` is called with its messages."""
         from amiwarp.live.stream.sources import open_source
@@ -203,14 +207,14 @@ def check_angles(source: Source, link: Link | None, second_ratio: float | None =
 
 def check_model(source: Source, link: Link | None, angles: int, found: Calibration) -> None:
     """Raise :class:`AmiwarpError` unless the number of angles that a session has is that of the calibrated model."""
-    needed, what = found.model.ANGLES, f"the calibration is that of a {found.model.TEXT}"
-    if angles == needed:
+    if angles == found.model.ANGLES:
         return
-    if needed == 1:
+    if found.model.ANGLES == 1:
         raise AmiwarpError(
-            f"{source.name}: there are two prism angles, but {what}, which has one; give a calibration of a pair of "
-            "prisms or of a mirror, made from a recording with both encoders"
+            f"{source.name}: there are two prism angles, but the calibrated model, {found.model_name}, has one; give a "
+            "calibration of a pair of prisms or of a mirror, made from a recording with both encoders"
         )
+    what = f"the calibration is that of a {found.model.TEXT}"
     other = (
         "leave --port out to take the samples of the source"
         if source.encoders == 2
@@ -248,6 +252,8 @@ def session_summary(s: SessionStatus, source: Source) -> dict[str, Any]:
 
 _in_adaptive = partial(typer.Option, rich_help_panel="Adaptive speed")
 _in_outputs = partial(typer.Option, rich_help_panel="Outputs")
+LEAST_RPM, MOST_RPM = 120.0, 1440.0
+"""Lowest and highest speed that adaptive control may set, by default [turns/min]."""
 START_RPM = 720.0
 """Speed at which adaptive control begins [turns/min], limited to the speeds that the options allow."""
 
@@ -259,15 +265,23 @@ class AdaptiveOptions:
     adaptive: Annotated[
         bool, _in_adaptive("--adaptive", help="Set the prism's speed automatically: just fast enough to see the edges.")
     ] = False
-    least_rpm: Annotated[float, _in_adaptive(min=1.0, help="Lowest speed allowed (turns/min).")] = 120.0
-    limit_rpm: Annotated[float, _in_adaptive(min=1.0, help="Highest speed allowed (turns/min).")] = 1440.0
+    least_rpm: Annotated[float, _in_adaptive(min=1.0, help="Lowest speed allowed (turns/min).")] = LEAST_RPM
+    limit_rpm: Annotated[float, _in_adaptive(min=1.0, help="Highest speed allowed (turns/min).")] = MOST_RPM
     most_mev_s: Annotated[
         float | None, _in_adaptive(min=0.001, help="Highest event rate allowed (million events/s). Default: any.")
     ] = None
 
+    def __post_init__(self) -> None:
+        if not self.adaptive and (self.least_rpm, self.limit_rpm, self.most_mev_s) != (LEAST_RPM, MOST_RPM, None):
+            raise AmiwarpError("--least-rpm, --limit-rpm and --most-mev-s apply to --adaptive; add it, or remove them")
+        if not self.least_rpm <= self.limit_rpm < math.inf:
+            raise AmiwarpError(
+                f"--least-rpm {self.least_rpm:g} .. --limit-rpm {self.limit_rpm:g} is no range of speeds; give a "
+                "lowest speed that is not above the highest one"
+            )
+
     def build(self, model: Model, link: Link | None, say: Callable[[str], None]) -> SpeedKeeper | None:
         """Set the motor's first speed and return the speed control; None without ``--adaptive``."""
-
         if not self.adaptive:
             return None
         if model.ANGLES > 1:
@@ -606,6 +620,8 @@ def run_record(
 
 LIMIT_RPM = 3000.0
 """Default of ``--limit-rpm``, the largest accepted speed [turns/min]."""
+RAMP_RPM_S = 500.0
+"""Default of ``--ramp-rpm-s``, the largest change of the speed [turns/min/s]."""
 WAIT_S = 2.5
 """Longest wait for the controller's status, which is sent once a second, and for its clock [s]."""
 POLL_S = 0.02
@@ -646,8 +662,8 @@ def run_motor(
         float | None, typer.Option(help="Speed to set (turns/min); negative: backwards. For check: 240 by default.")
     ] = None,
     ramp_rpm_s: Annotated[
-        float, typer.Option(min=0.001, help="Largest change of the speed (turns/min per second).")
-    ] = 500.0,
+        float, typer.Option(min=0.001, help="For set: largest change of the speed (turns/min per second).")
+    ] = RAMP_RPM_S,
     limit_rpm: Annotated[
         float,
         typer.Option(min=0.0, help="Largest accepted speed (turns/min): what prism, mount and bearing withstand."),
@@ -664,6 +680,8 @@ def run_motor(
         rpm = CHECK_RPM if rpm is None else rpm
     elif (rpm is None) == (action is Action.SET):
         raise AmiwarpError("'amiwarp motor set' needs --rpm, the speed to set; status and stop do not accept it")
+    if ramp_rpm_s != RAMP_RPM_S and action is not Action.SET:
+        raise AmiwarpError("--ramp-rpm-s applies to 'amiwarp motor set'; to stop slowly, set --rpm 0")
     if rpm is not None and not abs(rpm) <= limit_rpm:
         raise AmiwarpError(
             f"--rpm {rpm:g} is beyond the limit of {limit_rpm:g} rpm; raise --limit-rpm only if prism and mount "
@@ -875,6 +893,8 @@ def run_emulate(
     Programs can be tried out against it without hardware.
     """
     played = playback.open()
+    if played is not None and options.rpm:
+        raise AmiwarpError("--rpm applies to the emulated motor, which --recording replaces; remove one of them")
     rotor = Motor(options.rpm, seed=common.seed) if played is None else played.rotor
     controller = options.build(rotor, common.seed)
     origin = monotonic_us()
