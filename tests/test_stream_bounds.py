@@ -87,7 +87,7 @@ def test_a_queue_bounds_packets_without_events(policy: Policy, make: Callable[[i
 
     thread = threading.Thread(target=feed, daemon=True)
     thread.start()
-    reached(lambda: queue.fill > 0.98)
+    reached(lambda: queue.held_bytes > 0.98 * MOST)
     assert len(most) < 500
     got: list[Packet] = []
     while not queue.ended:
@@ -176,7 +176,7 @@ def test_a_session_bounds_encoder_samples_without_events() -> None:
     session = Session(source, raw=[taker])
     thread = threading.Thread(target=session.run, args=(stop, lambda _: None), daemon=True)
     thread.start()
-    reached(lambda: session._queue.fill > 0.98)
+    reached(lambda: session._queue.held_bytes > 0.98 * MOST)
     for _ in range(50):  # it stays there
         time.sleep(0.002)
         assert session._queue.held_bytes <= MOST

@@ -187,11 +187,6 @@ class PacketQueue:
         return self._held
 
     @property
-    def fill(self) -> float:
-        """Fill level of the queue, 0 .. 1; above 1 while a single packet is larger than the limits."""
-        return self._share(self._held, self.held_bytes)
-
-    @property
     def ended(self) -> bool:
         """Whether the queue is closed and empty."""
         with self._changed:

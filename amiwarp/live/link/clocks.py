@@ -71,10 +71,6 @@ class ClockMap:
         own = np.asarray(own_us, np.int64)
         return own + np.rint(self.offset_us + self.drift * (own - self.at_us)).astype(np.int64)
 
-    def std_us(self, own_us: float) -> float:
-        """Return the standard deviation of a mapped time [us]. It grows with the distance from :attr:`at_us`."""
-        return math.hypot(self.offset_std_us, self.drift_std * (own_us - self.at_us))
-
 
 def fit_to_pulses(own_us: ArrayLike, other_us: ArrayLike, sigma_us: float = 1.0) -> ClockMap:
     """Fit a clock map to pulses that both clocks recorded.
@@ -161,11 +157,6 @@ class CameraClock:
         self._pairs: deque[tuple[int, int]] = deque(maxlen=MOST_PAIRS)
         self._delays: deque[int] = deque(maxlen=MOST_DELAYS)
         self._map: ClockMap | None = None
-
-    @property
-    def pulses(self) -> int:
-        """Number of pulse pairs with a time on both clocks that are in memory."""
-        return len(self._pairs)
 
     def restart(self) -> None:
         """Discard all times of the controller's clock, because that clock restarted."""
