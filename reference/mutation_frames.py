@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from amiwarp.events.encoder import LARGEST_ANGLE
 from amiwarp.live.link.link import Follower
 from amiwarp.live.link.protocol import (
     LONGEST,
@@ -37,7 +38,7 @@ from amiwarp.live.stream.sources import StreamSource
 WIDTH, HEIGHT = 64, 48
 WHOLE = [0, 1, 2, 255, 256, 65535, 65536, (1 << 31) - 1, 1 << 31, (1 << 32) - 1]
 TIMES = [0, -1, 1, 1 << 31, 1 << 40, 1 << 60, (1 << 60) + 1, 1 << 62, (1 << 63) - 1, -(1 << 63), -(1 << 60)]
-ANGLES = [0.0, -1e3, 1e12, 1.1e12, 1e308, -1e308, math.inf, -math.inf, math.nan, 5e-324]
+ANGLES = [0.0, -1e3, LARGEST_ANGLE, 1.1 * LARGEST_ANGLE, 1e308, -1e308, math.inf, -math.inf, math.nan, 5e-324]
 NUMBERS = [
     "1e999",
     "-1e999",
@@ -113,7 +114,7 @@ def rows(kind: int, rng: random.Random, at: int) -> bytes:
         if k == 0:
             column = (at + np.sort(np.array([rng.randrange(3000) for _ in range(n)], np.int64))).astype(dtype)
         elif dtype in ("<f8", "<f4"):
-            column = np.array([at * 7e-5 + 0.1 * i for i in range(n)]).astype(dtype)
+            column = np.array([at * 7e-6 + 0.1 * i for i in range(n)]).astype(dtype)
         else:
             column = np.array([rng.randrange(2 if dtype == "u1" else HEIGHT) for _ in range(n)]).astype(dtype)
         if n and rng.random() < 0.01:
