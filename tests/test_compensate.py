@@ -25,7 +25,10 @@ from amiwarp import (
     ExactModel,
     Fisheye,
     FlatSide,
+    ImuSamples,
     MemoryEvents,
+    MemoryImages,
+    Poses,
     Prism,
     RadialTangential,
     Recording,
@@ -270,6 +273,29 @@ def test_a_fault_in_the_middle_of_a_file_leaves_nothing(
     with pytest.raises(AmiwarpError, match=f"event {at} .* outside the 200x150 frame"):
         compensate(open_recording(tmp_path / "in.h5"), calibration, tmp_path / "out.h5")
     assert list(tmp_path.iterdir()) == [tmp_path / "in.h5"]
+
+
+def test_a_native_file_gets_the_calibrated_camera_and_what_is_still_true(
+    recording: Recording, exact: Calibration, tmp_path: Path
+) -> None:
+    imu = ImuSamples(np.array([0, 1000]), np.zeros((2, 3)), np.ones((2, 3)))
+    poses = Poses(np.array([0, 1000]), np.tile([0.0, 0, 0, 0, 0, 0, 1], (2, 1)))
+    width, height = recording.events.size
+    frames = MemoryImages(np.array([500]), np.zeros((1, height, width), np.uint8))
+    assert recording.truth is not None
+    assert exact.camera != (better := replace(exact.camera, fx=500.0, fy=500.0))
+    given = replace(recording, imu=imu, frames=frames, truth=replace(recording.truth, poses=poses))
+    calibration = replace(exact, parameters={**exact.parameters, "focal_length": 500.0})
+    out = tmp_path / "out.h5"
+    assert compensate(given, calibration, out).left_out == ("ground truth of events", "frames")
+    found = open_recording(out)
+    assert found.camera == better
+    assert found.imu is not None
+    np.testing.assert_array_equal(found.imu.acceleration, imu.acceleration)
+    assert found.truth is not None
+    assert found.truth.poses is not None
+    np.testing.assert_array_equal(found.truth.poses[:].camera, poses.camera)
+    assert found.frames is None
 
 
 def test_empty_recording(recording: Recording, calibration: Calibration, tmp_path: Path) -> None:

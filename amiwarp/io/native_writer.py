@@ -25,7 +25,7 @@ from amiwarp.events import recording as checks
 from amiwarp.events import truth as ground_truth
 from amiwarp.events.encoder import Encoder
 from amiwarp.events.recording import Events, ImuSamples, MetadataValue, Recording, regroup
-from amiwarp.events.truth import EventTruth, FrameTruth, Poses, Truth, WorldLabels
+from amiwarp.events.truth import EventTruth, FrameTruth, Poses, WorldLabels
 from amiwarp.io import hdf5_files
 from amiwarp.io.files import NewFile, allocate, check_output, errors_name, link_new, put_in_place
 from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
@@ -734,12 +734,16 @@ def write_recording(
         truth_parameters=parameters, truth_labels=labels,
     ) as writer:  # fmt: skip
         _copy_events(recording, writer, size, progress)
+        copy_records(recording, writer)
+        if recording.frames is not None:
+            for index, t in enumerate(recording.frames.t.tolist()):
+                writer.append_image(t, recording.frames[index])
 
 
 def _copy_events(
     recording: Recording, writer: RecordingWriter, size: tuple[int, int], progress: Progress | None
 ) -> None:
-    """Append all events of a recording to a writer, with their ground truth and flags, IMU samples and frames.
+    """Append all events of a recording to a writer, with their ground truth and flags.
 
     ``size`` is that of the image [px]. Flags that a source of compensated events does not have follow from it.
     """
@@ -756,17 +760,15 @@ def _copy_events(
         start = stop
         if progress is not None:
             progress("writing events", start / len(source))
-    if truth is not None:
-        _copy_world_truth(truth, writer)
+
+
+def copy_records(recording: Recording, writer: RecordingWriter) -> None:
+    """Append to a writer a recording's IMU samples, ground truth of instants, masks of known pixels, and poses."""
+    truth = recording.truth
     if recording.imu is not None:
         writer.append_imu(recording.imu)
-    if recording.frames is not None:
-        for index, t in enumerate(recording.frames.t.tolist()):
-            writer.append_image(t, recording.frames[index])
-
-
-def _copy_world_truth(truth: Truth, writer: RecordingWriter) -> None:
-    """Append to a writer the ground truth of instants, the masks of known pixels, and the poses."""
+    if truth is None:
+        return
     if truth.known is not None:
         for index, t in enumerate(truth.known.t.tolist()):
             writer.append_known(t, truth.known[index])
