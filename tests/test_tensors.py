@@ -220,6 +220,15 @@ def test_surfaces(device: str) -> None:
     assert (expected == 0.0).any()
 
 
+def test_surfaces_are_1_after_the_end_of_the_window(device: str) -> None:
+    """The read-out of a sensor delays events beyond the window in which they are delivered."""
+    events = put(Events.from_arrays([0, 1, 2], [0, 0, 0], [10, 20, 90], [1, 1, 1]), device)
+    cut = amiwarp.Windows(*(np.array([value], np.int64) for value in (0, 3, 0, 20)))
+    for linear, first in ((False, np.exp(-1.0)), (True, 0.0)):
+        found = amiwarp.time_surface(events, 3, 1, 10.0, linear=linear, per_polarity=False, windows=cut)
+        np.testing.assert_allclose(host(found), [[[first, 1.0, 1.0]]], rtol=0, atol=EXACT)
+
+
 def test_latest_times_of_dv_processing() -> None:
     dv = pytest.importorskip("dv_processing")
     events = some_events(300)
@@ -405,6 +414,16 @@ def test_time_surface_of_tonic(device: str) -> None:
     alone = host(amiwarp.time_surface(put(events, device), WIDTH, HEIGHT, 7e3, windows=cut))
     assert (alone <= found).all()
     assert (alone < found).any()
+
+
+def test_times_are_carried_through_a_window_without_events(device: str) -> None:
+    events = put(Events.from_arrays([0, 1, 0, 1], [0] * 4, [100, 110, 160, 170], [1] * 4), device)
+    cut = amiwarp.windows(events, ranges=[(0, 0), (0, 2), (2, 2), (2, 4), (4, 4)])
+    assert cut.t_start.tolist() == [100, 100, 110, 160, 170]
+    assert cut.t_end.tolist() == [100, 110, 110, 170, 170]
+    found = amiwarp.time_surface(events, 2, 1, 20.0, linear=True, per_polarity=False, windows=cut, carry=True)
+    expected = [[0.0, 0.0], [0.5, 1.0], [0.5, 1.0], [0.5, 1.0], [0.5, 1.0]]
+    np.testing.assert_allclose(host(found)[:, 0], expected, rtol=0, atol=EXACT)
 
 
 def test_carried_times_in_several_launches(monkeypatch: pytest.MonkeyPatch) -> None:

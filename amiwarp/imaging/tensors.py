@@ -119,7 +119,8 @@ def windows(
     count : int, optional
         Number of events in a window. It starts at the time of its first event and ends at that of its last one.
     ranges : array_like, optional
-        First index, and index after the last, of each window, shape ``(n, 2)``. Times are as for ``count``.
+        First index, and index after the last, of each window, shape ``(n, 2)``. Times are as for ``count``; a window
+        without events is at the time of the event before it.
     encoder : Encoder, optional
         Encoder that covers the events. Windows start at the first event, and last until the prism has turned by
         ``turns`` since their start.
@@ -188,12 +189,15 @@ def _turn_edges(encoder: Any, first: int, last: int, turns: float, incomplete: b
 
 
 def _at_indices(events: Events | DeviceEvents, start: NDArray[np.int64], stop: NDArray[np.int64]) -> Windows:
-    """Return windows at indices, which start and end at the times of their first and last events."""
-    filled = stop > start
-    t_start, t_end = np.zeros(len(start), np.int64), np.zeros(len(start), np.int64)
-    times = times_at(events, np.concatenate([start[filled], stop[filled] - 1]))
-    t_start[filled], t_end[filled] = np.split(times, 2)
-    return Windows(start, stop, t_start, t_end)
+    """Return windows at indices, which start and end at the times of their first and last events.
+
+    Those without events start and end at the time of the event before them, or of the first one.
+    """
+    if not len(events):
+        return Windows(start, stop, np.zeros_like(start), np.zeros_like(start))
+    last = np.maximum(np.maximum(start, stop) - 1, 0)
+    times = times_at(events, np.concatenate([np.minimum(start, last), last]))
+    return Windows(start, stop, *np.split(times, 2))
 
 
 # Batches of recordings.
@@ -941,7 +945,7 @@ def time_surface(
     Notes
     -----
     With the latest event at time t, a pixel is ``exp(-(t_end - t) / tau_us)`` [1]_, or
-    ``max(0, 1 - (t_end - t) / tau_us)``; without events, it is 0.
+    ``max(0, 1 - (t_end - t) / tau_us)``; without events, it is 0. If t is after ``t_end``, it is 1.
 
     References
     ----------
