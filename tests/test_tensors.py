@@ -272,6 +272,9 @@ def test_no_events(device: str) -> None:
     assert host(amiwarp.latest_times(none, 4, 3)).shape == (2, 3, 4)
     assert len(amiwarp.windows(none, duration_us=10)) == len(amiwarp.windows(none, count=3)) == 0
     assert host(amiwarp.event_count(none, 4, 3, windows=amiwarp.windows(none, count=3))).shape == (0, 3, 4)
+    short = put(some_events(9), device)
+    no_windows = amiwarp.windows(short, count=10)
+    assert host(amiwarp.voxel_grid(short, 4, 3, 2, normalize=True, windows=no_windows)).shape == (0, 2, 3, 4)
 
 
 @pytest.mark.parametrize("burst", [0, 300, 3000])

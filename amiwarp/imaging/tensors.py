@@ -800,7 +800,7 @@ def voxel_grid(
     intervals = bins - 1 if end_bin else bins
     grid = _grid(width, height, steps=max(intervals, 1), rate=intervals, off=-1)
     out = _shares(batch, grid, bins)
-    if normalize:
+    if normalize and len(batch.windows):
         _normalise(out.reshape((len(batch.windows), -1)))
     return batch.finish(out)
 
