@@ -407,6 +407,26 @@ def test_windows_of_turns_at_varying_speed() -> None:
     np.testing.assert_allclose(turned, np.pi, rtol=0, atol=4e-3)  # a whole microsecond
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_windows_of_turns_to_and_fro(sign: float) -> None:
+    """A window ends a quarter turn from its start on either side; less to and fro does not count."""
+    events = Events.from_arrays([0] * 2, [0] * 2, [0, 100], [1] * 2)
+    turned = np.array([-0.5, 0.0, 0.9, -0.1, 2.9, 1.9, -1.1, -1.2])
+    encoder = Encoder(np.array([-10, 0, 20, 30, 60, 70, 100, 110]), sign * np.pi / 2 * turned)
+    found = amiwarp.windows(events, encoder=encoder, turns=0.25)
+    assert found.t_start.tolist() == [0, 41, 51, 79, 89]
+    assert found.t_end.tolist() == [41, 51, 79, 89, 99]
+
+
+def test_the_only_window_of_turns_is_incomplete() -> None:
+    encoder = Encoder.constant_speed(1200.0, 0, 100)
+    for t in ([5], [5, 5]):
+        events = Events.from_arrays([1] * len(t), [0] * len(t), t, [1] * len(t))
+        found = amiwarp.windows(events, encoder=encoder, incomplete=True)
+        assert (found.start.tolist(), found.stop.tolist()) == ([0], [len(t)])
+        assert (found.t_start.tolist(), found.t_end.tolist()) == ([5], [5])
+
+
 def test_time_surface_of_tonic(device: str) -> None:
     """Tonic keeps the times of earlier windows, and lets them decay until the end of each window."""
     events = some_events(400)
