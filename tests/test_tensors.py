@@ -648,6 +648,8 @@ def test_refusals() -> None:
         ("limit = 256", lambda: amiwarp.stacked_histogram(events, 9, 9, 2, limit=256)),
         ("tau_us = 0", lambda: amiwarp.time_surface(events, 9, 9, 0.0)),
         ("width = 0", lambda: amiwarp.event_count(events, 0, 9)),
+        ("windows are indexed by 2; give a slice", lambda: cut[2]),
+        ("windows are indexed by 0; give a slice", lambda: list(cut)),
         ("expected int64", lambda: amiwarp.Windows(*np.zeros((4, 2)))),
         ("a window lasts", lambda: amiwarp.voxel_grid(events, 9, 9, 5, t_start=0, t_end=1 << 60)),
         ("give fewer bins", lambda: amiwarp.voxel_grid(events, 9_999, 9_999, 999)),

@@ -92,6 +92,8 @@ class Windows:
 
     def __getitem__(self, which: slice | NDArray[Any]) -> Windows:
         """Return the windows of a slice, or at an index or boolean array."""
+        if np.ndim(self.start[which]) == 0:
+            raise AmiwarpError(f"windows are indexed by {which}; give a slice, such as [k : k + 1] for one window")
         return Windows(self.start[which], self.stop[which], self.t_start[which], self.t_end[which])
 
 
