@@ -471,6 +471,14 @@ def test_batch_of_recordings(device: str) -> None:
     assert np.array_equal(amiwarp.voxel_grid(blocks, WIDTH, HEIGHT, BINS, device=device), expected)
 
 
+def test_batch_of_raw_and_compensated_events(device: str) -> None:
+    raw, moved = some_events(300), positions(some_events(400))
+    expected = [amiwarp.voxel_grid(block, WIDTH, HEIGHT, BINS) for block in (raw, moved)]
+    blocks = [DeviceEvents.from_arrays(*(getattr(e, n) for n in "xytp"), device=device) for e in (raw, moved)]
+    for batch in ([raw, moved], blocks):
+        np.testing.assert_allclose(host(amiwarp.voxel_grid(batch, WIDTH, HEIGHT, BINS)), expected, rtol=0, atol=EXACT)
+
+
 # Compensated events.
 
 

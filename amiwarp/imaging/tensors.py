@@ -246,7 +246,8 @@ def collate(blocks: Sequence[Events] | Sequence[DeviceEvents], *, device: Any = 
     Returns
     -------
     Events or DeviceEvents
-        All events, in the order of the recordings. Their times start anew with each recording.
+        All events, in the order of the recordings. Their times start anew with each recording. If some are compensated,
+        all coordinates are float32.
     Windows
         One window for each recording, from its first to its last event.
 
