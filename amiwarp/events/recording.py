@@ -362,7 +362,7 @@ class Events:
         Returns
         -------
         Events
-            All events.
+            All events. If some are compensated, all coordinates are float32.
         """
         if len(blocks) == 1:
             return blocks[0]
