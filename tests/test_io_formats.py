@@ -434,10 +434,10 @@ def test_triggers_of_raw_files(tmp_path, version):
     else:
         words = np.array([0x8 << 28 | 1, 0xA << 28 | 5 << 22 | 3 << 8, 1 << 28 | 6 << 22 | 10 << 11 | 7,
                           0xA << 28 | 9 << 22 | 3 << 8, 0xA << 28 | 16 << 22 | 3 << 8], "<u8")  # fmt: skip
-        value = np.array([0, 1, 1, 0, 1], "<u8")
-        words = (
-            (words | value * (np.arange(5) != 2)).astype("<u4") if version == "2" else words << np.uint64(32) | value
-        )
+        words |= np.array([0, 1, 0, 0, 1], "<u8")
+        # The lower half of an EVT 2.1 word holds the pixels of an event; that of a trigger is 0.
+        pixels = np.array([0, 0, 1, 0, 0], "<u8")
+        words = words.astype("<u4") if version == "2" else words << np.uint64(32) | pixels
     layout = "% format EVT21;endianness=little;height=240;width=320\n" if version == "2.1" else "% geometry 320x240\n"
     path = tmp_path / "a.raw"
     path.write_bytes(

@@ -68,8 +68,8 @@ class Evt2Decoder:
             self.high = int(highs[-1])
         events = known & (kind <= 1)
         trigger = known & (kind == TRIGGER)
-        value = (words.astype(np.uint64) if self.vectors else head)[trigger] & 1
-        triggers = head[trigger] >> 8 & 0x1F, np.zeros(value.size, np.int64), t[trigger], value.astype(np.int64)
+        edges = head[trigger]
+        triggers = edges >> 8 & 0x1F, np.zeros(edges.size, np.int64), t[trigger], edges & 1
         x, y, p = head[events] >> 11 & 0x7FF, head[events] & 0x7FF, kind[events]
         if not self.vectors:
             return (x, y, t[events], p), triggers
