@@ -439,12 +439,15 @@ def test_triggers_of_raw_files(tmp_path, version):
         pixels = np.array([0, 0, 1, 0, 0], "<u8")
         words = words.astype("<u4") if version == "2" else words << np.uint64(32) | pixels
     layout = "% format EVT21;endianness=little;height=240;width=320\n" if version == "2.1" else "% geometry 320x240\n"
+    layout += "% t0 1700000000000000\n"
     path = tmp_path / "a.raw"
     path.write_bytes(
         f"% evt {version if '.' in version else version + '.0'}\n{layout}% end\n".encode() + words.tobytes()
     )
-    assert open_recording(path).metadata["triggers"] == 3
-    assert np.diff(read_encoder_triggers(path, 3).t).tolist() == [11]
+    recording, start = open_recording(path), 1_700_000_000_000_000 + (4096 if version == "3" else 64)
+    assert recording.metadata["triggers"] == 3
+    assert recording.events.t_first == start + 6
+    assert read_encoder_triggers(path, 3).t.tolist() == [start + 5, start + 16]
 
 
 def test_triggers_of_aedat4(tmp_path):

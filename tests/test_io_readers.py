@@ -364,6 +364,7 @@ def test_evt_headers(tmp_path):
         assert_equal(recording.events.slice(0, 999), EVENTS)
     for header, message in (
         (b"% evt 9.0\n", "version in the header is '9.0'"),
+        (b"% evt 2.0\n% t0 5.5\n", "t0 in the header is '5.5'; expected a time"),
         (b"% evt 2.0\n% geometry 10x10\n", "after|before"),
     ):
         path.write_bytes(header + body)
