@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from amiwarp.errors import AmiwarpError
 from amiwarp.events.encoder import Encoder
-from amiwarp.events.recording import SENSOR_DTYPE, Events, EventSource, Recording
+from amiwarp.events.recording import SENSOR_DTYPE, Events, EventSource, Recording, check_coordinates
 from amiwarp.events.truth import FrameStore, Poses, PoseStore
 from amiwarp.io import formats
 from amiwarp.io.file_scan import RECORDS, FileEvents
@@ -62,8 +62,16 @@ def export(
     check_limits(outline, limits)
     pixels = Pixels(limits, size, rounding, seed)
     write: Writer = formats.io_function(formats.WRITERS[chosen])
-    with NewFile(path, overwrite=overwrite) as new, errors_name(path, lambda: f"writing {limits.label}"):
-        write(new.part, _written(source.blocks() if blocks is None else blocks, pixels, len(source), progress), outline)
+    foreign: list[Exception] = []
+    written = _written(source.blocks() if blocks is None else blocks, pixels, outline, len(source), progress, foreign)
+    with NewFile(path, overwrite=overwrite) as new:
+        try:
+            write(new.part, written, outline)
+        except BaseException as error:
+            if error in foreign:
+                raise
+            with errors_name(path, lambda: f"writing {limits.label}"):
+                raise
     return pixels.dropped
 
 
@@ -86,16 +94,34 @@ def check_limits(about: Outline, limits: formats.Limits) -> None:
         )
 
 
-def _written(blocks: Iterable[Events], pixels: Pixels, count: int, progress: Progress | None) -> Iterator[Events]:
-    """Yield the events as the format holds them, in blocks of at least one. ``count`` is the number of all events."""
+def _written(
+    blocks: Iterable[Events],
+    pixels: Pixels,
+    about: Outline,
+    count: int,
+    progress: Progress | None,
+    foreign: list[Exception],
+) -> Iterator[Events]:
+    """Yield the events as the format holds them, in blocks of at least one. ``count`` is the number of all events.
+
+    An exception that is not amiwarp's, of a caller's function or source, is noted in ``foreign``.
+    """
     done = 0
-    for block in blocks:
-        events = pixels(block)
-        if len(events):
-            yield events
-        done += len(block)
-        if progress is not None:
-            progress("writing events", done / count)
+    try:
+        for block in blocks:
+            events = pixels(block)
+            if len(events):
+                if events.whole_pixels:
+                    check_coordinates(events, about.width, about.height, where=str(about.path), first_index=done)
+                yield events
+            done += len(block)
+            if progress is not None:
+                progress("writing events", done / count)
+    except AmiwarpError:
+        raise
+    except Exception as error:
+        foreign.append(error)
+        raise
 
 
 class Pixels:
@@ -211,9 +237,10 @@ def convert(
     """Convert a recording to the native format or to another one, in constant memory.
 
     Only the native format holds the encoder, the camera, the prism, the ground truth, the IMU samples, the frames and
-    the metadata. All formats keep x, y, t and p of every event exactly, with two exceptions for compensated events:
-    text holds their coordinates to 1e-6 px, and formats of whole pixels need ``rounding``. From a ROS 2 bag to a ROS 2
-    bag, the messages of all other topics are copied.
+    the metadata. All formats keep x, y, t and p of every event exactly, with three exceptions. Of compensated events,
+    text holds the coordinates to 1e-6 px, and formats of whole pixels need ``rounding``. In a ROS 2 bag the times begin
+    at 0 if the last is later than 28 h, as are times since 1970: only the stamps of its messages hold those. From a
+    ROS 2 bag to a ROS 2 bag, the messages of all other topics are copied.
 
     Parameters
     ----------
