@@ -106,6 +106,15 @@ def test_every_format_reads_back(tmp_path, monkeypatch, name, keep):
         assert recording.camera == Camera(*SIZE, 200, 201, 150, 110, RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.01))
 
 
+@pytest.mark.parametrize("name", ["text", "native"])
+def test_changed_arrays_leave_the_recording_as_it_is(tmp_path, name):
+    source = open_recording(write_sample(tmp_path, name, EVENTS)).events
+    for given in (source[:], source[5:9], source.between(source.t_first, source.t_last), *source.blocks()):
+        for values in (given.x, given.y, given.t, given.p):
+            values[:] = 0
+    assert_same_source(source, MemoryEvents(EVENTS, *SIZE))
+
+
 @pytest.mark.parametrize("name", WRITERS)
 def test_content_decides_not_the_ending(tmp_path, name):
     path = write_sample(tmp_path, name, EVENTS, ending="bin")
