@@ -211,9 +211,14 @@ def test_text_names_the_bad_line(tmp_path, monkeypatch, line, message):
 
 def test_text_with_a_size_comments_and_no_last_newline(tmp_path):
     path = tmp_path / "events.txt"
-    path.write_text("500 400\n# from a bench\n\n" + "\n".join(LINES))
-    source = open_recording(path).events
-    assert (len(source), source.size) == (1000, (500, 400))
+    for head, size in (
+        ("500 400\n# from a bench\n\n", (500, 400)),
+        ("# a bench\n\n500 400\n", (500, 400)),
+        ("# events\n", (240, 180)),
+    ):
+        path.write_text(head + "\n".join(LINES))
+        source = open_recording(path).events
+        assert (len(source), source.size) == (1000, size)
     path.write_text("500 -4\n" + "\n".join(LINES))
     with pytest.raises(AmiwarpError, match="line 1 '500 -4' is not a size"):
         open_recording(path)

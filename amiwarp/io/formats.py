@@ -179,9 +179,14 @@ def _is_evt(head: bytes) -> bool:
     return any(line.startswith((b"% evt ", b"% format EVT")) for line in lines)
 
 
+def holds_values(line: bytes) -> bool:
+    """Return whether a line of a text file is neither empty nor a comment."""
+    return line.lstrip()[:1] not in (b"", b"#")
+
+
 def _looks_like_text(head: bytes) -> bool:
     """Return whether the first line without a comment consists of two or four numbers."""
-    line = next((line for line in head.split(b"\n") if line.strip() and not line.lstrip().startswith(b"#")), b"")
+    line = next(filter(holds_values, head.split(b"\n")), b"")
     try:
         return len([float(word) for word in line.split()]) in (2, 4)
     except ValueError:
