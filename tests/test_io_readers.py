@@ -106,6 +106,14 @@ def test_every_format_reads_back(tmp_path, monkeypatch, name, keep):
         assert recording.camera == Camera(*SIZE, 200, 201, 150, 110, RadialTangential(-0.3, 0.1, 1e-4, -2e-4, 0.01))
 
 
+@pytest.mark.parametrize("name", ["t", "array", "a" * 200])
+def test_a_file_is_named_also_if_its_name_is_a_word_of_the_error(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    with open(name, "wb") as file:
+        np.savez(file, x=[1], y=[0], t=[0.5], p=[1])
+    assert str(refusal(open_recording, Path(name))).startswith((f"{name}: before the first event: ", f"{name[:100]}..."))
+
+
 @pytest.mark.parametrize("name", ["text", "native"])
 def test_changed_arrays_leave_the_recording_as_it_is(tmp_path, name):
     source = open_recording(write_sample(tmp_path, name, EVENTS)).events
