@@ -425,6 +425,8 @@ def test_triggers_become_an_encoder(data_dir, tmp_path):
     write_bin(tmp_path / "a.bin", small(EVENTS, 34, 34, t_first=0))
     with pytest.raises(AmiwarpError, match=r"files of the format bin store no triggers"):
         read_encoder_triggers(tmp_path / "a.bin")
+    with pytest.raises(AmiwarpError, match=r"out.h5: .*only Prophesee's files hold triggers"):
+        read_encoder_triggers(tmp_path / "out.h5")
 
 
 @pytest.mark.parametrize("version", ["2", "3", "2.1"])
@@ -448,6 +450,8 @@ def test_triggers_of_raw_files(tmp_path, version):
     assert recording.metadata["triggers"] == 3
     assert recording.events.t_first == start + 6
     assert read_encoder_triggers(path, 3).t.tolist() == [start + 5, start + 16]
+    with pytest.raises(AmiwarpError, match=r"a.raw: holds one stream of events, no topics; leave the topic out"):
+        read_encoder_triggers(path, 3, topic="/events")
 
 
 def test_triggers_of_aedat4(tmp_path):

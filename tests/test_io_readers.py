@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -111,7 +112,9 @@ def test_a_file_is_named_also_if_its_name_is_a_word_of_the_error(tmp_path, monke
     monkeypatch.chdir(tmp_path)
     with open(name, "wb") as file:
         np.savez(file, x=[1], y=[0], t=[0.5], p=[1])
-    assert str(refusal(open_recording, Path(name))).startswith((f"{name}: before the first event: ", f"{name[:100]}..."))
+    assert str(refusal(open_recording, Path(name))).startswith(
+        (f"{name}: before the first event: ", f"{name[:100]}...")
+    )
 
 
 @pytest.mark.parametrize("name", ["text", "native"])
@@ -174,6 +177,15 @@ def test_paths_and_formats_that_are_none(tmp_path):
     (tmp_path / "old.aedat").write_bytes(b"#!AER-DAT1.0\r\n")
     with pytest.raises(AmiwarpError, match=r"is AEDAT 1\.0; only 2\.0, 3\.1 and 4 are read"):
         open_recording(tmp_path / "old.aedat")
+
+
+def test_compensated_events_far_outside_do_not_count_for_the_size(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["events/x"] = np.array([1.5, 639.6, np.nan, 3e9, -1e9], np.float32)
+        file["events/y"] = np.array([1.5, 2.0, np.nan, 3e9, 70_000], np.float32)
+        file["events/t"], file["events/p"] = np.arange(5), np.ones(5, np.uint8)
+        file["events/inside"] = np.array([1, 1, 0, 0, 0], np.uint8)
+    assert open_recording(tmp_path / "a.h5").events.size == (1280, 720)  # 639.6 px lies on pixel 640
 
 
 def test_a_file_without_a_size_gets_that_of_the_smallest_sensor_that_holds_it():

@@ -234,10 +234,15 @@ def open_recording(
     chosen = detect_format(path) if format is None else choice(Format, format, f"{path}: format")
     if format is not None and _folder_format(path) is not chosen:
         check_regular(path)
-    if topic is not None and chosen not in TOPICS:
-        raise AmiwarpError(f"{path}: holds one stream of events, no topics; leave the topic out")
+    check_topic(path, topic, chosen)
     recording: Recording = io_function(OPENERS[chosen])(path, *((topic,) if chosen in TOPICS else ()))
     return recording
+
+
+def check_topic(path: Path, topic: str | None, found: Format) -> None:
+    """Raise :class:`AmiwarpError` if a topic is given for a file of a format without topics."""
+    if topic is not None and found not in TOPICS:
+        raise AmiwarpError(f"{path}: holds one stream of events, no topics; leave the topic out")
 
 
 # Formats that are written.
