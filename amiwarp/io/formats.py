@@ -605,9 +605,11 @@ class RecordedDataset:
     def __getitem__(self, index: int) -> Any:
         """Return an item: the value that ``transform`` returns, or its events or tensor, and its labels.
 
-        Raises IndexError after the last item, and :class:`AmiwarpError` if the file is missing or is not the one that
-        the manifest describes.
+        Raises IndexError after the last item, and :class:`AmiwarpError` if the index is no whole number, or if the file
+        is missing or is not the one that the manifest describes.
         """
+        if not hasattr(index, "__index__"):
+            raise AmiwarpError(f"the index of an item is {shown(index)}; give a whole number, one for each item")
         item = self._items[index]
         if item.representation is not None:
             arrays = io_function("plain_files:read_tensors")(self.folder / item.file)
