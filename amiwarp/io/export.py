@@ -26,6 +26,7 @@ from amiwarp.io.file_scan import RECORDS, FileEvents
 from amiwarp.io.files import NewFile, check_output, errors_name
 from amiwarp.io.formats import LIMITS, Bag, Codec, Outline, OutputFormat, Rounding, open_recording
 from amiwarp.io.native_writer import write_recording
+from amiwarp.io.plain_files import write_array
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import NominalPrism
 from amiwarp.tasks import Progress
@@ -524,21 +525,21 @@ def save_flow_mvsec(
     count = len(intervals) + 1
     with NewFile(path, overwrite=overwrite) as new, zipfile.ZipFile(new.part, "w", zipfile.ZIP_DEFLATED) as archive:
         seconds = np.asarray(frames.t, np.float64) * 1e-6
-        _write_array(archive, "timestamps", seconds.shape, seconds.dtype, iter([seconds]))
+        write_array(archive, "timestamps", seconds.shape, "<f8", [seconds.astype("<f8").tobytes()])
         height, width = frames[0].depth.shape
         for axis, name in enumerate(("x_flow_dist", "y_flow_dist")):
 
-            def maps(axis: int = axis) -> Iterator[NDArray[np.float32]]:
+            def maps(axis: int = axis) -> Iterator[bytes]:
                 for index in range(count):
                     moved, _ = _displacement(frames, index, with_prism=with_prism)
                     known = np.isfinite(moved).all(axis=2)
-                    yield np.where(known, moved[..., axis], 0.0).astype(np.float32)
+                    yield np.where(known, moved[..., axis], 0.0).astype("<f4").tobytes()
                     if progress is not None:
                         progress("writing flow", (axis + (index + 1) / count) / 2.0)
 
-            _write_array(archive, name, (count, height, width), np.dtype(np.float32), maps())
-        occlusion = (_displacement(frames, index, with_prism=with_prism)[1] for index in range(count))
-        _write_array(archive, "occlusion", (count, height, width), np.dtype(np.uint8), occlusion)
+            write_array(archive, name, (count, height, width), "<f4", maps())
+        found = (_displacement(frames, index, with_prism=with_prism)[1] for index in range(count))
+        write_array(archive, "occlusion", (count, height, width), "|u1", (part.tobytes() for part in found))
     return count
 
 
@@ -624,14 +625,3 @@ def encode_png16(picture: NDArray[np.uint16]) -> bytes:
 def _png_part(kind: bytes, data: bytes) -> bytes:
     """Return a chunk of a PNG file: length, kind, data and checksum."""
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-
-def _write_array(
-    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: np.dtype[Any], parts: Iterator[NDArray[Any]]
-) -> None:
-    """Write an array to a .npz archive part by part."""
-    with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-        header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
-        np.lib.format.write_array_header_1_0(file, header)
-        for part in parts:
-            file.write(np.ascontiguousarray(part, dtype).tobytes())

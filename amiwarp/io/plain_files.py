@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-import shutil
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -524,16 +523,22 @@ def write_npz(part: Path, blocks: Iterable[Events], about: Outline) -> None:
                     files[name].write(np.ascontiguousarray(getattr(events, name), dtype).data)
         with zipfile.ZipFile(part, "x") as archive:
             for name, dtype in columns.items():
-                with (
-                    archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member,
-                    (folder / name).open("rb") as column,
-                ):
-                    header = {"descr": dtype, "fortran_order": False, "shape": (count,)}
-                    npy.write_array_header_1_0(member, header)
-                    shutil.copyfileobj(column, member, 1 << 20)
+                with (folder / name).open("rb") as column:
+                    write_array(archive, name, (count,), dtype, iter(partial(column.read, 1 << 20), b""))
             for name in ("width", "height"):
-                with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w") as member:
-                    npy.write_array(member, np.array(getattr(about, name)))
+                write_array(archive, name, (), "<i8", [np.array([getattr(about, name)], "<i8").tobytes()])
+
+
+def write_array(
+    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: str, parts: Iterable[bytes]
+) -> None:
+    """Write an array to an archive part by part. Equal arrays give equal files."""
+    member = zipfile.ZipInfo(f"{name}.npy")
+    member.compress_type = archive.compression
+    with archive.open(member, "w", force_zip64=True) as file:
+        npy.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
+        for part in parts:
+            file.write(part)
 
 
 # Reader of the ``.bin`` files of N-MNIST and N-Caltech101: events of 5 bytes, without a header.
