@@ -361,6 +361,14 @@ def native(
     return path, summary
 
 
+@pytest.mark.parametrize("file", ["again.h5", "again.npz"])
+def test_compensated_recordings_are_not_compensated_again(
+    exact: Calibration, native: tuple[Path, CompensationSummary], tmp_path: Path, file: str
+) -> None:
+    with pytest.raises(AmiwarpError, match=r"^native: its events are already compensated; give those of the sensor"):
+        compensate(open_recording(native[0]), exact, tmp_path / file)
+
+
 @pytest.mark.parametrize("file", FORMATS)
 def test_other_formats_hold_what_the_native_one_holds(
     turn: Recording, exact: Calibration, native: tuple[Path, CompensationSummary], tmp_path: Path, file: str

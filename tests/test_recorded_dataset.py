@@ -51,6 +51,9 @@ def test_items_are_the_events_and_labels_of_a_split(folder: Path) -> None:
     assert dataset[-1][1] == {"k": 3}
     with pytest.raises(IndexError):
         dataset[4]
+    part: Any = slice(0, 1)
+    with pytest.raises(AmiwarpError, match=r"index of an item is slice\(0, 1, None\); give a whole number"):
+        dataset[part]
 
 
 def test_a_transform_makes_the_item(folder: Path) -> None:

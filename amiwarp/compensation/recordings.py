@@ -327,9 +327,9 @@ def compensate(
     Raises
     ------
     AmiwarpError
-        If the calibration is for another sensor size, the encoder does not cover the events, a depth map is given for
-        another optic than a plate or has another size, the format cannot hold the events, or the output cannot be
-        written, is the recording itself, or exists. No partial file remains.
+        If the calibration is for another sensor size, the events are already compensated or not covered by the encoder,
+        a depth map is given for another optic than a plate or has another size, the format cannot hold the events, or
+        the output cannot be written, is the recording itself, or exists. No partial file remains.
 
     Examples
     --------
@@ -356,6 +356,8 @@ def compensate(
     n = len(recording.events)
     encoder = recording.encoder
     if n:
+        if not recording.events[:1].whole_pixels:
+            raise AmiwarpError(f"{recording.name}: its events are already compensated; give those of the sensor")
         encoder = calibration.encoder_for(encoder, recording.events.t_first, recording.events.t_last)
     outside = done = dropped = 0
     metadata: dict[str, MetadataValue] = {**recording.metadata, "compensated_with": calibration.model_name}

@@ -179,9 +179,14 @@ def _is_evt(head: bytes) -> bool:
     return any(line.startswith((b"% evt ", b"% format EVT")) for line in lines)
 
 
+def holds_values(line: bytes) -> bool:
+    """Return whether a line of a text file is neither empty nor a comment."""
+    return line.lstrip()[:1] not in (b"", b"#")
+
+
 def _looks_like_text(head: bytes) -> bool:
     """Return whether the first line without a comment consists of two or four numbers."""
-    line = next((line for line in head.split(b"\n") if line.strip() and not line.lstrip().startswith(b"#")), b"")
+    line = next(filter(holds_values, head.split(b"\n")), b"")
     try:
         return len([float(word) for word in line.split()]) in (2, 4)
     except ValueError:
@@ -229,10 +234,15 @@ def open_recording(
     chosen = detect_format(path) if format is None else choice(Format, format, f"{path}: format")
     if format is not None and _folder_format(path) is not chosen:
         check_regular(path)
-    if topic is not None and chosen not in TOPICS:
-        raise AmiwarpError(f"{path}: holds one stream of events, no topics; leave the topic out")
+    check_topic(path, topic, chosen)
     recording: Recording = io_function(OPENERS[chosen])(path, *((topic,) if chosen in TOPICS else ()))
     return recording
+
+
+def check_topic(path: Path, topic: str | None, found: Format) -> None:
+    """Raise :class:`AmiwarpError` if a topic is given for a file of a format without topics."""
+    if topic is not None and found not in TOPICS:
+        raise AmiwarpError(f"{path}: holds one stream of events, no topics; leave the topic out")
 
 
 # Formats that are written.
@@ -595,9 +605,11 @@ class RecordedDataset:
     def __getitem__(self, index: int) -> Any:
         """Return an item: the value that ``transform`` returns, or its events or tensor, and its labels.
 
-        Raises IndexError after the last item, and :class:`AmiwarpError` if the file is missing or is not the one that
-        the manifest describes.
+        Raises IndexError after the last item, and :class:`AmiwarpError` if the index is no whole number, or if the file
+        is missing or is not the one that the manifest describes.
         """
+        if not hasattr(index, "__index__"):
+            raise AmiwarpError(f"the index of an item is {shown(index)}; give a whole number, one for each item")
         item = self._items[index]
         if item.representation is not None:
             arrays = io_function("plain_files:read_tensors")(self.folder / item.file)

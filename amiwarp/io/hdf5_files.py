@@ -36,6 +36,7 @@ from amiwarp.optics.camera import (
     CAMERA_NUMBERS,
     COEFFICIENTS,
     DISTORTIONS,
+    LARGEST_SIZE,
     Camera,
     Distortion,
     camera_to_json,
@@ -925,7 +926,9 @@ class NativeEvents(EventSource):
         for start in range(0, min(self._count, head_limit() or self._count), DEFAULT_BLOCK):
             for axis, name in enumerate(("x", "y")):
                 values = self._read(name, start, min(start + DEFAULT_BLOCK, self._count))
-                largest[axis] = max(largest[axis], int(values.max()))
+                if values.dtype.kind == "f":  # compensated events may lie far outside, or have no coordinates
+                    values = np.rint(values[(values >= 0) & (values < LARGEST_SIZE)])
+                largest[axis] = max(largest[axis], int(values.max(initial=0)))
         width, height = smallest_sensor(largest[0], largest[1])
         return max(width, DSEC_SIZE[0]), max(height, DSEC_SIZE[1])
 

@@ -567,7 +567,8 @@ def is_dataset(found: Any) -> bool:
 def _check_rows(dataset: Any, name: str, path: str) -> None:
     """Check that a dataset holds rows of events, and that all of it is in the file."""
     if not is_dataset(dataset):
-        raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
+        why = "only Prophesee's files hold triggers" if name.startswith("EXT_TRIGGER") else "the file is incomplete"
+        raise AmiwarpError(f"no dataset '{name}'; {why}")
     wanted = ("p", "t", "id") if name.startswith("EXT_TRIGGER") else ("x", "y", "p", "t")
     fields = dataset.dtype.fields
     if dataset.ndim == 1 and fields is not None:
