@@ -235,6 +235,50 @@ def test_a_writer_refuses_truth_that_does_not_fit(tmp_path: Path, recording: ami
     assert [path.name for path in tmp_path.iterdir()] == ["good.h5"]
 
 
+def test_refused_truth_leaves_a_file_that_can_be_read(tmp_path: Path, recording: amiwarp.Recording) -> None:
+    """All datasets of a kind of records keep the same length."""
+    frame, later = frames_of(recording)[:2]
+    endless = np.full_like(frame.intensity, np.inf)
+    pose, joint = np.tile([0.0, 0, 0, 0, 0, 0, 1], (1, 1)), np.zeros((1, 3))
+    assert frame.joints
+
+    def poses(t: int, *bodies: str, joints: tuple[str, ...] = ("hand",), camera: Any = pose) -> amiwarp.Poses:
+        return amiwarp.Poses(np.array([t]), camera, dict.fromkeys(bodies, pose), dict.fromkeys(joints, joint))
+
+    path = tmp_path / "a.h5"
+    with amiwarp.RecordingWriter(path, width=SIZE[0], height=SIZE[1], truth_parameters={}) as writer:
+        with pytest.raises(AmiwarpError, match="'truth/frames/intensity' holds inf"):
+            writer.append_frame(dataclasses.replace(frame, joints={"other": np.zeros(3)}, intensity=endless))
+        writer.append_frame(frame)
+        for change, message in (
+            ({"intensity": endless}, "'truth/frames/intensity' holds inf"),
+            ({"joints": {"other": np.zeros(3)}}, r"truth/joints/names comes with \('other',\), before with \("),
+            ({"joints": {}}, "truth/frames/t comes with"),
+        ):
+            with pytest.raises(AmiwarpError, match=message):
+                writer.append_frame(dataclasses.replace(later, **change))  # type: ignore[arg-type]
+        writer.append_frame(later)
+    assert len(frames_of(amiwarp.open_recording(path)).t) == 2
+    with amiwarp.RecordingWriter(path, width=4, height=4, truth_parameters={}, overwrite=True) as writer:
+        writer.append_poses(poses(0, "ball"))
+        for refused, message in (
+            (
+                poses(1, "car"),
+                r"truth/poses/body_names comes with \('car',\), before with \('ball',\); append the same",
+            ),
+            (poses(1), "truth/poses/t comes with"),
+            (poses(1, "ball", joints=()), "truth/poses/t comes with"),
+            (poses(1, "ball", camera=pose * np.nan), "'truth/poses/camera' holds nan"),
+            (poses(0, "ball"), "does not follow 0 us"),
+        ):
+            with pytest.raises(AmiwarpError, match=message):
+                writer.append_poses(refused)
+        writer.append_poses(poses(1, "ball"))
+    found = truth_of(amiwarp.open_recording(path)).poses
+    assert found is not None
+    same_poses(found[:], amiwarp.Poses.concatenate([poses(0, "ball"), poses(1, "ball")]))
+
+
 def test_the_file_is_read_with_h5py_as_the_page_shows(stored: Path, tmp_path: Path) -> None:
     page = (ROOT / "docs" / "reference" / "recording-format.md").read_text()
     (program,) = (

@@ -124,17 +124,30 @@ ROWS = 1024
 
 
 class RecordWriter:
-    """Writer of all but the events into an open HDF5 file: ground truth, IMU samples and frames.
+    """Writer of an open HDF5 file through HDF5: ground truth, IMU samples, frames, and other small datasets.
 
     Datasets are created at their first rows. All instants must have the same joints. All tables of poses must have the
-    same bodies and joints.
+    same bodies and joints. Records that are refused leave the file as it was.
     """
 
     def __init__(self, file: Any, path: Path, size: tuple[int, int], codec: Codec) -> None:
         """Set up the writer; ``size`` is the width and height of the sensor [px]."""
         self._file, self._path, self._size, self._codec = file, path, size, codec
         self._datasets: dict[str, Any] = {}
-        self._names: dict[str, tuple[str, ...]] = {}
+        self._given: dict[str, tuple[str, ...]] = {}  # names that all calls must give: of datasets, bodies and joints
+
+    def dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = (), chunk_rows: int = CHUNK) -> Any:
+        """Return a dataset, which is created at the first call."""
+        if name not in self._datasets:
+            self._datasets[name] = hdf5_files.make_dataset(self._file, name, dtype, row, chunk_rows, self._codec)
+        return self._datasets[name]
+
+    def extend(self, name: str, values: NDArray[Any], chunk_rows: int = CHUNK) -> None:
+        """Append rows to a dataset."""
+        dataset = self.dataset(name, values.dtype, values.shape[1:], chunk_rows)
+        start = dataset.shape[0]
+        dataset.resize(start + len(values), axis=0)
+        dataset[start:] = values
 
     def write_truth_header(self, parameters: Mapping[str, float] | None, labels: WorldLabels | None) -> None:
         """Write the true parameters of a simulation, and the names of a world's instances and their classes."""
@@ -151,71 +164,44 @@ class RecordWriter:
     def append_frame(self, frame: FrameTruth) -> None:
         """Append the ground truth of an instant, which must be later than the previous instants."""
         width, height = self._size
-        rows: dict[str, NDArray[Any]] = {}
+        maps: Columns = {}
         for name, (dtype, tail) in ground_truth.MAPS.items():
-            rows[name] = np.asarray(getattr(frame, name), dtype)
-            if rows[name].shape != (height, width, *tail):
+            values = np.asarray(getattr(frame, name), dtype)
+            if values.shape != (height, width, *tail):
                 raise AmiwarpError(
-                    f"{self._path}: {name} of the instant {frame.t_us} us has shape {rows[name].shape}; "
+                    f"{self._path}: {name} of the instant {frame.t_us} us has shape {values.shape}; "
                     f"expected {(height, width, *tail)}"
                 )
-        self._check_later("truth/frames/t", frame.t_us)
-        self._append("truth/frames/t", np.array([frame.t_us], np.int64), ROWS)
-        self._append("truth/frames/pose", ground_truth.as_poses(frame.rotation, frame.position)[None], ROWS)
-        self._append_joints("truth/frames/joints", {name: at[None] for name, at in frame.joints.items()})
-        for name, values in rows.items():
-            self._append(f"truth/frames/{name}", values[None], 1)
+            maps[f"truth/frames/{name}"] = values[None]
+        pose = ground_truth.as_poses(frame.rotation, frame.position)[None]
+        rows = {"truth/frames/t": np.array([frame.t_us], np.int64), "truth/frames/pose": pose}
+        joints = {name: at[None] for name, at in frame.joints.items()}
+        self._append(rows, maps, {"truth/joints/names": ("truth/frames/joints", joints)})
 
     def append_poses(self, poses: Poses) -> None:
         """Append a table of poses, which must be later than the previous poses."""
-        if not len(poses):
-            return
-        self._check_later("truth/poses/t", int(poses.t[0]))
-        self._append("truth/poses/t", np.asarray(poses.t, np.int64), ROWS)
-        self._append("truth/poses/camera", np.asarray(poses.camera, np.float64), ROWS)
-        self._append_joints("truth/joints/position", poses.joints)
-        if poses.bodies:
-            self._keep_names("truth/poses/body_names", poses.bodies)
-            self._append("truth/poses/bodies", np.stack(list(poses.bodies.values()), axis=1), ROWS)
+        rows = {
+            "truth/poses/t": np.asarray(poses.t, np.int64),
+            "truth/poses/camera": np.asarray(poses.camera, np.float64),
+        }
+        named = {
+            "truth/joints/names": ("truth/joints/position", poses.joints),
+            "truth/poses/body_names": ("truth/poses/bodies", poses.bodies),
+        }
+        if len(poses):
+            self._append(rows, named=named)
 
     def append_known(self, t_us: int, mask: NDArray[np.bool_]) -> None:
         """Append a mask of known pixels, which holds from a time later than those before."""
         width, height = self._size
         if mask.shape != (height, width):
             raise AmiwarpError(f"{self._path}: mask at {t_us} us has shape {mask.shape}; expected {(height, width)}")
-        self._check_later("truth/known/t", t_us)
-        self._append("truth/known/t", np.array([t_us], np.int64), ROWS)
-        self._append("truth/known/mask", np.asarray(mask, np.uint8)[None], 1)
-
-    def _append_joints(self, name: str, joints: Mapping[str, NDArray[np.float64]]) -> None:
-        """Append the positions of joints [m], shape (k, 3) each, to the dataset ``name``."""
-        if joints:
-            self._keep_names("truth/joints/names", joints)
-            self._append(name, np.stack(list(joints.values()), axis=1).astype(np.float64), ROWS)
-
-    def _keep_names(self, name: str, given: Iterable[str]) -> None:
-        """Write the names at the first call, and check that later calls give the same names."""
-        names = tuple(given)
-        if name not in self._names:
-            self._names[name] = names
-            self._write_names(name, names)
-        elif self._names[name] != names:
-            raise AmiwarpError(f"{self._path}: {name} changed between calls; give the same names in the same order")
-
-    def _write_names(self, name: str, names: tuple[str, ...]) -> None:
-        """Write names to a dataset of UTF-8 strings."""
-        import h5py
-
-        encoded = [text.encode("utf-8", "replace") for text in names]
-        kind = h5py.string_dtype("utf-8", max([1, *(len(text) for text in encoded)]))
-        self._file.create_dataset(name, data=np.array(encoded, kind))
+        rows = {"truth/known/t": np.array([t_us], np.int64)}
+        self._append(rows, {"truth/known/mask": np.asarray(mask, np.uint8)[None]})
 
     def append_imu(self, samples: ImuSamples) -> None:
         """Append samples, which must not be earlier than those before."""
-        if len(samples):
-            self._check_later("imu/t", int(samples.t[0]), equal=True)
-        for name in ("t", "angular_velocity", "acceleration"):
-            self._append(f"imu/{name}", getattr(samples, name), ROWS)
+        self._append({f"imu/{name}": getattr(samples, name) for name in ("t", "angular_velocity", "acceleration")})
 
     def append_image(self, t_us: int, image: NDArray[Any]) -> None:
         """Append a frame, which must not be earlier than the frame before."""
@@ -225,36 +211,63 @@ class RecordWriter:
             checks.check_image(image, shape, dtype)
         except AmiwarpError as error:
             raise AmiwarpError(f"{self._path}: {error}") from error
-        self._check_later("frames/t", t_us, equal=True)
-        self._append("frames/t", np.array([t_us], np.int64), ROWS)
-        self._append("frames/image", image[None], 1)
+        self._append({"frames/t": np.array([t_us], np.int64)}, {"frames/image": image[None]})
 
-    def _append(self, name: str, values: NDArray[Any], chunk_rows: int) -> None:
-        """Append rows to a dataset, which is created at the first call with ``chunk_rows`` rows per chunk."""
-        if name.startswith("truth/"):
-            ground_truth.check_truth(name, values)
-        if name not in self._datasets:
-            self._datasets[name] = hdf5_files.make_dataset(
-                self._file, name, values.dtype, values.shape[1:], chunk_rows, self._codec
-            )
-        dataset = self._datasets[name]
-        if dataset.shape[1:] != values.shape[1:]:
-            raise AmiwarpError(
-                f"{self._path}: rows of {name} have shape {values.shape[1:]}; expected {dataset.shape[1:]}"
-            )
-        start = dataset.shape[0]
-        dataset.resize(start + len(values), axis=0)
-        dataset[start:] = values
+    def _append(
+        self,
+        rows: Columns,
+        images: Columns | None = None,
+        named: Mapping[str, tuple[str, Mapping[str, NDArray[np.float64]]]] | None = None,
+    ) -> None:
+        """Append records to their datasets, of which the first holds the times [us].
 
-    def _check_later(self, name: str, t: int, *, equal: bool = False) -> None:
-        """Raise :class:`AmiwarpError` if the time ``t`` [us] does not follow the last time in a dataset.
+        ``images`` are stored in chunks of one row. ``named`` are arrays by name, which are stored side by side in a
+        dataset, if there are any: by the dataset of the names, that of the values and the arrays.
+        """
+        times, *_ = rows
+        names: dict[str, tuple[str, ...]] = {}
+        for where, (name, arrays) in (named or {}).items():
+            if arrays:
+                names[where] = tuple(arrays)
+                rows[name] = np.stack(list(arrays.values()), axis=1).astype(np.float64)
+        columns = rows | (images or {})
+        self._check_later(times, rows[times])
+        given = {times: tuple(columns), **names}
+        for where, found in given.items():
+            before = self._given.get(where, found)
+            if found != before:
+                change = f"{where} comes with {shown(found)}, before with {shown(before)}"
+                raise AmiwarpError(f"{self._path}: {change}; append the same in each call")
+        for name, values in columns.items():
+            if name.startswith("truth/"):
+                ground_truth.check_truth(name, values)
+            row = self._datasets[name].shape[1:] if name in self._datasets else values.shape[1:]
+            if values.shape[1:] != row:
+                raise AmiwarpError(f"{self._path}: rows of {name} have shape {values.shape[1:]}; expected {row}")
+        for where, found in names.items():
+            if where not in self._given:
+                self._write_names(where, found)
+        self._given |= given
+        for name, values in columns.items():
+            self.extend(name, values, ROWS if name in rows else 1)
 
-        ``equal``: whether the same time is allowed too.
+    def _write_names(self, name: str, names: tuple[str, ...]) -> None:
+        """Write names to a dataset of UTF-8 strings."""
+        import h5py
+
+        encoded = [text.encode("utf-8", "replace") for text in names]
+        kind = h5py.string_dtype("utf-8", max([1, *(len(text) for text in encoded)]))
+        self._file.create_dataset(name, data=np.array(encoded, kind))
+
+    def _check_later(self, name: str, t: NDArray[np.int64]) -> None:
+        """Raise :class:`AmiwarpError` if times [us] do not follow the last time in a dataset.
+
+        Only times of the ground truth must be later.
         """
         stored = self._datasets.get(name)
-        if stored is not None and len(stored) and (t < int(stored[-1]) or (t == int(stored[-1]) and not equal)):
+        if stored is not None and len(stored) and len(t) and t[0] < int(stored[-1]) + name.startswith("truth/"):
             raise AmiwarpError(
-                f"{self._path}: {name} {t} us does not follow {int(stored[-1])} us; append in order of time"
+                f"{self._path}: {name} {t[0]} us does not follow {int(stored[-1])} us; append in order of time"
             )
 
 
@@ -334,7 +347,6 @@ class RecordingWriter:
         self._chunks: Any = None
         self._records: RecordWriter | None = None
         self._file: Any = None
-        self._datasets: dict[str, Any] = {}
         self._turns = itertools.count()
         self._new: NewFile | None = None
         self._pending: list[Columns] = []
@@ -612,7 +624,7 @@ class RecordingWriter:
 
     def _write_index(self, least: int) -> None:
         if self._ms_count >= least:
-            self._extend("ms_to_idx", np.concatenate(self._ms))
+            self._open_records().extend("ms_to_idx", np.concatenate(self._ms))
             self._ms, self._ms_count = [], 0
 
     def _flush(self, whole: int) -> None:
@@ -638,26 +650,15 @@ class RecordingWriter:
             self._chunks.write(turn, chunks, self._dataset_of)
 
     def _dataset_of(self, chunk: EncodedChunk) -> Any:
-        return self._dataset(chunk.name, chunk.values.dtype, chunk.values.shape[1:])
-
-    def _extend(self, name: str, values: NDArray[Any]) -> None:
-        """Append values to a small dataset through HDF5."""
-        dataset = self._dataset(name, values.dtype)
-        start = dataset.shape[0]
-        dataset.resize(start + values.size, axis=0)
-        dataset[start:] = values
-
-    def _dataset(self, name: str, dtype: np.dtype[Any], row: tuple[int, ...] = ()) -> Any:
-        if name not in self._datasets:
-            self._datasets[name] = hdf5_files.make_dataset(self._file, name, dtype, row, codec=self._codec)
-        return self._datasets[name]
+        return self._open_records().dataset(chunk.name, chunk.values.dtype, chunk.values.shape[1:])
 
     def _finish(self) -> None:
+        extend = self._open_records().extend
         self._flush(whole=self._pending_count)
         self._ms.append(np.array([len(self)], np.int64))
         self._write_index(0)
         for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.uint8)):
-            self._extend(f"events/{name}", np.zeros(0, (self._columns or {}).get(f"events/{name}", np.dtype(dtype))))
+            extend(f"events/{name}", np.zeros(0, (self._columns or {}).get(f"events/{name}", np.dtype(dtype))))
         self._file["t_offset"] = np.int64(self._t_offset)
         if self._encoder is not None:
             group = self._file.create_group("encoder")
@@ -665,10 +666,10 @@ class RecordingWriter:
             for name in ("t", "angle", "index_t"):
                 values = getattr(self._encoder, name)
                 if values is not None:
-                    self._extend(f"encoder/{name}", values)
+                    extend(f"encoder/{name}", values)
             if self._encoder.second is not None:
                 for name in ("t", "angle"):
-                    self._extend(f"encoder/second_{name}", getattr(self._encoder.second, name))
+                    extend(f"encoder/second_{name}", getattr(self._encoder.second, name))
 
     def _close(self) -> None:
         if self._chunks is not None:
