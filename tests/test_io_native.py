@@ -281,8 +281,18 @@ def test_writer_refuses_its_path(tmp_path):
         write(tmp_path / "folder.h5", make(10))
     with pytest.raises(AmiwarpError, match="does not exist"):
         write(tmp_path / "no" / "a.h5", make(10))
-    with pytest.raises(AmiwarpError, match="outside the writer's 'with' block"):
-        RecordingWriter(tmp_path / "b.h5", width=1, height=1).append(make(1))
+    closed = RecordingWriter(tmp_path / "c.h5", width=SIZE[0], height=SIZE[1])
+    with closed:
+        closed.append(make(1))
+    for writer in (RecordingWriter(tmp_path / "b.h5", width=SIZE[0], height=SIZE[1]), closed):
+        for use in (
+            lambda w: w.append(make(1)),
+            lambda w: w.fill([], count=CHUNK, t_first=0, done=lambda *_: None),
+            lambda w: w.append_image(0, np.zeros((2, 3), np.uint8)),
+        ):
+            with pytest.raises(AmiwarpError, match="outside its 'with' block, before or after it"):
+                use(writer)
+    assert len(closed) == len(open_recording(tmp_path / "c.h5").events) == 1
     del recording
     with pytest.raises(AmiwarpError, match=r"a\.h5: exists; .*overwrite=True"):
         write(path, make(20))

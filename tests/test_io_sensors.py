@@ -114,7 +114,7 @@ def test_wrong_arrays_are_refused(tmp_path: Path) -> None:
         writer.append_imu(make_imu(4))
         with pytest.raises(AmiwarpError, match="imu/t 1000000 us does not follow 1001000 us"):
             writer.append_imu(make_imu(4))
-    with pytest.raises(AmiwarpError, match="append outside the writer's with block"):
+    with pytest.raises(AmiwarpError, match="outside its 'with' block"):
         RecordingWriter(tmp_path / "b.h5", width=4, height=4).append_imu(make_imu(4))
 
 

@@ -346,7 +346,6 @@ class RecordingWriter:
         self._metadata = dict(metadata or {})
         self._chunks: Any = None
         self._records: RecordWriter | None = None
-        self._file: Any = None
         self._turns = itertools.count()
         self._new: NewFile | None = None
         self._pending: list[Columns] = []
@@ -364,9 +363,8 @@ class RecordingWriter:
         try:
             with errors_name(self.path, lambda: "making the file"):
                 self._chunks = ChunkFile(self._new.part)
-                self._file = self._chunks.hdf5
-                self._records = RecordWriter(self._file, self.path, self._size, self._codec)
-                write_header(self._file, self._size, self._camera, self._prism, self._metadata)
+                self._records = RecordWriter(self._chunks.hdf5, self.path, self._size, self._codec)
+                write_header(self._chunks.hdf5, self._size, self._camera, self._prism, self._metadata)
                 self._records.write_truth_header(self._truth_parameters, self._truth_labels)
         except BaseException:
             self._discard()
@@ -417,8 +415,7 @@ class RecordingWriter:
         AmiwarpError
             If events are unsorted or outside the frame, or the arrays differ from those of the first call.
         """
-        if self._file is None:
-            raise AmiwarpError(f"{self.path}: append() was called outside the writer's 'with' block; call it inside")
+        self._open_records()
         self._check(events, len(self), allow_nan=inside is not None, after_t=self._t_last)
         if not len(events):
             return
@@ -459,9 +456,10 @@ class RecordingWriter:
         AmiwarpError
             If other events were written before, or events are unsorted or outside the frame.
         """
-        if self._file is None or len(self) or count % CHUNK:
-            given = "fill() was called outside the writer's 'with' block, after append(), or for parts of chunks"
-            raise AmiwarpError(f"{self.path}: {given}; call it inside the block, before other events")
+        self._open_records()
+        if len(self) or count % CHUNK:
+            given = f"fill() was called after {len(self)} events, for pieces of {count}"
+            raise AmiwarpError(f"{self.path}: {given}; call it before append(), for a multiple of {CHUNK}")
         self._t_offset = t_first
         jobs = (partial(self._write_piece, piece, k * count, next(self._turns)) for k, piece in enumerate(pieces))
         with contextlib.closing(in_order(jobs)) as written:
@@ -576,12 +574,12 @@ class RecordingWriter:
         """Name the file and the place in errors, and raise the error of a full disk."""
         with errors_name(self.path, place):
             yield
-            if self._chunks is not None:
-                self._chunks.check()
+            self._chunks.check()
 
     def _open_records(self) -> RecordWriter:
         if self._records is None:
-            raise AmiwarpError(f"{self.path}: append outside the writer's with block; call it inside")
+            given = "the writer is used outside its 'with' block, before or after it"
+            raise AmiwarpError(f"{self.path}: {given}; append inside the block of a new writer")
         return self._records
 
     def set_encoder(self, encoder: Encoder) -> None:
@@ -659,9 +657,9 @@ class RecordingWriter:
         self._write_index(0)
         for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.uint8)):
             extend(f"events/{name}", np.zeros(0, (self._columns or {}).get(f"events/{name}", np.dtype(dtype))))
-        self._file["t_offset"] = np.int64(self._t_offset)
+        self._chunks.hdf5["t_offset"] = np.int64(self._t_offset)
         if self._encoder is not None:
-            group = self._file.create_group("encoder")
+            group = self._chunks.hdf5.create_group("encoder")
             group.attrs["clock_offset_us"] = float(self._encoder.clock_offset_us)
             for name in ("t", "angle", "index_t"):
                 values = getattr(self._encoder, name)
@@ -672,6 +670,7 @@ class RecordingWriter:
                     extend(f"encoder/second_{name}", getattr(self._encoder.second, name))
 
     def _close(self) -> None:
+        self._records = None
         if self._chunks is not None:
             self._chunks.close()
 
