@@ -238,6 +238,30 @@ def test_failure_leaves_nothing(tmp_path, append, message):
     assert_nothing_left(tmp_path)
 
 
+def test_arrays_may_be_used_again_after_append(tmp_path):
+    """Some appends end within a chunk, others fill one or several."""
+    events, points = make(4 * CHUNK), np.random.default_rng(1).random((4 * CHUNK, 2), np.float32)
+    with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        for start, stop in itertools.pairwise([0, 9, 20, CHUNK + 5, 3 * CHUNK, 3 * CHUNK + 7, 4 * CHUNK]):
+            given = Events(*(getattr(events, name)[start:stop].copy() for name in "xytp"))
+            xy = points[start:stop].copy()
+            writer.append(given, truth_points=xy)
+            for array in (given.x, given.y, given.t, given.p, xy):
+                array[:] = 0
+    recording = open_recording(tmp_path / "a.h5")
+    assert_equal(recording.events[:], events)
+    np.testing.assert_array_equal(recording.truth.points(0, 4 * CHUNK), points, strict=True)
+
+
+def test_recording_goes_on_after_refused_events(tmp_path):
+    with RecordingWriter(tmp_path / "a.h5", width=SIZE[0], height=SIZE[1]) as writer:
+        damaged = Events.from_arrays([1, 1], [1, 1], [7, 2**61], [0, 1])
+        with pytest.raises(AmiwarpError, match="timestamp is damaged"):
+            writer.append(damaged, inside=[1, 1])
+        writer.append(make(10, start=0))
+    assert_equal(open_recording(tmp_path / "a.h5").events[:], make(10, start=0))
+
+
 def test_failure_keeps_the_file_that_was_there(tmp_path):
     path = write(tmp_path / "a.h5", make(10))
     before = path.read_bytes()

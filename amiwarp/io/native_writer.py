@@ -71,6 +71,18 @@ def ms_entries(t: NDArray[np.int64], t_offset: int, first_ms: int, before: int) 
         yield np.searchsorted(t, ms * 1000 + t_offset) + before
 
 
+def filled(chunk: Columns, start: int, columns: Columns) -> Columns:
+    """Return a chunk with a copy of columns from element ``start`` on; a new chunk if this is its first element.
+
+    Callers may change their arrays before the chunk is written.
+    """
+    if not start:
+        chunk = {name: np.empty((CHUNK, *column.shape[1:]), column.dtype) for name, column in columns.items()}
+    for name, column in columns.items():
+        chunk[name][start : start + len(column)] = column
+    return chunk
+
+
 def describe_columns(columns: Mapping[str, np.dtype[Any]]) -> str:
     """Return names and data types of columns as text for messages."""
     return ", ".join(f"{name} {dtype}" for name, dtype in columns.items())
@@ -348,9 +360,9 @@ class RecordingWriter:
         self._records: RecordWriter | None = None
         self._turns = itertools.count()
         self._new: NewFile | None = None
-        self._pending: list[Columns] = []
+        self._pending: Columns = {}
         self._written = self._pending_count = 0
-        self._columns: dict[str, np.dtype[Any]] | None = None
+        self._columns: dict[str, np.dtype[Any]] = {}
         self._t_offset = self._next_ms = self._ms_count = 0
         self._t_last: int | None = None
         self._ms: list[NDArray[np.int64]] = []
@@ -424,9 +436,7 @@ class RecordingWriter:
             columns = self._as_columns(events, known, {"inside": inside, "extrapolated": extrapolated})
             self._index(events.t, len(self))
             columns["events/t"] = events.t - self._t_offset
-            self._pending.append(columns)
-            self._pending_count += len(events)
-            self._flush(whole=self._pending_count - self._pending_count % CHUNK)
+            self._store(columns, len(events))
 
     def fill(
         self,
@@ -600,7 +610,7 @@ class RecordingWriter:
         columns |= event_columns(truth, len(events))
         check_lengths(columns, len(events))
         dtypes = {name: column.dtype for name, column in columns.items()}
-        if self._columns is None:
+        if not len(self):
             self._columns = dtypes
             self._t_offset = int(events.t[0])
         elif dtypes != self._columns:
@@ -625,21 +635,31 @@ class RecordingWriter:
             self._open_records().extend("ms_to_idx", np.concatenate(self._ms))
             self._ms, self._ms_count = [], 0
 
-    def _flush(self, whole: int) -> None:
-        """Write the first ``whole`` pending events. Each chunk is compressed once."""
-        if not whole:
-            return
-        joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
+    def _store(self, columns: Columns, count: int) -> None:
+        """Write the chunks that are full with new events, and keep the other events."""
+        full: list[Columns] = []
+        start = 0
+        while start < count:
+            stop = min(start + CHUNK - self._pending_count, count)
+            part = {name: column[start:stop] for name, column in columns.items()}
+            if stop - start < CHUNK:
+                part = self._pending = filled(self._pending, self._pending_count, part)
+            self._pending_count = (self._pending_count + stop - start) % CHUNK
+            full += [] if self._pending_count else [part]
+            start = stop
+        if full:
+            self._write(full)
+
+    def _write(self, chunks: Sequence[Columns]) -> None:
+        """Write chunks of events, of which only the last of a recording is not full. Each is compressed once."""
         jobs = (
-            partial(self._write_chunk, name, self._written + at, column[at : min(at + CHUNK, whole)], next(self._turns))
-            for name, column in joined.items()
-            for at in range(0, whole, CHUNK)
+            partial(self._write_chunk, name, self._written + k * CHUNK, chunk[name], next(self._turns))
+            for name in chunks[0]
+            for k, chunk in enumerate(chunks)
         )
         with contextlib.closing(in_order(jobs)) as written:
             deque(written, maxlen=0)
-        self._written += whole
-        self._pending_count -= whole
-        self._pending = [{name: column[whole:] for name, column in joined.items()}] if self._pending_count else []
+        self._written += sum(len(chunk["events/t"]) for chunk in chunks)
 
     def _write_chunk(self, name: str, start: int, values: NDArray[Any], turn: int) -> None:
         """Encode and write the values of a chunk that begins at element ``start``. Runs in a thread."""
@@ -652,11 +672,13 @@ class RecordingWriter:
 
     def _finish(self) -> None:
         extend = self._open_records().extend
-        self._flush(whole=self._pending_count)
+        if self._pending_count:
+            self._write([{name: column[: self._pending_count] for name, column in self._pending.items()}])
+            self._pending_count = 0
         self._ms.append(np.array([len(self)], np.int64))
         self._write_index(0)
         for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.uint8)):
-            extend(f"events/{name}", np.zeros(0, (self._columns or {}).get(f"events/{name}", np.dtype(dtype))))
+            extend(f"events/{name}", np.zeros(0, self._columns.get(f"events/{name}", np.dtype(dtype))))
         self._chunks.hdf5["t_offset"] = np.int64(self._t_offset)
         if self._encoder is not None:
             group = self._chunks.hdf5.create_group("encoder")
@@ -871,7 +893,7 @@ class LiveWriter:
         self._file: Any = None
         self._columns: dict[str, Any] = {}
         self._small: dict[str, _GrowingDataset] = {}
-        self._pending: list[Columns] = []
+        self._pending: Columns = {}
         self._pending_count = 0
         self._written = 0  # number of events in full chunks
         self._stored = 0  # number of events in the file, including those of the last, partial chunk
@@ -976,7 +998,8 @@ class LiveWriter:
         for entries in ms_entries(t, self._t_offset, self._next_ms, len(self)):
             self._small["ms_to_idx"].add(entries)
             self._next_ms += entries.size
-        self._pending.append({**columns, "events/t": t - self._t_offset})
+        new = {**columns, "events/t": t - self._t_offset}
+        self._pending = filled(self._pending, self._pending_count, new)
         self._pending_count += t.size
         self._t_last = int(t[-1])
         if self._pending_count == CHUNK:
@@ -994,7 +1017,7 @@ class LiveWriter:
         self._check_open("append_encoder")
         name = self._names[second]
         offset = round(self._clock_offset_us)
-        t, angles = np.atleast_1d(as_times(t_us)) + offset, np.atleast_1d(np.asarray(angle, np.float64))
+        t, angles = np.atleast_1d(as_times(t_us)) + offset, np.atleast_1d(np.array(angle, np.float64))
         if t.shape != angles.shape or t.ndim != 1 or not np.isfinite(angles).all():
             shapes = f"t {t.shape}, angle {angles.shape}"
             raise AmiwarpError(
@@ -1090,17 +1113,14 @@ class LiveWriter:
     def _write(self) -> None:
         """Write the pending events of the current chunk. Start a new chunk if the chunk is full."""
         count = self._pending_count
-        joined = {name: np.concatenate([part[name] for part in self._pending]) for name in self._pending[0]}
         with contextlib.closing(
-            in_order(partial(hdf5_files.encode, column[:count]) for column in joined.values())
+            in_order(partial(hdf5_files.encode, column[:count]) for column in self._pending.values())
         ) as encoded:
-            for name, stored in zip(joined, encoded, strict=True):
+            for name, stored in zip(self._pending, encoded, strict=True):
                 hdf5_files.append_chunk(self._columns[name], self._written, stored, count)
-        # One statement, so that Ctrl-C cannot interrupt it halfway.
-        if count == CHUNK:
-            self._written, self._pending, self._pending_count = self._written + count, [], 0
-        self._pending = [joined] if self._pending_count else []
-        self._stored = len(self)
+        self._stored = self._written + count
+        if count == CHUNK:  # one statement, so that Ctrl-C cannot interrupt it halfway
+            self._written, self._pending_count = self._stored, 0
 
     def _flush(self) -> None:
         if self._stored < len(self):
