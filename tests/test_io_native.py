@@ -365,6 +365,17 @@ def test_damaged_files_name_the_place(tmp_path, edit, message):
     assert "a.h5" in str(caught.value)
 
 
+def test_blocks_are_in_order_across_chunks(tmp_path):
+    write(tmp_path / "a.h5", make(2 * CHUNK, mean_us=0))
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        del file["events/t"]
+        file["events/t"] = np.repeat([1, 0], CHUNK)
+    events = open_recording(tmp_path / "a.h5").events
+    for options in ({}, {"count": 1000}, {"duration_us": 10}):
+        with pytest.raises(AmiwarpError, match=rf"a\.h5: event {CHUNK} .* earlier than the one before"):
+            list(events.blocks(**options))
+
+
 def test_index_that_disagrees_is_noticed(tmp_path):
     path = write(tmp_path / "a.h5", make(5000))
     with h5py.File(path, "r+") as file:

@@ -1022,8 +1022,13 @@ class NativeEvents(EventSource):
         return {f"events/{n}": c for n, c in chunks.items() if c is not None and self._columns[n].dtype == dtypes[n]}
 
     def _pieces_in_order(self) -> Iterator[Events]:
+        start, last = 0, None
         with contextlib.closing(in_order(self.pieces(CHUNK))) as pieces:
-            yield from pieces
+            for piece in pieces:  # whose own order is checked
+                checks.check_events(piece[:1], *self._size, where=str(self.path), first_index=start, allow_nan=True,
+                                    after_t=last)  # fmt: skip
+                start, last = start + len(piece), int(piece.t[-1])
+                yield piece
 
     def _times(self, start: int, stop: int) -> NDArray[np.int64]:
         return self._since_zero(rounded_times(self._read("t", start, stop)))
