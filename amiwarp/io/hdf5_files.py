@@ -336,7 +336,7 @@ class ChunkFile:
         self._columns: dict[str, ChunkedColumn] = {}
         self._turns = threading.Condition()
         self._turn = 0
-        self._stopped = False
+        self._failed = math.inf  # the lowest turn whose work failed
         with contextlib.ExitStack() as undo:
             with interrupts_later():
                 self.output = _Output(path)
@@ -352,24 +352,27 @@ class ChunkFile:
         """Wait until all lower numbers, from 0 on, had their turn, and keep out other turns.
 
         Chunks get their places in turn, so the bytes of a file do not depend on the speed of the threads. Raises
-        :class:`AmiwarpError` if another thread failed.
+        :class:`AmiwarpError` if the work of a lower turn failed.
         """
         with self._turns:
-            self._turns.wait_for(lambda: self._turn == number or self._stopped)
-            if self._stopped:
-                raise AmiwarpError("another thread could not write its part")
+            self._turns.wait_for(lambda: self._turn == number or self._failed < number)
+            if self._failed < number:
+                raise AmiwarpError("an earlier part could not be written")
             yield
             self._turn += 1
             self._turns.notify_all()
 
     @contextlib.contextmanager
-    def stopping(self) -> Iterator[None]:
-        """If the work of a thread in the ``with`` block fails, end the waiting of the others."""
+    def stopping(self, turn: int) -> Iterator[None]:
+        """If the work for a turn in the ``with`` block fails, end the waiting of all later turns.
+
+        Earlier ones go on, so that the first error in order is that of the work which failed.
+        """
         try:
             yield
         except BaseException:
             with self._turns:
-                self._stopped = True
+                self._failed = min(self._failed, turn)
                 self._turns.notify_all()
             raise
 

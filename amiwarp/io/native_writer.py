@@ -32,7 +32,7 @@ from amiwarp.io.formats import MAX_MS, Codec, Outline, check_native
 from amiwarp.io.hdf5_files import CHUNK, ChunkFile, EncodedChunk, camera_attributes, open_hdf5, prism_attributes
 from amiwarp.optics.camera import Camera, check_size
 from amiwarp.optics.prism import NominalPrism
-from amiwarp.tasks import Progress, in_order
+from amiwarp.tasks import Progress, Result, in_order
 from amiwarp.validation import as_times, choice, guarded, shown
 
 # Layout of the file: header, datasets, chunks and the millisecond index.
@@ -472,7 +472,7 @@ class RecordingWriter:
             raise AmiwarpError(f"{self.path}: {given}; call it before append(), for a multiple of {CHUNK}")
         self._t_offset = t_first
         jobs = (partial(self._write_piece, piece, k * count, next(self._turns)) for k, piece in enumerate(pieces))
-        with contextlib.closing(in_order(jobs)) as written:
+        with self._results(jobs) as written:
             for events, inside in written:
                 with errors_name(self.path, lambda: f"after {len(self)} events"):
                     if self._written % count:
@@ -484,7 +484,7 @@ class RecordingWriter:
         self, piece: Callable[[], FlaggedEvents], start: int, turn: int
     ) -> tuple[Events, NDArray[np.uint8]]:
         """Compute, encode and write a piece whose first event is event ``start``. Runs in a thread."""
-        with self._chunks.stopping():
+        with self._chunks.stopping(turn):
             if not callable(piece):
                 raise AmiwarpError(f"{self.path}: a piece is {shown(piece)}; expected a function")
             events, inside, known = piece()
@@ -588,9 +588,19 @@ class RecordingWriter:
 
     def _open_records(self) -> RecordWriter:
         if self._records is None:
-            given = "the writer is used outside its 'with' block, before or after it"
+            given = "the writer is used outside its 'with' block, before or after it, or after it failed"
             raise AmiwarpError(f"{self.path}: {given}; append inside the block of a new writer")
         return self._records
+
+    @contextlib.contextmanager
+    def _results(self, jobs: Iterable[Callable[[], Result]]) -> Iterator[Iterator[Result]]:
+        """Run jobs that write chunks, and give their results in order. After an error the writer cannot go on."""
+        try:
+            with contextlib.closing(in_order(jobs)) as results:
+                yield results
+        except BaseException:
+            self._records = None
+            raise
 
     def set_encoder(self, encoder: Encoder) -> None:
         """Set or replace the encoder, which is written at the end.
@@ -657,13 +667,13 @@ class RecordingWriter:
             for name in chunks[0]
             for k, chunk in enumerate(chunks)
         )
-        with contextlib.closing(in_order(jobs)) as written:
+        with self._results(jobs) as written:
             deque(written, maxlen=0)
         self._written += sum(len(chunk["events/t"]) for chunk in chunks)
 
     def _write_chunk(self, name: str, start: int, values: NDArray[Any], turn: int) -> None:
         """Encode and write the values of a chunk that begins at element ``start``. Runs in a thread."""
-        with self._chunks.stopping():
+        with self._chunks.stopping(turn):
             chunks = EncodedChunk.of(name, start, values, hdf5_files.encode_parts(values, self._codec))
             self._chunks.write(turn, chunks, self._dataset_of)
 
