@@ -185,6 +185,20 @@ def test_slices_of_events_and_truth_stay_aligned(
             np.testing.assert_array_equal(getattr(truth, name), expected)
 
 
+def test_truth_of_a_file_is_sliced_without_steps(stored: Path) -> None:
+    truth = truth_of(amiwarp.open_recording(stored))
+    for name, rows in {
+        "truth": truth.stored_points, "truth/events/cause": truth.stored_causes, "truth/poses": truth.poses,
+    }.items():  # fmt: skip
+        for which, message in (
+            (slice(None, None, 5), "rows are sliced in steps of 5; slice without steps, then NumPy arrays"),
+            (slice(None, None, -1), "rows are sliced in steps of -1"),
+            (3, "rows are indexed by the number 3; give a slice, such as [3:4] for one"),
+        ):
+            with pytest.raises(AmiwarpError, match=re.escape(f"world.h5: {name}: {message}")):
+                rows[which]  # type: ignore[index]
+
+
 def test_truth_across_chunks_of_the_file(tmp_path: Path) -> None:
     """Places, whose rows have three numbers, in a file of more than one chunk, appended in odd pieces."""
     rng, count = np.random.default_rng(0), CHUNK + 1000
@@ -588,6 +602,8 @@ def test_truth_of_events_that_stay_on_the_device(device: str) -> None:
     assert isinstance(found.events, amiwarp.DeviceMemoryEvents)
     assert len(found.events) == len(expected.events)
     same_truth(found, expected)
+    with pytest.raises(AmiwarpError, match="values are sliced in steps of 5"):
+        truth_of(found).stored_causes[::5]  # type: ignore[index]
 
 
 def test_how_pixels_see_the_world(named: Path) -> None:

@@ -1119,8 +1119,8 @@ class StoredImages:
 
 # Ground truth of native recordings. Events, instants and poses are read on demand.
 
-Read = Callable[[int, int], NDArray[Any]]
-"""Function that returns the rows of a dataset from ``start`` up to ``stop`` (excluded)."""
+Read = Callable[[int, int], Any]
+"""Function that returns rows from ``start`` up to ``stop`` (excluded)."""
 
 
 def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) -> Truth:
@@ -1139,22 +1139,26 @@ def read_truth(path: Path, file: Hdf5File, count: int, size: tuple[int, int]) ->
         stored_places=values["place"],
         labels=_labels(path, file),
         frames=_StoredFrames(path, file, size) if "truth/frames/t" in file.columns else None,
-        poses=_StoredPoses(path, file) if "truth/poses/t" in file.columns else None,
+        poses=_poses(path, file),
         known=_StoredMasks(path, file, size) if "truth/known/t" in file.columns else None,
     )
 
 
 class _StoredRows:
-    """Rows of a dataset, or of several datasets side by side, that are read on demand."""
+    """Rows of one or several datasets that are read on demand."""
 
     def __init__(self, path: Path, name: str, count: int, read: Read, file: Hdf5File) -> None:
         self._path, self._name, self._count, self._read = path, name, count, read
         self._file = file  # keeps the file open: the columns hold only a weak reference to the file
 
-    def __getitem__(self, which: slice, /) -> NDArray[Any]:
-        start, stop, _ = which.indices(self._count)
-        with errors_name(self._path, lambda: f"{self._name} {which.start} .. {which.stop}"):
-            return self._read(start, max(start, stop))
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, which: slice, /) -> Any:
+        with errors_name(self._path, lambda: self._name):
+            start, stop = checks.slice_bounds(which, self._count, "rows")
+        with errors_name(self._path, lambda: f"{self._name} {start} .. {stop}"):
+            return self._read(start, stop)
 
 
 def _points(path: Path, file: Hdf5File, count: int) -> _StoredRows | None:
@@ -1286,37 +1290,32 @@ class _StoredMasks:
             return self._masks.read(at, at + 1)[0] != 0
 
 
-class _StoredPoses:
-    """Poses of camera, bodies and joints, read from a file on demand."""
+def _poses(path: Path, file: Hdf5File) -> _StoredRows | None:
+    """Return the poses of camera, bodies and joints, or None if they are not stored."""
+    if "truth/poses/t" not in file.columns:
+        return None
+    t = file.columns["truth/poses/t"]
+    camera = _column(file, "truth/poses/camera", len(t), (7,))
+    tables = {
+        what: (names, _column(file, table, len(t), (len(names), width)))
+        for what, names, table, width in (
+            ("bodies", _names(file, "truth/poses/body_names"), "truth/poses/bodies", 7),
+            ("joints", _names(file, "truth/joints/names"), "truth/joints/position", 3),
+        )
+        if names and table in file.columns
+    }
+    return _StoredRows(path, "truth/poses", len(t), partial(_read_poses, t, camera, tables), file)
 
-    def __init__(self, path: Path, file: Hdf5File) -> None:
-        self._path, self._file = path, file
-        self._t = file.columns["truth/poses/t"]
-        count = len(self._t)
-        self._camera = _column(file, "truth/poses/camera", count, (7,))
-        self._tables = {
-            what: (names, _column(file, table, count, (len(names), width)) if names and table in file.columns else None)
-            for what, names, table, width in (
-                ("bodies", _names(file, "truth/poses/body_names"), "truth/poses/bodies", 7),
-                ("joints", _names(file, "truth/joints/names"), "truth/joints/position", 3),
-            )
-        }
 
-    def __len__(self) -> int:
-        return len(self._t)
-
-    def __getitem__(self, which: slice, /) -> Poses:
-        start, stop, _ = which.indices(len(self))
-        stop = max(start, stop)
-        with errors_name(self._path, lambda: f"truth/poses {start} .. {stop}"):
-            tables = {
-                what: {} if column is None else dict(
-                    zip(names, np.moveaxis(_read_as(column, np.float64, start, stop), 1, 0), strict=True)
-                )
-                for what, (names, column) in self._tables.items()
-            }  # fmt: skip
-            camera = _read_as(self._camera, np.float64, start, stop)
-            return Poses(rounded_times(self._t.read(start, stop)), camera, **tables)
+def _read_poses(
+    t: Column, camera: Column, tables: Mapping[str, tuple[tuple[str, ...], Column]], start: int, stop: int
+) -> Poses:
+    """Return the poses of the camera, and those of the bodies and joints, whose ``tables`` have names."""
+    named = {
+        what: dict(zip(names, np.moveaxis(_read_as(column, np.float64, start, stop), 1, 0), strict=True))
+        for what, (names, column) in tables.items()
+    }
+    return Poses(rounded_times(t.read(start, stop)), _read_as(camera, np.float64, start, stop), **named)
 
 
 # Files of MVSEC and Prophesee, which hold one row per event. They are read from the beginning.
