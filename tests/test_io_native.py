@@ -353,7 +353,10 @@ def _replace(name: str, values):
         (lambda f: f.create_group("prism").attrs.update(apex=0.1, index=1.5, flat_side="up"), "flat_side is 'up'"),
         (lambda f: f.create_group("encoder"), "encoder/t"),
         (lambda f: f.update({"encoder/t": [0, 0], "encoder/angle": [0.0, 1.0]}), "sample 1"),
-        (lambda f: f.update({"truth/x": np.zeros(9), "truth/y": np.zeros(9)}), "truth/x and truth/y have 9 and 9 rows"),
+        (
+            lambda f: f.update({"truth/x": np.zeros(9), "truth/y": np.zeros(9)}),
+            r"'truth/x' has shape \(9,\); expected \(50,\)",
+        ),
     ],
 )
 def test_damaged_files_name_the_place(tmp_path, edit, message):

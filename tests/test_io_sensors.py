@@ -121,11 +121,11 @@ def test_wrong_arrays_are_refused(tmp_path: Path) -> None:
 def test_damage_is_named(tmp_path: Path) -> None:
     whole = Recording(MemoryEvents(EVENTS, *SIZE), imu=make_imu(9), frames=make_images(np.uint8))
     faults = {
-        "imu/acceleration": (np.zeros((8, 3)), r"'imu/acceleration' has shape \(8, 3\), its times are 9"),
+        "imu/acceleration": (np.zeros((8, 3)), r"'imu/acceleration' has shape \(8, 3\); expected \(9, 3\)"),
         "imu/t": (np.arange(9)[::-1], "IMU times decrease"),
         "imu/angular_velocity": (np.full((9, 3), np.inf), "IMU angular_velocity of sample 0 is .*expected finite"),
         "frames/image": (np.zeros((5, 7, 9)), "dataset 'frames/image' is float64"),
-        "frames/t": (np.arange(4), r"'frames/image' has shape \(5, 7, 9\), its times are 4"),
+        "frames/t": (np.arange(4), r"'frames/image' has shape \(5, 7, 9\); expected \(4, 7, 9\)"),
     }
     for name, (values, message) in faults.items():
         path = tmp_path / f"{name.replace('/', '_')}.h5"

@@ -344,8 +344,8 @@ def test_a_file_without_truth_has_no_new_groups(tmp_path: Path) -> None:
 
 
 DAMAGE: list[tuple[str, Any, str]] = [
-    ("truth/events/cause", lambda old: old[:-1], "truth/events/cause has shape"),
-    ("truth/events/place", lambda old: old[:, :2], "truth/events/place has shape"),
+    ("truth/events/cause", lambda old: old[:-1], "dataset 'truth/events/cause' has shape"),
+    ("truth/events/place", lambda old: old[:, :2], "dataset 'truth/events/place' has shape"),
     ("truth/events/place", lambda old: old[:, 0], "no 2-dimensional dataset 'truth/events/place'"),
     ("truth/events/cause", lambda old: old.astype(np.float32), "dataset 'truth/events/cause' is float32"),
     ("truth/frames/t", lambda old: old[::-1], "truth/frames/t does not increase"),

@@ -772,10 +772,19 @@ def _attributes(file: Hdf5File, group: str) -> Mapping[str, Any]:
     return file.attributes(group) or {}
 
 
-def _needed(file: Hdf5File, name: str) -> Column:
+def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int, ...] | None = None) -> Column:
+    """Return a dataset; raise :class:`AmiwarpError` if the dataset is missing or does not have the expected shape.
+
+    ``count``: expected number of rows; ``row``: expected shape of a row. None accepts any.
+    """
     if name not in file.columns:
         raise AmiwarpError(f"no dataset '{name}'; the file is incomplete")
-    return file.columns[name]
+    column = file.columns[name]
+    shape = (len(column), *column.row)
+    expected = (len(column) if count is None else count, *(column.row if row is None else row))
+    if shape != expected:
+        raise AmiwarpError(f"dataset '{name}' has shape {shape}; expected {expected}; the file is damaged")
+    return column
 
 
 def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
@@ -794,7 +803,7 @@ def _read_encoder(path: Path, file: Hdf5File) -> Encoder | None:
 
 def _read_samples(file: Hdf5File, name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
     """Return times [us] and angles [rad] of an encoder whose datasets begin with ``name``; None without samples."""
-    columns = [_needed(file, name + column) for column in ("t", "angle")]
+    columns = [_column(file, name + column) for column in ("t", "angle")]
     t, angle = (column.read(0, len(column)) for column in columns)
     t, angle = rounded_times(t), angle.astype(np.float64)
     if file.unfinished:
@@ -901,7 +910,7 @@ class NativeEvents(EventSource):
         """Open the events of a file. If the file is unfinished, these are the events that are complete now."""
         self.path = path
         self._file = file
-        self._columns = {name: _needed(file, f"events/{name}") for name in ("t", "p", "x", "y")}
+        self._columns = {name: _column(file, f"events/{name}") for name in ("t", "p", "x", "y")}
         for name in ("inside", "extrapolated"):
             if f"events/{name}" in file.columns:
                 self._columns[name] = file.columns[f"events/{name}"]
@@ -1067,20 +1076,9 @@ def read_imu(path: Path, file: Hdf5File) -> ImuSamples | None:
         return None
     with errors_name(path, lambda: "imu"):
         count = len(file.columns["imu/t"])
-        values = [_rows(file, f"imu/{name}", count, (3,)) for name in ("angular_velocity", "acceleration")]
+        values = [_column(file, f"imu/{name}", count, (3,)) for name in ("angular_velocity", "acceleration")]
         t = rounded_times(file.columns["imu/t"].read(0, count))
         return ImuSamples(t, *(column.read(0, count).astype(np.float64, copy=False) for column in values))
-
-
-def _rows(file: Hdf5File, name: str, count: int, row: tuple[int, ...] | None) -> Column:
-    """Return a dataset of ``count`` rows of the shape ``row``, or of any shape if it is None."""
-    if name not in file.columns:
-        raise AmiwarpError(f"dataset '{name}' is missing; the file is incomplete")
-    column = file.columns[name]
-    if len(column) != count or column.row != (row or column.row):
-        shape = (len(column), *column.row)
-        raise AmiwarpError(f"dataset '{name}' has shape {shape}, its times are {count}; the file is damaged")
-    return column
 
 
 def read_frames(path: Path, file: Hdf5File) -> StoredImages | None:
@@ -1097,7 +1095,7 @@ class StoredImages:
     def __init__(self, path: Path, file: Hdf5File) -> None:
         self._path, self._file = path, file  # the columns hold only a weak reference to the file
         times = file.columns["frames/t"]
-        self._image = _rows(file, "frames/image", len(times), None)
+        self._image = _column(file, "frames/image", len(times))
         if self._image.dtype not in (np.uint8, np.uint16) or not all(self._image.row):
             raise AmiwarpError(f"frames are {self._image.dtype} of shape {self._image.row}; expected uint8 or uint16")
         self.t = rounded_times(times.read(0, len(times)))
@@ -1165,11 +1163,7 @@ def _points(path: Path, file: Hdf5File, count: int) -> _StoredRows | None:
     """Return the true points of the events, or None if they are not stored."""
     if "truth/x" not in file.columns:
         return None
-    x, y = (_column(file, f"truth/{name}") for name in ("x", "y"))
-    if len(x) != count or len(y) != count:
-        raise AmiwarpError(
-            f"{path}: truth/x and truth/y have {len(x)} and {len(y)} rows for {count} events; the file is damaged"
-        )
+    x, y = (_column(file, f"truth/{name}", count) for name in ("x", "y"))
     return _StoredRows(path, "truth", count, partial(_read_points, x, y), file)
 
 
@@ -1180,16 +1174,10 @@ def _read_points(x: Column, y: Column, start: int, stop: int) -> NDArray[np.floa
 
 def _event_values(path: Path, file: Hdf5File, name: str, count: int) -> _StoredRows | None:
     """Return the values of the dataset ``truth/events/name``, or None if the dataset is missing."""
-    column = file.columns.get(f"truth/events/{name}")
-    if column is None:
+    stored, (dtype, row) = f"truth/events/{name}", EVENT_COLUMNS[name]
+    if stored not in file.columns:
         return None
-    dtype, row = EVENT_COLUMNS[name]
-    if len(column) != count or column.row != row:
-        shape = (len(column), *column.row)
-        raise AmiwarpError(
-            f"{path}: truth/events/{name} has shape {shape} for {count} events; expected {(count, *row)}"
-        )
-    return _StoredRows(path, f"truth/events/{name}", count, partial(_read_as, column, dtype), file)
+    return _StoredRows(path, stored, count, partial(_read_as, _column(file, stored, count, row), dtype), file)
 
 
 def _read_as(column: Column, dtype: Any, start: int, stop: int) -> NDArray[Any]:
@@ -1222,21 +1210,6 @@ def _names(file: Hdf5File, name: str) -> tuple[str, ...]:
     if column is None:
         return ()
     return tuple(bytes(text).decode("utf-8", "replace") for text in column.read(0, len(column)).tolist())
-
-
-def _column(file: Hdf5File, name: str, count: int | None = None, row: tuple[int, ...] | None = None) -> Column:
-    """Return a dataset; raise :class:`AmiwarpError` if the dataset is missing or does not have the expected shape.
-
-    ``count``: expected number of rows; ``row``: expected shape of a row. None accepts any.
-    """
-    if name not in file.columns:
-        raise AmiwarpError(f"dataset '{name}' is missing; the file is incomplete")
-    column = file.columns[name]
-    shape = (len(column), *column.row)
-    expected = (len(column) if count is None else count, *(column.row if row is None else row))
-    if shape != expected:
-        raise AmiwarpError(f"dataset '{name}' has shape {shape}; expected {expected}; the file is damaged")
-    return column
 
 
 class _StoredFrames:
