@@ -605,8 +605,7 @@ class DeviceValues:
         self._values = values
 
     def __getitem__(self, which: slice, /) -> NDArray[Any]:
-        start, stop, _ = which.indices(len(self._values))
-        return np.asarray(part(self._values, start, stop).numpy())
+        return np.asarray(part(self._values, *slice_bounds(which, len(self._values), "values")).numpy())
 
 
 def device_of(source: EventSource, device: Any) -> Any:
