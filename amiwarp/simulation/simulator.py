@@ -42,7 +42,7 @@ from amiwarp.simulation.scenery import DeviceWorld, MapRing, WorldMapRing, World
 from amiwarp.simulation.sensor_model import SensorModel
 from amiwarp.simulation.worlds.world import WorldScene
 from amiwarp.tasks import Progress
-from amiwarp.validation import TIME_LIMIT, array, guarded, real, shown
+from amiwarp.validation import TIME_LIMIT, array, guarded, real, shown, whole
 
 # Ground truth of a simulated world at an instant: depth, normals, instances, optical flow and luminance.
 
@@ -726,8 +726,9 @@ class Engine:
             self._maps = MapRing(simulation, scenery.place_scene(simulation))
             if scene.frames.interval_us is not None:
                 longest_chunk = FRAMES_PER_CHUNK * scene.frames.interval_us
-        self._chunk_steps = self._steps_per_chunk(chunk_us, longest_chunk)
         self._margin = int(pixels.LARGEST_LAG) // (int(pixels.TICKS) * self._step) + 2
+        self._shift = int(pixels.LOW_BITS) + (self._pixels - 1).bit_length()
+        self._chunk_steps = self._steps_per_chunk(chunk_us, longest_chunk)
         self._axis = axis_rotation(*simulation.motion.tilt)
         self._sensor = sensor_params(simulation.sensor, self._step)
         self._view = scenery.prism_view_of(simulation, self._device)
@@ -747,8 +748,13 @@ class Engine:
 
         ``chunk_us``: length of a chunk [us], None for the default; ``longest``: upper bound of the length [us].
         """
-        span = chunk_us or CHUNK_US[self._device.is_cpu] * min(self._pixels, 640 * 480) // self._pixels
-        return max(1, int(min(span, longest)) // self._step)
+        if chunk_us is None:
+            span = CHUNK_US[self._device.is_cpu] * min(self._pixels, 640 * 480) // self._pixels
+        else:
+            span = whole(chunk_us, "chunk_us", 1, TIME_LIMIT, " us")
+        of_keys = 1 << (63 - self._shift)  # first time that a key cannot hold [us]
+        of_ticks = (1 << 31) // int(pixels.TICKS) - self._margin * self._step  # of DeviceBlock.arrays.ticks, an int32
+        return max(1, int(min(span, longest, min(of_keys, of_ticks) - LATEST_US)) // self._step)
 
     def prepare(self) -> None:
         """Load the kernels and read or render the first maps, which otherwise happens in the first chunk."""
@@ -793,7 +799,7 @@ class Engine:
         steps.angle, steps.turn = self._angles(angle)
         steps.second_angle, steps.second_turn = self._angles(second)
         steps.per_tick = 1.0 / (self._step * int(pixels.TICKS))
-        steps.shift = int(pixels.LOW_BITS) + (self._pixels - 1).bit_length()
+        steps.shift = self._shift
         steps.margin, steps.count, steps.ticks = margin, count, self._step * int(pixels.TICKS)
         return steps
 
@@ -1117,7 +1123,8 @@ class Simulation(SimulationValues):
         Parameters
         ----------
         chunk_us : int, optional
-            Length of a span [us]. The default depends on the device. The events do not depend on it.
+            Length of a span [us], at least 1. The default depends on the device. The events do not depend on it. Spans
+            of over 134 s are divided; with more than 16,384 pixels, shorter ones too, at 1280x720 those of over 2 s.
         progress : Progress, optional
             Called with the finished share.
 
@@ -1138,7 +1145,8 @@ class Simulation(SimulationValues):
         Parameters
         ----------
         chunk_us : int, optional
-            Length of a span [us]. The default depends on the device. The events do not depend on it.
+            Length of a span [us], at least 1. The default depends on the device. The events do not depend on it. Spans
+            of over 134 s are divided; with more than 16,384 pixels, shorter ones too, at 1280x720 those of over 2 s.
         progress : Progress, optional
             Called with the finished share.
 
