@@ -20,8 +20,8 @@ from amiwarp.validation import TIME_LIMIT, array, guarded, instance, on_gpu, who
 
 MOST_CAMERAS = 1 << 16
 """Largest number of cameras of an :class:`EventSensor`."""
-MOST_PIXELS = 1 << 26
-"""Largest number of pixels of all cameras of an :class:`EventSensor`."""
+MOST_PIXELS = 1 << 24
+"""Largest number of pixels of all cameras of an :class:`EventSensor`, whose steps then take up to 65 ms."""
 EVENTS_PER_PIXEL = 4
 """Initial capacity of the event buffer of a step [events per pixel]. The buffer grows if necessary."""
 LARGEST_LEVEL = 100.0
@@ -55,7 +55,8 @@ class EventSensor:
     Raises
     ------
     AmiwarpError
-        If a value is out of range, the seeds are not one for each camera, or all cameras have over 2**26 pixels.
+        If a value is out of range, the seeds are not one for each camera, or all cameras have over 2**24 pixels. With
+        ``row_us``, the number of cameras and that of pixels of each count as the next power of two.
 
     Examples
     --------
@@ -86,13 +87,16 @@ class EventSensor:
         )
         self._shape = (n, height, width)
         self._pixels = height * width
-        if n * self._pixels > MOST_PIXELS:
-            raise AmiwarpError(
-                f"{n} cameras of {width} x {height} have {n * self._pixels} pixels; the limit is {MOST_PIXELS}; "
-                "give fewer cameras at a time"
-            )
         self._model = instance(SensorModel() if model is None else model, SensorModel, "model")
         self._scan, self._bus = row_scan(self._model, width, height), bus_of(self._model)
+        scans = int(self._scan.row_ps) > 0
+        count = 1 << ((n - 1).bit_length() + (self._pixels - 1).bit_length()) if scans else n * self._pixels
+        if count > MOST_PIXELS:
+            have = "with row_us count as" if scans else "have"
+            raise AmiwarpError(
+                f"{n} cameras of {width} x {height} {have} {count} pixels; the limit is {MOST_PIXELS}; "
+                "give fewer cameras at a time"
+            )
         self._device = wp.get_device(device)
         self._cameras = pixels.Cameras()
         self._cameras.pixels = self._pixels
@@ -112,13 +116,15 @@ class EventSensor:
 
     def _key_layout(self) -> Any:
         """Return the layout of the keys of events."""
-        n = self._shape[0]
+        bits_of_camera = (self._shape[0] - 1).bit_length()
         layout = event_keys.CameraKeys()
         layout.pixels, layout.width = self._pixels, self._shape[2]
-        layout.shift = int(pixels.LOW_BITS) + (n * self._pixels - 1).bit_length()
-        layout.time = int(event_keys.CAMERA_LOW_BITS) + (self._pixels - 1).bit_length()
-        layout.part = 61  # two bits; the sign stays 0
-        layout.camera = int(layout.part) - (n - 1).bit_length()
+        layout.shift = int(pixels.LOW_BITS) + (self._shape[0] * self._pixels - 1).bit_length()
+        layout.pixel = int(event_keys.CAMERA_LOW_BITS) if int(self._scan.row_ps) else 1
+        layout.time = int(layout.pixel) + (self._pixels - 1).bit_length()
+        # the sign stays 0 in both kinds of keys; the part has two bits
+        layout.camera = int(layout.time) + min(63 - int(layout.shift), 61 - bits_of_camera - int(layout.time))
+        layout.part = int(layout.camera) + bits_of_camera
         return layout
 
     def step(self, images: Any, t_us: int) -> tuple[DeviceEvents, Windows]:
@@ -278,7 +284,7 @@ class EventSensor:
             keys.numpy()[:total].sort()  # shares the memory of keys
             return
         # without a row scan, no two events of a pixel share a microsecond: bits below the pixel's need no sorting
-        lowest = 0 if int(self._scan.row_ps) else int(event_keys.CAMERA_LOW_BITS)
+        lowest = 0 if int(self._scan.row_ps) else int(self._layout.pixel)
         order = wp.empty(2 * total, dtype=wp.int32, device=self._device)
         wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=int(self._layout.part) + 2)
 
