@@ -336,7 +336,7 @@ def chosen_instants(
         raise AmiwarpError("truth_hz and truth_times_us are both given; give one of them")
     if truth_hz is not None:
         rate = real(truth_hz, "truth_hz", 1e-3, 1e6, " 1/s")
-        count = int(duration_us * 1e-6 * rate) + 1
+        count = int(duration_us * rate / 1e6 + 1e-9) + 1  # rounding must not lose the last instant
         if count > MOST_INSTANTS:
             raise AmiwarpError(
                 f"truth_hz {rate:g} gives {count} instants; the limit is {MOST_INSTANTS}; give a lower rate"
