@@ -173,6 +173,8 @@ class EventSensor:
         """Start cameras anew at their next images, with the same random numbers as at first.
 
         Their events that have not been read out yet are dropped. If all cameras start anew, so do the times.
+        Otherwise a row scan goes on, so that these cameras may get other time stamps than at first, and lose other
+        events.
 
         Parameters
         ----------
