@@ -15,7 +15,7 @@ from amiwarp.imaging.tensors import Windows
 from amiwarp.kernels import event_keys, launch, pixels, prism_view
 from amiwarp.optics.camera import LARGEST_SIZE
 from amiwarp.simulation.sensor_model import SensorModel
-from amiwarp.simulation.simulator import LATEST_US, KeyBuffer, bus_of, row_scan, sensor_params
+from amiwarp.simulation.simulator import LATEST_US, KeyBuffer, bus_of, row_scan, sensor_params, sort_keys
 from amiwarp.validation import TIME_LIMIT, array, guarded, instance, on_gpu, whole
 
 MOST_CAMERAS = 1 << 16
@@ -271,7 +271,8 @@ class EventSensor:
             self._scan.origin, self._scan.shift = self._now_us - self._first_us, self._layout.shift
             self._launch(event_keys.stamp_rows, total - len(self._carry), [self._scan, keys])
         self._launch(event_keys.sort_by_camera, total, [self._layout, self._cameras.starts, keys])
-        self._sort(keys, total)
+        lowest = 0 if int(self._scan.row_ps) else int(self._layout.pixel)
+        sort_keys(keys, total, lowest, int(self._layout.part) + 2)
         found = wp.empty(n + 2, dtype=int, device=self._device)
         self._launch(event_keys.find_cameras, n + 2, [self._layout, keys, total, n], [found])
         edges = found.numpy().astype(np.int64)
@@ -279,16 +280,6 @@ class EventSensor:
         self._carry = wp.clone(keys[now:later]) if now < later else self._nothing
         self._launch(event_keys.carry_over, len(self._carry), [self._layout, self._carry])
         return keys[:now] if now else self._nothing, edges[: n + 1]
-
-    def _sort(self, keys: wp.array, total: int) -> None:
-        """Sort the first ``total`` keys."""
-        if self._device.is_cpu:
-            keys.numpy()[:total].sort()  # shares the memory of keys
-            return
-        # without a row scan, no two events of a pixel share a microsecond: bits below the pixel's need no sorting
-        lowest = 0 if int(self._scan.row_ps) else int(self._layout.pixel)
-        order = wp.empty(2 * total, dtype=wp.int32, device=self._device)
-        wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=int(self._layout.part) + 2)
 
     def _read(self, keys: wp.array, edges: NDArray[np.int64]) -> tuple[DeviceEvents, NDArray[np.int64]]:
         """Return the events of sorted keys that the sensors read out, and the ranges of the cameras."""

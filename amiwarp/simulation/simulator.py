@@ -522,6 +522,18 @@ class KeyBuffer:
         list(launch.pool().map(run, starts, [min(start + CPU_RUN, self._pixels) for start in starts]))
 
 
+def sort_keys(keys: wp.array, total: int, lowest: int, top: int) -> None:
+    """Sort the first ``total`` keys by their bits from ``lowest`` to below ``top``.
+
+    Without a row scan, no two events of a pixel share a microsecond, so that bits below the pixel's need no sorting.
+    """
+    if keys.device.is_cpu:
+        keys.numpy()[:total].sort()  # shares the memory of keys
+        return
+    order = wp.empty(2 * total, dtype=wp.int32, device=keys.device)
+    wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=top)
+
+
 # Readout of the simulated sensor: sequential readout of rows, and a bus with a queue that limits the event rate.
 
 LONGEST_SCAN_US = 10_000.0
@@ -772,7 +784,7 @@ class Engine:
             if first == 0:
                 self._start_pixels(steps)
             keys = self._generate_keys(steps, count)
-            block = self._unpack(keys, steps, first, count)
+            block = self._unpack(keys, steps, first)
             self.now_us = (first + count) * self._step
             yield block
 
@@ -892,20 +904,15 @@ class Engine:
 
     def _sort(self, keys: wp.array, total: int, limit: int, top: int) -> int:
         """Sort the first ``total`` keys by their lowest ``top`` bits; return the number of keys below ``limit``."""
+        sort_keys(keys, total, int(event_keys.LAG_BIT) if self._readout.scans_rows else int(pixels.LOW_BITS), top)
         if self._device.is_cpu:
-            values = keys.numpy()[:total]  # shares the memory of keys
-            values.sort()
-            return int(np.searchsorted(values, limit))
-        # without a row scan, no two events of a pixel share a microsecond: bits below the pixel's need no sorting
-        lowest = int(event_keys.LAG_BIT) if self._readout.scans_rows else int(pixels.LOW_BITS)
-        order = wp.empty(2 * total, dtype=wp.int32, device=self._device)
-        wp.utils.radix_sort_pairs(keys, order, total, begin_bit=lowest, end_bit=top)
+            return int(np.searchsorted(keys.numpy()[:total], limit))
         found = wp.empty(1, dtype=int, device=self._device)
         wp.launch(event_keys.find, dim=1, inputs=[keys, total, limit], outputs=[found], device=self._device)
         return int(found.numpy()[0])
 
-    def _unpack(self, keys: wp.array, steps: Any, first: int, count: int) -> DeviceBlock:
-        """Convert sorted keys of events to a block of events with ground truth."""
+    def _unpack(self, keys: wp.array, steps: Any, first: int) -> DeviceBlock:
+        """Convert sorted keys of events to a block of events with ground truth. ``first``: number of the first step."""
         keys, stamps = self._readout.read(keys, steps.shift, first * self._step)
         n = len(keys)
         block = event_keys.Block()
