@@ -38,6 +38,7 @@ from amiwarp.kernels import launch as launching
 from amiwarp.kernels import pixels as kernels
 from amiwarp.simulation.pictures import DARK, Placement, linear_luminance, log_map, place_picture, read_picture
 from amiwarp.simulation.scenery import step_us
+from amiwarp.simulation.simulator import LATEST_US, Engine
 
 CAMERA = Camera.from_fov(64, 48, math.radians(50.0))
 PRISM = Prism(math.radians(3.0), 1.55)
@@ -183,6 +184,21 @@ def test_chunks_do_not_matter(device: str, chunk_us: int) -> None:
     for name in ("x", "y", "t", "p"):
         np.testing.assert_array_equal(getattr(events, name), getattr(whole[0], name))
     np.testing.assert_array_equal(np.concatenate([p for _, p in parts]), whole[1])
+
+
+def test_a_chunk_of_minutes_keeps_the_scene_points() -> None:
+    simulation = base(camera=Camera.from_fov(4, 3, 1.0), motion=PrismMotion(3.0), duration_s=140.0)
+    whole = everything(simulation.run())
+    parts = list(simulation.blocks(chunk_us=140_000_000))
+    assert whole[0].t[-1] > 2**31 / 16  # us; ticks are 32-bit integers
+    np.testing.assert_array_equal(np.concatenate([e.t for e, _ in parts]), whole[0].t)
+    np.testing.assert_array_equal(np.concatenate([p for _, p in parts]), whole[1])
+
+
+def test_the_times_of_a_long_chunk_of_many_pixels_fit_into_their_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("amiwarp.simulation.simulator.EVENTS_PER_PIXEL", 1)  # saves memory
+    engine = Engine(base(camera=Camera.from_fov(1280, 720, 1.0)), 3_000_000)
+    assert 2_000_000 <= engine._chunk_steps * engine._step <= 2**21 - LATEST_US  # us; 22 + 20 bits are below the time
 
 
 @pytest.mark.usefixtures("every_core")
@@ -498,6 +514,8 @@ def test_a_picture_is_cut_to_the_view() -> None:
         (lambda: read_picture("nowhere.png"), "nowhere.png: no such file"),
         (lambda: base(camera_motion=CameraMotion((0.0, 30.0, 0.0))).run(), "turn the camera less far"),
         (lambda: base(motion=PrismMotion(1e9)).run(), "slow down prism"),
+        (lambda: list(base().blocks(chunk_us=0)), "chunk_us = 0 is not a whole number in 1 "),
+        (lambda: list(base().blocks(chunk_us=-5)), "chunk_us = -5"),
     ],
 )
 def test_bad_input_is_told(make: object, message: str) -> None:

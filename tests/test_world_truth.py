@@ -421,6 +421,13 @@ def test_numbers_that_the_type_cannot_hold_are_refused(stored: Path, tmp_path: P
 
 def test_instants() -> None:
     np.testing.assert_array_equal(chosen_instants(10_000, 300.0), [0, 3333, 6667, 10_000])
+    for duration, rate, count in (
+        (290_000, 100.0, 30),
+        (1_100_000, 30.0, 34),
+        (300_000, 1.0 / 0.03, 11),
+        (9999, 100.0, 1),
+    ):
+        assert len(chosen_instants(duration, rate)) == count
     np.testing.assert_array_equal(chosen_instants(10_000, None, [5, 7000]), [5, 7000])
     assert chosen_instants(10_000).size == 0
     for given in ([-1], [10_001], [5, 5], [[1]]):
