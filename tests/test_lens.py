@@ -506,6 +506,14 @@ def test_still_spans_of_one_recording_are_found(moved: amiwarp.Recording) -> Non
     assert "s" in poses[0].name
 
 
+def test_recordings_of_one_name_are_all_used(recordings: list[amiwarp.Recording]) -> None:
+    """The files ``day0/pose.h5`` and ``day1/pose.h5`` have the same name."""
+    same = [replace(one, name="pose") for one in recordings[:3]]
+    poses, reasons = still_poses([*same, replace(same[0], encoder=None), replace(same[0], encoder=None)])
+    assert [pose.name for pose in poses] == ["pose", "pose (2)", "pose (3)"]
+    assert list(reasons) == ["pose (4)", "pose (5)"]
+
+
 def streamed(recording: amiwarp.Recording, late_us: int = 0) -> list[amiwarp.Recording]:
     """Return the still spans found in a stream of 5 ms packets whose events come later than its encoder samples."""
     assert recording.encoder is not None
