@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from amiwarp.errors import AmiwarpError
 from amiwarp.imaging import tensors
 from amiwarp.io.files import errors_name, open_input
+from amiwarp.io.formats import SPLIT_NAME
 from amiwarp.io.json_files import LARGEST_INTEGER, at_field, build, fields_of, read_json, read_toml
 from amiwarp.optics.camera import Camera
 from amiwarp.optics.prism import Prism
@@ -258,7 +259,7 @@ def _check(values: _Plain) -> None:
     if len(values.splits) > MOST_SPLITS:
         raise AmiwarpError(f"field splits has {len(values.splits):,} names; give at most {MOST_SPLITS}")
     for name, share in values.splits.items():
-        if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        if not re.fullmatch(SPLIT_NAME, name):
             raise AmiwarpError(f"field splits has the name {shown(name)}; use letters, digits, '-' and '_'")
         real(share, f"field splits.{name}", 0.0, 1.0)
     total = math.fsum(values.splits.values())
