@@ -218,6 +218,27 @@ def test_what_a_changed_specification_leaves_is_reported(place: Path) -> None:
     assert make(place).made == 2
 
 
+def test_a_recording_moves_to_the_folder_of_its_split(place: Path) -> None:
+    """No recording stays in the folder of its old split, where it would mix test and training data."""
+    halves = "splits = {train = 0.5, test = 0.5}\nduration_s"
+    (place / "spec.toml").write_text(BASE.replace("duration_s", halves, 1) + PICTURES)
+    make(place)
+    before = checksums(place)
+    (place / "spec.toml").write_text(BASE.replace("duration_s", f"split_seed = 5\n{halves}", 1) + PICTURES)
+    items = list_items(load_specification(place / "spec.toml"))
+    moved = sorted({item.file for item in items} - set(before))
+    damaged = place / "out" / next(file for file in before if file.endswith(moved[0].split("/")[1]))
+    damaged.write_bytes(damaged.read_bytes()[:-1] + b"x")
+    assert amiwarp.plan_dataset(place / "spec.toml", place / "out", workers=1).missing == 0
+    again = make(place)
+    assert (again.made, again.kept, again.not_in_specification) == (1, 11, ())
+    after = checksums(place)
+    assert set(after) == {item.file for item in items} == {item["file"] for item in manifest(place)["items"]}
+    assert sorted(after.values()) == sorted(before.values())
+    assert len(moved) > 2
+    assert make(place).kept == 12
+
+
 def test_a_failure_is_reported_and_does_not_stop_the_rest(place: Path) -> None:
     (place / "pictures" / "disc" / "bad.png").write_bytes(b"no picture")
     result = run(place / "spec.toml", place / "out", "--workers", "1", "--device", "cpu", "--json")
@@ -789,6 +810,7 @@ def test_an_invented_journal_is_not_trusted(place: Path) -> None:
     for line in lines[3:5]:
         append_line(journal, {**line, "sha256": "1" * 64})  # anybody can compute the checksum of a line
     append_line(journal, {**lines[5], "file": "../secret.h5", "key": "0" * 16})
+    append_line(journal, {**lines[5], "file": lines[6]["file"]})
     append_line(journal, {**lines[5], "events": 10**300})
     append_line(journal, {**lines[5], "colour": "red"})
     for line in (lines[6], lines[6], lines[7]):
@@ -797,7 +819,7 @@ def test_an_invented_journal_is_not_trusted(place: Path) -> None:
     done = make(place)
     assert (done.made, done.kept, done.failed) == (10, 2, {})
     assert len(done.damaged) == 3
-    assert "line 1: field checksum is missing; 7 lines are damaged" in done.damaged[0]
+    assert "line 1: field checksum is missing; 8 lines are damaged" in done.damaged[0]
     assert "does not have the checksum of journal.jsonl" in done.damaged[1]
     assert {item["file"]: item["sha256"] for item in manifest(place)["items"]} == checksums(place) == before
     journal.unlink()
