@@ -620,6 +620,8 @@ def arrays_of(arrays: dict[str, np.ndarray], labels: dict[str, Any]) -> dict[str
         ('{representation = "voxels"}', "field output.representation is 'voxels'; choose among event_count"),
         ('{representation = "voxel_grid"}', "field output.bins is missing; voxel_grid needs it"),
         ('{representation = "voxel_grid", bins = 0}', "field output.bins = 0 is not a whole number"),
+        ('{representation = "voxel_grid", bins = 2000000}', "field output.bins = 2000000 is not a whole number in 1"),
+        ('{representation = "event_count", t_start = 5, t_end = 1}', "field output.t_end is 1 us, before output.t_st"),
         ('{representation = "event_count", bins = 3}', "field output.bins does not apply to event_count; remove it"),
         ('{representation = "stacked_histogram", bins = 3, limit = 300}', "field output.limit = 300 is not"),
         ('{representation = "time_surface", tau_us = 0.0}', r"field output.tau_us = 0\.0 is not"),
@@ -689,7 +691,8 @@ def test_other_sources(place: Path, recording: amiwarp.Recording) -> None:
     (place / "tile.toml").write_text(
         'format = "amiwarp-world"\nversion = 1\nbodies = [{name = "tile", mesh = "tile.obj"}]\n'
     )
-    (place / "labels.csv").write_text("file,speed,code,name\nreal.h5,1.5,007,a\nother.h5,2,1,b\n")
+    table = "file,speed,code,name\nreal.h5,1.5,007,a\nother.h5,2,1,b\n"
+    (place / "labels.csv").write_text(table, encoding="utf-8-sig")  # as Excel's "CSV UTF-8"
     (place / "spec.toml").write_text(
         HEAD + "duration_s = 0.01\nprisms = [{apex_deg = 1.0}]\nspeeds_rpm = [900.0]\ntruth_hz = 200.0\n"
         'sensors = [{name = "mine", preset = "gen4", refractory_us = 5.0}]\n'
@@ -902,6 +905,35 @@ def test_a_mesh_or_a_file_of_poses_that_changed_is_seen(place: Path) -> None:
         (place / "poses.csv").write_text(poses)
         keys |= {item.key for item in list_items(load_specification(place / "spec.toml"))}
     assert len(keys) == 3 * 2
+
+
+def test_what_a_mesh_names_is_part_of_its_world(place: Path) -> None:
+    """A changed texture of an OBJ file changes the recordings, and one that cannot be read stops only them."""
+    (place / "spec.toml").write_text(BASE + '[[sources]]\nworld_files = "w.toml"\n')
+    (place / "w.toml").write_text('bodies = [{mesh = "tile.obj"}]\n')
+    (place / "tile.obj").write_text(
+        "mtllib tile.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\n"
+    )
+    keys = []
+    for name, grey in (("t.png", 0), ("t.png", 9), ("t.png\nKs 0 0 0", 9), ("no.png", 9)):
+        (place / "tile.mtl").write_text(f"newmtl a\nmap_Kd {name}\n")
+        Image.new("L", (4, 4), grey).save(place / "t.png")
+        keys.append(list_items(load_specification(place / "spec.toml"))[0].key)
+    assert len(set(keys)) == 4
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("file,a,a\npictures/disc/0.png,1,2\n", "has the column 'a' twice; give each label one column"),
+        ("file,a\nx.png,1\n./x.png,2\n", r"has the file '.*x\.png' twice; keep one row of it"),
+    ],
+)
+def test_a_table_with_two_labels_for_one_file_is_refused(place: Path, table: str, message: str) -> None:
+    (place / "labels.csv").write_text(table)
+    (place / "spec.toml").write_text(BASE + '[[sources]]\npictures = "pictures/*/*.png"\nlabel_table = "labels.csv"\n')
+    with pytest.raises(AmiwarpError, match=f"labels.csv: .*{message}"):
+        list_items(load_specification(place / "spec.toml"))
 
 
 def test_the_specification_of_the_guide(place: Path) -> None:

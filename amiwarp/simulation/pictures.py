@@ -462,7 +462,7 @@ def _read_times(table: Path) -> tuple[list[Path], NDArray[np.int64]]:
             text = file.read(MOST_TABLE_BYTES + 1)
         if len(text) > MOST_TABLE_BYTES:
             raise AmiwarpError(f"it is larger than {MOST_TABLE_BYTES >> 20} MiB")
-        rows = csv.DictReader(io.StringIO(text.decode("utf-8"), newline=""))
+        rows = csv.DictReader(io.StringIO(text.decode("utf-8-sig"), newline=""))
         files: list[Path] = []
         times = []
         for row in rows:
