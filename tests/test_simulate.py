@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
@@ -480,6 +481,21 @@ def test_an_eccentric_encoder_is_wrong_by_its_harmonics_only() -> None:
 def test_luminance_is_linear_light() -> None:
     codes = np.array([[[0, 0, 0], [255, 255, 255]], [[188, 188, 188], [255, 0, 0]]], np.uint8)
     np.testing.assert_allclose(linear_luminance(codes), [[0.0, 1.0], [0.5029, 0.2126]], rtol=0, atol=1e-4)
+
+
+def test_integers_of_a_picture_keep_their_values(tmp_path: Path) -> None:
+    """Of 32 bits, only what 16 bits hold; of either byte order."""
+    codes = np.array([[0, 65535], [30000, 12]])
+    light = linear_luminance(codes.astype(np.uint16))
+    np.testing.assert_array_equal(linear_luminance(codes.astype(">u2")), light)
+    Image.fromarray(codes.astype(np.int32)).save(tmp_path / "wide.tif")
+    np.testing.assert_array_equal(read_picture(tmp_path / "wide.tif"), light)
+    Image.frombytes("I;16B", (2, 2), codes.astype(">u2").tobytes()).save(tmp_path / "big.tif")
+    np.testing.assert_array_equal(read_picture(tmp_path / "big.tif"), light)
+    for value in (-1, 65536):
+        Image.fromarray((codes // 65535 * value).astype(np.int32)).save(tmp_path / "over.tif")
+        with pytest.raises(AmiwarpError, match=rf"over\.tif has values from .*{value}.*; save it with 16 bits, 0 to"):
+            read_picture(tmp_path / "over.tif")
 
 
 def test_a_picture_is_cut_to_the_view() -> None:

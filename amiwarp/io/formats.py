@@ -8,6 +8,7 @@ from __future__ import annotations
 import enum
 import importlib
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
@@ -498,6 +499,8 @@ def check_codec(path: Path, given: Codec | str, chosen: OutputFormat) -> Codec:
 FORMAT, VERSION = "amiwarp-dataset", 1
 """Values of the manifest's fields ``format`` and ``version``."""
 MANIFEST = "manifest.json"
+SPLIT_NAME = "[A-Za-z0-9_-]+"
+"""Regular expression of the names of splits, which become names of folders and files."""
 MOST_BYTES = 1 << 30
 """Largest manifest that is read [bytes]: about a million recordings."""
 
@@ -658,7 +661,12 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], list[ManifestItem]]:
             raise AmiwarpError(f"field version is {version}, newer than {VERSION}; update amiwarp")
         items = instance(data.get("items"), list, "field items")
         head = {name: value for name, value in data.items() if name != "items"}
-        return head, [_item(entry, f"items[{k}]") for k, entry in enumerate(items)]
+        found = [_item(entry, f"items[{k}]") for k, entry in enumerate(items)]
+        first: dict[PurePosixPath, int] = {}
+        for k, item in enumerate(found):
+            if (other := first.setdefault(PurePosixPath(item.file), k)) != k:
+                raise AmiwarpError(f"field items[{k}].file is {shown(item.file)}, as items[{other}].file; remove one")
+        return head, found
 
 
 def _item(entry: Any, where: str) -> ManifestItem:
@@ -668,11 +676,14 @@ def _item(entry: Any, where: str) -> ManifestItem:
     path = PurePosixPath(file)
     if path.is_absolute() or ".." in path.parts or "\\" in file or not path.parts:
         raise AmiwarpError(f"field {where}.file is {shown(file)}; expected a path below the folder of the manifest")
+    split = instance(fields.get("split"), str, f"field {where}.split")
+    if not re.fullmatch(SPLIT_NAME, split):
+        raise AmiwarpError(f"field {where}.split is {shown(split)}; use letters, digits, '-' and '_'")
     made = fields.get("representation")
     return ManifestItem(
         fields,
         file,
-        instance(fields.get("split"), str, f"field {where}.split"),
+        split,
         instance(fields.get("labels"), dict, f"field {where}.labels"),
         whole(fields.get("events"), f"field {where}.events", 0, 1 << 62),
         None if made is None else instance(made, str, f"field {where}.representation"),

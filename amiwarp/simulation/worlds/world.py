@@ -238,7 +238,7 @@ class Trajectory:
         values = plain_array("d")
         for number, line in text_lines(path):
             words = line.split("#")[0].replace(",", " ").split()
-            if not words or (number == 1 and words[0].lower() in ("t", "time", "timestamp", "t_s")):
+            if not words or (not values and words[0].lower() in ("t", "time", "timestamp", "t_s")):
                 continue
             try:
                 row = [float(word) for word in words]
